@@ -1,0 +1,93 @@
+"""The errors that a user can meet, each with the exit code that the command line answers with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+
+class CtidError(Exception):
+    """Base of every error that ctid raises on purpose; its text is meant for the user."""
+
+    exit_code = 1
+
+
+class UsageError(CtidError):
+    """The request itself cannot be carried out: a bad option, specification or record."""
+
+    exit_code = 2
+
+
+class DataError(UsageError):
+    """A record (times, input, output) that cannot be used, and why."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing wrong in a specification, with its place in the file.
+
+    Parameters
+    ----------
+    file : str
+        Name of the file as the user gave it.
+    line, column : int
+        Position of the offending key or value, counted from 1.
+    key : str
+        Key path, for example ``sampling.interval``; empty for the file as a whole.
+    message : str
+        What is wrong and what is allowed.
+    """
+
+    file: str
+    line: int
+    column: int
+    key: str
+    message: str
+
+    def __str__(self) -> str:
+        key = f"{self.key}: " if self.key else ""
+        return f"{self.file}:{self.line}:{self.column}: {key}{self.message}"
+
+
+class SpecError(UsageError):
+    """A specification with one or more problems, all of them reported at once.
+
+    Parameters
+    ----------
+    problems : iterable of Problem
+        What is wrong, in the order of the file.
+    """
+
+    def __init__(self, problems: Iterable[Problem]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(str(problem) for problem in self.problems))
+
+
+class RefusedError(CtidError):
+    """The folder holds something that this command must not touch or mix with."""
+
+    exit_code = 3
+
+
+class TooManyFailuresError(CtidError):
+    """The run finished, but more estimates failed than the user accepts."""
+
+    exit_code = 4
+
+
+class StoppedEarlyError(CtidError):
+    """The run stopped before its end and can be resumed."""
+
+    exit_code = 5
+
+
+class StorageError(CtidError):
+    """Results could not be written or read back; what was finished before is safe."""
+
+    exit_code = 6
+
+
+class MismatchError(CtidError):
+    """A comparison or verification found a difference."""
+
+    exit_code = 7

@@ -1,0 +1,575 @@
+r"""Filtered signals of a record and their second moments, exactly, for any clock, hold and delay.
+
+For a monic A of degree n, a numerator B, and a delay tau, the *standard rows* at each used sample are
+
+====================  =====================================================
+rows                  signal
+====================  =====================================================
+``0 … n-1``           ``p^k/A u(t - tau)``, k = 0 … n-1
+``n``                 ``u(t - tau)``
+``n+1 … 2n``          ``p^k/A x(t)``, ``x = B/A u(t - tau)``
+``2n+1 … 3n``         ``p^k/A y``
+``3n+1``              ``y - x``, the output error
+``3n+2``              ``p x``, the derivative of the output error with respect to tau
+====================  =====================================================
+
+Every refined instrumental variable step, cost, gradient and Hessian is a function of their second moments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ctid_cli.filtering.exponential import held_step, place
+from ctid_cli.filtering.kernels import irregular_chain_pass, modal_pass, regular_chain_pass
+from ctid_cli.filtering.sections import chain, polynomial_roots, time_scale
+from ctid_cli.signals.held import Hold
+from ctid_cli.signals.record import Record
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+BoolArray = NDArray[np.bool_]
+Form = Literal["auto", "modal", "chain"]
+
+#: Partial fractions are used while they amplify rounding by less than this; beyond, poles count as repeated.
+MODAL_CONDITION_LIMIT = 1e4
+#: A delay closer to a whole number of intervals than this fraction of one is that whole number.
+WHOLE_INTERVAL = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class FilterData:
+    """A record laid out for the compiled passes.
+
+    Parameters
+    ----------
+    t, y : ndarray, shape (N,)
+        Sampling instants [s] and outputs, masked samples bridged by straight lines.
+    use : ndarray of bool, shape (N,)
+        Samples that enter sums: present, and not before the start-up time.
+    tu, u : ndarray, shape (M,)
+        Breaks [s] and values of the input.
+    input_foh : bool
+        Whether the input is held linearly.
+    y_foh : bool
+        Whether the output is taken as linear between samples (else constant). It never biases a converged estimate.
+    interval : float or None
+        The common interval [s] if input and output share one regular clock.
+    common_clock : bool
+        Whether ``tu`` equals ``t``.
+    """
+
+    t: Array
+    y: Array
+    use: BoolArray
+    tu: Array
+    u: Array
+    input_foh: bool
+    y_foh: bool
+    interval: float | None
+    common_clock: bool
+
+    @property
+    def count(self) -> int:
+        """Number of samples that enter sums."""
+        return int(self.use.sum())
+
+    @property
+    def y_used(self) -> Array:
+        """Outputs that enter sums, shape (count,)."""
+        return self.y[self.use]
+
+
+def filter_data(record: Record, start: float = 0.0, hold_output: Hold = "foh") -> FilterData:
+    """Lay a record out for filtering.
+
+    Parameters
+    ----------
+    record : Record
+        The record.
+    start : float, default 0.0
+        Samples earlier than this after the first input break [s] do not enter sums: the longest trial delay, so that
+        the delayed input is known wherever the output is compared.
+    hold_output : {"foh", "zoh"}, default "foh"
+        Interpolation of the measured output inside the estimator's own filters.
+
+    Returns
+    -------
+    FilterData
+        Arrays for the compiled passes.
+    """
+    valid = record.valid
+    y = record.y if valid.all() else np.interp(record.t, record.t[valid], record.y[valid])
+    slack = 1e-9 * (record.interval or 0.0)
+    use = valid & (record.t >= record.input.t[0] + start - slack)
+    on_grid = record.input_on_grid
+    same = record.input.t.size == record.t.size and bool(np.array_equal(record.input.t, record.t))
+    return FilterData(
+        t=record.t,
+        y=np.ascontiguousarray(y),
+        use=use,
+        tu=record.input.t,
+        u=record.input.values,
+        input_foh=record.input.hold == "foh",
+        y_foh=hold_output == "foh",
+        interval=record.interval if on_grid else None,
+        common_clock=same,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _scaled(coefficients: Array, w0: float) -> Array:
+    """Coefficients of A in the time unit 1/w0."""
+    scaled = np.empty(coefficients.size)
+    for k in range(coefficients.size):
+        scaled[k] = coefficients[k] / w0**k
+    return scaled
+
+
+@njit(cache=True, nogil=True)
+def double_chain(a: Array, b: Array) -> tuple[float, Array, Array, Array, Array]:
+    """Realise 1/A driven by the input and a second 1/A driven by the output of B/A.
+
+    Parameters
+    ----------
+    a : ndarray, shape (n + 1,)
+        Monic denominator, descending powers.
+    b : ndarray, shape (m + 1,)
+        Numerator, ``m < n``.
+
+    Returns
+    -------
+    w0 : float
+        Time unit is 1/w0 [rad/s].
+    dynamics, gain : ndarray, shapes (2 n, 2 n), (2 n,)
+        The cascade in that unit.
+    powers : ndarray, shape (n, n)
+        Row k: ``p^k/A v`` (p in rad/s) from the n states of either chain.
+    output : ndarray, shape (n,)
+        ``B/A v`` from the first n states.
+    """
+    n = a.size - 1
+    m = b.size - 1
+    w0 = time_scale(a)
+    single, entry, powers = chain(polynomial_roots(_scaled(a, w0)))
+    for k in range(n):
+        for i in range(n):
+            powers[k, i] *= w0 ** (k - n)
+    output = np.zeros(n)
+    for i in range(m + 1):
+        for j in range(n):
+            output[j] += b[i] * powers[m - i, j]
+    dynamics = np.zeros((2 * n, 2 * n))
+    gain = np.zeros(2 * n)
+    place(dynamics, 0, 0, single)
+    place(dynamics, n, n, single)
+    for i in range(n):
+        gain[i] = entry[i]
+        for j in range(n):
+            dynamics[n + i, j] = entry[i] * output[j]
+    return w0, dynamics, gain, powers, output
+
+
+@njit(cache=True, nogil=True)
+def _fill_derivative(a: Array, b: Array, mapping: Array) -> None:
+    """Write the row ``p x`` of a map to standard rows from the rows above it."""
+    n = a.size - 1
+    m = b.size - 1
+    last = 3 * n + 2
+    for column in range(mapping.shape[1]):
+        total = 0.0
+        for i in range(m + 1):
+            power = m - i + 1
+            if power < n:
+                total += b[i] * mapping[power, column]
+            else:
+                total += b[i] * mapping[n, column]
+                for k in range(1, n + 1):
+                    total -= b[i] * a[k] * mapping[n - k, column]
+        mapping[last, column] = total
+
+
+@njit(cache=True, nogil=True)
+def _to_standard(mapping: Array, rows: Array, gram: Array, want_rows: bool) -> Array:
+    """Apply the map to internal rows or to their moments."""
+    if want_rows:
+        return rows @ np.ascontiguousarray(mapping.T)
+    return mapping @ gram @ np.ascontiguousarray(mapping.T)
+
+
+@njit(cache=True, nogil=True)
+def split_delay(delay: float, interval: float) -> tuple[int, float]:
+    """Whole intervals by which the read-out lags, and the fraction of an interval read beyond that break.
+
+    Parameters
+    ----------
+    delay : float
+        Delay [s].
+    interval : float
+        Sampling interval [s].
+
+    Returns
+    -------
+    shift : int
+        ``t_k - delay`` lies in the interval that starts at break ``k - shift``.
+    fraction : float
+        Position in that interval, in [0, 1).
+    """
+    ratio = delay / interval
+    shift = int(np.ceil(ratio))
+    fraction = shift - ratio
+    if fraction > 1.0 - WHOLE_INTERVAL:
+        return shift - 1, 0.0
+    if fraction < WHOLE_INTERVAL:
+        return shift, 0.0
+    return shift, fraction
+
+
+@njit(cache=True, nogil=True)
+def _regular_chain(
+    a: Array,
+    b: Array,
+    delay: float,
+    interval: float,
+    u: Array,
+    input_foh: bool,
+    y: Array,
+    y_foh: bool,
+    use: BoolArray,
+    want_rows: bool,
+) -> Array:
+    n = a.size - 1
+    w0, dynamics, gain, powers, output = double_chain(a, b)
+    transition, from_value, from_change = held_step(dynamics, gain, interval * w0)
+    y_transition = transition[:n, :n].copy()
+    y_value, y_change = from_value[:n].copy(), from_change[:n].copy()
+    shift, fraction = split_delay(delay, interval)
+    readout = np.zeros((2 * n, 2 * n + 2))
+    if fraction > 0.0:
+        part, part_value, part_change = held_step(dynamics, gain, fraction * interval * w0)
+        place(readout, 0, 0, part)
+        for i in range(2 * n):
+            readout[i, 2 * n] = part_value[i]
+            readout[i, 2 * n + 1] = part_change[i] * fraction
+    else:
+        for i in range(2 * n):
+            readout[i, i] = 1.0
+    q = 3 * n + 3
+    mapping = np.zeros((q, q))
+    place(mapping, 0, 0, powers @ readout[:n])
+    mapping[n, 2 * n] = 1.0
+    mapping[n, 2 * n + 1] = fraction
+    place(mapping, n + 1, 0, powers @ readout[n:])
+    place(mapping, 2 * n + 1, 2 * n + 2, powers)
+    mapping[3 * n + 1, 3 * n + 2] = 1.0
+    _fill_derivative(a, b, mapping)
+    count = np.count_nonzero(use)
+    rows = np.zeros((count if want_rows else 0, q))
+    gram = np.zeros((0 if want_rows else q, 0 if want_rows else q))
+    regular_chain_pass(
+        transition,
+        from_value,
+        from_change,
+        output @ readout[:n],
+        u,
+        input_foh,
+        shift,
+        y_transition,
+        y_value,
+        y_change,
+        y,
+        y_foh,
+        use,
+        np.zeros(0),
+        rows,
+        gram,
+    )
+    return _to_standard(mapping, rows, gram, want_rows)
+
+
+@njit(cache=True, nogil=True)
+def _evaluate(coefficients: Array, point: complex) -> tuple[complex, complex, complex]:
+    """Value and first two derivatives of a polynomial."""
+    value, first, second = 0.0j, 0.0j, 0.0j
+    for k in range(coefficients.size):
+        second = second * point + 2.0 * first
+        first = first * point + value
+        value = value * point + coefficients[k]
+    return value, first, second
+
+
+@njit(cache=True, nogil=True)
+def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Array]:
+    """Partial fractions of the standard rows.
+
+    Parameters
+    ----------
+    a : ndarray, shape (n + 1,)
+        Monic denominator.
+    b : ndarray, shape (m + 1,)
+        Numerator, ``m < n``.
+
+    Returns
+    -------
+    condition : float
+        Amplification of rounding by the expansion of ``1/A^2`` at zero frequency; infinite with a repeated pole or one at the origin.
+    poles : ndarray, shape (modes,)
+        One pole of each conjugate pair [rad/s].
+    residues : ndarray, shape (modes,)
+        ``x = sum Re(residue z)``.
+    mapping : ndarray, shape (3 n + 3, 3 n + 2)
+        Standard rows from the rows of the modal pass.
+    """
+    n = a.size - 1
+    w0 = time_scale(a)
+    roots = polynomial_roots(_scaled(a, w0)) * w0
+    modes = 0
+    for i in range(n):
+        if roots[i].imag >= 0.0:
+            modes += 1
+    poles = np.zeros(modes, np.complex128)
+    residues = np.zeros(modes, np.complex128)
+    mapping = np.zeros((3 * n + 3, 3 * n + 2))
+    place, mode = 0, 0
+    amplification = 0.0
+    for i in range(n):
+        pole = roots[i]
+        if pole.imag < 0.0:
+            continue
+        paired = pole.imag > 0.0
+        weight = 2.0 if paired else 1.0
+        slope = 1.0 + 0.0j  # A'(pole), as a product: exact where the polynomial form would cancel
+        curvature = 0.0j  # A''/A' = 2 sum 1/(pole - other)
+        for j in range(n):
+            if j != i:
+                slope *= pole - roots[j]
+                if roots[j] != pole:
+                    curvature += 2.0 / (pole - roots[j])
+        if slope == 0.0 or pole == 0.0:
+            return np.inf, poles, residues, mapping
+        poles[mode] = pole
+        value, first, _ = _evaluate(b, pole)
+        residues[mode] = weight * value / slope
+        gain = 1.0 / (slope * pole)
+        amplification += weight * (abs(gain) ** 2 + abs(curvature / (slope * slope * pole)))
+        power, power_slope = 1.0 + 0.0j, 0.0j
+        for k in range(n):
+            single = weight * power / slope
+            numerator = power * value
+            numerator_slope = power_slope * value + power * first
+            double = weight * numerator / (slope * slope)
+            mixed = weight * (numerator_slope - numerator * curvature) / (slope * slope)
+            mapping[k, place] = single.real
+            mapping[2 * n + 1 + k, 2 * n + 1 + place] = single.real
+            mapping[n + 1 + k, place] = mixed.real
+            mapping[n + 1 + k, n + place] = double.real
+            if paired:
+                mapping[k, place + 1] = -single.imag
+                mapping[2 * n + 1 + k, 2 * n + 2 + place] = -single.imag
+                mapping[n + 1 + k, place + 1] = -mixed.imag
+                mapping[n + 1 + k, n + place + 1] = -double.imag
+            power_slope = power_slope * pole + power
+            power *= pole
+        place += 2 if paired else 1
+        mode += 1
+    mapping[n, 2 * n] = 1.0
+    mapping[3 * n + 1, 3 * n + 1] = 1.0
+    _fill_derivative(a, b, mapping)
+    return amplification * a[n] * a[n], poles, residues, mapping
+
+
+@njit(cache=True, nogil=True)
+def _modal(
+    poles: ComplexArray,
+    residues: ComplexArray,
+    mapping: Array,
+    delay: float,
+    interval: float,
+    tu: Array,
+    u: Array,
+    input_foh: bool,
+    t: Array,
+    y: Array,
+    y_foh: bool,
+    common_clock: bool,
+    use: BoolArray,
+    want_rows: bool,
+) -> Array:
+    q = mapping.shape[1]
+    rows = np.zeros((np.count_nonzero(use) if want_rows else 0, q))
+    gram = np.zeros((0 if want_rows else q, 0 if want_rows else q))
+    shift, fraction = 0, 0.0
+    if interval > 0.0:
+        shift, fraction = split_delay(delay, interval)
+    modal_pass(
+        poles,
+        residues,
+        interval,
+        shift,
+        fraction,
+        tu,
+        u,
+        input_foh,
+        delay,
+        t,
+        y,
+        y_foh,
+        common_clock,
+        use,
+        np.zeros(0),
+        rows,
+        gram,
+    )
+    return _to_standard(mapping, rows, gram, want_rows)
+
+
+@njit(cache=True, nogil=True)
+def _irregular_chain(
+    a: Array,
+    b: Array,
+    delay: float,
+    tu: Array,
+    u: Array,
+    input_foh: bool,
+    t: Array,
+    y: Array,
+    y_foh: bool,
+    use: BoolArray,
+    want_rows: bool,
+) -> Array:
+    n = a.size - 1
+    w0, dynamics, gain, powers, output = double_chain(a, b)
+    q = 3 * n + 2
+    mapping = np.zeros((3 * n + 3, q))
+    place(mapping, 0, 0, powers)
+    mapping[n, 2 * n] = 1.0
+    place(mapping, n + 1, n, powers)
+    place(mapping, 2 * n + 1, 2 * n + 1, powers)
+    mapping[3 * n + 1, 3 * n + 1] = 1.0
+    _fill_derivative(a, b, mapping)
+    rows = np.zeros((np.count_nonzero(use) if want_rows else 0, q))
+    gram = np.zeros((0 if want_rows else q, 0 if want_rows else q))
+    output_map = np.zeros(2 * n)
+    for i in range(n):
+        output_map[i] = output[i]
+    irregular_chain_pass(
+        dynamics,
+        gain,
+        output_map,
+        tu * w0,
+        u,
+        input_foh,
+        delay * w0,
+        dynamics[:n, :n].copy(),
+        gain[:n].copy(),
+        t * w0,
+        y,
+        y_foh,
+        use,
+        np.zeros(0),
+        rows,
+        gram,
+    )
+    return _to_standard(mapping, rows, gram, want_rows)
+
+
+@njit(cache=True, nogil=True)
+def _dispatch(
+    a: Array,
+    b: Array,
+    delay: float,
+    interval: float,
+    tu: Array,
+    u: Array,
+    input_foh: bool,
+    t: Array,
+    y: Array,
+    y_foh: bool,
+    common_clock: bool,
+    use: BoolArray,
+    want_rows: bool,
+    limit: float,
+) -> Array:
+    """One compiled entry, so that a call from Python costs one crossing."""
+    condition, poles, residues, mapping = modal_map(a, b)
+    if condition < limit:
+        return _modal(
+            poles, residues, mapping, delay, interval, tu, u, input_foh, t, y, y_foh, common_clock, use, want_rows
+        )
+    if interval > 0.0:
+        return _regular_chain(a, b, delay, interval, u, input_foh, y, y_foh, use, want_rows)
+    return _irregular_chain(a, b, delay, tu, u, input_foh, t, y, y_foh, use, want_rows)
+
+
+def _run(data: FilterData, a: Array, b: Array, delay: float, want_rows: bool, form: Form) -> Array:
+    limit = {"chain": 0.0, "modal": np.inf, "auto": MODAL_CONDITION_LIMIT}[form]
+    moments: Array = _dispatch(
+        a,
+        b,
+        delay,
+        data.interval or 0.0,
+        data.tu,
+        data.u,
+        data.input_foh,
+        data.t,
+        data.y,
+        data.y_foh,
+        data.common_clock,
+        data.use,
+        want_rows,
+        limit,
+    )
+    return moments
+
+
+def second_moments(data: FilterData, a: Array, b: Array, delay: float = 0.0, form: Form = "auto") -> Array:
+    """Sums of products of the standard rows over the used samples.
+
+    Parameters
+    ----------
+    data : FilterData
+        The record.
+    a : ndarray, shape (n + 1,)
+        Monic denominator, descending powers.
+    b : ndarray, shape (m + 1,)
+        Numerator, ``m < n``.
+    delay : float, default 0.0
+        Delay of the input [s].
+    form : {"auto", "modal", "chain"}, default "auto"
+        Realisation of 1/A; ``auto`` takes partial fractions while they are well conditioned. Both give the same numbers.
+
+    Returns
+    -------
+    ndarray, shape (3 n + 3, 3 n + 3)
+        Second moments in the order of the standard rows.
+    """
+    return _run(data, a, b, delay, False, form)
+
+
+def standard_rows(data: FilterData, a: Array, b: Array, delay: float = 0.0, form: Form = "auto") -> Array:
+    """The standard rows themselves.
+
+    Parameters
+    ----------
+    data : FilterData
+        The record.
+    a : ndarray, shape (n + 1,)
+        Monic denominator, descending powers.
+    b : ndarray, shape (m + 1,)
+        Numerator, ``m < n``.
+    delay : float, default 0.0
+        Delay of the input [s].
+    form : {"auto", "modal", "chain"}, default "auto"
+        Realisation of 1/A.
+
+    Returns
+    -------
+    ndarray, shape (count, 3 n + 3)
+        One line per used sample.
+    """
+    return _run(data, a, b, delay, True, form)

@@ -1,0 +1,124 @@
+"""Exact one-step maps of a linear system under a held input."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@njit(cache=True, nogil=True)
+def place(target: Array, row: int, column: int, source: Array) -> None:
+    """Copy a small matrix into a larger one. (Slice assignment costs seconds of compilation in every kernel.)
+
+    Parameters
+    ----------
+    target : ndarray
+        Matrix to write into.
+    row, column : int
+        Where the upper left corner goes.
+    source : ndarray
+        Matrix to copy.
+    """
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[row + i, column + j] = source[i, j]
+
+
+@njit(cache=True, nogil=True)
+def _multiply(left: Array, right: Array, out: Array) -> None:
+    """``out = left @ right`` for small matrices, without the call into BLAS."""
+    n = left.shape[0]
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = 0.0
+        for k in range(n):
+            scale = left[i, k]
+            if scale != 0.0:
+                for j in range(n):
+                    out[i, j] += scale * right[k, j]
+
+
+@njit(cache=True, nogil=True)
+def exponential_minus_identity(matrix: Array) -> Array:
+    r"""``exp(M) - I`` of a small matrix.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (n, n)
+        M, dimensionless.
+
+    Returns
+    -------
+    ndarray, shape (n, n)
+        ``exp(M) - I``.
+
+    Notes
+    -----
+    Scaling and squaring on ``X = exp(M/2^s) - I`` by ``X <- 2 X + X X``. Squaring X instead of I + X keeps the
+    relative accuracy of slow modes when a fast one forces many squarings (poles spread over six decades).
+    """
+    n = matrix.shape[0]
+    norm = 0.0
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += abs(matrix[i, j])
+        norm = max(norm, total)
+    squarings = 0
+    while norm > 0.25 and squarings < 200:
+        norm *= 0.5
+        squarings += 1
+    scaled = matrix * 0.5**squarings
+    # Taylor polynomial of degree 12, Horner form: the remainder is below 1e-17 at norm 1/4.
+    result = scaled / 12.0
+    work = np.empty((n, n))
+    for degree in range(11, 0, -1):
+        _multiply(scaled, result, work)
+        for i in range(n):
+            for j in range(n):
+                result[i, j] = (scaled[i, j] + work[i, j]) / degree
+    for _ in range(squarings):
+        _multiply(result, result, work)
+        for i in range(n):
+            for j in range(n):
+                result[i, j] = 2.0 * result[i, j] + work[i, j]
+    return result
+
+
+@njit(cache=True, nogil=True)
+def held_step(dynamics: Array, gain: Array, step: float) -> tuple[Array, Array, Array]:
+    r"""Exact map of ``z' = F z + g v`` over one step with v constant or linear.
+
+    Parameters
+    ----------
+    dynamics : ndarray, shape (n, n)
+        F [1/time].
+    gain : ndarray, shape (n,)
+        g [1/time].
+    step : float
+        Length of the step [time].
+
+    Returns
+    -------
+    transition : ndarray, shape (n, n)
+        ``E = exp(F step)``.
+    from_value : ndarray, shape (n,)
+        Response of z to ``v = 1``.
+    from_change : ndarray, shape (n,)
+        Response of z to v rising from 0 to 1 over the step.
+    """
+    n = gain.size
+    augmented = np.zeros((n + 2, n + 2))
+    for i in range(n):
+        for j in range(n):
+            augmented[i, j] = dynamics[i, j] * step
+        augmented[i, n] = gain[i] * step
+    augmented[n, n + 1] = 1.0
+    result = exponential_minus_identity(augmented)
+    transition = result[:n, :n].copy()
+    for i in range(n):
+        transition[i, i] += 1.0
+    return transition, result[:n, n].copy(), result[:n, n + 1].copy()

@@ -1,0 +1,528 @@
+"""The three compiled passes over a record: modal form on any clock, chain form on a regular and on an irregular clock.
+
+Each pass advances the state z of a filter driven by the delayed held input and the state of a filter driven by the
+measured output, reads both at the sampling instants, and forms the *internal row*
+``[z(t_k - tau), input terms, filtered output, y_k - x_k]``. Rows are accumulated into their second-moment (Gram)
+matrix, written out, or both. Everything that an estimator needs is a linear map of these rows.
+
+The input state is advanced on the input's own breaks and only *read out* at ``t_k - tau``. The recursion therefore does
+not depend on the delay, and on a regular clock the read-out is one constant map that need not be applied per sample.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ctid_cli.filtering.exponential import exponential_minus_identity, place
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+BoolArray = NDArray[np.bool_]
+
+#: Rows are collected in blocks of this many samples, so that the products run along contiguous memory.
+BLOCK = 128
+#: Digits per level and Taylor degree of the chain-form transition on an irregular clock.
+BASE = 16
+TAYLOR_DEGREE = 5
+QUANTUM_NORM = 2.0**-9
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _accumulate(block: Array, count: int, gram: Array) -> None:
+    """Add the products of ``count`` buffered rows to the upper triangle of the Gram matrix."""
+    q = block.shape[0]
+    for i in range(q):
+        left = block[i]
+        for j in range(i, q):
+            right = block[j]
+            total = 0.0
+            for k in range(count):
+                total += left[k] * right[k]
+            gram[i, j] += total
+
+
+@njit(cache=True, nogil=True)
+def _emit(block: Array, filled: int, written: int, rows: Array, gram: Array) -> int:
+    """Pass a block on to whatever the caller asked for; returns the number of rows written so far."""
+    if gram.size:
+        _accumulate(block, filled, gram)
+    if rows.size:
+        for k in range(filled):
+            for i in range(block.shape[0]):
+                rows[written + k, i] = block[i, k]
+    return written + filled
+
+
+@njit(cache=True, nogil=True)
+def _mirror(gram: Array) -> None:
+    for i in range(gram.shape[0]):
+        for j in range(i):
+            gram[i, j] = gram[j, i]
+
+
+@njit(cache=True, nogil=True)
+def regular_chain_pass(
+    transition: Array,
+    from_value: Array,
+    from_change: Array,
+    output_map: Array,
+    u: Array,
+    input_foh: bool,
+    shift: int,
+    y_transition: Array,
+    y_from_value: Array,
+    y_from_change: Array,
+    y: Array,
+    y_foh: bool,
+    use: BoolArray,
+    output: Array,
+    rows: Array,
+    gram: Array,
+) -> None:
+    """Pass over a regular clock in chain form: any poles, repeated ones included.
+
+    Parameters
+    ----------
+    transition, from_value, from_change : ndarray
+        One-interval map of the input filter, shapes (nz, nz), (nz,), (nz,).
+    output_map : ndarray, shape (nz + 2,)
+        ``x_k`` from ``[z_j, u_j, u_(j+1) - u_j]`` with ``j = k - shift``.
+    u : ndarray, shape (N,)
+        Input samples.
+    input_foh : bool
+        Whether the input is held linearly.
+    shift : int
+        Whole intervals by which the read-out lags the sample.
+    y_transition, y_from_value, y_from_change : ndarray
+        One-interval map of the output filter, shapes (ny, ny), (ny,), (ny,); ny may be 0.
+    y : ndarray, shape (N,)
+        Output samples, gaps filled.
+    y_foh : bool
+        Whether the output is held linearly.
+    use : ndarray of bool, shape (N,)
+        Samples that enter rows and moments.
+    output : ndarray, shape (N,) or (0,)
+        Receives x at every sample, if asked for.
+    rows : ndarray, shape (count, nz + 3 + ny) or (0, 0)
+        Receives the rows ``[z_j, u_j, du_j, z_y, y_k - x_k]``, if asked for.
+    gram : ndarray, shape (nz + 3 + ny, nz + 3 + ny) or (0, 0)
+        Receives their second moments, if asked for.
+    """
+    nz, ny = from_value.size, y_from_value.size
+    q = nz + 3 + ny
+    n_samples = y.size
+    last = u.size - 1
+    block = np.zeros((q, BLOCK))
+    z, z_next = np.zeros(nz), np.zeros(nz)
+    w, w_next = np.zeros(ny), np.zeros(ny)
+    filled, written = 0, 0
+    keep_rows = gram.size > 0 or rows.size > 0
+    for k in range(n_samples):
+        j = k - shift
+        x = 0.0
+        value, change = 0.0, 0.0
+        if j >= 0:
+            value = u[j]
+            if input_foh and j < last:
+                change = u[j + 1] - value
+            x = output_map[nz] * value + output_map[nz + 1] * change
+            for i in range(nz):
+                x += output_map[i] * z[i]
+        if keep_rows and use[k]:
+            for i in range(nz):
+                block[i, filled] = z[i]
+            block[nz, filled] = value
+            block[nz + 1, filled] = change
+            for i in range(ny):
+                block[nz + 2 + i, filled] = w[i]
+            block[nz + 2 + ny, filled] = y[k] - x
+            filled += 1
+            if filled == BLOCK:
+                written = _emit(block, filled, written, rows, gram)
+                filled = 0
+        if output.size:
+            output[k] = x
+        if j >= 0:
+            for i in range(nz):
+                total = from_value[i] * value + from_change[i] * change
+                for m in range(min(i + 2, nz)):
+                    total += transition[i, m] * z[m]
+                z_next[i] = total
+            z, z_next = z_next, z
+        if ny > 0 and k + 1 < n_samples:
+            change = y[k + 1] - y[k] if y_foh else 0.0
+            for i in range(ny):
+                total = y_from_value[i] * y[k] + y_from_change[i] * change
+                for m in range(min(i + 2, ny)):
+                    total += y_transition[i, m] * w[m]
+                w_next[i] = total
+            w, w_next = w_next, w
+    _emit(block, filled, written, rows, gram)
+    _mirror(gram)
+
+
+@njit(cache=True, nogil=True)
+def _modal_step(
+    decay: complex,
+    step: float,
+    inverse: complex,
+    square: complex,
+    cube: complex,
+    z: complex,
+    w: complex,
+    start: float,
+    end: float,
+    slope: float,
+) -> tuple[complex, complex]:
+    """Advance ``z = 1/(s - p) v`` and ``w = 1/(s - p)^2 v`` over a step with v linear from start to end.
+
+    The deviation from the particular solution of a linear input evolves freely; ``inverse``, ``square`` and ``cube``
+    are the first three powers of 1/p.
+    """
+    bend = slope * square
+    twist = 2.0 * slope * cube
+    z_free = z + start * inverse + bend
+    w_free = w - start * square - twist
+    return decay * z_free - end * inverse - bend, decay * (w_free + step * z_free) + end * square + twist
+
+
+@njit(cache=True, nogil=True)
+def modal_pass(
+    poles: ComplexArray,
+    output_map: ComplexArray,
+    interval: float,
+    shift: int,
+    fraction: float,
+    tu: Array,
+    u: Array,
+    input_foh: bool,
+    delay: float,
+    t: Array,
+    y: Array,
+    y_foh: bool,
+    common_clock: bool,
+    use: BoolArray,
+    output: Array,
+    rows: Array,
+    gram: Array,
+) -> None:
+    """Pass in modal form, for simple poles, on any clock.
+
+    Parameters
+    ----------
+    poles : ndarray, shape (modes,)
+        Simple non-zero poles, one of each conjugate pair (that with positive imaginary part) [rad/s].
+    output_map : ndarray, shape (modes,)
+        Residues r: ``x = sum Re(r z)``, twice the residue for a pair.
+    interval : float
+        The common interval [s] of a regular clock, which makes every exponential a constant; 0 on an irregular one.
+    shift, fraction : int, float
+        The delay on a regular clock, see :func:`ctid_cli.filtering.bank.split_delay`.
+    tu, u : ndarray, shape (M,)
+        Breaks [s] and values of the input.
+    input_foh : bool
+        Whether the input is held linearly.
+    delay : float
+        Delay [s].
+    t, y : ndarray, shape (N,)
+        Sampling instants [s] and outputs, gaps filled.
+    y_foh : bool
+        Whether the output is held linearly.
+    common_clock : bool
+        Whether ``tu`` equals ``t``, so that exponentials can be shared.
+    use : ndarray of bool, shape (N,)
+        Samples that enter rows and moments.
+    output : ndarray, shape (N,) or (0,)
+        Receives x at every sample, if asked for.
+    rows : ndarray, shape (count, 3 n + 2) or (0, 0)
+        Receives ``[z, w, v(t_k - tau), z_y, y_k - x_k]``; n numbers each for z, w and z_y: the real part of a mode and,
+        for a pair, the imaginary part after it.
+    gram : ndarray, shape (3 n + 2, 3 n + 2) or (0, 0)
+        Receives their second moments, if asked for.
+    """
+    modes = poles.size
+    n = 0
+    for i in range(modes):
+        n += 2 if poles[i].imag != 0.0 else 1
+    q = 3 * n + 2
+    n_samples, n_breaks = t.size, tu.size
+    regular = interval > 0.0
+    block = np.zeros((q, BLOCK))
+    inverse = 1.0 / poles
+    square = inverse * inverse
+    cube = square * inverse
+    z, w, zy = np.zeros(modes, np.complex128), np.zeros(modes, np.complex128), np.zeros(modes, np.complex128)
+    u_decay, read_decay = np.exp(poles * interval), np.exp(poles * (interval * fraction))
+    y_decay = u_decay.copy()
+    share = common_clock and not regular
+    memory = np.zeros((n_samples if share else 0, modes), np.complex128)
+    # Instants that differ by rounding only are one instant.
+    slack = 1e-10 * (t[-1] - t[0]) / n_samples
+    filled, written = 0, 0
+    keep_rows = gram.size > 0 or rows.size > 0
+    j = -1  # the last break that has been reached
+    for k in range(n_samples):
+        instant = t[k] - delay
+        while j + 1 < n_breaks and (j + 1 <= k - shift if regular else tu[j + 1] <= instant + slack):
+            if j >= 0:
+                step = interval if regular else tu[j + 1] - tu[j]
+                slope = (u[j + 1] - u[j]) / step if input_foh else 0.0
+                end = u[j + 1] if input_foh else u[j]
+                for i in range(modes):
+                    if not regular:
+                        u_decay[i] = memory[j, i] if share else np.exp(poles[i] * step)
+                    z[i], w[i] = _modal_step(
+                        u_decay[i], step, inverse[i], square[i], cube[i], z[i], w[i], u[j], end, slope
+                    )
+            j += 1
+        used = keep_rows and use[k]
+        x, value = 0.0, 0.0
+        if j >= 0 and (used or output.size):
+            step = fraction * interval if regular else instant - tu[j]
+            slope = 0.0
+            if input_foh and j + 1 < n_breaks:
+                slope = (u[j + 1] - u[j]) / (interval if regular else tu[j + 1] - tu[j])
+            value = u[j] + slope * step
+            place = 0
+            for i in range(modes):
+                z_now, w_now = z[i], w[i]
+                if step > 0.0:
+                    if not regular:
+                        read_decay[i] = np.exp(poles[i] * step)
+                    z_now, w_now = _modal_step(
+                        read_decay[i], step, inverse[i], square[i], cube[i], z_now, w_now, u[j], value, slope
+                    )
+                x += output_map[i].real * z_now.real - output_map[i].imag * z_now.imag
+                if used:
+                    block[place, filled] = z_now.real
+                    block[n + place, filled] = w_now.real
+                    place += 1
+                    if poles[i].imag != 0.0:
+                        block[place, filled] = z_now.imag
+                        block[n + place, filled] = w_now.imag
+                        place += 1
+        elif used:
+            for i in range(2 * n):
+                block[i, filled] = 0.0
+        if used:
+            block[2 * n, filled] = value
+            place = 2 * n + 1
+            for i in range(modes):
+                block[place, filled] = zy[i].real
+                place += 1
+                if poles[i].imag != 0.0:
+                    block[place, filled] = zy[i].imag
+                    place += 1
+            block[place, filled] = y[k] - x
+            filled += 1
+            if filled == BLOCK:
+                written = _emit(block, filled, written, rows, gram)
+                filled = 0
+        if output.size:
+            output[k] = x
+        if k + 1 < n_samples and (keep_rows or share):
+            step = interval if regular else t[k + 1] - t[k]
+            slope = (y[k + 1] - y[k]) / step if y_foh else 0.0
+            end = y[k + 1] if y_foh else y[k]
+            for i in range(modes):
+                if not regular:
+                    y_decay[i] = np.exp(poles[i] * step)
+                if share:
+                    memory[k, i] = y_decay[i]
+                bend = slope * square[i]
+                zy[i] = y_decay[i] * (zy[i] + y[k] * inverse[i] + bend) - end * inverse[i] - bend
+    _emit(block, filled, written, rows, gram)
+    _mirror(gram)
+
+
+@njit(cache=True, nogil=True)
+def transition_table(dynamics: Array, gain: Array, longest: float) -> tuple[Array, float, Array]:
+    r"""Transitions over the multiples of a small quantum, digit by digit.
+
+    Parameters
+    ----------
+    dynamics, gain : ndarray, shapes (n, n), (n,)
+        F and g of ``z' = F z + g v``.
+    longest : float
+        Longest step that will be asked for.
+
+    Returns
+    -------
+    table : ndarray, shape (levels, BASE, n + 2, n + 2)
+        ``exp(M d BASE^l q)`` for digit d of level l, M acting on ``[z, v, v']``.
+    quantum : float
+        q, so small that a short Taylor series covers what is left.
+    augmented : ndarray, shape (n + 2, n + 2)
+        M.
+    """
+    n = gain.size
+    augmented = np.zeros((n + 2, n + 2))
+    place(augmented, 0, 0, dynamics)
+    for i in range(n):
+        augmented[i, n] = gain[i]
+    augmented[n, n + 1] = 1.0
+    norm = 0.0
+    for i in range(n + 2):
+        total = 0.0
+        for j in range(n + 2):
+            total += abs(augmented[i, j])
+        norm = max(norm, total)
+    quantum = QUANTUM_NORM / norm
+    levels = 1
+    while quantum * float(BASE) ** levels <= longest and levels < 40:
+        levels += 1
+    table = np.zeros((levels, BASE, n + 2, n + 2))
+    for level in range(levels):
+        for digit in range(BASE):
+            power = exponential_minus_identity(augmented * (digit * quantum * float(BASE) ** level))
+            place(table[level, digit], 0, 0, power)
+            for i in range(n + 2):
+                table[level, digit, i, i] += 1.0
+    return table, quantum, augmented
+
+
+@njit(cache=True, nogil=True)
+def _table_step(table: Array, quantum: float, augmented: Array, step: float, state: Array, work: Array) -> None:
+    """Advance ``state = [z, v, v']`` by ``step``, in place."""
+    size = state.size
+    whole = np.floor(step / quantum)
+    rest = step - whole * quantum
+    level = 0
+    while whole > 0.0 and level < table.shape[0]:
+        shifted = np.floor(whole / BASE)
+        digit = int(whole - shifted * BASE)
+        if level == table.shape[0] - 1:
+            digit = min(int(whole), BASE - 1)
+        if digit > 0:
+            for i in range(size):
+                total = 0.0
+                for m in range(size):
+                    total += table[level, digit, i, m] * state[m]
+                work[i] = total
+            for i in range(size):
+                state[i] = work[i]
+        whole = shifted
+        level += 1
+    if rest > 0.0:
+        term = state.copy()
+        for degree in range(1, TAYLOR_DEGREE + 1):
+            for i in range(size):
+                total = 0.0
+                for m in range(size):
+                    total += augmented[i, m] * term[m]
+                work[i] = total * rest / degree
+            for i in range(size):
+                term[i] = work[i]
+                state[i] += work[i]
+
+
+@njit(cache=True, nogil=True)
+def irregular_chain_pass(
+    dynamics: Array,
+    gain: Array,
+    output_map: Array,
+    tu: Array,
+    u: Array,
+    input_foh: bool,
+    delay: float,
+    y_dynamics: Array,
+    y_gain: Array,
+    t: Array,
+    y: Array,
+    y_foh: bool,
+    use: BoolArray,
+    output: Array,
+    rows: Array,
+    gram: Array,
+) -> None:
+    """Pass over an irregular clock in chain form: any poles, repeated ones included.
+
+    Parameters
+    ----------
+    dynamics, gain : ndarray, shapes (nz, nz), (nz,)
+        Input filter, in the time unit of all times below.
+    output_map : ndarray, shape (nz,)
+        x from z.
+    tu, u : ndarray, shape (M,)
+        Breaks and values of the input.
+    input_foh : bool
+        Whether the input is held linearly.
+    delay : float
+        Delay.
+    y_dynamics, y_gain : ndarray, shapes (ny, ny), (ny,)
+        Output filter; ny may be 0.
+    t, y : ndarray, shape (N,)
+        Sampling instants and outputs, gaps filled.
+    y_foh : bool
+        Whether the output is held linearly.
+    use : ndarray of bool, shape (N,)
+        Samples that enter rows and moments.
+    output : ndarray, shape (N,) or (0,)
+        Receives x at every sample, if asked for.
+    rows : ndarray, shape (count, nz + 2 + ny) or (0, 0)
+        Receives ``[z(t_k - tau), v(t_k - tau), z_y, y_k - x_k]``, if asked for.
+    gram : ndarray, shape (nz + 2 + ny, nz + 2 + ny) or (0, 0)
+        Receives their second moments, if asked for.
+    """
+    nz, ny = gain.size, y_gain.size
+    q = nz + 2 + ny
+    n_samples, n_breaks = t.size, tu.size
+    longest = t[-1] - t[0]
+    if tu[0] < t[0]:
+        longest = t[-1] - tu[0]
+    if n_samples > 1:
+        longest = 0.0
+        for k in range(n_samples - 1):
+            longest = max(longest, t[k + 1] - t[k])
+        for k in range(n_breaks - 1):
+            longest = max(longest, tu[k + 1] - tu[k])
+        longest = max(longest, t[-1] - delay - tu[-1])
+    table, quantum, augmented = transition_table(dynamics, gain, longest)
+    y_table, y_quantum, y_augmented = table, quantum, augmented
+    if ny > 0:
+        y_table, y_quantum, y_augmented = transition_table(y_dynamics, y_gain, longest)
+    block = np.zeros((q, BLOCK))
+    base, now, work = np.zeros(nz + 2), np.zeros(nz + 2), np.zeros(max(nz, ny) + 2)
+    filtered = np.zeros(ny + 2)
+    slack = 1e-10 * (t[-1] - t[0]) / n_samples
+    filled, written = 0, 0
+    keep_rows = gram.size > 0 or rows.size > 0
+    j = -1
+    for k in range(n_samples):
+        instant = t[k] - delay
+        while j + 1 < n_breaks and tu[j + 1] <= instant + slack:
+            if j >= 0:
+                _table_step(table, quantum, augmented, tu[j + 1] - tu[j], base, work)
+            j += 1
+            base[nz] = u[j]
+            base[nz + 1] = 0.0
+            if input_foh and j + 1 < n_breaks:
+                base[nz + 1] = (u[j + 1] - u[j]) / (tu[j + 1] - tu[j])
+        used = keep_rows and use[k]
+        x = 0.0
+        if j >= 0 and (used or output.size):
+            for i in range(nz + 2):
+                now[i] = base[i]
+            _table_step(table, quantum, augmented, max(0.0, instant - tu[j]), now, work)
+            for i in range(nz):
+                x += output_map[i] * now[i]
+        if used:
+            for i in range(nz + 1):
+                block[i, filled] = now[i]
+            for i in range(ny):
+                block[nz + 1 + i, filled] = filtered[i]
+            block[nz + 1 + ny, filled] = y[k] - x
+            filled += 1
+            if filled == BLOCK:
+                written = _emit(block, filled, written, rows, gram)
+                filled = 0
+        if output.size:
+            output[k] = x
+        if ny > 0 and k + 1 < n_samples:
+            filtered[ny] = y[k]
+            filtered[ny + 1] = (y[k + 1] - y[k]) / (t[k + 1] - t[k]) if y_foh else 0.0
+            _table_step(y_table, y_quantum, y_augmented, t[k + 1] - t[k], filtered, work)
+    _emit(block, filled, written, rows, gram)
+    _mirror(gram)

@@ -1,0 +1,125 @@
+"""Rational transfer functions in the Laplace variable, with a pure delay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctid_cli.errors import DataError
+
+
+@dataclass(frozen=True, eq=False)
+class TransferFunction:
+    r"""``G(s) = B(s)/A(s) exp(-delay s)`` with coefficients in descending powers of s.
+
+    Parameters
+    ----------
+    numerator : array_like, shape (m + 1,)
+        Coefficients of B in descending powers; leading zeros are dropped.
+    denominator : array_like, shape (n + 1,)
+        Coefficients of A in descending powers; both polynomials are divided by its leading one,
+        so that ``denominator[0] == 1`` afterwards.
+    delay : float, default 0.0
+        Pure delay [s].
+
+    Raises
+    ------
+    DataError
+        If a coefficient is not finite, the leading denominator coefficient is zero, or the delay is negative.
+
+    Examples
+    --------
+    >>> g = TransferFunction([2], [0.25, 0.7, 1], delay=8.0)
+    >>> g.numerator, g.denominator, round(g.dc_gain, 6)
+    (array([8.]), array([1. , 2.8, 4. ]), 2.0)
+    """
+
+    numerator: NDArray[np.float64]
+    denominator: NDArray[np.float64]
+    delay: float = 0.0
+
+    def __init__(self, numerator: ArrayLike, denominator: ArrayLike, delay: float = 0.0) -> None:
+        b = np.atleast_1d(np.array(numerator, dtype=float))
+        a = np.atleast_1d(np.array(denominator, dtype=float))
+        if a.ndim != 1 or b.ndim != 1 or not a.size or not b.size:
+            raise DataError("numerator and denominator must be lists of coefficients in descending powers of s")
+        if not (np.isfinite(a).all() and np.isfinite(b).all()):
+            raise DataError("a coefficient of the transfer function is not a finite number")
+        if a[0] == 0:
+            raise DataError("the first denominator coefficient is zero; drop leading zeros")
+        if not (np.isfinite(delay) and delay >= 0):
+            raise DataError(f"a delay must be a finite number of seconds, zero or more; got {delay}")
+        b = np.trim_zeros(b, "f")
+        b = (b if b.size else np.zeros(1)) / a[0]
+        a = a / a[0]
+        b.setflags(write=False)
+        a.setflags(write=False)
+        object.__setattr__(self, "numerator", b)
+        object.__setattr__(self, "denominator", a)
+        object.__setattr__(self, "delay", float(delay))
+
+    @property
+    def order(self) -> int:
+        """Number of poles."""
+        return int(self.denominator.size - 1)
+
+    @property
+    def relative_degree(self) -> int:
+        """Number of poles minus number of zeros."""
+        return int(self.denominator.size - self.numerator.size)
+
+    @property
+    def poles(self) -> NDArray[np.complex128]:
+        """Roots of A [rad/s], fastest first, shape (n,)."""
+        return sorted_roots(self.denominator)
+
+    @property
+    def zeros(self) -> NDArray[np.complex128]:
+        """Roots of B [rad/s], fastest first, shape (m,)."""
+        return sorted_roots(self.numerator)
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether every pole lies strictly in the left half-plane."""
+        return bool((self.poles.real < 0).all())
+
+    @property
+    def dc_gain(self) -> float:
+        """``G(0)``; infinite with a pole at the origin."""
+        return float(self.numerator[-1] / self.denominator[-1]) if self.denominator[-1] else float("inf")
+
+    def frequency_response(self, frequencies: ArrayLike) -> NDArray[np.complex128]:
+        """``G(j w)``.
+
+        Parameters
+        ----------
+        frequencies : array_like
+            Angular frequencies w [rad/s].
+
+        Returns
+        -------
+        ndarray
+            Complex gain at each frequency.
+        """
+        s = 1j * np.asarray(frequencies, dtype=float)
+        gain = np.polyval(self.numerator, s) / np.polyval(self.denominator, s) * np.exp(-s * self.delay)
+        return np.asarray(gain, dtype=complex)
+
+
+def sorted_roots(coefficients: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Roots of a polynomial, largest magnitude first.
+
+    Parameters
+    ----------
+    coefficients : ndarray, shape (n + 1,)
+        Coefficients in descending powers.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        The roots.
+    """
+    roots = np.asarray(np.roots(coefficients), dtype=complex)
+    return roots[np.lexsort((roots.imag, -np.abs(roots)))]

@@ -1,0 +1,101 @@
+"""Signals that are held between known instants: the only kind of input an exact simulation needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctid_cli.errors import DataError
+
+Hold = Literal["zoh", "foh"]
+
+#: Instants closer than this fraction of the shortest break interval count as the same instant.
+#: Products such as ``k * 0.05`` and ``j * 0.5`` name one instant and differ in the last bit.
+COINCIDENCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class HeldSignal:
+    """A signal given at break times and held between them; zero before the first break.
+
+    Parameters
+    ----------
+    t : ndarray, shape (M,)
+        Break times [s], strictly increasing.
+    values : ndarray, shape (M,)
+        Values at the break times [input unit].
+    hold : {"zoh", "foh"}
+        ``zoh`` keeps each value until the next break; ``foh`` joins the values by straight lines.
+        After the last break both keep the last value.
+
+    Raises
+    ------
+    DataError
+        If the arrays differ in length, hold non-finite numbers, or the times do not increase.
+    """
+
+    t: NDArray[np.float64]
+    values: NDArray[np.float64]
+    hold: Hold = "zoh"
+
+    def __post_init__(self) -> None:
+        t = np.array(self.t, dtype=float)
+        values = np.array(self.values, dtype=float)
+        if t.ndim != 1 or t.shape != values.shape or t.size == 0:
+            raise DataError(
+                "a held signal needs times and values of one equal, non-zero length; "
+                f"got {t.shape} and {values.shape}"
+            )
+        if self.hold not in ("zoh", "foh"):
+            raise DataError(f"hold must be 'zoh' or 'foh', not {self.hold!r}")
+        if not (np.isfinite(t).all() and np.isfinite(values).all()):
+            raise DataError("the input holds a value or a time that is not a finite number")
+        if not (np.diff(t) > 0).all():
+            k = int(np.argmin(np.diff(t) > 0))
+            raise DataError(
+                f"input times must increase strictly; samples {k} and {k + 1} are {t[k]:g} and {t[k + 1]:g}"
+            )
+        t.setflags(write=False)
+        values.setflags(write=False)
+        object.__setattr__(self, "t", t)
+        object.__setattr__(self, "values", values)
+
+    def at(self, times: ArrayLike) -> NDArray[np.float64]:
+        """Value of the signal at given instants, from the right at a jump.
+
+        Parameters
+        ----------
+        times : array_like, shape (N,)
+            Instants [s].
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Values [input unit]; zero before the first break.
+        """
+        instants = np.asarray(times, dtype=float)
+        slack = COINCIDENCE * float(np.diff(self.t).min()) if self.t.size > 1 else 0.0
+        index = np.searchsorted(self.t, instants + slack, side="right") - 1
+        if self.hold == "zoh":
+            held = self.values[np.maximum(index, 0)]
+        else:
+            held = np.interp(instants, self.t, self.values)
+        return np.where(index < 0, 0.0, held)
+
+    def delayed(self, delay: float) -> HeldSignal:
+        """The same signal, later by ``delay``.
+
+        Parameters
+        ----------
+        delay : float
+            Shift [s].
+
+        Returns
+        -------
+        HeldSignal
+            Signal with every break moved by ``delay``.
+        """
+        return HeldSignal(self.t + delay, self.values, self.hold)
