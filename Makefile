@@ -1,0 +1,54 @@
+# make demo       install into .venv, run the quickstart, print its table
+# make test       everything that CI runs
+# make reproduce  the whole study; stop it and run it again at will, it goes on where it was
+# make bench      speed, measured against other tools
+# make clean      remove what the other targets built (never results)
+
+PYTHON ?= python3
+RUNS ?= 100
+JOBS ?= 2
+OUT ?= results
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+STUDY := $(sort $(wildcard configs/useful_redundancy/*.yaml))
+
+.PHONY: demo test reproduce bench clean
+.DELETE_ON_ERROR:
+
+demo: $(VENV)/.installed
+	$(BIN)/ctid run configs/quickstart.yaml
+	$(BIN)/ctid table quickstart
+
+test: $(VENV)/.test-installed
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m pytest -q
+
+reproduce: $(VENV)/.installed
+	@test -n "$(STUDY)" || { echo "no configs in configs/useful_redundancy"; exit 1; }
+	set -e; for config in $(STUDY); do $(BIN)/ctid run "$$config" --runs $(RUNS) --jobs $(JOBS) --out "$(OUT)"; done
+	$(BIN)/ctid table --format md --out "$(OUT)" > "$(OUT)/useful_redundancy.md"
+	$(BIN)/ctid table --format csv --out "$(OUT)" > "$(OUT)/useful_redundancy.csv"
+	$(BIN)/ctid table --out "$(OUT)"
+
+bench: $(VENV)/.test-installed
+	set -e; for benchmark in benchmarks/bench_*.py; do $(BIN)/python "$$benchmark"; done
+
+clean:
+	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	find benchmarks ctid_cli experiments tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The installation is editable: sources may change without a new one.
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) -e .
+	@touch $@
+
+$(VENV)/.test-installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) -e '.[test]'
+	@touch $@ $(VENV)/.installed

@@ -1,0 +1,191 @@
+"""What every estimator of a single transfer function checks and reports in the same way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators.problems import CoefficientProblem
+from ctid_cli.filtering.bank import FilterData
+from ctid_cli.inference.covariance import condition_number, white_noise_covariance
+from ctid_cli.inference.fit import Fit, IterationRecord
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.status import Status
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.record import Record
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where an estimator starts.
+
+    Parameters
+    ----------
+    delay : float, optional
+        Initial delay [s]; None leaves the choice to the estimator.
+    """
+
+    delay: float | None = field(default=None, metadata={"doc": "Initial delay", "unit": "s"})
+
+
+def check_structure(poles: int, zeros: int) -> None:
+    """Check the degrees of a strictly proper model.
+
+    Parameters
+    ----------
+    poles, zeros : int
+        Degrees of the denominator and the numerator.
+
+    Raises
+    ------
+    ValueError
+        If they do not describe a strictly proper model of order 1 to 12.
+    """
+    if not 1 <= poles <= 12:
+        raise ValueError(f"poles must be between 1 and 12, not {poles}")
+    if zeros < 0:
+        raise ValueError(f"zeros must be 0 or more, not {zeros}")
+    if zeros >= poles:
+        raise ValueError(
+            f"zeros must be fewer than poles (a strictly proper model): got {zeros} zeros and {poles} poles"
+        )
+
+
+def check_iteration(max_iterations: int, tolerance: float) -> None:
+    """Check the stopping rule of an iteration.
+
+    Parameters
+    ----------
+    max_iterations : int
+        Largest number of iterations.
+    tolerance : float
+        Relative tolerance.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of range.
+    """
+    if max_iterations < 1:
+        raise ValueError(f"max_iterations must be 1 or more, not {max_iterations}")
+    if not 0 < tolerance < 1:
+        raise ValueError(f"tolerance must lie between 0 and 1, not {tolerance}")
+
+
+def check_record(record: Record, data: FilterData, parameters: int) -> None:
+    """Refuse records from which nothing can be estimated.
+
+    Parameters
+    ----------
+    record : Record
+        The record.
+    data : FilterData
+        The same, with the samples that will be used.
+    parameters : int
+        Number of free parameters.
+
+    Raises
+    ------
+    DataError
+        If there are fewer usable samples than parameters, or the input or the output is constant.
+    """
+    where = f"{record.name}: " if record.name else ""
+    if data.count <= parameters:
+        raise DataError(
+            f"{where}{data.count} usable samples for {parameters} parameters; "
+            "take a longer record, a smaller model, or a smaller largest delay"
+        )
+    if np.ptp(record.input.values) == 0.0:
+        raise DataError(f"{where}the input is constant ({record.input.values[0]:g}); it excites nothing to identify")
+    if np.ptp(data.y_used) == 0.0:
+        raise DataError(f"{where}the output is constant ({data.y_used[0]:g}) over the samples that can be used")
+
+
+def history_entry(stage: str, iteration: int, problem: CoefficientProblem, theta: Array, cost: float) -> IterationRecord:
+    """Describe one accepted iteration.
+
+    Parameters
+    ----------
+    stage : str
+        Part of the algorithm.
+    iteration : int
+        Counted from 0 within the stage.
+    problem : CoefficientProblem
+        Knows how theta splits.
+    theta : ndarray, shape (p,)
+        Parameters.
+    cost : float
+        Mean squared output error [output unit^2].
+
+    Returns
+    -------
+    IterationRecord
+        The entry.
+    """
+    a, b, delay = problem.split(theta)
+    return IterationRecord(stage, iteration, delay, cost, tuple(a.tolist()), tuple(b.tolist()))
+
+
+def finish(
+    problem: CoefficientProblem,
+    theta: Array,
+    status: Status,
+    iterations: int,
+    history: list[IterationRecord],
+    accurate: bool = True,
+) -> Fit:
+    """Assemble the result of an estimation.
+
+    Parameters
+    ----------
+    problem : CoefficientProblem
+        The problem on unfiltered data.
+    theta : ndarray, shape (p,)
+        The estimate.
+    status : Status
+        How the iterations ended.
+    iterations : int
+        Iterations in all stages.
+    history : list of IterationRecord
+        The accepted iterations.
+    accurate : bool, default True
+        Whether the estimate is a minimum of the output-error cost, so that its covariance is defined.
+
+    Returns
+    -------
+    Fit
+        The result; its numbers are NaN where the estimate has no finite response.
+    """
+    structure: Structure = problem.structure
+    a, b, delay = problem.split(theta)
+    model = TransferFunction(b, a, delay)
+    count = problem.data.count
+    moments = problem.moments(theta)
+    undefined = np.full((structure.size, structure.size), np.nan)
+    if moments is None:
+        nan = float("nan")
+        return Fit(
+            model, structure.names, undefined, Status.DIVERGED, nan, nan, nan, count, iterations, nan, tuple(history)
+        )
+    hessian = structure.hessian(moments)
+    squared_error = structure.squared_error(moments)
+    y = problem.data.y_used
+    r2 = 1.0 - squared_error / float(np.sum((y - y.mean()) ** 2))
+    return Fit(
+        model=model,
+        parameter_names=structure.names,
+        covariance=white_noise_covariance(hessian, squared_error, count) if accurate else undefined,
+        status=status,
+        cost=squared_error / count,
+        fit_percent=100.0 * (1.0 - float(np.sqrt(max(1.0 - r2, 0.0)))),
+        r2=r2,
+        count=count,
+        iterations=iterations,
+        condition_number=condition_number(hessian),
+        history=tuple(history),
+    )

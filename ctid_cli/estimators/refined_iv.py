@@ -1,0 +1,239 @@
+r"""The one refined instrumental variable iteration: ``theta+ = theta + [sum psi phi']^-1 sum psi eps``.
+
+``psi`` are the sensitivities of the simulated output (the optimal instruments), ``phi`` the regressors built with the
+measured output, ``eps`` the output error. At a fixed point ``sum psi eps = 0``: the gradient of the output-error cost
+vanishes, whatever ``phi`` was. Which signals make up psi and phi (delay or not, regular clock or not) is the business
+of the *problem*; this file only iterates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.inference.status import Status
+
+Array = NDArray[np.float64]
+Variant = Literal["plain", "guarded"]
+
+#: Halvings of a step before a direction is given up.
+HALVINGS = 12
+#: A rise of the cost below this fraction is rounding, not a rise.
+ROUNDING = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """Second moments at one parameter vector.
+
+    Parameters
+    ----------
+    instrument_regressor : ndarray, shape (p, p)
+        ``sum psi phi'``.
+    instrument_error : ndarray, shape (p,)
+        ``sum psi eps``.
+    hessian : ndarray, shape (p, p)
+        ``sum psi psi'``.
+    squared_error : float
+        ``sum eps^2``.
+    output_power : float
+        ``sum x^2``, x the simulated output.
+    """
+
+    instrument_regressor: Array
+    instrument_error: Array
+    hessian: Array
+    squared_error: float
+    output_power: float
+
+
+class Problem(Protocol):
+    """What the iteration needs to know of an estimation problem."""
+
+    def equations(self, theta: Array) -> Equations | None:
+        """Second moments at theta, or None where theta is not admissible."""
+
+    def admissible(self, theta: Array) -> Array:
+        """The nearest admissible parameter vector (unstable models reflected)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Iterated:
+    """Result of an iteration.
+
+    Parameters
+    ----------
+    theta : ndarray, shape (p,)
+        The last accepted parameters.
+    equations : Equations
+        Second moments there.
+    status : Status
+        How it ended.
+    iterations : int
+        Number of accepted steps.
+    """
+
+    theta: Array
+    equations: Equations
+    status: Status
+    iterations: int
+
+
+def scaled_solve(matrix: Array, right: Array, rows: Array, columns: Array) -> Array | None:
+    """Solve ``matrix x = right`` with rows and columns brought to a common scale first.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (p, p)
+        The matrix.
+    right : ndarray, shape (p,)
+        The right-hand side.
+    rows, columns : ndarray, shape (p,)
+        Squares of the scales of rows and columns, as found on the diagonal of a Gram matrix.
+
+    Returns
+    -------
+    ndarray, shape (p,) or None
+        The solution; None if the matrix is singular or holds non-finite numbers.
+    """
+    if not (rows > 0).all() or not (columns > 0).all():
+        return None
+    left_scale = 1.0 / np.sqrt(rows)
+    right_scale = left_scale if rows is columns else 1.0 / np.sqrt(columns)
+    try:
+        solution: Array = right_scale * np.linalg.solve(
+            matrix * left_scale[:, None] * right_scale, right * left_scale
+        )
+    except np.linalg.LinAlgError:
+        return None
+    return solution if np.isfinite(solution).all() else None
+
+
+def iterate(
+    problem: Problem,
+    theta: Array,
+    *,
+    max_iterations: int,
+    tolerance: float,
+    variant: Variant,
+    on_step: Callable[[Array, Equations], None] | None = None,
+) -> Iterated | None:
+    """Run the refined instrumental variable iteration.
+
+    Parameters
+    ----------
+    problem : Problem
+        Supplies second moments.
+    theta : ndarray, shape (p,)
+        Start.
+    max_iterations : int
+        Largest number of steps.
+    tolerance : float
+        Stop when a step changes the simulated output by less than this fraction of its rms value [-].
+    variant : {"plain", "guarded"}
+        ``plain`` takes every full step. ``guarded`` accepts a step only if the output-error cost does not rise, halves
+        it otherwise, and falls back on the Gauss-Newton direction, along which the cost must fall.
+    on_step : callable, optional
+        Called with the parameters and their second moments at the start and after every accepted step.
+
+    Returns
+    -------
+    Iterated or None
+        The result; None if the start itself is not admissible.
+    """
+    theta = problem.admissible(theta)
+    current = problem.equations(theta)
+    if current is None:
+        return None
+    if on_step:
+        on_step(theta, current)
+    for iteration in range(max_iterations):
+        step = scaled_solve(
+            current.instrument_regressor,
+            current.instrument_error,
+            np.diag(current.hessian),
+            np.abs(np.diag(current.instrument_regressor)),
+        )
+        newton = step is None and variant == "guarded"
+        if step is None and variant == "plain":
+            return Iterated(theta, current, Status.SINGULAR, iteration)
+        accepted = None
+        if step is not None:
+            accepted = _take(problem, theta, current, step, variant)
+        if accepted is None and variant == "guarded":
+            newton = True
+            step = gauss_newton_step(current)
+            if step is None:
+                return Iterated(theta, current, Status.SINGULAR, iteration)
+            accepted = _take(problem, theta, current, step, variant)
+        assert step is not None
+        change = relative_change(current, step)
+        if accepted is None:
+            if variant == "plain":
+                return Iterated(theta, current, Status.DIVERGED, iteration)
+            # At the minimum up to rounding no step can lower the cost: that is convergence, not failure.
+            done = newton and change <= max(tolerance, 1e-7)
+            return Iterated(theta, current, Status.CONVERGED if done else Status.STALLED, iteration)
+        theta, current, fraction = accepted
+        if on_step:
+            on_step(theta, current)
+        if fraction == 1.0 and change <= tolerance:
+            return Iterated(theta, current, Status.CONVERGED, iteration + 1)
+    return Iterated(theta, current, Status.MAX_ITERATIONS, max_iterations)
+
+
+def gauss_newton_step(equations: Equations) -> Array | None:
+    """Gauss-Newton step of the output-error cost.
+
+    Parameters
+    ----------
+    equations : Equations
+        Second moments at the current parameters.
+
+    Returns
+    -------
+    ndarray, shape (p,) or None
+        ``[sum psi psi']^-1 sum psi eps``; None if singular.
+    """
+    diagonal = np.diag(equations.hessian)
+    return scaled_solve(equations.hessian, equations.instrument_error, diagonal, diagonal)
+
+
+def relative_change(equations: Equations, step: Array) -> float:
+    """Change of the simulated output that a step makes, to first order and relative to its rms value.
+
+    Parameters
+    ----------
+    equations : Equations
+        Second moments at the current parameters.
+    step : ndarray, shape (p,)
+        Change of the parameters.
+
+    Returns
+    -------
+    float
+        ``sqrt(step' H step / sum x^2)`` [-]: free of the units of parameters, time and signals.
+    """
+    power = equations.output_power
+    return float(np.sqrt(max(step @ equations.hessian @ step, 0.0) / power)) if power > 0 else float("inf")
+
+
+def _take(
+    problem: Problem, theta: Array, current: Equations, step: Array, variant: Variant
+) -> tuple[Array, Equations, float] | None:
+    """The first acceptable fraction of a step, or None."""
+    fraction = 1.0
+    for _ in range(HALVINGS if variant == "guarded" else 1):
+        candidate = problem.admissible(theta + fraction * step)
+        trial = problem.equations(candidate)
+        if trial is not None and np.isfinite(trial.squared_error):
+            rounding = ROUNDING * (trial.output_power + current.output_power)
+            limit = current.squared_error * (1.0 + ROUNDING) + rounding * ROUNDING
+            if variant == "plain" or trial.squared_error <= limit:
+                return candidate, trial, fraction
+        fraction *= 0.5
+    return None

@@ -1,0 +1,367 @@
+"""SRIVC with an estimated time delay: Gauss-Newton on the delay around SRIVC for the coefficients."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators.common import (
+    Start,
+    check_iteration,
+    check_record,
+    check_structure,
+    finish,
+    history_entry,
+)
+from ctid_cli.estimators.problems import CoefficientProblem, DelayProblem
+from ctid_cli.estimators.refined_iv import Equations, Iterated, Variant, iterate, scaled_solve
+from ctid_cli.estimators.srivc import initial_coefficients
+from ctid_cli.filtering.bank import FilterData, filter_data
+from ctid_cli.filtering.lowpass import Lowpass
+from ctid_cli.inference.fit import Fit, IterationRecord
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.status import Status
+from ctid_cli.signals.checks import require_positive
+from ctid_cli.signals.held import Hold
+from ctid_cli.signals.record import Record
+
+Array = NDArray[np.float64]
+
+#: SRIVC iterations at each trial delay while searching.
+INNER_ITERATIONS = 20
+#: The smallest delay step, as a fraction of the range of the delay.
+SMALLEST_STEP = 1e-5
+
+
+@dataclass(frozen=True)
+class TdSrivc:
+    """Coefficients and delay by separable least squares: SRIVC for the coefficients, Gauss-Newton for the delay.
+
+    Parameters
+    ----------
+    poles : int
+        Degree of the denominator, 1 to 12.
+    zeros : int
+        Degree of the numerator, below ``poles``.
+    delay_bounds : tuple of float
+        Least and greatest delay [s]. Samples earlier than the greatest delay after the first input are not used.
+    lowpass : Lowpass, optional
+        Search on low-pass-filtered data first, which widens the region of convergence; then refine on the data as
+        they are. None searches on the data as they are.
+    svf_cutoff : float, default 1.0
+        Cut-off of the state-variable filter of the start [rad/s], near the bandwidth of the system.
+    max_iterations : int, default 50
+        Largest number of Gauss-Newton iterations on the delay, in the search and in the refinement each.
+    tolerance : float, default 1e-6
+        Stop when the cost falls by less than this fraction; also the tolerance of SRIVC at each trial delay [-].
+    variant : {"guarded", "plain"}, default "guarded"
+        ``plain`` is the published algorithm. ``guarded`` never lets the cost rise inside SRIVC and ends with joint
+        iterations on coefficients and delay.
+    hold_output : {"foh", "zoh"}, default "foh"
+        Interpolation of the measured output between samples; changes the path, not the converged estimate.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+
+    Notes
+    -----
+    The cost as a function of the delay has many local minima, roughly one for each half period of the system's
+    dominant frequency. The search finds the one in whose basin it starts; a low-pass filter merges basins. With
+    ``eps = y - B/A u(t - tau)``, ``d eps/d tau = p B/A u(t - tau)`` and psi the sensitivities to the coefficients,
+
+    ``H = eps_tau' eps_tau - eps_tau' psi (psi' psi)^-1 psi' eps_tau``, step ``-(eps_tau' eps)/H``,
+
+    halved while it leaves the bounds or the cost does not fall.
+
+    References
+    ----------
+    F. Chen, H. Garnier and M. Gilson, "Robust identification of continuous-time models with arbitrary time-delay from
+    irregularly sampled data", *J. Process Control* 25 (2015) 19-27. doi:10.1016/j.jprocont.2014.10.003
+    """
+
+    kind: ClassVar[str] = "td_srivc"
+    uses_start: ClassVar[bool] = True
+
+    poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})
+    zeros: int = field(metadata={"doc": "Number of zeros, fewer than poles"})
+    delay_bounds: tuple[float, float] = field(metadata={"doc": "Least and greatest delay", "unit": "s"})
+    lowpass: Lowpass | None = field(
+        default=None, metadata={"doc": "Low-pass filter of the search; none searches on the data as they are"}
+    )
+    svf_cutoff: float = field(
+        default=1.0, metadata={"doc": "Cut-off of the state-variable filter of the start", "unit": "rad/s"}
+    )
+    max_iterations: int = field(
+        default=50, metadata={"doc": "Largest number of Gauss-Newton iterations on the delay in each stage"}
+    )
+    tolerance: float = field(
+        default=1e-6, metadata={"doc": "Stop when the cost falls by less than this fraction"}
+    )
+    variant: Variant = field(
+        default="guarded", metadata={"doc": "plain: as published; guarded: the cost never rises"}
+    )
+    hold_output: Hold = field(
+        default="foh", metadata={"doc": "Interpolation of the measured output between samples"}
+    )
+
+    def __post_init__(self) -> None:
+        check_structure(self.poles, self.zeros)
+        require_positive("svf_cutoff", self.svf_cutoff, "rad/s")
+        check_iteration(self.max_iterations, self.tolerance)
+        object.__setattr__(self, "delay_bounds", tuple(float(bound) for bound in self.delay_bounds))
+        low, high = self.delay_bounds
+        if not 0 <= low < high < np.inf:
+            raise ValueError(
+                f"delay_bounds must be two delays in seconds, the smaller one (0 or more) first: got [{low:g}, {high:g}]"
+            )
+
+    def prepare(self, record: Record) -> PreparedTdSrivc:
+        """Check a record, lay it out and filter it, once for any number of starts.
+
+        Parameters
+        ----------
+        record : Record
+            The record.
+
+        Returns
+        -------
+        PreparedTdSrivc
+            Ready to fit from any start.
+
+        Raises
+        ------
+        DataError
+            If nothing can be estimated from the record.
+        """
+        return PreparedTdSrivc(self, record)
+
+    def fit(self, record: Record, start: Start | None = None) -> Fit:
+        """Estimate coefficients and delay.
+
+        Parameters
+        ----------
+        record : Record
+            The record.
+        start : Start, optional
+            Initial delay; the middle of the bounds by default.
+
+        Returns
+        -------
+        Fit
+            The estimate.
+
+        Raises
+        ------
+        DataError
+            If nothing can be estimated from the record, or the start lies outside the bounds.
+        """
+        return self.prepare(record).fit(start)
+
+
+class PreparedTdSrivc:
+    """A record checked, laid out and filtered for :class:`TdSrivc`.
+
+    Parameters
+    ----------
+    options : TdSrivc
+        The estimator.
+    record : Record
+        The record.
+    """
+
+    def __init__(self, options: TdSrivc, record: Record) -> None:
+        self.options = options
+        self.structure = Structure(options.poles, options.zeros)
+        greatest = options.delay_bounds[1]
+        if greatest >= record.t[-1] - record.input.t[0]:
+            raise DataError(
+                f"{record.name + ': ' if record.name else ''}the greatest delay, {greatest:g} s, is not shorter than "
+                f"the record, {record.t[-1] - record.input.t[0]:g} s"
+            )
+        self.data = filter_data(record, greatest, options.hold_output)
+        check_record(record, self.data, self.structure.size + 1)
+        self.search_data = self.data
+        if options.lowpass is not None:
+            try:
+                filtered = options.lowpass.apply(record)
+            except ValueError as error:
+                raise DataError(str(error)) from error
+            self.search_data = filter_data(filtered, greatest, options.hold_output)
+
+    def fit(self, start: Start | None = None) -> Fit:
+        """Estimate coefficients and delay from one start.
+
+        Parameters
+        ----------
+        start : Start, optional
+            Initial delay; the middle of the bounds by default.
+
+        Returns
+        -------
+        Fit
+            The estimate.
+
+        Raises
+        ------
+        DataError
+            If the start lies outside the bounds, or the equations of the start are singular.
+        """
+        options = self.options
+        low, high = options.delay_bounds
+        delay = 0.5 * (low + high) if start is None or start.delay is None else start.delay
+        if not low <= delay <= high:
+            raise DataError(f"the initial delay, {delay:g} s, lies outside the bounds {low:g} to {high:g} s")
+        search = _DelaySearch(self.search_data, self.structure, options, "search")
+        result = search.run(delay, None)
+        if result is None:
+            raise DataError(Status.SINGULAR.value)
+        iterations, history = result.iterations, search.history
+        if options.lowpass is not None:
+            refinement = _DelaySearch(self.data, self.structure, options, "refine")
+            refined = refinement.run(float(result.theta[-1]), result.theta[:-1])
+            if refined is not None:
+                result = refined
+                iterations += refined.iterations
+                history += refinement.history
+        problem = DelayProblem(self.data, self.structure, options.delay_bounds)
+        theta, status = result.theta, result.status
+        if options.variant == "guarded":
+            polished = self._polish(problem, theta, history)
+            if polished is not None:
+                theta, iterations = polished.theta, iterations + polished.iterations
+                # An end at a bound is the search's finding; the polishing cannot see it.
+                if status is not Status.DELAY_AT_BOUND or polished.status is Status.CONVERGED:
+                    status = polished.status
+                if status is Status.CONVERGED and _near(theta[-1], options.delay_bounds):
+                    status = Status.DELAY_AT_BOUND
+        return finish(problem, theta, status, iterations, history)
+
+    def _polish(self, problem: DelayProblem, theta: Array, history: list[IterationRecord]) -> Iterated | None:
+        """Joint iterations on coefficients and delay: from the right basin they converge in a few steps."""
+        first = len(history)
+
+        def record_step(theta: Array, equations: Equations) -> None:
+            cost = equations.squared_error / problem.data.count
+            history.append(history_entry("joint", len(history) - first, problem, theta, cost))
+
+        return iterate(
+            problem,
+            theta,
+            max_iterations=self.options.max_iterations,
+            tolerance=self.options.tolerance,
+            variant="guarded",
+            on_step=record_step,
+        )
+
+
+def _near(delay: float, bounds: tuple[float, float]) -> bool:
+    """Whether a delay lies within the smallest step of a bound."""
+    return min(delay - bounds[0], bounds[1] - delay) <= SMALLEST_STEP * (bounds[1] - bounds[0])
+
+
+class _DelaySearch:
+    """Gauss-Newton on the delay, the coefficients re-estimated by SRIVC at every trial delay."""
+
+    def __init__(self, data: FilterData, structure: Structure, options: TdSrivc, stage: str) -> None:
+        self.data = data
+        self.structure = structure
+        self.options = options
+        self.stage = stage
+        self.joint = DelayProblem(data, structure, options.delay_bounds)
+        self.history: list[IterationRecord] = []
+
+    def coefficients(self, delay: float, theta: Array | None) -> Iterated | None:
+        """SRIVC at one delay, from given coefficients or from the least-squares start."""
+        problem = CoefficientProblem(self.data, self.structure, delay)
+        options = self.options
+        if theta is None:
+            theta = initial_coefficients(problem, options.svf_cutoff, options.variant)
+            if theta is None:
+                return None
+        result = iterate(
+            problem,
+            theta,
+            max_iterations=INNER_ITERATIONS,
+            tolerance=options.tolerance,
+            variant=options.variant,
+        )
+        return result if result is not None and np.isfinite(result.theta).all() else None
+
+    def log(self, delay: float, result: Iterated) -> None:
+        """Remember an accepted trial delay."""
+        theta = np.concatenate((result.theta, [delay]))
+        cost = result.equations.squared_error / self.data.count
+        self.history.append(history_entry(self.stage, len(self.history), self.joint, theta, cost))
+
+    def run(self, delay: float, theta: Array | None) -> Iterated | None:
+        """Search from a delay; ``theta`` of the result holds the coefficients and the delay."""
+        options = self.options
+        low, high = options.delay_bounds
+        smallest = SMALLEST_STEP * (high - low)
+        current = self.coefficients(delay, theta)
+        if current is None:
+            return None
+        self.log(delay, current)
+        status = Status.MAX_ITERATIONS
+        iterations = 0
+        equations: Equations | None = None
+        for _ in range(options.max_iterations):
+            equations = self.joint.equations(np.concatenate((current.theta, [delay])))
+            step = None if equations is None else delay_step(equations)
+            if step is None:
+                status = Status.SINGULAR
+                break
+            at_bound = not low <= delay + step <= high
+            accepted = None
+            while accepted is None:
+                while not low <= delay + step <= high:
+                    step *= 0.5
+                if abs(step) <= smallest:
+                    break
+                trial = self.coefficients(delay + step, current.theta)
+                if trial is not None and trial.equations.squared_error < current.equations.squared_error:
+                    accepted = trial
+                else:
+                    step *= 0.5
+            if accepted is None:
+                status = Status.DELAY_AT_BOUND if at_bound and _near(delay, (low, high)) else Status.CONVERGED
+                break
+            fall = 1.0 - accepted.equations.squared_error / current.equations.squared_error
+            delay += step
+            current = accepted
+            iterations += 1
+            self.log(delay, current)
+            if fall < options.tolerance:
+                status = Status.CONVERGED
+                break
+        return Iterated(np.concatenate((current.theta, [delay])), current.equations, status, iterations)
+
+
+def delay_step(equations: Equations) -> float | None:
+    """Gauss-Newton step of the delay with the coefficients projected out.
+
+    Parameters
+    ----------
+    equations : Equations
+        Second moments of the joint problem, the delay last.
+
+    Returns
+    -------
+    float or None
+        Step [s]; None if the data do not determine the delay.
+    """
+    hessian, gradient = equations.hessian, equations.instrument_error
+    diagonal = np.diag(hessian)[:-1]
+    projection = scaled_solve(hessian[:-1, :-1], hessian[:-1, -1], diagonal, diagonal)
+    if projection is None:
+        return None
+    curvature = hessian[-1, -1] - projection @ hessian[:-1, -1]
+    if not curvature > 1e-14 * hessian[-1, -1]:
+        return None
+    return float(gradient[-1] / curvature)

@@ -1,0 +1,99 @@
+"""What an estimation returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.inference.status import Status
+from ctid_cli.models.transfer_function import TransferFunction
+
+
+@dataclass(frozen=True)
+class IterationRecord:
+    """One accepted iteration.
+
+    Parameters
+    ----------
+    stage : str
+        Part of the algorithm, for example ``search`` (on low-pass-filtered data) or ``refine``.
+    iteration : int
+        Counted from 0, the start, within the stage.
+    delay : float
+        Delay [s].
+    cost : float
+        Mean squared output error [output unit^2] on the data of this stage.
+    denominator, numerator : tuple of float
+        Coefficients in descending powers.
+    """
+
+    stage: str
+    iteration: int
+    delay: float
+    cost: float
+    denominator: tuple[float, ...]
+    numerator: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """An estimated model, its accuracy, and how it was reached.
+
+    Parameters
+    ----------
+    model : TransferFunction
+        The estimate: monic denominator, descending powers, delay [s].
+    parameter_names : tuple of str
+        Names of the free parameters, in the order of ``covariance``.
+    covariance : ndarray, shape (p, p)
+        Asymptotic covariance for white residuals; NaN where it is not defined.
+    status : Status
+        How the iterations ended.
+    cost : float
+        Mean squared output error over the used samples [output unit^2].
+    fit_percent : float
+        ``100 (1 - ||y - x|| / ||y - mean y||)`` over the used samples, zero initial state [%].
+    r2 : float
+        ``1 - ||y - x||^2 / ||y - mean y||^2`` [-].
+    count : int
+        Number of samples used.
+    iterations : int
+        Iterations in all stages.
+    condition_number : float
+        Of the scaled ``sum psi psi'`` [-].
+    history : tuple of IterationRecord
+        The accepted iterations.
+    """
+
+    model: TransferFunction
+    parameter_names: tuple[str, ...]
+    covariance: NDArray[np.float64] = field(repr=False)
+    status: Status
+    cost: float
+    fit_percent: float
+    r2: float
+    count: int
+    iterations: int
+    condition_number: float
+    history: tuple[IterationRecord, ...] = field(default=(), repr=False)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Free parameters by name."""
+        a, b = self.model.denominator, self.model.numerator
+        values = {f"a{i}": float(a[i]) for i in range(1, a.size)}
+        # A leading numerator coefficient may be exactly zero and is dropped by the model; names keep their powers.
+        zeros = sum(name.startswith("b") for name in self.parameter_names)
+        padded = np.concatenate([np.zeros(zeros - b.size), b])
+        values |= {f"b{j}": float(value) for j, value in enumerate(padded)}
+        values["delay"] = self.model.delay
+        return {name: values[name] for name in self.parameter_names}
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Asymptotic standard errors by name; NaN where they are not defined."""
+        with np.errstate(invalid="ignore"):
+            errors = np.sqrt(np.diag(self.covariance))
+        return dict(zip(self.parameter_names, errors.tolist(), strict=True))

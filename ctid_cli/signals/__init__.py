@@ -1,0 +1,50 @@
+"""Records, held signals, excitations, sampling schemes and noise."""
+
+from ctid_cli.signals.csv_file import read_columns, read_held_signal, read_record
+from ctid_cli.signals.excitation import (
+    EXCITATIONS,
+    TAPS,
+    Excitation,
+    Gaussian,
+    InputFile,
+    Multisine,
+    Prbs,
+    Step,
+    maximal_length_sequence,
+)
+from ctid_cli.signals.held import COINCIDENCE, HeldSignal, Hold
+from ctid_cli.signals.noise import NOISES, Noise, WhiteNoise
+from ctid_cli.signals.record import Record, regular_interval
+from ctid_cli.signals.sampling import SAMPLINGS, InputRecord, RegularSampling, Sampling, UniformIntervals
+from ctid_cli.signals.streams import ROLES, Role, stream
+
+__all__ = [
+    "COINCIDENCE",
+    "EXCITATIONS",
+    "NOISES",
+    "ROLES",
+    "SAMPLINGS",
+    "TAPS",
+    "Excitation",
+    "Gaussian",
+    "HeldSignal",
+    "Hold",
+    "InputFile",
+    "InputRecord",
+    "Multisine",
+    "Noise",
+    "Prbs",
+    "Record",
+    "RegularSampling",
+    "Role",
+    "Sampling",
+    "Step",
+    "UniformIntervals",
+    "WhiteNoise",
+    "maximal_length_sequence",
+    "read_columns",
+    "read_held_signal",
+    "read_record",
+    "regular_interval",
+    "stream",
+]

@@ -1,0 +1,435 @@
+"""Inputs: each is a frozen dataclass of options that generates a held signal."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import ClassVar, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.signals.checks import (
+    require_choice,
+    require_finite,
+    require_integer,
+    require_not_negative,
+    require_positive,
+)
+from ctid_cli.signals.csv_file import read_held_signal
+from ctid_cli.signals.held import COINCIDENCE, HeldSignal, Hold
+
+#: Lags of a maximal-length feedback register by its number of stages: ``c[k]`` is the parity of the
+#: ``c[k - lag]``. The polynomial 1 + sum of x^lag is primitive over GF(2), hence the period is 2^stages - 1.
+#: These are the customary choices with two or four taps (P. Alfke, Xilinx application note XAPP 052, 1996);
+#: the tests verify every period.
+TAPS: dict[int, tuple[int, ...]] = {
+    2: (2, 1),
+    3: (3, 2),
+    4: (4, 3),
+    5: (5, 3),
+    6: (6, 5),
+    7: (7, 6),
+    8: (8, 6, 5, 4),
+    9: (9, 5),
+    10: (10, 7),
+    11: (11, 9),
+    12: (12, 6, 4, 1),
+    13: (13, 4, 3, 1),
+    14: (14, 5, 3, 1),
+    15: (15, 14),
+    16: (16, 15, 13, 4),
+    17: (17, 14),
+    18: (18, 11),
+    19: (19, 6, 2, 1),
+    20: (20, 17),
+}
+
+_CLOCK_DOC = "time for which each value is held; null: a new value at every sampling instant"
+
+
+def maximal_length_sequence(stages: int, length: int, state: int) -> NDArray[np.uint8]:
+    """Output of a maximal-length feedback shift register.
+
+    Parameters
+    ----------
+    stages : int
+        Number of stages n, 2 to 20.
+    length : int
+        Number of bits to generate; they repeat after 2^n - 1.
+    state : int
+        Initial state, 1 to 2^n - 1; its binary digits, least significant first, are the first n bits.
+
+    Returns
+    -------
+    ndarray of uint8, shape (length,)
+        Bits, 0 or 1.
+
+    Notes
+    -----
+    Over GF(2) the square of the feedback polynomial has the same coefficients at twice the exponents, so a
+    sequence that obeys the recurrence at lags ``l`` obeys it at ``2 l``, ``4 l``, … too. Doubling the lags as
+    soon as the history reaches back far enough yields ever longer blocks at once.
+
+    Examples
+    --------
+    >>> from ctid_cli.signals import maximal_length_sequence
+    >>> maximal_length_sequence(stages=3, length=9, state=1).tolist()
+    [1, 0, 0, 1, 0, 1, 1, 1, 0]
+    """
+    bits = np.empty(max(length, stages), dtype=np.uint8)
+    bits[:stages] = [(state >> k) & 1 for k in range(stages)]
+    lags = np.array(TAPS[stages])
+    known = stages
+    while known < length:
+        if 2 * lags.max() <= known:
+            lags = 2 * lags
+        block = min(int(lags.min()), length - known)
+        bits[known : known + block] = np.bitwise_xor.reduce(
+            [bits[known - lag : known - lag + block] for lag in lags]
+        )
+        known += block
+    return bits[:length]
+
+
+@dataclass(frozen=True)
+class Prbs:
+    """Pseudo-random binary sequence from a maximal-length feedback register.
+
+    Parameters
+    ----------
+    stages : int
+        Number of stages n of the register, 2 to 20; the sequence repeats after 2^n - 1 clock periods.
+    clock_period : float
+        Time for which each value is held [s]; independent of the sampling.
+    amplitude : float, default 1.0
+        The signal is plus or minus this [input unit].
+
+    Notes
+    -----
+    The register's state at the start is drawn at random, zero excluded, so each data set has another phase of
+    the same sequence. Over one period the two values differ in number by one, and the autocorrelation is
+    amplitude^2 at lag zero and -amplitude^2 / (2^n - 1) at all other multiples of the clock period.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli.signals import Prbs
+    >>> sample_times = np.array([0.0, 0.3, 1.4])
+    >>> signal = Prbs(stages=4, clock_period=0.5).generate(sample_times, np.random.default_rng(0))
+    >>> signal.t
+    array([0. , 0.5, 1. ])
+    """
+
+    kind: ClassVar[str] = "prbs"
+
+    stages: int = field(metadata={"doc": "stages of the feedback register, 2 to 20", "unit": "-"})
+    clock_period: float = field(metadata={"doc": "time for which each value is held", "unit": "s"})
+    amplitude: float = field(
+        default=1.0, metadata={"doc": "the signal is plus or minus this", "unit": "input unit"}
+    )
+
+    def __post_init__(self) -> None:
+        require_integer("stages", self.stages, min(TAPS), max(TAPS))
+        require_positive("clock_period", self.clock_period, "s")
+        require_positive("amplitude", self.amplitude, "input unit")
+
+    def generate(self, sample_times: NDArray[np.float64], rng: np.random.Generator) -> HeldSignal:
+        """The signal over one record.
+
+        Parameters
+        ----------
+        sample_times : ndarray, shape (N,)
+            Sampling instants [s]; the first and the last bound the signal.
+        rng : numpy.random.Generator
+            Source of the register's initial state.
+
+        Returns
+        -------
+        HeldSignal
+            The signal [input unit] on its clock, the first edge at the first instant.
+        """
+        clock = _clock(sample_times, self.clock_period)
+        bits = maximal_length_sequence(self.stages, clock.size, int(rng.integers(1, 2**self.stages)))
+        return HeldSignal(clock, np.where(bits == 1, self.amplitude, -self.amplitude))
+
+
+@dataclass(frozen=True)
+class Multisine:
+    """Sum of sinusoids with equal amplitudes and random phases, held between clock instants.
+
+    Parameters
+    ----------
+    lowest_frequency : float
+        Frequency of the first tone [rad/s].
+    highest_frequency : float
+        Frequency of the last tone [rad/s], below pi over the (mean) clock period.
+    tones : int
+        Number of tones, spaced linearly over the band; a single one lies at its lower end.
+    amplitude : float, default 1.0
+        Root mean square over whole periods of the tones [input unit].
+    clock_period : float, optional
+        Time for which each value is held [s]; None for a new value at every sampling instant.
+
+    Notes
+    -----
+    Each tone has the amplitude ``amplitude * sqrt(2 / tones)``, whatever the length of the record: a longer
+    record begins with the shorter one.
+    """
+
+    kind: ClassVar[str] = "multisine"
+
+    lowest_frequency: float = field(metadata={"doc": "frequency of the first tone", "unit": "rad/s"})
+    highest_frequency: float = field(metadata={"doc": "frequency of the last tone", "unit": "rad/s"})
+    tones: int = field(metadata={"doc": "number of tones, spaced linearly over the band", "unit": "-"})
+    amplitude: float = field(default=1.0, metadata={"doc": "root mean square", "unit": "input unit"})
+    clock_period: float | None = field(default=None, metadata={"doc": _CLOCK_DOC, "unit": "s"})
+
+    def __post_init__(self) -> None:
+        require_positive("lowest_frequency", self.lowest_frequency, "rad/s")
+        require_positive("highest_frequency", self.highest_frequency, "rad/s")
+        require_integer("tones", self.tones, 1)
+        require_positive("amplitude", self.amplitude, "input unit")
+        _check_clock(self.clock_period)
+        band = f"{self.lowest_frequency:g} and {self.highest_frequency:g} rad/s"
+        if self.lowest_frequency > self.highest_frequency:
+            raise ValueError(f"lowest_frequency must not exceed highest_frequency; they are {band}.")
+        if self.tones > 1 and self.lowest_frequency == self.highest_frequency:
+            raise ValueError(
+                f"{self.tones} tones need a band, but both ends are at {self.lowest_frequency:g} rad/s."
+            )
+
+    @property
+    def frequencies(self) -> NDArray[np.float64]:
+        """Frequencies of the tones [rad/s], shape (tones,)."""
+        return np.linspace(self.lowest_frequency, self.highest_frequency, self.tones)
+
+    def generate(self, sample_times: NDArray[np.float64], rng: np.random.Generator) -> HeldSignal:
+        """The signal over one record.
+
+        Parameters
+        ----------
+        sample_times : ndarray, shape (N,)
+            Sampling instants [s]; the first and the last bound the signal.
+        rng : numpy.random.Generator
+            Source of the phases.
+
+        Returns
+        -------
+        HeldSignal
+            The signal [input unit].
+
+        Raises
+        ------
+        DataError
+            If the clock is too slow for the highest tone.
+        """
+        clock = _clock(sample_times, self.clock_period)
+        mean_period = (clock[-1] - clock[0]) / (clock.size - 1) if clock.size > 1 else math.inf
+        limit = math.pi / mean_period
+        if self.frequencies[-1] >= limit:
+            raise DataError(
+                f"the multisine's highest tone, {self.frequencies[-1]:g} rad/s, is not below {limit:g} rad/s "
+                f"= pi / {mean_period:g} s, the most its clock can carry; lower one or the other"
+            )
+        phases = rng.uniform(0.0, 2 * math.pi, self.tones)
+        elapsed = clock - clock[0]
+        total = np.zeros(clock.size)
+        # One tone at a time: a table of all tones at all instants would not fit in memory for long records.
+        for frequency, phase in zip(self.frequencies, phases, strict=True):
+            total += np.cos(frequency * elapsed + phase)
+        return HeldSignal(clock, self.amplitude * math.sqrt(2 / self.tones) * total)
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """Independent Gaussian values, held between clock instants.
+
+    Parameters
+    ----------
+    standard_deviation : float, default 1.0
+        Standard deviation [input unit].
+    clock_period : float, optional
+        Time for which each value is held [s]; None for a new value at every sampling instant.
+    """
+
+    kind: ClassVar[str] = "gaussian"
+
+    standard_deviation: float = field(
+        default=1.0, metadata={"doc": "standard deviation", "unit": "input unit"}
+    )
+    clock_period: float | None = field(default=None, metadata={"doc": _CLOCK_DOC, "unit": "s"})
+
+    def __post_init__(self) -> None:
+        require_positive("standard_deviation", self.standard_deviation, "input unit")
+        _check_clock(self.clock_period)
+
+    def generate(self, sample_times: NDArray[np.float64], rng: np.random.Generator) -> HeldSignal:
+        """The signal over one record.
+
+        Parameters
+        ----------
+        sample_times : ndarray, shape (N,)
+            Sampling instants [s]; the first and the last bound the signal.
+        rng : numpy.random.Generator
+            Source of the values.
+
+        Returns
+        -------
+        HeldSignal
+            The signal [input unit].
+        """
+        clock = _clock(sample_times, self.clock_period)
+        return HeldSignal(clock, self.standard_deviation * rng.standard_normal(clock.size))
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step from zero.
+
+    Parameters
+    ----------
+    amplitude : float, default 1.0
+        Height, not zero [input unit].
+    time : float, default 0.0
+        When it happens [s]; at 0 the input is already high at the first sample.
+    """
+
+    kind: ClassVar[str] = "step"
+
+    amplitude: float = field(
+        default=1.0, metadata={"doc": "height of the step, not zero", "unit": "input unit"}
+    )
+    time: float = field(default=0.0, metadata={"doc": "when the step happens", "unit": "s"})
+
+    def __post_init__(self) -> None:
+        require_finite("amplitude", self.amplitude, "input unit")
+        if self.amplitude == 0:
+            raise ValueError(
+                "amplitude must not be zero [input unit]: a step of height zero excites nothing."
+            )
+        require_not_negative("time", self.time, "s")
+
+    def generate(self, sample_times: NDArray[np.float64], rng: np.random.Generator) -> HeldSignal:
+        """The signal over one record.
+
+        Parameters
+        ----------
+        sample_times : ndarray, shape (N,)
+            Sampling instants [s]; the first and the last bound the signal.
+        rng : numpy.random.Generator
+            Not used; every excitation takes one.
+
+        Returns
+        -------
+        HeldSignal
+            The signal [input unit].
+
+        Raises
+        ------
+        DataError
+            If the step comes after the last sample.
+        """
+        start, end = float(sample_times[0]), float(sample_times[-1])
+        if self.time >= end:
+            raise DataError(f"the step at {self.time:g} s comes too late for a record that ends at {end:g} s")
+        if self.time <= start:
+            return HeldSignal(np.array([start]), np.array([self.amplitude]))
+        return HeldSignal(np.array([start, self.time]), np.array([0.0, self.amplitude]))
+
+
+@dataclass(frozen=True)
+class InputFile:
+    """The user's own input, from a comma-separated file.
+
+    Parameters
+    ----------
+    file : str
+        Name of the file; its first line names the columns.
+    time : str, default "t"
+        Column of the break times [s], strictly increasing; they need not be the sampling instants.
+    input : str, default "u"
+        Column of the values [input unit].
+    hold : {"zoh", "foh"}, default "zoh"
+        How the input behaves between its breaks.
+
+    Notes
+    -----
+    The input is zero before the file's first instant and keeps its last value after the last one. The file's
+    clock is the record's: what lies before the first sample is not applied.
+    """
+
+    kind: ClassVar[str] = "file"
+
+    file: str = field(metadata={"doc": "comma-separated file with the input", "unit": "-"})
+    time: str = field(default="t", metadata={"doc": "column of the times [s]", "unit": "-"})
+    input: str = field(default="u", metadata={"doc": "column of the input", "unit": "-"})
+    hold: Hold = field(
+        default="zoh", metadata={"doc": "how the input behaves between its breaks", "unit": "-"}
+    )
+
+    def __post_init__(self) -> None:
+        require_choice("hold", self.hold, get_args(Hold))
+        if self.time == self.input:
+            raise ValueError(f"time and input must be two columns; both are {self.time!r}.")
+
+    def generate(self, sample_times: NDArray[np.float64], rng: np.random.Generator) -> HeldSignal:
+        """The signal over one record.
+
+        Parameters
+        ----------
+        sample_times : ndarray, shape (N,)
+            Sampling instants [s]; the first and the last bound the signal.
+        rng : numpy.random.Generator
+            Not used; every excitation takes one.
+
+        Returns
+        -------
+        HeldSignal
+            The signal [input unit].
+
+        Raises
+        ------
+        DataError
+            If the file cannot be used, or none of it lies before the last sample.
+        """
+        whole = read_held_signal(self.file, time=self.time, input=self.input, hold=self.hold)
+        start, end = float(sample_times[0]), float(sample_times[-1])
+        if whole.t[0] >= end:
+            raise DataError(
+                f"{self.file}: the input begins at {whole.t[0]:g} s, and the record ends at {end:g} s; "
+                "shift the file's times or take more samples"
+            )
+        # One break beyond the end stays: straight lines need it.
+        stop = int(np.searchsorted(whole.t, end)) + 1
+        times, values = whole.t[:stop], whole.values[:stop]
+        if times[0] < start:
+            slack = COINCIDENCE * float(np.diff(whole.t).min()) if whole.t.size > 1 else 0.0
+            inside = times > start + slack
+            times = np.concatenate(([start], times[inside]))
+            values = np.concatenate((whole.at([start]), values[inside]))
+        return HeldSignal(times, values, self.hold)
+
+
+Excitation = Prbs | Multisine | Gaussian | Step | InputFile
+
+#: Excitations by the word that selects them in a specification.
+EXCITATIONS: dict[str, type[Excitation]] = {
+    excitation.kind: excitation for excitation in (Prbs, Multisine, Gaussian, Step, InputFile)
+}
+
+
+def _clock(sample_times: NDArray[np.float64], period: float | None) -> NDArray[np.float64]:
+    """Instants at which the signal takes a new value, from the first sample to the last."""
+    if period is None:
+        return sample_times
+    duration = float(sample_times[-1] - sample_times[0])
+    # An edge that coincides with the last sample counts, on whichever side rounding puts it.
+    ticks = math.floor(duration / period + COINCIDENCE) + 1
+    return np.asarray(sample_times[0] + period * np.arange(ticks))
+
+
+def _check_clock(period: float | None) -> None:
+    if period is not None:
+        require_positive("clock_period", period, "s")

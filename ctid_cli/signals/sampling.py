@@ -1,0 +1,124 @@
+"""When the output is sampled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.signals.checks import require_choice, require_integer, require_positive
+
+InputRecord = Literal["sampled", "exact"]
+
+_INPUT_RECORD_DOC = (
+    "what the estimator is told of the input: "
+    "its samples at the output's instants (sampled), or its true edges (exact)"
+)
+
+
+@dataclass(frozen=True)
+class RegularSampling:
+    """Samples at equal intervals, from 0 s.
+
+    Parameters
+    ----------
+    interval : float
+        Sampling interval [s].
+    samples : int
+        Number of samples, at least 2.
+    input_record : {"sampled", "exact"}, default "sampled"
+        What the estimator is told of the input: its samples at the output's instants, or its true edges.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli.signals import RegularSampling
+    >>> RegularSampling(interval=0.5, samples=4).times(np.random.default_rng(0))
+    array([0. , 0.5, 1. , 1.5])
+    """
+
+    kind: ClassVar[str] = "regular"
+
+    interval: float = field(metadata={"doc": "sampling interval", "unit": "s"})
+    samples: int = field(metadata={"doc": "number of samples, at least 2", "unit": "-"})
+    input_record: InputRecord = field(default="sampled", metadata={"doc": _INPUT_RECORD_DOC, "unit": "-"})
+
+    def __post_init__(self) -> None:
+        require_positive("interval", self.interval, "s")
+        require_integer("samples", self.samples, 2)
+        require_choice("input_record", self.input_record, get_args(InputRecord))
+
+    def times(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Sampling instants.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+            Not used; every sampling scheme takes one.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Instants [s], the first 0.
+        """
+        return self.interval * np.arange(self.samples, dtype=float)
+
+
+@dataclass(frozen=True)
+class UniformIntervals:
+    """Samples at independent random intervals, each uniform between two bounds, from 0 s.
+
+    Parameters
+    ----------
+    low : float
+        Shortest interval [s].
+    high : float
+        Longest interval [s].
+    samples : int
+        Number of samples, at least 2.
+    input_record : {"sampled", "exact"}, default "sampled"
+        What the estimator is told of the input: its samples at the output's instants, or its true edges.
+
+    Notes
+    -----
+    Holding the samples of an input whose edges fall between them makes it late by half an interval on
+    average, which biases the delay; ``exact`` removes that bias.
+    """
+
+    kind: ClassVar[str] = "uniform_intervals"
+
+    low: float = field(metadata={"doc": "shortest sampling interval", "unit": "s"})
+    high: float = field(metadata={"doc": "longest sampling interval", "unit": "s"})
+    samples: int = field(metadata={"doc": "number of samples, at least 2", "unit": "-"})
+    input_record: InputRecord = field(default="sampled", metadata={"doc": _INPUT_RECORD_DOC, "unit": "-"})
+
+    def __post_init__(self) -> None:
+        require_positive("low", self.low, "s")
+        require_positive("high", self.high, "s")
+        if self.low > self.high:
+            raise ValueError(f"low must not exceed high; they are {self.low:g} s and {self.high:g} s.")
+        require_integer("samples", self.samples, 2)
+        require_choice("input_record", self.input_record, get_args(InputRecord))
+
+    def times(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Sampling instants.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+            Source of the intervals.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Instants [s], the first 0.
+        """
+        return np.concatenate(([0.0], np.cumsum(rng.uniform(self.low, self.high, self.samples - 1))))
+
+
+Sampling = RegularSampling | UniformIntervals
+
+#: Sampling schemes by the word that selects them in a specification.
+SAMPLINGS: dict[str, type[Sampling]] = {scheme.kind: scheme for scheme in (RegularSampling, UniformIntervals)}

@@ -1,0 +1,87 @@
+"""Held signals: their value at any instant, and what they refuse."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctid_cli.errors import DataError
+from ctid_cli.signals import HeldSignal
+
+BREAKS = st.lists(st.integers(-1000, 1000), min_size=1, max_size=30, unique=True).map(
+    lambda ticks: 0.05 * np.sort(np.array(ticks, dtype=float))
+)
+
+
+@st.composite
+def signals(draw):
+    t = draw(BREAKS)
+    values = draw(st.lists(st.floats(-10, 10), min_size=t.size, max_size=t.size))
+    return HeldSignal(t, np.array(values), draw(st.sampled_from(["zoh", "foh"])))
+
+
+def test_zero_order_hold_jumps_at_its_breaks():
+    signal = HeldSignal([0.0, 1.0, 3.0], [2.0, 4.0, -1.0])
+    assert signal.at([-0.1, 0.0, 0.9, 1.0, 2.9, 3.0, 100.0]).tolist() == [0.0, 2.0, 2.0, 4.0, 4.0, -1.0, -1.0]
+
+
+def test_first_order_hold_joins_its_values():
+    signal = HeldSignal([0.0, 1.0, 3.0], [2.0, 4.0, -1.0], "foh")
+    assert signal.at([-0.1, 0.0, 0.5, 1.0, 2.0, 3.0, 100.0]).tolist() == [0.0, 2.0, 3.0, 4.0, 1.5, -1.0, -1.0]
+
+
+@given(signals())
+def test_breaks_carry_their_values(signal):
+    np.testing.assert_allclose(signal.at(signal.t), signal.values, atol=1e-12)
+
+
+@given(signals())
+def test_signal_is_zero_before_and_constant_after(signal):
+    assert signal.at(signal.t[0] - 1.0) == 0.0
+    assert signal.at(signal.t[-1] + 1.0) == signal.values[-1]
+
+
+@given(signals(), st.floats(-50, 50), st.floats(0, 50))
+def test_delay_shifts_the_signal(signal, time, delay):
+    later = signal.delayed(delay)
+    # Away from jumps, since the rounding of time + delay may put an instant on either side of one.
+    if np.abs(signal.t - time).min() > 1e-6:
+        np.testing.assert_allclose(later.at(time + delay), signal.at(time), atol=1e-9)
+
+
+def test_an_edge_and_a_sample_of_one_name_are_one_instant():
+    # The same instants, rounded differently: some of the coarse ones lie before the fine ones.
+    coarse, fine = 0.3 * np.arange(400), 0.1 * np.arange(1200)
+    assert (coarse < fine[::3]).any()
+    signal = HeldSignal(fine, np.arange(1200.0))
+    assert np.array_equal(signal.at(coarse), np.arange(0.0, 1200.0, 3.0))
+    signal = HeldSignal(coarse, np.arange(400.0))
+    assert np.array_equal(signal.at(fine), np.repeat(np.arange(400.0), 3))
+
+
+def test_signal_never_changes():
+    t, values = np.array([0.0, 1.0]), np.array([1.0, 2.0])
+    signal = HeldSignal(t, values)
+    t[0], values[0] = -5.0, 9.0
+    assert signal.t[0] == 0.0
+    assert signal.values[0] == 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        signal.values[0] = 3.0
+
+
+@pytest.mark.parametrize(
+    ("t", "values", "hold", "message"),
+    [
+        ([], [], "zoh", "one equal, non-zero length"),
+        ([0.0, 1.0], [1.0], "zoh", "one equal, non-zero length"),
+        ([[0.0]], [[1.0]], "zoh", "one equal, non-zero length"),
+        ([0.0, 1.0], [1.0, np.nan], "zoh", "not a finite number"),
+        ([0.0, np.inf], [1.0, 2.0], "zoh", "not a finite number"),
+        ([0.0, 2.0, 1.0], [1.0, 2.0, 3.0], "zoh", "samples 1 and 2 are 2 and 1"),
+        ([0.0, 2.0, 2.0], [1.0, 2.0, 3.0], "zoh", "must increase strictly"),
+        ([0.0], [1.0], "cubic", "hold must be 'zoh' or 'foh', not 'cubic'"),
+    ],
+)
+def test_unusable_signals_are_refused(t, values, hold, message):
+    with pytest.raises(DataError, match=message):
+        HeldSignal(t, values, hold)

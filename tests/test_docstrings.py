@@ -1,0 +1,90 @@
+"""Every argument of every public function, method and class is documented, and nothing else is."""
+
+import enum
+import importlib
+import inspect
+import pkgutil
+import re
+import typing
+
+import pytest
+
+import ctid_cli
+
+
+def public_callables():
+    for info in pkgutil.walk_packages(ctid_cli.__path__, "ctid_cli."):
+        if "._" in info.name:
+            continue
+        module = importlib.import_module(info.name)
+        for name, member in vars(module).items():
+            if name.startswith("_") or getattr(member, "__module__", None) != info.name:
+                continue
+            if inspect.isclass(member):
+                yield f"{info.name}.{name}", member
+                for method_name, method in vars(member).items():
+                    if not method_name.startswith("_") and callable(getattr(member, method_name)):
+                        plain = inspect.unwrap(getattr(method, "__func__", method))
+                        if inspect.isfunction(plain):
+                            yield f"{info.name}.{name}.{method_name}", plain
+            elif callable(member) and inspect.isfunction(plain := inspect.unwrap(member)):
+                yield f"{info.name}.{name}", plain
+
+
+def documented(text):
+    """Names in the Parameters section: the lines ``name : type`` or ``one, two : type``."""
+    section = re.search(r"^Parameters\n-+\n(.*?)(?=^\S[^\n]*\n-{3,}$|\Z)", text, re.DOTALL | re.MULTILINE)
+    entries = re.findall(r"^(\S[^:\n]*?)(?: : .*)?$", section.group(1) if section else "", re.MULTILINE)
+    return [name.strip().lstrip("*") for entry in entries for name in entry.split(",")]
+
+
+def described_in_place(annotation):
+    """Whether the annotation itself carries the text, as command line options and specification fields do."""
+    metadata = typing.get_args(annotation)[1:] if typing.get_origin(annotation) is typing.Annotated else ()
+    return any(getattr(item, "help", None) or getattr(item, "description", None) for item in metadata)
+
+
+def expected(member):
+    if hasattr(member, "model_fields"):  # pydantic: the description of a field is its documentation
+        return [name for name, field in member.model_fields.items() if not field.description]
+    if inspect.isclass(member) and (issubclass(member, enum.Enum) or not inspect.isfunction(member.__init__)):
+        return []
+    hints = typing.get_type_hints(member, include_extras=True) if inspect.isfunction(member) else {}
+    names = [name for name in inspect.signature(member).parameters if name not in ("self", "cls")]
+    return [name for name in names if not described_in_place(hints.get(name))]
+
+
+CALLABLES = dict(public_callables())
+
+
+@pytest.mark.parametrize("name", CALLABLES)
+def test_docstring_names_exactly_the_arguments(name):
+    text = inspect.getdoc(CALLABLES[name]) or ""
+    assert text, f"{name} has no docstring"
+    assert sorted(documented(text)) == sorted(expected(CALLABLES[name]))
+
+
+def test_the_check_sees_what_is_missing_and_what_is_too_much():
+    def function(one, two, *rest):
+        """Summary.
+
+        Parameters
+        ----------
+        one, *rest : int
+            Text: with a colon.
+        three : {"a", "b"}, default "a"
+            Text.
+
+        Returns
+        -------
+        four : int
+            Text.
+        """
+
+    assert documented(inspect.getdoc(function)) == ["one", "rest", "three"]
+    assert expected(function) == ["one", "two", "rest"]
+    assert {
+        "ctid_cli.signals.excitation.Prbs",
+        "ctid_cli.signals.excitation.Prbs.generate",
+    } <= CALLABLES.keys()
+    assert "ctid_cli.signals.record.Record.from_arrays" in CALLABLES
