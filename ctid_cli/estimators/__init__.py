@@ -3,6 +3,7 @@
 from typing import Any
 
 from ctid_cli.estimators.common import Start
+from ctid_cli.estimators.compilation import compile_kernels
 from ctid_cli.estimators.srivc import Srivc
 from ctid_cli.estimators.svf import Svf
 from ctid_cli.estimators.td_srivc import TdSrivc
@@ -11,4 +12,4 @@ from ctid_cli.filtering.lowpass import Lowpass
 #: Every estimator by the name that a specification gives it.
 ESTIMATORS: dict[str, type[Any]] = {estimator.kind: estimator for estimator in (Svf, Srivc, TdSrivc)}
 
-__all__ = ["ESTIMATORS", "Lowpass", "Srivc", "Start", "Svf", "TdSrivc"]
+__all__ = ["ESTIMATORS", "Lowpass", "Srivc", "Start", "Svf", "TdSrivc", "compile_kernels"]

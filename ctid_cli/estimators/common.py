@@ -106,7 +106,9 @@ def check_record(record: Record, data: FilterData, parameters: int) -> None:
         raise DataError(f"{where}the output is constant ({data.y_used[0]:g}) over the samples that can be used")
 
 
-def history_entry(stage: str, iteration: int, problem: CoefficientProblem, theta: Array, cost: float) -> IterationRecord:
+def history_entry(
+    stage: str, iteration: int, problem: CoefficientProblem, theta: Array, cost: float
+) -> IterationRecord:
     """Describe one accepted iteration.
 
     Parameters

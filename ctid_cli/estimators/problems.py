@@ -258,7 +258,7 @@ def least_squares_start(data: FilterData, structure: Structure, delay: float, sv
         ``(a_1 … a_n, b_0 … b_m)`` of a stable model; None if the equations are singular.
     """
     n, m = structure.poles, structure.zeros
-    filter_denominator = np.poly(np.full(n, -svf_cutoff))
+    filter_denominator = np.asarray(np.poly(np.full(n, -svf_cutoff)), dtype=np.float64)
     # With a zero numerator the "output error" row is y itself.
     moments = second_moments(data, filter_denominator, np.zeros(1), delay)
     rows = Structure(n, m).regressor_rows

@@ -8,6 +8,7 @@ of the *problem*; this file only iterates.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -105,9 +106,7 @@ def scaled_solve(matrix: Array, right: Array, rows: Array, columns: Array) -> Ar
     left_scale = 1.0 / np.sqrt(rows)
     right_scale = left_scale if rows is columns else 1.0 / np.sqrt(columns)
     try:
-        solution: Array = right_scale * np.linalg.solve(
-            matrix * left_scale[:, None] * right_scale, right * left_scale
-        )
+        solution: Array = right_scale * np.linalg.solve(matrix * left_scale[:, None] * right_scale, right * left_scale)
     except np.linalg.LinAlgError:
         return None
     return solution if np.isfinite(solution).all() else None
@@ -219,7 +218,8 @@ def relative_change(equations: Equations, step: Array) -> float:
         ``sqrt(step' H step / sum x^2)`` [-]: free of the units of parameters, time and signals.
     """
     power = equations.output_power
-    return float(np.sqrt(max(step @ equations.hessian @ step, 0.0) / power)) if power > 0 else float("inf")
+    change = max(float(step @ equations.hessian @ step), 0.0)
+    return math.sqrt(change / power) if power > 0 else math.inf
 
 
 def _take(

@@ -96,12 +96,8 @@ class Srivc:
         default=1e-6,
         metadata={"doc": "Stop when a step changes the simulated output by less than this fraction of its rms value"},
     )
-    variant: Variant = field(
-        default="guarded", metadata={"doc": "plain: as published; guarded: the cost never rises"}
-    )
-    hold_output: Hold = field(
-        default="foh", metadata={"doc": "Interpolation of the measured output between samples"}
-    )
+    variant: Variant = field(default="guarded", metadata={"doc": "plain: as published; guarded: the cost never rises"})
+    hold_output: Hold = field(default="foh", metadata={"doc": "Interpolation of the measured output between samples"})
 
     def __post_init__(self) -> None:
         check_structure(self.poles, self.zeros)

@@ -57,9 +57,7 @@ class Svf:
     zeros: int = field(metadata={"doc": "Number of zeros, fewer than poles"})
     delay: float = field(default=0.0, metadata={"doc": "Known delay", "unit": "s"})
     svf_cutoff: float = field(default=1.0, metadata={"doc": "Cut-off of the state-variable filter", "unit": "rad/s"})
-    hold_output: Hold = field(
-        default="foh", metadata={"doc": "Interpolation of the measured output between samples"}
-    )
+    hold_output: Hold = field(default="foh", metadata={"doc": "Interpolation of the measured output between samples"})
 
     def __post_init__(self) -> None:
         check_structure(self.poles, self.zeros)

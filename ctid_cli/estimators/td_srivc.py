@@ -100,15 +100,9 @@ class TdSrivc:
     max_iterations: int = field(
         default=50, metadata={"doc": "Largest number of Gauss-Newton iterations on the delay in each stage"}
     )
-    tolerance: float = field(
-        default=1e-6, metadata={"doc": "Stop when the cost falls by less than this fraction"}
-    )
-    variant: Variant = field(
-        default="guarded", metadata={"doc": "plain: as published; guarded: the cost never rises"}
-    )
-    hold_output: Hold = field(
-        default="foh", metadata={"doc": "Interpolation of the measured output between samples"}
-    )
+    tolerance: float = field(default=1e-6, metadata={"doc": "Stop when the cost falls by less than this fraction"})
+    variant: Variant = field(default="guarded", metadata={"doc": "plain: as published; guarded: the cost never rises"})
+    hold_output: Hold = field(default="foh", metadata={"doc": "Interpolation of the measured output between samples"})
 
     def __post_init__(self) -> None:
         check_structure(self.poles, self.zeros)
@@ -118,7 +112,7 @@ class TdSrivc:
         low, high = self.delay_bounds
         if not 0 <= low < high < np.inf:
             raise ValueError(
-                f"delay_bounds must be two delays in seconds, the smaller one (0 or more) first: got [{low:g}, {high:g}]"
+                f"delay_bounds must be two delays in seconds, the smaller (0 or more) first: got [{low:g}, {high:g}]"
             )
 
     def prepare(self, record: Record) -> PreparedTdSrivc:

@@ -23,7 +23,7 @@ from typing import Literal
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.filtering.exponential import held_step, place
 from ctid_cli.filtering.kernels import irregular_chain_pass, modal_pass, regular_chain_pass
@@ -85,6 +85,22 @@ class FilterData:
         return self.y[self.use]
 
 
+def plain_array(values: ArrayLike) -> Array:
+    """A fresh, writeable, contiguous array.
+
+    Parameters
+    ----------
+    values : array_like
+        Numbers.
+
+    Returns
+    -------
+    ndarray
+        A copy. Compiled code tells read-only arrays from others and would be compiled anew for every mixture of them.
+    """
+    return np.array(values, dtype=np.float64, order="C")
+
+
 def filter_data(record: Record, start: float = 0.0, hold_output: Hold = "foh") -> FilterData:
     """Lay a record out for filtering.
 
@@ -110,11 +126,11 @@ def filter_data(record: Record, start: float = 0.0, hold_output: Hold = "foh") -
     on_grid = record.input_on_grid
     same = record.input.t.size == record.t.size and bool(np.array_equal(record.input.t, record.t))
     return FilterData(
-        t=record.t,
-        y=np.ascontiguousarray(y),
+        t=plain_array(record.t),
+        y=plain_array(y),
         use=use,
-        tu=record.input.t,
-        u=record.input.values,
+        tu=plain_array(record.input.t),
+        u=plain_array(record.input.values),
         input_foh=record.input.hold == "foh",
         y_foh=hold_output == "foh",
         interval=record.interval if on_grid else None,
@@ -317,7 +333,8 @@ def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Ar
     Returns
     -------
     condition : float
-        Amplification of rounding by the expansion of ``1/A^2`` at zero frequency; infinite with a repeated pole or one at the origin.
+        Amplification of rounding by the expansion of ``1/A^2`` at zero frequency; infinite with a repeated pole or one
+        at the origin.
     poles : ndarray, shape (modes,)
         One pole of each conjugate pair [rad/s].
     residues : ndarray, shape (modes,)
@@ -509,9 +526,9 @@ def _dispatch(
 def _run(data: FilterData, a: Array, b: Array, delay: float, want_rows: bool, form: Form) -> Array:
     limit = {"chain": 0.0, "modal": np.inf, "auto": MODAL_CONDITION_LIMIT}[form]
     moments: Array = _dispatch(
-        a,
-        b,
-        delay,
+        plain_array(a),
+        plain_array(b),
+        float(delay),
         data.interval or 0.0,
         data.tu,
         data.u,
@@ -541,7 +558,7 @@ def second_moments(data: FilterData, a: Array, b: Array, delay: float = 0.0, for
     delay : float, default 0.0
         Delay of the input [s].
     form : {"auto", "modal", "chain"}, default "auto"
-        Realisation of 1/A; ``auto`` takes partial fractions while they are well conditioned. Both give the same numbers.
+        Realisation of 1/A; ``auto`` takes partial fractions while they are well conditioned. Both give the same.
 
     Returns
     -------

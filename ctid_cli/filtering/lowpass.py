@@ -43,9 +43,7 @@ class Lowpass:
         """The analogue filter, unit gain at zero frequency."""
         angles = np.pi * (2 * np.arange(self.order) + 1 + self.order) / (2 * self.order)
         denominator = np.real(np.poly(np.exp(1j * angles)))
-        return TransferFunction(
-            [self.cutoff**self.order], denominator * self.cutoff ** np.arange(self.order + 1)
-        )
+        return TransferFunction([self.cutoff**self.order], denominator * self.cutoff ** np.arange(self.order + 1))
 
     def apply(self, record: Record) -> Record:
         """Filter the input and the output of a record by the same operator, both from rest.

@@ -89,7 +89,7 @@ def polynomial_roots(coefficients: Array) -> ComplexArray:
             if not abs(value) < 1e-3 * gap * abs(slope):
                 break
             raw[i] -= value / slope
-    return _pair_conjugates(raw)
+    return _pair_conjugates(raw)  # type: ignore[arg-type]  # numba declares eigvals wider than it is
 
 
 @njit(cache=True, nogil=True)

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from ctid_cli.filtering.bank import split_delay
+from ctid_cli.filtering.bank import plain_array, split_delay
 from ctid_cli.filtering.exponential import held_step
 from ctid_cli.filtering.kernels import irregular_chain_pass, regular_chain_pass
 from ctid_cli.filtering.sections import chain, polynomial_roots, time_scale
@@ -51,28 +51,26 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
     >>> simulate(TransferFunction([1], [1, 1], delay=0.5), step, [0.25, 1.5]).round(6)
     array([0.      , 0.632121])
     """
-    t = np.ascontiguousarray(times, dtype=float)
+    t = plain_array(times)
     if model.relative_degree < 0:
         raise ValueError("a model with more zeros than poles has no response to a jump")
     if model.order == 0:
-        return model.numerator[0] * signal.at(t - model.delay)
+        return np.asarray(model.numerator[0] * signal.at(t - model.delay))
     numerator = np.concatenate([np.zeros(model.relative_degree), model.numerator])
     direct = numerator[0]
     strictly_proper = (numerator - direct * model.denominator)[1:]
     foh = signal.hold == "foh"
     interval = regular_interval(t)
     on_grid = (
-        interval is not None
-        and signal.t.size == t.size
-        and bool(np.abs(signal.t - t).max() <= REGULARITY * interval)
+        interval is not None and signal.t.size == t.size and bool(np.abs(signal.t - t).max() <= REGULARITY * interval)
     )
     x: Array = _response(
-        model.denominator,
-        strictly_proper,
+        plain_array(model.denominator),
+        plain_array(strictly_proper),
         model.delay,
         (interval or 0.0) if on_grid else 0.0,
-        signal.t,
-        signal.values,
+        plain_array(signal.t),
+        plain_array(signal.values),
         foh,
         t,
     )

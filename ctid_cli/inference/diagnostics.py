@@ -26,7 +26,7 @@ def fit_percent(y: ArrayLike, x: ArrayLike) -> float:
     >>> fit_percent([0.0, 1.0, 2.0], [0.0, 1.0, 2.0])
     100.0
     """
-    return 100.0 * (1.0 - np.sqrt(1.0 - r_squared(y, x)))
+    return 100.0 * (1.0 - float(np.sqrt(1.0 - r_squared(y, x))))
 
 
 def r_squared(y: ArrayLike, x: ArrayLike) -> float:

@@ -55,7 +55,7 @@ class Structure:
 
     @cached_property
     def regressor_rows(self) -> NDArray[np.intp]:
-        """Standard rows of the regressor: as the sensitivities, with the measured output in the model output's place."""
+        """Standard rows of the regressor: as the sensitivities, the measured output in the model output's place."""
         rows = self.sensitivity_rows.copy()
         rows[: self.poles] += self.poles
         return rows
