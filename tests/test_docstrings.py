@@ -25,7 +25,8 @@ def public_callables():
                 for method_name, method in vars(member).items():
                     if not method_name.startswith("_") and callable(getattr(member, method_name)):
                         plain = inspect.unwrap(getattr(method, "__func__", method))
-                        if inspect.isfunction(plain):
+                        # Methods that a library put into the class, such as pydantic's, are documented there.
+                        if inspect.isfunction(plain) and plain.__module__ == info.name:
                             yield f"{info.name}.{name}.{method_name}", plain
             elif callable(member) and inspect.isfunction(plain := inspect.unwrap(member)):
                 yield f"{info.name}.{name}", plain
@@ -49,7 +50,9 @@ def expected(member):
         return [name for name, field in member.model_fields.items() if not field.description]
     if inspect.isclass(member) and (issubclass(member, enum.Enum) or not inspect.isfunction(member.__init__)):
         return []
-    hints = typing.get_type_hints(member, include_extras=True) if inspect.isfunction(member) else {}
+    hints = {}
+    if inspect.isfunction(member) and any("Annotated" in str(hint) for hint in member.__annotations__.values()):
+        hints = typing.get_type_hints(member, include_extras=True)
     names = [name for name in inspect.signature(member).parameters if name not in ("self", "cls")]
     return [name for name in names if not described_in_place(hints.get(name))]
 

@@ -15,6 +15,7 @@ from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.record import Record
 
 Array = NDArray[np.float64]
@@ -46,10 +47,8 @@ def check_structure(poles: int, zeros: int) -> None:
     ValueError
         If they do not describe a strictly proper model of order 1 to 12.
     """
-    if not 1 <= poles <= 12:
-        raise ValueError(f"poles must be between 1 and 12, not {poles}")
-    if zeros < 0:
-        raise ValueError(f"zeros must be 0 or more, not {zeros}")
+    require_integer("poles", poles, 1, 12)
+    require_integer("zeros", zeros, 0)
     if zeros >= poles:
         raise ValueError(
             f"zeros must be fewer than poles (a strictly proper model): got {zeros} zeros and {poles} poles"
@@ -71,8 +70,7 @@ def check_iteration(max_iterations: int, tolerance: float) -> None:
     ValueError
         If a number is out of range.
     """
-    if max_iterations < 1:
-        raise ValueError(f"max_iterations must be 1 or more, not {max_iterations}")
+    require_integer("max_iterations", max_iterations, 1)
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance must lie between 0 and 1, not {tolerance}")
 
@@ -175,13 +173,22 @@ def finish(
             model, structure.names, undefined, Status.DIVERGED, nan, nan, nan, count, iterations, nan, tuple(history)
         )
     hessian = structure.hessian(moments)
+    free = structure.size - int(status is Status.DELAY_AT_BOUND)
+    covariance = undefined
+    if accurate:
+        # A delay at its bound is no minimum: it has no standard error, and the others hold for that delay.
+        covariance[:free, :free] = white_noise_covariance(
+            hessian[:free, :free], structure.squared_error(moments), count
+        )
+        if status is Status.CONVERGED and np.isnan(covariance[:free, :free]).any():
+            status = Status.SINGULAR
     squared_error = structure.squared_error(moments)
     y = problem.data.y_used
     r2 = 1.0 - squared_error / float(np.sum((y - y.mean()) ** 2))
     return Fit(
         model=model,
         parameter_names=structure.names,
-        covariance=white_noise_covariance(hessian, squared_error, count) if accurate else undefined,
+        covariance=covariance,
         status=status,
         cost=squared_error / count,
         fit_percent=100.0 * (1.0 - float(np.sqrt(max(1.0 - r2, 0.0)))),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from ctid_cli.filtering.bank import FilterData, filter_data
 from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
-from ctid_cli.signals.checks import require_not_negative, require_positive
+from ctid_cli.signals.checks import require_choice, require_not_negative, require_positive
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
@@ -101,6 +101,8 @@ class Srivc:
 
     def __post_init__(self) -> None:
         check_structure(self.poles, self.zeros)
+        require_choice("hold_output", self.hold_output, get_args(Hold))
+        require_choice("variant", self.variant, get_args(Variant))
         require_positive("svf_cutoff", self.svf_cutoff, "rad/s")
         check_iteration(self.max_iterations, self.tolerance)
         require_not_negative("delay", self.delay, "s")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, get_args
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.common import Start, check_record, check_structure, finish, history_entry
@@ -12,7 +12,7 @@ from ctid_cli.filtering.bank import filter_data
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
-from ctid_cli.signals.checks import require_not_negative, require_positive
+from ctid_cli.signals.checks import require_choice, require_not_negative, require_positive
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
@@ -61,6 +61,7 @@ class Svf:
 
     def __post_init__(self) -> None:
         check_structure(self.poles, self.zeros)
+        require_choice("hold_output", self.hold_output, get_args(Hold))
         require_positive("svf_cutoff", self.svf_cutoff, "rad/s")
         require_not_negative("delay", self.delay, "s")
 

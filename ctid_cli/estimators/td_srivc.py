@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
-from ctid_cli.signals.checks import require_positive
+from ctid_cli.signals.checks import require_choice, require_positive
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 
 #: SRIVC iterations at each trial delay while searching.
 INNER_ITERATIONS = 20
+#: Tolerance of the guarded variant while it searches.
+SEARCH_TOLERANCE = 1e-3
 #: The smallest delay step, as a fraction of the range of the delay.
 SMALLEST_STEP = 1e-5
 
@@ -106,14 +108,19 @@ class TdSrivc:
 
     def __post_init__(self) -> None:
         check_structure(self.poles, self.zeros)
+        require_choice("hold_output", self.hold_output, get_args(Hold))
+        require_choice("variant", self.variant, get_args(Variant))
         require_positive("svf_cutoff", self.svf_cutoff, "rad/s")
         check_iteration(self.max_iterations, self.tolerance)
-        object.__setattr__(self, "delay_bounds", tuple(float(bound) for bound in self.delay_bounds))
-        low, high = self.delay_bounds
+        try:
+            low, high = (float(bound) for bound in self.delay_bounds)
+        except (TypeError, ValueError):
+            low, high = np.nan, np.nan
         if not 0 <= low < high < np.inf:
             raise ValueError(
-                f"delay_bounds must be two delays in seconds, the smaller (0 or more) first: got [{low:g}, {high:g}]"
+                f"delay_bounds must be two delays in seconds, the smaller (0 or more) first: got {self.delay_bounds!r}"
             )
+        object.__setattr__(self, "delay_bounds", (low, high))
 
     def prepare(self, record: Record) -> PreparedTdSrivc:
         """Check a record, lay it out and filter it, once for any number of starts.
@@ -228,13 +235,31 @@ class PreparedTdSrivc:
         if options.variant == "guarded":
             polished = self._polish(problem, theta, history)
             if polished is not None:
-                theta, iterations = polished.theta, iterations + polished.iterations
-                # An end at a bound is the search's finding; the polishing cannot see it.
-                if status is not Status.DELAY_AT_BOUND or polished.status is Status.CONVERGED:
-                    status = polished.status
-                if status is Status.CONVERGED and _near(theta[-1], options.delay_bounds):
-                    status = Status.DELAY_AT_BOUND
+                theta, iterations, status = polished.theta, iterations + polished.iterations, polished.status
+        bound = bound_in_the_way(problem, theta)
+        if bound is not None:
+            status = Status.DELAY_AT_BOUND
+            if options.variant == "guarded":
+                theta = self._at_bound(problem, theta, bound, history)
         return finish(problem, theta, status, iterations, history)
+
+    def _at_bound(self, problem: DelayProblem, theta: Array, bound: float, history: list[IterationRecord]) -> Array:
+        """The best coefficients at a bound of the delay, if the cost is no higher there."""
+        here = problem.equations(theta)
+        coefficients = CoefficientProblem(self.data, self.structure, bound)
+        there = iterate(
+            coefficients,
+            theta[:-1],
+            max_iterations=self.options.max_iterations,
+            tolerance=self.options.tolerance,
+            variant="guarded",
+        )
+        if here is None or there is None or there.equations.squared_error > here.squared_error:
+            return theta
+        cost = there.equations.squared_error / problem.data.count
+        moved = np.concatenate((there.theta, [bound]))
+        history.append(history_entry("bound", 0, problem, moved, cost))
+        return moved
 
     def _polish(self, problem: DelayProblem, theta: Array, history: list[IterationRecord]) -> Iterated | None:
         """Joint iterations on coefficients and delay: from the right basin they converge in a few steps."""
@@ -254,9 +279,29 @@ class PreparedTdSrivc:
         )
 
 
-def _near(delay: float, bounds: tuple[float, float]) -> bool:
-    """Whether a delay lies within the smallest step of a bound."""
-    return min(delay - bounds[0], bounds[1] - delay) <= SMALLEST_STEP * (bounds[1] - bounds[0])
+def bound_in_the_way(problem: DelayProblem, theta: Array) -> float | None:
+    """The bound that keeps the delay from a lower cost.
+
+    Parameters
+    ----------
+    problem : DelayProblem
+        Record, degrees and bounds.
+    theta : ndarray, shape (p,)
+        Where the iterations ended, the delay last.
+
+    Returns
+    -------
+    float or None
+        The bound [s] beyond which the next full Gauss-Newton step would lead; None if it stays inside.
+    """
+    equations = problem.equations(theta)
+    step = None if equations is None else delay_step(equations)
+    if step is None:
+        return None
+    low, high = problem.bounds
+    if theta[-1] + step < low:
+        return low
+    return high if theta[-1] + step > high else None
 
 
 class _DelaySearch:
@@ -269,6 +314,8 @@ class _DelaySearch:
         self.stage = stage
         self.joint = DelayProblem(data, structure, options.delay_bounds)
         self.history: list[IterationRecord] = []
+        # The guarded variant ends with joint iterations: its search only has to find the basin.
+        self.tolerance = options.tolerance if options.variant == "plain" else max(options.tolerance, SEARCH_TOLERANCE)
 
     def coefficients(self, delay: float, theta: Array | None) -> Iterated | None:
         """SRIVC at one delay, from given coefficients or from the least-squares start."""
@@ -282,7 +329,7 @@ class _DelaySearch:
             problem,
             theta,
             max_iterations=INNER_ITERATIONS,
-            tolerance=options.tolerance,
+            tolerance=self.tolerance,
             variant=options.variant,
         )
         return result if result is not None and np.isfinite(result.theta).all() else None
@@ -311,7 +358,6 @@ class _DelaySearch:
             if step is None:
                 status = Status.SINGULAR
                 break
-            at_bound = not low <= delay + step <= high
             accepted = None
             while accepted is None:
                 while not low <= delay + step <= high:
@@ -324,14 +370,14 @@ class _DelaySearch:
                 else:
                     step *= 0.5
             if accepted is None:
-                status = Status.DELAY_AT_BOUND if at_bound and _near(delay, (low, high)) else Status.CONVERGED
+                status = Status.CONVERGED
                 break
             fall = 1.0 - accepted.equations.squared_error / current.equations.squared_error
             delay += step
             current = accepted
             iterations += 1
             self.log(delay, current)
-            if fall < options.tolerance:
+            if fall < self.tolerance:
                 status = Status.CONVERGED
                 break
         return Iterated(np.concatenate((current.theta, [delay])), current.equations, status, iterations)

@@ -39,7 +39,7 @@ Form = Literal["auto", "modal", "chain"]
 #: Partial fractions are used while they amplify rounding by less than this; beyond, poles count as repeated.
 MODAL_CONDITION_LIMIT = 1e4
 #: A delay closer to a whole number of intervals than this fraction of one is that whole number.
-WHOLE_INTERVAL = 1e-12
+WHOLE_INTERVAL = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,6 +320,35 @@ def _evaluate(coefficients: Array, point: complex) -> tuple[complex, complex, co
 
 
 @njit(cache=True, nogil=True)
+def _modal_condition(roots: ComplexArray, slopes: ComplexArray, curvatures: ComplexArray) -> float:
+    """How much the partial fractions of ``p^k/A^2`` amplify rounding, against the peak gain of each.
+
+    Gains are compared at zero frequency and at the magnitude of every pole; the worst power k counts.
+    """
+    n = roots.size
+    worst = 0.0
+    for k in range(n):
+        peak, spread = 0.0, 0.0
+        for at in range(n + 1):
+            s = 1j * (abs(roots[at - 1]) if at > 0 else 0.0)
+            exact, total = 1.0, 0.0
+            for i in range(n):
+                distance = s - roots[i]
+                exact /= abs(distance) ** 2
+                power = roots[i] ** k
+                lower = k * roots[i] ** (k - 1) if k > 0 else 0.0j
+                square = slopes[i] * slopes[i]
+                total += abs(power / (square * distance * distance))
+                total += abs((lower - power * curvatures[i]) / (square * distance))
+            peak = max(peak, exact * abs(s) ** k if k > 0 else exact)
+            spread = max(spread, total)
+        if not peak > 0.0:
+            return np.inf
+        worst = max(worst, spread / peak)
+    return worst
+
+
+@njit(cache=True, nogil=True)
 def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Array]:
     """Partial fractions of the standard rows.
 
@@ -333,8 +362,7 @@ def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Ar
     Returns
     -------
     condition : float
-        Amplification of rounding by the expansion of ``1/A^2`` at zero frequency; infinite with a repeated pole or one
-        at the origin.
+        Amplification of rounding by the expansion; infinite with a repeated pole or one at the origin.
     poles : ndarray, shape (modes,)
         One pole of each conjugate pair [rad/s].
     residues : ndarray, shape (modes,)
@@ -353,7 +381,7 @@ def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Ar
     residues = np.zeros(modes, np.complex128)
     mapping = np.zeros((3 * n + 3, 3 * n + 2))
     place, mode = 0, 0
-    amplification = 0.0
+    slopes, curvatures = np.zeros(n, np.complex128), np.zeros(n, np.complex128)
     for i in range(n):
         pole = roots[i]
         if pole.imag < 0.0:
@@ -369,11 +397,12 @@ def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Ar
                     curvature += 2.0 / (pole - roots[j])
         if slope == 0.0 or pole == 0.0:
             return np.inf, poles, residues, mapping
+        slopes[i], curvatures[i] = slope, curvature
+        if paired:
+            slopes[i + 1], curvatures[i + 1] = np.conj(slope), np.conj(curvature)
         poles[mode] = pole
         value, first, _ = _evaluate(b, pole)
         residues[mode] = weight * value / slope
-        gain = 1.0 / (slope * pole)
-        amplification += weight * (abs(gain) ** 2 + abs(curvature / (slope * slope * pole)))
         power, power_slope = 1.0 + 0.0j, 0.0j
         for k in range(n):
             single = weight * power / slope
@@ -397,7 +426,7 @@ def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Ar
     mapping[n, 2 * n] = 1.0
     mapping[3 * n + 1, 3 * n + 1] = 1.0
     _fill_derivative(a, b, mapping)
-    return amplification * a[n] * a[n], poles, residues, mapping
+    return _modal_condition(roots, slopes, curvatures), poles, residues, mapping
 
 
 @njit(cache=True, nogil=True)

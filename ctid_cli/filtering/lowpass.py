@@ -65,9 +65,10 @@ class Lowpass:
 
         Notes
         -----
-        On a common regular clock the samples pass through one discrete filter; all operators then commute and no error
-        is made. On any other clock the held signals pass through the analogue filter exactly, and the smooth results
-        are taken as linear between the samples.
+        On a common regular clock the samples pass through one discrete filter. That commutes with any filter of the
+        held signal, so no error is made; only a linearly held input that begins with a jump keeps a transient. On any
+        other clock the held signals pass through the analogue filter exactly, and the smooth results are taken as
+        linear between the samples.
         """
         valid = record.valid
         y = record.y if valid.all() else np.interp(record.t, record.t[valid], record.y[valid])

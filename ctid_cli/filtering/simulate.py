@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from ctid_cli.errors import DataError
 from ctid_cli.filtering.bank import plain_array, split_delay
 from ctid_cli.filtering.exponential import held_step
 from ctid_cli.filtering.kernels import irregular_chain_pass, regular_chain_pass
@@ -36,8 +37,8 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
 
     Raises
     ------
-    ValueError
-        If the model has more zeros than poles.
+    DataError
+        If the instants do not increase strictly, or the model has more zeros than poles.
 
     Notes
     -----
@@ -52,8 +53,12 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
     array([0.      , 0.632121])
     """
     t = plain_array(times)
+    if t.ndim != 1 or not np.isfinite(t).all() or not (np.diff(t) > 0).all():
+        raise DataError("the instants of a simulation must be finite numbers that increase strictly")
+    if t.size == 0:
+        return t
     if model.relative_degree < 0:
-        raise ValueError("a model with more zeros than poles has no response to a jump")
+        raise DataError("a model with more zeros than poles has no response to a jump")
     if model.order == 0:
         return np.asarray(model.numerator[0] * signal.at(t - model.delay))
     numerator = np.concatenate([np.zeros(model.relative_degree), model.numerator])

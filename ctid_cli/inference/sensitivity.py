@@ -75,12 +75,20 @@ class Structure:
         return 3 * self.poles + 1
 
     @cached_property
-    def _hessian_index(self) -> tuple[NDArray[np.intp], ...]:
-        return np.ix_(self.sensitivity_rows, self.sensitivity_rows)
+    def _hessian_index(self) -> NDArray[np.intp]:
+        return self._flat(self.sensitivity_rows, self.sensitivity_rows)
 
     @cached_property
-    def _mixed_index(self) -> tuple[NDArray[np.intp], ...]:
-        return np.ix_(self.sensitivity_rows, self.regressor_rows)
+    def _mixed_index(self) -> NDArray[np.intp]:
+        return self._flat(self.sensitivity_rows, self.regressor_rows)
+
+    @cached_property
+    def _error_index(self) -> NDArray[np.intp]:
+        return self._flat(self.sensitivity_rows, np.array([self.error_row]))[:, 0]
+
+    def _flat(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Places of a submatrix in the flattened moments: twice as fast to take as row and column lists."""
+        return rows[:, None] * (3 * self.poles + 3) + columns
 
     @cached_property
     def _sign_products(self) -> Array:
@@ -99,7 +107,7 @@ class Structure:
         ndarray, shape (size, size)
             The matrix.
         """
-        product: Array = moments[self._hessian_index] * self._sign_products
+        product: Array = moments.take(self._hessian_index) * self._sign_products
         return product
 
     def instrument_regressor(self, moments: Array) -> Array:
@@ -115,7 +123,7 @@ class Structure:
         ndarray, shape (size, size)
             The matrix.
         """
-        product: Array = moments[self._mixed_index] * self._sign_products
+        product: Array = moments.take(self._mixed_index) * self._sign_products
         return product
 
     def instrument_error(self, moments: Array) -> Array:
@@ -131,7 +139,7 @@ class Structure:
         ndarray, shape (size,)
             The vector.
         """
-        product: Array = moments[self.sensitivity_rows, self.error_row] * self.signs
+        product: Array = moments.take(self._error_index) * self.signs
         return product
 
     def squared_error(self, moments: Array) -> float:

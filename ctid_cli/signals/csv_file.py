@@ -108,9 +108,7 @@ def read_held_signal(
     """
     name = os.fspath(path)
     columns, lines = read_columns(path, (time, input))
-    return HeldSignal(
-        _times(name, time, columns[time], lines), _input(name, input, columns[input], lines), hold
-    )
+    return HeldSignal(_times(name, time, columns[time], lines), _input(name, input, columns[input], lines), hold)
 
 
 def read_columns(
@@ -160,9 +158,7 @@ def read_columns(
     except pd.errors.ParserError as error:
         _refuse_ragged(file, str(error))
     except UnicodeDecodeError:
-        raise DataError(
-            f"{file}: this is not a text file in UTF-8; export it as comma-separated UTF-8 text"
-        ) from None
+        raise DataError(f"{file}: this is not a text file in UTF-8; export it as comma-separated UTF-8 text") from None
     except OSError as error:
         raise DataError(f"{file}: cannot be read: {error.strerror}") from None
 
@@ -184,9 +180,7 @@ def read_columns(
         wrong = np.isnan(numbers) & ~text.str.lower().isin(MISSING).to_numpy(dtype=bool)
         if wrong.any():
             k = int(np.argmax(wrong))
-            raise DataError(
-                f"{file}:{lines[k]}: column {wanted!r} holds {text.iloc[k]!r}, which is not a number"
-            )
+            raise DataError(f"{file}:{lines[k]}: column {wanted!r} holds {text.iloc[k]!r}, which is not a number")
         columns[wanted] = numbers
     return columns, lines
 
@@ -220,15 +214,11 @@ def _input(file: str, column: str, u: NDArray[np.float64], lines: NDArray[np.int
 
 def _refuse_missing_column(file: str, wanted: str, present: Sequence[str]) -> NoReturn:
     if all(_is_number(column) for column in present):
-        raise DataError(
-            f"{file}:1: the first line holds numbers; it must name the columns, for example t,u,y"
-        )
+        raise DataError(f"{file}:1: the first line holds numbers; it must name the columns, for example t,u,y")
     message = f"{file}:1: there is no column {wanted!r}; the file has {', '.join(map(repr, present))}"
     if len(present) == 1:
         separators = [
-            word
-            for sign, word in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces"))
-            if sign in present[0]
+            word for sign, word in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces")) if sign in present[0]
         ]
         if separators:
             message += f". Its columns seem to be separated by {separators[0]}; separate them by commas"
@@ -243,9 +233,7 @@ def _refuse_ragged(file: str, message: str) -> NoReturn:
     if found is None:
         raise DataError(f"{file}: this is not a comma-separated file ({message.strip()})") from None
     expected, line, seen = found.groups()
-    raise DataError(
-        f"{file}:{line}: the line has {seen} fields where those before it have {expected}"
-    ) from None
+    raise DataError(f"{file}:{line}: the line has {seen} fields where those before it have {expected}") from None
 
 
 def _is_number(text: str) -> bool:

@@ -86,9 +86,7 @@ def maximal_length_sequence(stages: int, length: int, state: int) -> NDArray[np.
         if 2 * lags.max() <= known:
             lags = 2 * lags
         block = min(int(lags.min()), length - known)
-        bits[known : known + block] = np.bitwise_xor.reduce(
-            [bits[known - lag : known - lag + block] for lag in lags]
-        )
+        bits[known : known + block] = np.bitwise_xor.reduce([bits[known - lag : known - lag + block] for lag in lags])
         known += block
     return bits[:length]
 
@@ -126,9 +124,7 @@ class Prbs:
 
     stages: int = field(metadata={"doc": "stages of the feedback register, 2 to 20", "unit": "-"})
     clock_period: float = field(metadata={"doc": "time for which each value is held", "unit": "s"})
-    amplitude: float = field(
-        default=1.0, metadata={"doc": "the signal is plus or minus this", "unit": "input unit"}
-    )
+    amplitude: float = field(default=1.0, metadata={"doc": "the signal is plus or minus this", "unit": "input unit"})
 
     def __post_init__(self) -> None:
         require_integer("stages", self.stages, min(TAPS), max(TAPS))
@@ -196,9 +192,7 @@ class Multisine:
         if self.lowest_frequency > self.highest_frequency:
             raise ValueError(f"lowest_frequency must not exceed highest_frequency; they are {band}.")
         if self.tones > 1 and self.lowest_frequency == self.highest_frequency:
-            raise ValueError(
-                f"{self.tones} tones need a band, but both ends are at {self.lowest_frequency:g} rad/s."
-            )
+            raise ValueError(f"{self.tones} tones need a band, but both ends are at {self.lowest_frequency:g} rad/s.")
 
     @property
     def frequencies(self) -> NDArray[np.float64]:
@@ -256,9 +250,7 @@ class Gaussian:
 
     kind: ClassVar[str] = "gaussian"
 
-    standard_deviation: float = field(
-        default=1.0, metadata={"doc": "standard deviation", "unit": "input unit"}
-    )
+    standard_deviation: float = field(default=1.0, metadata={"doc": "standard deviation", "unit": "input unit"})
     clock_period: float | None = field(default=None, metadata={"doc": _CLOCK_DOC, "unit": "s"})
 
     def __post_init__(self) -> None:
@@ -298,17 +290,13 @@ class Step:
 
     kind: ClassVar[str] = "step"
 
-    amplitude: float = field(
-        default=1.0, metadata={"doc": "height of the step, not zero", "unit": "input unit"}
-    )
+    amplitude: float = field(default=1.0, metadata={"doc": "height of the step, not zero", "unit": "input unit"})
     time: float = field(default=0.0, metadata={"doc": "when the step happens", "unit": "s"})
 
     def __post_init__(self) -> None:
         require_finite("amplitude", self.amplitude, "input unit")
         if self.amplitude == 0:
-            raise ValueError(
-                "amplitude must not be zero [input unit]: a step of height zero excites nothing."
-            )
+            raise ValueError("amplitude must not be zero [input unit]: a step of height zero excites nothing.")
         require_not_negative("time", self.time, "s")
 
     def generate(self, sample_times: NDArray[np.float64], rng: np.random.Generator) -> HeldSignal:
@@ -365,9 +353,7 @@ class InputFile:
     file: str = field(metadata={"doc": "comma-separated file with the input", "unit": "-"})
     time: str = field(default="t", metadata={"doc": "column of the times [s]", "unit": "-"})
     input: str = field(default="u", metadata={"doc": "column of the input", "unit": "-"})
-    hold: Hold = field(
-        default="zoh", metadata={"doc": "how the input behaves between its breaks", "unit": "-"}
-    )
+    hold: Hold = field(default="zoh", metadata={"doc": "how the input behaves between its breaks", "unit": "-"})
 
     def __post_init__(self) -> None:
         require_choice("hold", self.hold, get_args(Hold))

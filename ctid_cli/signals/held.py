@@ -46,8 +46,7 @@ class HeldSignal:
         values = np.array(self.values, dtype=float)
         if t.ndim != 1 or t.shape != values.shape or t.size == 0:
             raise DataError(
-                "a held signal needs times and values of one equal, non-zero length; "
-                f"got {t.shape} and {values.shape}"
+                f"a held signal needs times and values of one equal, non-zero length; got {t.shape} and {values.shape}"
             )
         if self.hold not in ("zoh", "foh"):
             raise DataError(f"hold must be 'zoh' or 'foh', not {self.hold!r}")

@@ -52,9 +52,7 @@ class WhiteNoise:
     def __post_init__(self) -> None:
         if (self.snr_db is None) == (self.standard_deviation is None):
             given = "neither was" if self.snr_db is None else "both were"
-            raise ValueError(
-                f"noise needs either snr_db [dB] or standard_deviation [output unit]; {given} given."
-            )
+            raise ValueError(f"noise needs either snr_db [dB] or standard_deviation [output unit]; {given} given.")
         if self.snr_db is not None:
             require_finite("snr_db", self.snr_db, "dB")
         if self.standard_deviation is not None:

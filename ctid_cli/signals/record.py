@@ -54,8 +54,7 @@ class Record:
         where = f"{self.name}: " if self.name else ""
         if t.ndim != 1 or t.shape != y.shape:
             raise DataError(
-                f"{where}times and outputs must be one-dimensional and of equal length; "
-                f"got {t.shape} and {y.shape}"
+                f"{where}times and outputs must be one-dimensional and of equal length; got {t.shape} and {y.shape}"
             )
         if t.size == 0:
             raise DataError(f"{where}the record is empty")
@@ -64,8 +63,7 @@ class Record:
         if not (np.diff(t) > 0).all():
             k = int(np.argmin(np.diff(t) > 0))
             raise DataError(
-                f"{where}times must increase strictly; "
-                f"samples {k} and {k + 1} are at {t[k]:g} s and {t[k + 1]:g} s"
+                f"{where}times must increase strictly; samples {k} and {k + 1} are at {t[k]:g} s and {t[k + 1]:g} s"
             )
         if np.isinf(y).any():
             k = int(np.argmax(np.isinf(y)))
@@ -78,9 +76,7 @@ class Record:
         object.__setattr__(self, "y", y)
 
     @classmethod
-    def from_arrays(
-        cls, t: ArrayLike, u: ArrayLike, y: ArrayLike, hold: Hold = "zoh", name: str = ""
-    ) -> Record:
+    def from_arrays(cls, t: ArrayLike, u: ArrayLike, y: ArrayLike, hold: Hold = "zoh", name: str = "") -> Record:
         """Record whose input is known at the instants of the output.
 
         Parameters
@@ -102,9 +98,7 @@ class Record:
             The record.
         """
         times = np.asarray(t, dtype=float)
-        return cls(
-            times, np.asarray(y, dtype=float), HeldSignal(times, np.asarray(u, dtype=float), hold), name=name
-        )
+        return cls(times, np.asarray(y, dtype=float), HeldSignal(times, np.asarray(u, dtype=float), hold), name=name)
 
     @property
     def n_samples(self) -> int:

@@ -13,8 +13,7 @@ from ctid_cli.signals.checks import require_choice, require_integer, require_pos
 InputRecord = Literal["sampled", "exact"]
 
 _INPUT_RECORD_DOC = (
-    "what the estimator is told of the input: "
-    "its samples at the output's instants (sampled), or its true edges (exact)"
+    "what the estimator is told of the input: its samples at the output's instants (sampled), or its true edges (exact)"
 )
 
 

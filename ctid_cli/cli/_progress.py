@@ -1,0 +1,162 @@
+"""How a run looks on the terminal: a bar for people, a line now and then for log files."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import typer
+
+from ctid_cli.reporting.layout import count, seconds
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+    from ctid_cli.experiment.events import Event
+
+#: Seconds between two lines where stderr is not a terminal.
+LINE_EVERY = 10.0
+#: Kernels that are ready sooner than this came from the cache [s].
+QUICK = 2.0
+
+
+class Reporter:
+    """Shows the events of one run on stderr.
+
+    Parameters
+    ----------
+    experiment : str
+        Name shown in front.
+    clock : callable, optional
+        Source of time [s].
+    """
+
+    def __init__(self, experiment: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self.experiment = experiment
+        self.failed = 0
+        self._clock = clock
+        self._began = self._last = clock()
+        self._bar: Progress | None = None
+        self._task: TaskID | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __call__(self, event: Event) -> None:
+        """Show one event.
+
+        Parameters
+        ----------
+        event : Event
+            What happened.
+        """
+        from ctid_cli.experiment import events
+
+        match event:
+            case events.PlanReady():
+                self._plan(event)
+            case events.KernelsCompiling():
+                self._say("compiling numerical kernels (below 30 s the first time, cached afterwards)")
+            case events.KernelsCompiled():
+                if event.seconds > QUICK:
+                    self._say(f"kernels ready after {seconds(event.seconds)}")
+            case events.DataSetDone():
+                self._advance(event)
+            case events.WorkerDied():
+                self._say(
+                    f"a worker process died ({event.reason}); repeating {count(event.data_sets, 'data set')} alone"
+                )
+            case events.Stopping():
+                self._say(f"stopping ({event.reason}): storing what is finished; once more to stop at once")
+            case events.Sealed():
+                pass
+
+    def _plan(self, event: Any) -> None:
+        parts = [f"{count(event.estimates, 'estimate')} of {count(event.data_sets, 'data set')} to compute"]
+        if event.reused:
+            parts.append(f"{event.reused} already stored")
+        if event.left_aside:
+            parts.append(f"{event.left_aside} of other settings left aside")
+        self._say(", ".join(parts))
+        self._began = self._last = self._clock()
+        if event.data_sets and sys.stderr.isatty():
+            self._start_bar(event.data_sets)
+
+    def _start_bar(self, total: int) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=20),
+            MofNCompleteColumn(),
+            TextColumn("data sets, {task.fields[rate]}, {task.fields[failed]} failed, ETA"),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+        )
+        self._task = self._bar.add_task(self.experiment.rpartition("/")[2], total=total, rate="-", failed=0)
+        self._bar.start()
+
+    def _advance(self, event: Any) -> None:
+        from ctid_cli.experiment.manifest import FAILURES
+
+        self.failed += sum(row["status"] in FAILURES for row in event.rows)
+        now = self._clock()
+        speed = event.done / max(now - self._began, 1e-9)
+        rate = f"{speed:.2g}/s" if speed >= 0.1 else f"{60 * speed:.2g}/min"
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=event.done, rate=rate, failed=self.failed)
+        elif now - self._last >= LINE_EVERY or event.done == event.total:
+            self._last = now
+            left = f", ETA {seconds((event.total - event.done) / speed)}" if event.done < event.total else ""
+            self._say(f"{event.done}/{event.total} data sets, {rate}, {self.failed} failed{left}")
+
+    def _say(self, text: str) -> None:
+        line = f"{self.experiment}: {text}"
+        if self._bar is not None:
+            self._bar.console.print(line, markup=False, highlight=False)
+        else:
+            typer.echo(line, err=True)
+
+
+def json_lines(event: Event) -> list[str]:
+    """An event as JSON objects, one per line; a data set gives one object per estimate.
+
+    Parameters
+    ----------
+    event : Event
+        What happened.
+
+    Returns
+    -------
+    list of str
+        Each object names its kind under ``event``.
+    """
+    from ctid_cli.experiment import events
+    from ctid_cli.reporting.estimate import as_object
+
+    if isinstance(event, events.DataSetDone):
+        lines = [{"event": "estimate", **as_object(row)} for row in event.rows]
+        return [json.dumps(line, allow_nan=False) for line in lines]
+    names = {
+        events.PlanReady: "plan",
+        events.KernelsCompiling: "kernels_compiling",
+        events.KernelsCompiled: "kernels_compiled",
+        events.WorkerDied: "worker_died",
+        events.Stopping: "stopping",
+        events.Sealed: "sealed",
+    }
+    content = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(event).items()}
+    return [json.dumps({"event": names[type(event)], **content}, allow_nan=False)]

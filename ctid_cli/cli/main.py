@@ -1,0 +1,59 @@
+"""The ``ctid`` command: registers one function per command and nothing else."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+import ctid_cli
+from ctid_cli.cli.export import export
+from ctid_cli.cli.run import run
+from ctid_cli.cli.schema import schema
+from ctid_cli.cli.show import show
+from ctid_cli.cli.status import status
+from ctid_cli.cli.table import table
+from ctid_cli.cli.validate import validate
+
+# Plain help and error texts: they read well in log files, and leave rich out of the start-up.
+app = typer.Typer(
+    name="ctid",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"ctid {ctid_cli.__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Identify continuous-time models with a time delay, and tabulate how often it succeeds.
+
+    A YAML file describes one experiment: `ctid validate` checks it, `ctid run` computes it (again to resume),
+    `ctid table` prints the percentages. Exit codes: 0 done, 1 internal error, 2 bad input, 3 refused, 4 too many
+    failures, 5 stopped early, 6 storage error, 130 Ctrl-C, 143 terminated.
+    """
+
+
+for _command in (run, status, table, show, export, validate, schema):
+    app.command()(_command)
+
+
+def main() -> None:
+    """Entry point of the ``ctid`` command."""
+    app(prog_name="ctid")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Experiments: from a specification to stored and summarised estimates."""

@@ -1,0 +1,220 @@
+"""A plan as plain data: what the stored estimates are compared with, sorted by and described from.
+
+The journal and the sealed file keep the manifest, so that results can be listed, counted and exported without the
+specification that made them, also by later versions that read specifications differently.
+
+Keys of an estimate row
+-----------------------
+- ``id``: short name; ``experiment``, ``estimator``, ``kind``; ``cell``: hash of the data cell; ``replicate``;
+  ``start``: its label.
+- ``initial_delay``: where the search was asked to start [s], ``"random"``, or None for estimators without a start;
+  ``start_delay``: where it did start [s].
+- ``status``: name of a `Status`, or ``FAILED`` (the estimator raised an exception), ``CRASHED`` (its process died),
+  ``TIMEOUT``; ``message``: what that means, or the exception with a short traceback.
+- ``delay`` [s], ``numerator`` and ``denominator`` (monic, descending powers), ``standard_errors`` by parameter name.
+- ``cost`` [output unit^2], ``fit_percent``, ``validation_fit_percent``, ``iterations``, ``condition_number``.
+- ``seconds``: time for preparing the record and fitting, as if the estimate had been alone [s].
+- one key per swept field. None stands for a value that does not exist or is not finite.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from ctid_cli.experiment.plan import Plan
+
+Manifest = dict[str, Any]
+
+#: What an estimator returns, in the order of the columns.
+RESULT_FIELDS = (
+    "status",
+    "message",
+    "start_delay",
+    "delay",
+    "numerator",
+    "denominator",
+    "standard_errors",
+    "cost",
+    "fit_percent",
+    "validation_fit_percent",
+    "iterations",
+    "condition_number",
+)
+#: Statuses of estimates that have no result because something went wrong.
+FAILURES = ("FAILED", "CRASHED", "TIMEOUT")
+
+
+class Key(NamedTuple):
+    """Identity of an estimate: what it was computed from."""
+
+    data_hash: str
+    replicate: int
+    estimator_hash: str
+    start: str
+
+    @property
+    def id(self) -> str:
+        """Short name of the estimate."""
+        return hashlib.sha256("/".join(map(str, self)).encode()).hexdigest()[:12]
+
+
+class Slot(NamedTuple):
+    """One place in the table of estimates: which estimate belongs there and how it is labelled."""
+
+    key: Key
+    cell: Mapping[str, Any]
+    estimator: Mapping[str, Any]
+
+
+def build_manifest(plan: Plan) -> Manifest:
+    """Describe a plan as plain data.
+
+    Parameters
+    ----------
+    plan : Plan
+        The plan.
+
+    Returns
+    -------
+    dict
+        Can be written as JSON.
+    """
+    replicates = [0] * len(plan.data_cells)
+    starts: dict[str, list[str]] = {}
+    for task in plan.tasks():
+        replicates[task.cell] += 1
+        if not starts:
+            for _, cell, start in plan.keys(task):
+                starts.setdefault(f"{cell.name}/{cell.hash}", []).append(start.label)
+    canonical = plan.spec.canonical()
+    return {
+        "experiment": plan.experiment,
+        "runs": plan.runs,
+        "seed": (canonical.get("monte_carlo") or {}).get("seed"),
+        "spec_hash": plan.spec_hash,
+        "spec": canonical,
+        "success": canonical.get("success"),
+        "data_cells": [
+            {"hash": cell.hash, "replicates": count, "swept": dict(cell.swept), "content": cell.content}
+            for cell, count in zip(plan.data_cells, replicates, strict=True)
+        ],
+        "estimators": [
+            {
+                "name": cell.name,
+                "kind": cell.kind,
+                "hash": cell.hash,
+                "swept": dict(cell.swept),
+                "content": cell.content,
+                "starts": starts.get(f"{cell.name}/{cell.hash}", []),
+            }
+            for cell in plan.estimators
+        ],
+        "starts": {start.label: start.initial_delay for start in plan.starts},
+    }
+
+
+def slots(manifest: Manifest) -> Iterator[Slot]:
+    """Every estimate that a plan asks for.
+
+    Parameters
+    ----------
+    manifest : dict
+        The plan as plain data.
+
+    Yields
+    ------
+    Slot
+        In the order of the sealed file: estimator, data cell, replicate, start, each as in the specification.
+    """
+    for estimator in manifest["estimators"]:
+        for cell in manifest["data_cells"]:
+            for replicate in range(cell["replicates"]):
+                for start in estimator["starts"]:
+                    yield Slot(Key(cell["hash"], replicate, estimator["hash"], start), cell, estimator)
+
+
+def label(slot: Slot, manifest: Manifest) -> dict[str, Any]:
+    """The part of an estimate row that the plan decides.
+
+    Parameters
+    ----------
+    slot : Slot
+        Which estimate.
+    manifest : dict
+        The plan as plain data.
+
+    Returns
+    -------
+    dict
+        From ``id`` to ``initial_delay``.
+    """
+    return {
+        "id": slot.key.id,
+        "experiment": manifest["experiment"],
+        "estimator": slot.estimator["name"],
+        "kind": slot.estimator["kind"],
+        "cell": slot.key.data_hash,
+        "replicate": slot.key.replicate,
+        "start": slot.key.start,
+        "initial_delay": manifest["starts"].get(slot.key.start),
+    }
+
+
+def assemble(slot: Slot, manifest: Manifest, result: Mapping[str, Any], seconds: float | None) -> dict[str, Any]:
+    """An estimate row.
+
+    Parameters
+    ----------
+    slot : Slot
+        Which estimate.
+    manifest : dict
+        The plan as plain data.
+    result : mapping
+        What the worker returned.
+    seconds : float or None
+        Time it took [s].
+
+    Returns
+    -------
+    dict
+        See the top of this module.
+    """
+    row = label(slot, manifest) | {name: result.get(name) for name in RESULT_FIELDS} | {"seconds": seconds}
+    return row | dict(slot.cell["swept"]) | dict(slot.estimator["swept"])
+
+
+def swept_names(manifest: Manifest) -> list[str]:
+    """Names of the swept fields.
+
+    Parameters
+    ----------
+    manifest : dict
+        The plan as plain data.
+
+    Returns
+    -------
+    list of str
+        Data fields first, each in the order of the specification.
+    """
+    parts = [*manifest["data_cells"], *manifest["estimators"]]
+    return list(dict.fromkeys(name for part in parts for name in part["swept"]))
+
+
+def true_delay(cell: Mapping[str, Any]) -> float | None:
+    """Delay of the system that a data cell simulates.
+
+    Parameters
+    ----------
+    cell : mapping
+        The data cell as plain data.
+
+    Returns
+    -------
+    float or None
+        The delay [s]; None for a measured record.
+    """
+    system = cell["content"].get("system")
+    return None if not system else float(system.get("delay") or 0.0)

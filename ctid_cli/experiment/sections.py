@@ -1,0 +1,774 @@
+"""Sections of a specification, built from the option dataclasses of the floors below.
+
+An option dataclass is written once, with its units; this module turns it into a pydantic model that
+
+- refuses unknown keys and says which ones there are,
+- lets every scalar field be a list, which is swept,
+- explains in plain words what is wrong, everything in a section at once,
+- carries descriptions and units into the JSON Schema.
+
+Messages are final sentences: they travel through pydantic as custom errors, with their key path as ``loc``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import math
+import re
+import types
+import typing
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
+from pydantic.functional_validators import ModelWrapValidatorHandler, WrapValidator
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from ctid_cli.errors import CtidError
+from ctid_cli.experiment.yaml_source import KeyPath, did_you_mean
+
+#: Combinations that one section may sweep, and data cells that one experiment may hold.
+MAX_COMBINATIONS = 10_000
+
+#: Whole numbers beyond this fit no column of a table or archive.
+MAX_WHOLE = 2**63 - 1
+
+Check = Callable[[Any], Any]
+#: Key path inside a section, and what is wrong there.
+Complaint = tuple[KeyPath, str]
+
+
+def wrong(message: str) -> PydanticCustomError:
+    """An error whose text reaches the user as it is.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong and what is allowed.
+
+    Returns
+    -------
+    PydanticCustomError
+        To be raised in a validator.
+    """
+    return PydanticCustomError("ctid", "{message}", {"message": message})
+
+
+def several_wrong(title: str, complaints: Iterable[tuple[KeyPath, str, bool]]) -> ValidationError:
+    """One validation error that holds several complaints.
+
+    Parameters
+    ----------
+    title : str
+        Name of the model.
+    complaints : iterable of (path, message, at_key)
+        ``at_key`` says that the key rather than its value is the culprit.
+
+    Returns
+    -------
+    ValidationError
+        To be raised in a validator; pydantic joins it with the errors around it.
+    """
+    details = [
+        InitErrorDetails(
+            type=PydanticCustomError("ctid", "{message}", {"message": message, "at_key": at_key}), loc=path, input=None
+        )
+        for path, message, at_key in complaints
+    ]
+    return ValidationError.from_exception_data(title, details)
+
+
+def shown(value: Any) -> str:
+    """A value from a YAML file in the words of a message.
+
+    Parameters
+    ----------
+    value : Any
+        Scalar, list or dictionary.
+
+    Returns
+    -------
+    str
+        Short description.
+    """
+    if value is None:
+        return "nothing (null)"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return f"the text {value if len(value) <= 40 else value[:37] + '...'!r}"
+    if isinstance(value, (list, tuple)):
+        return "a list" if value else "an empty list"
+    if isinstance(value, Mapping):
+        return "a mapping"
+    return repr(value)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Scalars: each factory returns a check that gives back the value to keep, or raises `wrong`.
+
+
+def number(
+    unit: str = "", *, above: float = -math.inf, at_least: float = -math.inf, at_most: float = math.inf
+) -> Check:
+    """Check for a finite number.
+
+    Parameters
+    ----------
+    unit : str, default ""
+        Named in the messages.
+    above, at_least, at_most : float
+        Limits, the first excluded and the others included [unit].
+
+    Returns
+    -------
+    callable
+        Returns a float.
+    """
+    what = "a number" + (f" [{unit}]" if unit else "")
+    if above > -math.inf:
+        what += f" above {above:g}"
+    if at_least > -math.inf:
+        what += f" of at least {at_least:g}"
+    if at_most < math.inf:
+        what += f"{',' if above > -math.inf or at_least > -math.inf else ''} at most {at_most:g}"
+
+    def check(value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            hint = ""
+            if isinstance(value, (list, tuple)):
+                hint = "; this key cannot be swept"
+            elif isinstance(value, str) and _looks_like_number(value):
+                hint = "; write it without quotes, underscores or a unit"
+            raise wrong(f"must be {what}, not {shown(value)}{hint}")
+        try:
+            result = float(value)
+        except OverflowError:
+            result = math.inf
+        if not math.isfinite(result):
+            raise wrong(f"must be {what} that is finite, not {shown(result)}")
+        if not (result > above and at_least <= result <= at_most):
+            raise wrong(f"must be {what}, not {shown(value)}")
+        return result + 0.0  # -0.0 and 0.0 are one value and must have one text
+
+    return check
+
+
+def whole(unit: str = "", *, at_least: int = -MAX_WHOLE, at_most: int = MAX_WHOLE) -> Check:
+    """Check for a whole number.
+
+    Parameters
+    ----------
+    unit : str, default ""
+        Named in the messages.
+    at_least, at_most : int
+        Limits, both included.
+
+    Returns
+    -------
+    callable
+        Returns an int.
+    """
+    what = "a whole number" + (f" [{unit}]" if unit else "")
+    if at_least > -MAX_WHOLE:
+        what += f" of at least {at_least}"
+    if at_most < MAX_WHOLE:
+        what += f"{' and' if at_least > -MAX_WHOLE else ' of'} at most {at_most}"
+
+    def check(value: Any) -> int:
+        if isinstance(value, bool) or not isinstance(value, int):
+            hint = ""
+            if isinstance(value, (list, tuple)):
+                hint = "; this key cannot be swept"
+            elif isinstance(value, float) and value.is_integer() and abs(value) < MAX_WHOLE:
+                hint = f"; write {int(value)}"
+            raise wrong(f"must be {what}, not {shown(value)}{hint}")
+        if not at_least <= value <= at_most:
+            raise wrong(f"must be {what}, not {shown(value)}")
+        return value
+
+    return check
+
+
+def truth() -> Check:
+    """Check for ``true`` or ``false``.
+
+    Returns
+    -------
+    callable
+        Returns a bool.
+    """
+
+    def check(value: Any) -> bool:
+        if not isinstance(value, bool):
+            raise wrong(f"must be true or false, not {shown(value)}")
+        return value
+
+    return check
+
+
+def plain_text(pattern: str = "", explanation: str = "") -> Check:
+    """Check for a text.
+
+    Parameters
+    ----------
+    pattern : str, default ""
+        Regular expression that the whole text must match.
+    explanation : str, default ""
+        The pattern in words.
+
+    Returns
+    -------
+    callable
+        Returns a str.
+    """
+
+    def check(value: Any) -> str:
+        if not isinstance(value, str):
+            hint = f"; write it in quotes: '{shown(value)}'" if isinstance(value, (bool, int, float)) else ""
+            raise wrong(f"must be a text, not {shown(value)}{hint}")
+        if not value:
+            raise wrong("must not be empty")
+        if pattern and not re.fullmatch(pattern, value):
+            raise wrong(f"{value!r} cannot be used here: {explanation}")
+        return value
+
+    return check
+
+
+def choice(*allowed: Any) -> Check:
+    """Check for one of a few words.
+
+    Parameters
+    ----------
+    *allowed : Any
+        The words.
+
+    Returns
+    -------
+    callable
+        Returns the word.
+    """
+    names = ", ".join(repr(word) for word in allowed)
+
+    def check(value: Any) -> Any:
+        for word in allowed:
+            if type(value) is type(word) and value == word:
+                return word
+        hint = did_you_mean(value, [w for w in allowed if isinstance(w, str)]) if isinstance(value, str) else ""
+        raise wrong(f"must be one of {names}, not {shown(value)}{hint}")
+
+    return check
+
+
+def optional(check: Check) -> Check:
+    """Check that also lets null pass.
+
+    Parameters
+    ----------
+    check : callable
+        For everything else.
+
+    Returns
+    -------
+    callable
+        Returns None or what ``check`` returns.
+    """
+    return lambda value: None if value is None else check(value)
+
+
+def list_of(check: Check, what: str, *, length: int | None = None) -> Check:
+    """Check for a list that is one value, such as the coefficients of a polynomial.
+
+    Parameters
+    ----------
+    check : callable
+        For the items.
+    what : str
+        The list in words.
+    length : int, optional
+        Number of items; None lets any number above zero pass.
+
+    Returns
+    -------
+    callable
+        Returns a list.
+    """
+
+    def checked(value: Any) -> list[Any]:
+        if not isinstance(value, (list, tuple)):
+            raise wrong(f"must be {what}, not {shown(value)}")
+        if not value or (length is not None and len(value) != length):
+            raise wrong(f"must be {what}, not {'an empty list' if not value else f'{len(value)} of them'}")
+        return _each(check, value)
+
+    return checked
+
+
+def swept(check: Check) -> Check:
+    """Check for one value, or a list of values to sweep.
+
+    Parameters
+    ----------
+    check : callable
+        For one value.
+
+    Returns
+    -------
+    callable
+        Returns the value or the list.
+    """
+
+    def checked(value: Any) -> Any:
+        if not isinstance(value, (list, tuple)):
+            return check(value)
+        if not value:
+            raise wrong("an empty list sweeps nothing; give one value, or a list of at least one")
+        items = _each(check, value)
+        for k, item in enumerate(items):
+            if item in items[:k]:
+                raise several_wrong("list", [((k,), f"{shown(item)} is in this list twice; keep one of them", False)])
+        return items
+
+    return checked
+
+
+def _each(check: Check, values: Sequence[Any]) -> list[Any]:
+    items: list[Any] = []
+    complaints: list[tuple[KeyPath, str, bool]] = []
+    for k, value in enumerate(values):
+        try:
+            items.append(check(value))
+        except PydanticCustomError as error:
+            complaints.append(((k,), error.message(), False))
+        except ValidationError as error:
+            complaints += [((k, *path), message, at_key) for path, message, at_key in _complaints(error)]
+    if complaints:
+        raise several_wrong("list", complaints)
+    return items
+
+
+def _complaints(error: ValidationError) -> list[tuple[KeyPath, str, bool]]:
+    return [(e["loc"], e["msg"], bool(e.get("ctx", {}).get("at_key"))) for e in error.errors(include_url=False)]
+
+
+def _looks_like_number(value: str) -> bool:
+    return re.match(r"\s*[-+]?\.?[0-9]", value) is not None
+
+
+def checked(check: Check) -> WrapValidator:
+    """Pydantic validator that asks ``check`` alone; the annotated type only serves the JSON Schema.
+
+    Parameters
+    ----------
+    check : callable
+        Returns the value to keep, or raises `wrong`.
+
+    Returns
+    -------
+    WrapValidator
+        For ``Annotated``.
+    """
+    return WrapValidator(lambda value, _handler: check(value))
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Sections
+
+
+class Section(BaseModel):
+    """A mapping of the specification; unknown and missing keys are explained, all of them at once."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    #: Option dataclass that the section describes, if it describes one.
+    target: ClassVar[type | None] = None
+    #: Fields that may be a list of values to sweep.
+    sweepable: ClassVar[frozenset[str]] = frozenset()
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _in_plain_words(cls, value: Any, handler: ModelWrapValidatorHandler[Section]) -> Section:
+        if isinstance(value, cls):
+            return value
+        allowed = list(cls.model_fields)
+        if not isinstance(value, Mapping):
+            raise wrong(f"must be a mapping with the keys {', '.join(allowed)}, not {shown(value)}")
+        problems: list[tuple[KeyPath, str, bool]] = []
+        for key in value:
+            if key not in allowed:
+                hint = did_you_mean(str(key), allowed) or ";"
+                problems.append(((key,), f"there is no such key here{hint} allowed: {', '.join(allowed)}", True))
+        for name, info in cls.model_fields.items():
+            if info.is_required() and name not in value:
+                meaning = f" ({info.description})" if info.description else ""
+                problems.append(((name,), f"is missing; add it{meaning}", True))
+        problems += [(path, message, True) for path, message in cls.requirements(value)]
+        section = None
+        try:
+            section = handler({key: item for key, item in value.items() if key in allowed})
+        except ValidationError as error:
+            # Keys that are missing here are explained above, with what they mean.
+            problems += [c for c, e in zip(_complaints(error), error.errors(), strict=True) if e["type"] != "missing"]
+        if section is not None and not problems:
+            problems += [(path, message, False) for path, message in section.complaints()]
+        if problems or section is None:
+            raise several_wrong(cls.__name__, problems)
+        return section
+
+    @classmethod
+    def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
+        """What is wrong with the presence of keys, whatever their values.
+
+        Parameters
+        ----------
+        raw : mapping
+            The section as it was read.
+
+        Yields
+        ------
+        tuple
+            Key path inside the section, and message.
+        """
+        yield from ()
+
+    def complaints(self) -> Iterator[Complaint]:
+        """What is wrong with the section although every value is allowed by itself.
+
+        Yields
+        ------
+        tuple
+            Key path inside the section, and message.
+        """
+        if self.target is not None:
+            yield from _option_complaints(self)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One combination of a section's swept values.
+
+    Parameters
+    ----------
+    values : dict
+        The section with one value per swept field; JSON-able.
+    swept : dict
+        Value of every swept field by its key path inside the section.
+    options : Any
+        The option dataclass with these values.
+    """
+
+    values: dict[str, Any]
+    swept: dict[KeyPath, Any]
+    options: Any
+
+
+def variants(section: Section) -> list[Variant]:
+    """All combinations of a section's swept values, the last swept field changing fastest.
+
+    Parameters
+    ----------
+    section : Section
+        A section with a target.
+
+    Returns
+    -------
+    list of Variant
+        At least one.
+
+    Raises
+    ------
+    ValueError, CtidError, ArithmeticError
+        Whatever the option dataclass raises for a combination that it refuses.
+    """
+    return [Variant(values, combination, _instance(section, values)) for combination, values in _combinations(section)]
+
+
+def sweep_label(combination: Mapping[KeyPath, Any]) -> str:
+    """Swept values in the words of a message.
+
+    Parameters
+    ----------
+    combination : mapping
+        Value of every swept field by its key path.
+
+    Returns
+    -------
+    str
+        For example ``snr_db = 5, clock_period = 0.5``.
+    """
+    return ", ".join(f"{'.'.join(str(p) for p in path)} = {json.dumps(value)}" for path, value in combination.items())
+
+
+def grouped(failures: Iterable[tuple[KeyPath, str, Mapping[KeyPath, Any]]], total: int) -> list[Complaint]:
+    """Complaints about combinations, each said once, with the combinations it is about.
+
+    Parameters
+    ----------
+    failures : iterable of (path, message, combination)
+        One entry for every combination that fails.
+    total : int
+        Number of combinations; a complaint about all of them names none.
+
+    Returns
+    -------
+    list of Complaint
+        In the order of their first failure.
+    """
+    groups: dict[Complaint, list[str]] = {}
+    for path, message, combination in failures:
+        groups.setdefault((path, message), []).append(sweep_label(combination))
+    complaints: list[Complaint] = []
+    for (path, message), labels in groups.items():
+        if len(labels) < total and any(labels):
+            more = f"; and {len(labels) - 3} more" if len(labels) > 3 else ""
+            message += f" (with {'; '.join(labels[:3])}{more})"
+        complaints.append((path, message))
+    return complaints
+
+
+def _option_complaints(section: Section) -> Iterator[Complaint]:
+    count = math.prod(len(values) for _, values in _axes(section))
+    if count > MAX_COMBINATIONS:
+        yield (), f"the lists in this section combine to {count} cases; at most {MAX_COMBINATIONS} are allowed"
+        return
+    failures: list[tuple[KeyPath, str, Mapping[KeyPath, Any]]] = []
+    for combination, values in _combinations(section):
+        try:
+            _instance(section, values)
+        except _RefusedError as refused:
+            path = refused.path
+            message = refused.message
+            if path in combination:
+                # Point at the offending item of the list; its value then needs no repetition.
+                items = section
+                for part in path:
+                    items = getattr(items, str(part))
+                path = (*path, typing.cast(list[Any], items).index(combination[path]))
+                failures.append((path, message, {}))
+            else:
+                failures.append((path, message, combination))
+    yield from grouped(failures, count)
+
+
+class _RefusedError(ValueError):
+    """An option dataclass refused its values; where that is and why."""
+
+    def __init__(self, path: KeyPath, message: str) -> None:
+        super().__init__(message)
+        self.path = path
+        self.message = message
+
+
+def _axes(section: Section, prefix: KeyPath = ()) -> Iterator[tuple[KeyPath, list[Any]]]:
+    for name in type(section).model_fields:
+        value = getattr(section, name)
+        if isinstance(value, Section):
+            yield from _axes(value, (*prefix, name))
+        elif name in section.sweepable and isinstance(value, list):
+            yield (*prefix, name), value
+
+
+def _combinations(section: Section) -> Iterator[tuple[dict[KeyPath, Any], dict[str, Any]]]:
+    axes = list(_axes(section))
+    for point in itertools.product(*(values for _, values in axes)):
+        values = section.model_dump(mode="json")
+        combination: dict[KeyPath, Any] = {}
+        for (path, _), value in zip(axes, point, strict=True):
+            inner = values
+            for part in path[:-1]:
+                inner = inner[str(part)]
+            inner[str(path[-1])] = value
+            combination[path] = value
+        yield combination, values
+
+
+def _instance(section: Section, values: Mapping[str, Any]) -> Any:
+    """The option dataclass of a section with the given values."""
+    target = section.target
+    assert target is not None
+    arguments: dict[str, Any] = {}
+    for option in dataclasses.fields(target):
+        if not option.init or option.name not in values:
+            continue
+        value = values[option.name]
+        inner = getattr(section, option.name)
+        if isinstance(inner, Section):
+            try:
+                value = _instance(inner, value)
+            except _RefusedError as refused:
+                raise _RefusedError((option.name, *refused.path), refused.message) from None
+        elif isinstance(value, list):
+            value = tuple(value)
+        arguments[option.name] = value
+    try:
+        with np.errstate(all="ignore"):  # what overflows is refused, or found by the section's own complaints
+            return target(**arguments)
+    except (ValueError, ArithmeticError, CtidError) as error:
+        message = str(error).strip() or f"these values were refused ({type(error).__name__})"
+        raise _RefusedError(_field_in(message, list(arguments)), message) from None
+
+
+def _field_in(message: str, names: Sequence[str]) -> KeyPath:
+    """The only field that a message names; the whole section if it names none or several."""
+    rest = re.sub(r"(?<=\w)-(?=\w)", "", message)  # "cut-off" means the field "cutoff"
+    found: list[str] = []
+    for name in sorted(names, key=len, reverse=True):
+        pattern = rf"\b{re.escape(name).replace('_', '[_ ]')}\b"
+        if re.search(pattern, rest):
+            found.append(name)
+            rest = re.sub(pattern, " ", rest)
+    return (found[0],) if len(found) == 1 else ()
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# From option dataclasses to sections
+
+_NO_DEFAULT: Any = object()
+
+
+@dataclass(frozen=True)
+class _FieldForm:
+    check: Check
+    annotation: Any
+    scalar: bool
+
+
+def section_for(target: type, *, kind: str | None = None, extra: Mapping[str, Any] | None = None) -> type[Section]:
+    """Section model of an option dataclass.
+
+    Parameters
+    ----------
+    target : type
+        Frozen dataclass; the metadata of its fields may hold ``doc`` and ``unit``.
+    kind : str, optional
+        Value of the section's ``kind`` key; None for a section without one.
+    extra : mapping, optional
+        Further pydantic fields that the dataclass does not have.
+
+    Returns
+    -------
+    type
+        A subclass of `Section`.
+
+    Raises
+    ------
+    TypeError
+        For a field type that has no form in a specification.
+    """
+    hints = get_type_hints(target)
+    definitions: dict[str, Any] = {}
+    sweepable: set[str] = set()
+    if kind is not None:
+        definitions["kind"] = (Annotated[Literal[kind], checked(choice(kind))], Field(description="Which one it is"))
+    for option in dataclasses.fields(target):
+        if not option.init:
+            continue
+        unit = str(option.metadata.get("unit", ""))
+        unit = "" if unit == "-" else unit
+        form = _form(hints[option.name], unit, f"{target.__name__}.{option.name}")
+        annotation, check = form.annotation, form.check
+        if form.scalar:
+            sweepable.add(option.name)
+            annotation = Union[annotation, types.GenericAlias(list, (annotation,))]  # noqa: UP007 - built at run time
+            check = swept(check)
+        default = _default(option, form.check)
+        definitions[option.name] = (
+            Annotated[annotation, checked(check)],
+            Field(**({} if default is _NO_DEFAULT else {"default": default}), description=_description(option, unit)),
+        )
+    definitions.update(extra or {})
+    model = create_model(target.__name__, __base__=Section, __doc__=_summary(target), **definitions)
+    model.target = target
+    model.sweepable = frozenset(sweepable)
+    return model
+
+
+def by_kind(models: Mapping[str, type[Section]]) -> Any:
+    """Annotation of a section that is one of several, told apart by its ``kind``.
+
+    Parameters
+    ----------
+    models : mapping
+        Section model of every kind.
+
+    Returns
+    -------
+    Any
+        Annotated union for a pydantic field.
+    """
+    allowed = ", ".join(models)
+
+    def check(value: Any) -> Section:
+        if isinstance(value, tuple(models.values())):
+            return typing.cast(Section, value)
+        if not isinstance(value, Mapping):
+            raise wrong(f"must be a mapping with a 'kind' (one of {allowed}), not {shown(value)}")
+        if "kind" not in value:
+            raise several_wrong("kind", [(("kind",), f"is missing; allowed: {allowed}", True)])
+        kind = value["kind"]
+        if not isinstance(kind, str) or kind not in models:
+            hint = did_you_mean(kind, models) if isinstance(kind, str) else ""
+            message = f"must be one of {allowed}, not {shown(kind)}{hint}"
+            raise several_wrong("kind", [(("kind",), message, False)])
+        return models[kind].model_validate(value)
+
+    return Annotated[Union[tuple(models.values())], checked(check)]  # noqa: UP007 - built at run time
+
+
+def _form(hint: Any, unit: str, name: str) -> _FieldForm:
+    """How a field of a given type is checked and shown in the schema."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if hint is bool:
+        return _FieldForm(truth(), bool, True)
+    if hint is int:
+        return _FieldForm(whole(unit), int, True)
+    if hint is float:
+        return _FieldForm(number(unit), float, True)
+    if hint is str:
+        # Names of files and columns are no quantities, and sweeping them would hide what a result belongs to.
+        return _FieldForm(plain_text(), str, False)
+    if origin is Literal:
+        return _FieldForm(choice(*arguments), hint, True)
+    if origin in (Union, types.UnionType) and len(arguments) == 2 and type(None) in arguments:
+        inner = _form(next(a for a in arguments if a is not type(None)), unit, name)
+        return _FieldForm(optional(inner.check), inner.annotation | None, inner.scalar)
+    if origin in (tuple, list) and arguments and all(a in (float, int, Ellipsis) for a in arguments):
+        item = _form(arguments[0], unit, name)
+        length = len(arguments) if origin is tuple and Ellipsis not in arguments else None
+        what = f"a list of {f'{length} ' if length else ''}numbers{f' [{unit}]' if unit else ''}"
+        schema: Any = types.GenericAlias(list, (item.annotation,))
+        if length:
+            schema = Annotated[schema, Field(min_length=length, max_length=length)]
+        return _FieldForm(list_of(item.check, what, length=length), schema, False)
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        model = section_for(hint)
+        return _FieldForm(model.model_validate, model, False)
+    raise TypeError(f"{name}: a field of type {hint} has no form in a specification")
+
+
+def _default(option: dataclasses.Field[Any], check: Check) -> Any:
+    """The default in the form that the check gives to a value from a file, so that both have one canonical text."""
+    default = option.default
+    if default is dataclasses.MISSING:
+        if option.default_factory is dataclasses.MISSING:
+            return _NO_DEFAULT
+        default = option.default_factory()
+    if dataclasses.is_dataclass(default) and not isinstance(default, type):
+        default = dataclasses.asdict(default)
+    return check(default)
+
+
+def _description(option: dataclasses.Field[Any], unit: str) -> str | None:
+    doc = str(option.metadata.get("doc", "")).strip()
+    if unit and f"[{unit}]" not in doc:
+        doc = f"{doc.rstrip('.')} [{unit}]".strip()
+    return doc or None
+
+
+def _summary(target: type) -> str:
+    return (target.__doc__ or target.__name__).strip().splitlines()[0]

@@ -1,0 +1,462 @@
+"""Stored estimates: sealing them, and reading them back as a table, by id, or as counts."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ctid_cli.errors import StorageError, UsageError
+from ctid_cli.experiment import journal
+from ctid_cli.experiment.events import Sealed
+from ctid_cli.experiment.folder import (
+    SEALED,
+    TIMINGS,
+    InUseError,
+    experiment_folders,
+    lock,
+    no_results,
+    reading_journal,
+    require_experiment,
+    who_runs,
+    write_safely,
+)
+from ctid_cli.experiment.manifest import FAILURES, Key, Manifest, assemble, slots, swept_names, true_delay
+from ctid_cli.experiment.summary import is_converged
+from ctid_cli.experiment.version import Origin
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_TEXT_COLUMNS = ("id", "experiment", "estimator", "kind", "cell", "start", "status", "message")
+_FLOAT_COLUMNS = (
+    "start_delay",
+    "delay",
+    "cost",
+    "fit_percent",
+    "validation_fit_percent",
+    "condition_number",
+    "seconds",
+    "true_delay",
+)
+_COLUMNS = (
+    *("id", "experiment", "estimator", "kind", "cell", "replicate", "start", "initial_delay", "start_delay", "status"),
+    *("message", "delay", "numerator", "denominator", "standard_errors", "cost", "fit_percent"),
+    *("validation_fit_percent", "iterations", "condition_number", "seconds"),
+)
+
+
+@dataclass(frozen=True)
+class Stored:
+    """The stored estimates of one plan.
+
+    Parameters
+    ----------
+    manifest : dict
+        The plan as plain data.
+    origins : tuple of Origin
+        Code and platforms that computed them.
+    results : mapping
+        What the workers returned, by key.
+    seconds : mapping
+        Time that each took [s], by key.
+    """
+
+    manifest: Manifest
+    origins: tuple[Origin, ...]
+    results: Mapping[Key, dict[str, Any]]
+    seconds: Mapping[Key, float | None]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Estimate rows in the order of the sealed file, with ``true_delay`` and ``converged``."""
+        success = self.manifest["success"]
+        rows = []
+        for slot in slots(self.manifest):
+            result = self.results.get(slot.key)
+            if result is not None:
+                row = assemble(slot, self.manifest, result, self.seconds.get(slot.key))
+                delay = true_delay(slot.cell)
+                rows.append(row | {"converged": is_converged(row, success, delay), "true_delay": delay})
+        return rows
+
+
+@dataclass(frozen=True)
+class FoundEstimate:
+    """One estimate in full.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of its experiment.
+    row : dict
+        The estimate row, with ``true_delay`` and ``converged``.
+    data, estimator : dict
+        What it was computed from: the content of its data cell and of its estimator.
+    seed : int or None
+        Seed of the experiment.
+    origins : tuple of Origin
+        Code and platforms that computed the experiment.
+    """
+
+    folder: Path
+    row: dict[str, Any]
+    data: dict[str, Any]
+    estimator: dict[str, Any]
+    seed: int | None
+    origins: tuple[Origin, ...]
+
+
+@dataclass(frozen=True)
+class GroupStatus:
+    """Progress of one estimator on one data cell.
+
+    Parameters
+    ----------
+    estimator : str
+        Its name.
+    cell : str
+        Hash of the data cell.
+    swept : dict
+        Values of the swept fields.
+    planned, done, todo, failed : int
+        Estimates; failed ones are among those done.
+    """
+
+    estimator: str
+    cell: str
+    swept: dict[str, Any]
+    planned: int
+    done: int
+    todo: int
+    failed: int
+
+
+@dataclass(frozen=True)
+class ExperimentStatus:
+    """Progress of an experiment.
+
+    Parameters
+    ----------
+    experiment : str
+        Its name.
+    folder : Path
+        Where its results are.
+    planned, done, todo, failed : int
+        Estimates of the latest plan; failed ones are among those done.
+    left_aside : int or None
+        Stored estimates of earlier plans; None where only the sealed file is left, which does not hold them.
+    mixed : bool
+        Whether other code or arithmetic computed some of the estimates.
+    running : dict or None
+        Process that is computing now: ``pid``, ``host``, ``started``, ``done`` and ``total`` data sets.
+        The other counts are then those of the last sealed file.
+    groups : tuple of GroupStatus
+        By estimator and data cell.
+    """
+
+    experiment: str
+    folder: Path
+    planned: int
+    done: int
+    todo: int
+    failed: int
+    left_aside: int | None
+    mixed: bool
+    running: dict[str, Any] | None
+    groups: tuple[GroupStatus, ...]
+
+
+def seal(folder: Path, log: journal.Journal) -> Sealed:
+    """Write the estimates of the journal's plan to the sealed file, and their times to a table.
+
+    Parameters
+    ----------
+    folder : Path
+        The experiment's folder.
+    log : Journal
+        Its journal, open for writing.
+
+    Returns
+    -------
+    Sealed
+        File, number of estimates and checksum.
+
+    Raises
+    ------
+    StorageError
+        If it could not be written; the journal and an older sealed file are untouched.
+    """
+    from ctid_cli.experiment.sealed import seal_image, verify_sealed
+
+    manifest, entries, origins = log.manifest(), log.entries(), log.origins()
+    planned = list(dict.fromkeys(slot.key for slot in slots(manifest) if slot.key in entries))
+    used = {entries[key].origin for key in planned}
+    results = {key: entries[key].result for key in planned}
+    image, checksum, count = seal_image(manifest, [origins[number] for number in sorted(used)], results)
+    times = io.StringIO()
+    table = csv.writer(times, lineterminator="\n")
+    table.writerow(("id", "seconds", "session"))
+    table.writerows((key.id, entries[key].seconds, entries[key].session) for key in planned)
+    target = folder / SEALED
+    try:
+        write_safely(folder / TIMINGS, times.getvalue().encode())
+        write_safely(target, image)
+    except OSError as error:
+        reason = error.strerror or error
+        raise StorageError(
+            f"{target} could not be written ({reason}); all {len(entries)} estimates are safe in {log.path}."
+            " Make room and run the same command again"
+        ) from error
+    if verify_sealed(target) != checksum:
+        raise StorageError(f"{target} reads back otherwise than it was written; all estimates are safe in {log.path}")
+    log.mark_sealed(checksum)
+    return Sealed(target, count, checksum)
+
+
+def read_stored(folder: Path) -> Stored:
+    """The estimates of the latest plan of an experiment.
+
+    Parameters
+    ----------
+    folder : Path
+        The experiment's folder.
+
+    Returns
+    -------
+    Stored
+        From the sealed file, or from the journal if a run was killed before it could seal. While a run goes on, those
+        that were sealed before it.
+
+    Raises
+    ------
+    UsageError
+        If there are no results.
+    RefusedError
+        If a newer ctid wrote them, or a run goes on and nothing was sealed before.
+    StorageError
+        If they are damaged.
+    """
+    require_experiment(folder)
+    try:
+        with lock(folder, shared=True, patience=0.2), reading_journal(folder) as log:
+            if log is not None and (log.sealed() is None or not (folder / SEALED).exists()):
+                entries, origins = log.entries(), log.origins()
+                manifest = log.manifest()
+                used = {entries[slot.key].origin for slot in slots(manifest) if slot.key in entries}
+                return Stored(
+                    manifest,
+                    tuple(origins[number] for number in sorted(used)),
+                    {key: entry.result for key, entry in entries.items()},
+                    {key: entry.seconds for key, entry in entries.items()},
+                )
+    except InUseError:
+        if not (folder / SEALED).exists():
+            raise
+    if not (folder / SEALED).exists():
+        # The run was killed before it had planned anything.
+        raise no_results(folder)
+    return _read_sealed(folder)
+
+
+def _read_sealed(folder: Path) -> Stored:
+    from ctid_cli.experiment.sealed import read_sealed
+
+    try:
+        runs = read_sealed(folder / SEALED)
+    except StorageError as error:
+        if (folder / journal.FILE_NAME).exists():
+            advice = f"{journal.FILE_NAME} holds all estimates: 'ctid run' with the same specification seals them again"
+            raise StorageError(f"{error}; {advice}") from error
+        raise
+    times = _read_times(folder / TIMINGS)
+    return Stored(runs.manifest, runs.origins, runs.results, {key: times.get(key.id) for key in runs.results})
+
+
+def _read_times(path: Path) -> dict[str, float]:
+    # Times are extra: results without them, copied from elsewhere, are complete.
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return {row["id"]: float(row["seconds"]) for row in csv.DictReader(file) if row.get("seconds")}
+    except (OSError, ValueError, KeyError):
+        return {}
+
+
+def load_estimates(folder: Path) -> pd.DataFrame:
+    """Estimates of the latest plan of an experiment as a table.
+
+    Parameters
+    ----------
+    folder : Path
+        The experiment's folder.
+
+    Returns
+    -------
+    DataFrame
+        One row per estimate in the order of the specification (estimator, data cell, replicate, start), with the
+        columns of `ctid_cli.experiment.manifest`, then ``converged`` (missing where no success rule applies) and
+        ``true_delay`` [s]. ``attrs["mixed"]`` tells whether other code or arithmetic computed some of them.
+
+    Raises
+    ------
+    UsageError
+        If there are no results.
+    RefusedError
+        If a newer ctid wrote them, or a run goes on and nothing was sealed before.
+    StorageError
+        If they are damaged.
+    """
+    import pandas as pd
+
+    stored = read_stored(folder)
+    rows = stored.rows()
+    frame = pd.DataFrame(index=pd.RangeIndex(len(rows)))
+    for name in (*_COLUMNS, *swept_names(stored.manifest), "converged", "true_delay"):
+        frame[name] = _column(name, [row.get(name) for row in rows])
+    frame.attrs["mixed"] = len(stored.origins) > 1
+    return frame
+
+
+def _column(name: str, values: list[Any]) -> pd.Series[Any]:
+    import pandas as pd
+
+    if name == "converged":
+        return pd.Series(values, dtype="boolean")
+    if name == "replicate":
+        return pd.Series(values, dtype="int64")
+    if name == "iterations":
+        return pd.Series(values, dtype="Int64")
+    if name in _FLOAT_COLUMNS:
+        return pd.Series(values, dtype="float64")
+    if name in _TEXT_COLUMNS:
+        return pd.Series(values, dtype="str")
+    if name in _COLUMNS:
+        return pd.Series(values, dtype="object")
+    return pd.Series(values)
+
+
+def find_estimate(results: Path, prefix: str) -> FoundEstimate:
+    """Find one estimate among all experiments.
+
+    Parameters
+    ----------
+    results : Path
+        Results folder, or the folder of one experiment.
+    prefix : str
+        Beginning of its id.
+
+    Returns
+    -------
+    FoundEstimate
+        The estimate and what it was computed from; the first one if several experiments have it.
+
+    Raises
+    ------
+    UsageError
+        If no estimate or more than one has such an id.
+    """
+    matches: dict[str, FoundEstimate] = {}
+    in_use = ""
+    for folder in experiment_folders(results):
+        try:
+            stored = read_stored(folder)
+        except InUseError as error:
+            in_use = f"; it may come later: {error}"
+            continue
+        manifest = stored.manifest
+        for slot in slots(manifest):
+            if slot.key in stored.results and slot.key.id.startswith(prefix) and slot.key.id not in matches:
+                row = assemble(slot, manifest, stored.results[slot.key], stored.seconds.get(slot.key))
+                delay = true_delay(slot.cell)
+                row |= {"converged": is_converged(row, manifest["success"], delay), "true_delay": delay}
+                matches[slot.key.id] = FoundEstimate(
+                    folder,
+                    row,
+                    dict(slot.cell["content"]),
+                    dict(slot.estimator["content"]),
+                    manifest["seed"],
+                    stored.origins,
+                )
+    if not matches:
+        raise UsageError(
+            f"no estimate in {results} has an id that begins with {prefix!r}{in_use}; 'ctid export' lists all ids"
+        )
+    if len(matches) > 1:
+        some = ", ".join(sorted(matches)[:5])
+        raise UsageError(f"{len(matches)} estimates have an id that begins with {prefix!r}: {some}…; give more of it")
+    return next(iter(matches.values()))
+
+
+def experiment_status(folder: Path) -> ExperimentStatus:
+    """Count what is done and what is missing.
+
+    Parameters
+    ----------
+    folder : Path
+        The experiment's folder.
+
+    Returns
+    -------
+    ExperimentStatus
+        Counts by estimator and data cell.
+
+    Raises
+    ------
+    UsageError
+        If there are no results.
+    RefusedError
+        If a newer ctid wrote them.
+    StorageError
+        If they are damaged.
+    """
+    require_experiment(folder)
+    left_aside: int | None = None
+    running: dict[str, Any] | None = None
+    try:
+        with lock(folder, shared=True, patience=0.2), reading_journal(folder) as log:
+            if log is not None:
+                statuses, manifest = log.statuses(), log.manifest()
+                planned = {slot.key for slot in slots(manifest)}
+                left_aside = len(statuses.keys() - planned)
+                return _status(folder, manifest, statuses, left_aside, len(log.origins()) > 1, None)
+    except InUseError:
+        running = who_runs(folder) or {"pid": None, "host": None}
+        if not (folder / SEALED).exists():
+            name = str(running.get("experiment") or folder.name)
+            return ExperimentStatus(name, folder, 0, 0, 0, 0, None, False, running, ())
+    if not (folder / SEALED).exists():
+        raise no_results(folder)
+    stored = _read_sealed(folder)
+    statuses = {key: str(result["status"]) for key, result in stored.results.items()}
+    return _status(folder, stored.manifest, statuses, left_aside, len(stored.origins) > 1, running)
+
+
+def _status(
+    folder: Path,
+    manifest: Manifest,
+    statuses: Mapping[Key, str],
+    left_aside: int | None,
+    mixed: bool,
+    running: dict[str, Any] | None,
+) -> ExperimentStatus:
+    counts: dict[tuple[str, str, str], list[int]] = {}
+    swept: dict[tuple[str, str, str], dict[str, Any]] = {}
+    for slot in slots(manifest):
+        group = (slot.estimator["name"], slot.key.estimator_hash, slot.key.data_hash)
+        swept.setdefault(group, {**slot.cell["swept"], **slot.estimator["swept"]})
+        count = counts.setdefault(group, [0, 0, 0])
+        status = statuses.get(slot.key)
+        count[0] += 1
+        count[1] += status is not None
+        count[2] += status in FAILURES
+    groups = tuple(
+        GroupStatus(name, cell, swept[name, estimator, cell], planned, done, planned - done, failed)
+        for (name, estimator, cell), (planned, done, failed) in counts.items()
+    )
+    planned, done = sum(group.planned for group in groups), sum(group.done for group in groups)
+    failed = sum(group.failed for group in groups)
+    return ExperimentStatus(
+        manifest["experiment"], folder, planned, done, planned - done, failed, left_aside, mixed, running, groups
+    )

@@ -1,0 +1,186 @@
+"""Percentages over estimates, and estimates as flat tables.
+
+An estimate has *converged* if it satisfies every condition of the specification's ``success``:
+
+- ``delay_relative_error``: the estimated delay differs from the true one by at most this fraction of it;
+- ``fit_percent``: the fit on the record it was estimated from is at least this [%].
+
+Its status does not matter: an estimate that stopped at the iteration limit with the right delay has converged, one that
+settled elsewhere has not. An estimate without a result (``FAILED``, ``CRASHED``, ``TIMEOUT``) has not converged and
+counts in every percentage. Without ``success``, or without a true delay to compare with, nothing is said.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any
+
+from ctid_cli.experiment.manifest import FAILURES
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def is_converged(row: Mapping[str, Any], success: Mapping[str, Any] | None, true_delay: float | None) -> bool | None:
+    """Whether an estimate satisfies the success rule.
+
+    Parameters
+    ----------
+    row : mapping
+        The estimate row.
+    success : mapping or None
+        The specification's ``success``.
+    true_delay : float or None
+        Delay of the simulated system [s].
+
+    Returns
+    -------
+    bool or None
+        None where no rule applies.
+    """
+    tolerance = (success or {}).get("delay_relative_error")
+    least_fit = (success or {}).get("fit_percent")
+    if tolerance is not None and true_delay is None:
+        tolerance = None
+    if tolerance is None and least_fit is None:
+        return None
+    if row["status"] in FAILURES:
+        return False
+    if tolerance is not None:
+        delay = row["delay"]
+        assert true_delay is not None
+        if delay is None or not abs(delay - true_delay) <= tolerance * abs(true_delay):
+            return False
+    return least_fit is None or (row["fit_percent"] is not None and row["fit_percent"] >= least_fit)
+
+
+def wilson_interval(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
+    """Wilson's score interval for a proportion.
+
+    Parameters
+    ----------
+    k : int
+        Successes.
+    n : int
+        Trials.
+    level : float, default 0.95
+        Confidence level.
+
+    Returns
+    -------
+    (float, float)
+        Lower and upper limit, between 0 and 1; NaN without trials.
+
+    Notes
+    -----
+    With z the normal quantile and p = k / n, the limits are
+    ``(p + z^2 / 2n -+ z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)``. They stay inside [0, 1] and are useful for
+    few trials and for proportions of 0 and 1.
+
+    References
+    ----------
+    R. G. Newcombe, Two-sided confidence intervals for the single proportion: comparison of seven methods, Statistics in
+    Medicine 17 (1998) 857-872, method 3.
+
+    Examples
+    --------
+    >>> low, high = wilson_interval(81, 263)
+    >>> f"{low:.4f} {high:.4f}"
+    '0.2553 0.3662'
+    """
+    if not 0 <= k <= n:
+        raise ValueError(f"successes must lie between 0 and the number of trials; got {k} of {n}")
+    if n == 0:
+        return math.nan, math.nan
+    z = NormalDist().inv_cdf(0.5 + level / 2)
+    p = k / n
+    centre = p + z**2 / (2 * n)
+    half = z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
+    scale = 1 + z**2 / n
+    # Rounding would otherwise leave 0 or 1 by a hair.
+    low = 0.0 if k == 0 else (centre - half) / scale
+    high = 1.0 if k == n else (centre + half) / scale
+    return low, high
+
+
+def summarise(estimates: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+    """Count estimates in groups.
+
+    Parameters
+    ----------
+    estimates : DataFrame
+        As from `ctid_cli.experiment.store.load_estimates`.
+    by : sequence of str
+        Columns that make the groups; none for one group of all.
+
+    Returns
+    -------
+    DataFrame
+        One row per group in order of first appearance: the columns of `by`, then ``n``, ``failed``, ``converged``
+        (missing where no success rule applies), ``percent`` with its 95 % Wilson interval ``low`` to ``high`` [%], and
+        ``median_seconds`` [s].
+    """
+    import pandas as pd
+
+    groups: dict[tuple[Any, ...], list[int]] = {}
+    columns = [estimates[name].astype(object).where(estimates[name].notna(), None).tolist() for name in by]
+    for position in range(len(estimates)):
+        groups.setdefault(tuple(column[position] for column in columns), []).append(position)
+    rows = []
+    for values, positions in groups.items():
+        group = estimates.iloc[positions]
+        n = len(group)
+        row: dict[str, Any] = dict(zip(by, values, strict=True)) | {"n": n}
+        row["failed"] = int(group["status"].isin(FAILURES).sum())
+        judged = bool(group["converged"].notna().all())
+        converged = int(group["converged"].sum()) if judged else None
+        low, high = wilson_interval(converged, n) if converged is not None else (math.nan, math.nan)
+        row |= {"converged": converged, "percent": math.nan if converged is None else 100 * converged / n}
+        row |= {"low": 100 * low, "high": 100 * high, "median_seconds": float(group["seconds"].median())}
+        rows.append(row)
+    names = [*by, "n", "failed", "converged", "percent", "low", "high", "median_seconds"]
+    return pd.DataFrame({name: pd.Series([row[name] for row in rows], dtype=_dtype(name, by)) for name in names})
+
+
+def _dtype(name: str, by: Sequence[str]) -> Any:
+    if name in by:
+        return "object"
+    return {"n": "int64", "failed": "int64", "converged": "Int64"}.get(name, "float64")
+
+
+def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:
+    """Estimates as a flat table for other programs.
+
+    Parameters
+    ----------
+    estimates : DataFrame
+        As from `ctid_cli.experiment.store.load_estimates`.
+
+    Returns
+    -------
+    DataFrame
+        The same rows and columns, but coefficients as ``b0, b1, …`` and ``a1, a2, …`` (descending powers, the leading 1
+        of the denominator left out) and standard errors as ``se_b0, …, se_a1, …, se_delay``.
+    """
+    import pandas as pd
+
+    numerators, denominators = estimates["numerator"].tolist(), estimates["denominator"].tolist()
+    errors = estimates["standard_errors"].tolist()
+    flat: dict[str, list[Any]] = {}
+    for k in range(max((len(row) for row in numerators if row), default=0)):
+        flat[f"b{k}"] = [row[k] if row and k < len(row) else None for row in numerators]
+    for k in range(1, max((len(row) for row in denominators if row), default=0)):
+        flat[f"a{k}"] = [row[k] if row and k < len(row) else None for row in denominators]
+    present = {name for row in errors if row for name in row}
+    order = [name for name in (*flat, "delay") if name in present]
+    for name in (*order, *sorted(present.difference(order))):
+        flat[f"se_{name}"] = [row.get(name) if row else None for row in errors]
+    columns: dict[str, Any] = {}
+    for name in estimates.columns:
+        if name == "numerator":
+            columns |= {key: pd.Series(values, dtype="float64", index=estimates.index) for key, values in flat.items()}
+        elif name not in ("denominator", "standard_errors"):
+            columns[name] = estimates[name]
+    return pd.DataFrame(columns)

@@ -1,0 +1,1 @@
+"""Tables, exports and texts made from stored results."""

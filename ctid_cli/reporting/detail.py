@@ -1,0 +1,245 @@
+"""What ``ctid show`` answers: one estimate in full, what it was computed from, and the same once more."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from ctid_cli.errors import MismatchError
+from ctid_cli.experiment.plan import build_plan
+from ctid_cli.experiment.spec import spec_from_canonical
+from ctid_cli.experiment.store import FoundEstimate, read_stored
+from ctid_cli.experiment.worker import plain
+from ctid_cli.reporting.estimate import Parameter, as_object, parameter_table, parameters
+from ctid_cli.reporting.layout import delay_label, number, seconds, text_table
+from ctid_cli.reporting.results import out_option
+
+#: A repeated estimate agrees if no parameter moved by more than this fraction; other processors give other last bits.
+AGREEMENT = 1e-6
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """An estimate that was computed once more.
+
+    Parameters
+    ----------
+    history : list of dict
+        Its accepted iterations: stage, iteration, delay [s], cost [output unit^2], coefficients.
+    difference : float or None
+        Largest relative difference between its parameters and the stored ones; None where there are none.
+    """
+
+    history: list[dict[str, Any]]
+    difference: float | None
+
+    @property
+    def agrees(self) -> bool:
+        """Whether it is the stored estimate."""
+        return self.difference is None or self.difference <= AGREEMENT
+
+
+def parameters_of(found: FoundEstimate) -> list[Parameter]:
+    """Parameters of a stored estimate with their uncertainty.
+
+    Parameters
+    ----------
+    found : FoundEstimate
+        The estimate.
+
+    Returns
+    -------
+    list of Parameter
+        See `ctid_cli.reporting.estimate.parameters`.
+    """
+    return parameters(found.row, found.estimator.get("delay_bounds"))
+
+
+def detail_object(found: FoundEstimate, again: Repeated | None, out: Path) -> dict[str, Any]:
+    """One estimate for ``ctid show --json``.
+
+    Parameters
+    ----------
+    found : FoundEstimate
+        The estimate.
+    again : Repeated or None
+        The same once more.
+    out : Path
+        Results folder.
+
+    Returns
+    -------
+    dict
+        The keys of every estimate, then ``parameters``, ``data``, ``settings``, ``seed``, ``origins``, ``redo``,
+        and with a repetition ``history`` and ``difference``.
+    """
+    content = as_object(found.row) | {
+        "parameters": [item.as_dict() for item in parameters_of(found)],
+        "data": found.data,
+        "settings": found.estimator,
+        "seed": found.seed,
+        "origins": [asdict(origin) for origin in found.origins],
+        "redo": redo_command(found, out),
+    }
+    return content if again is None else content | {"history": again.history, "difference": again.difference}
+
+
+def detail_text(found: FoundEstimate, again: Repeated | None, out: Path) -> str:
+    """One estimate as text.
+
+    Parameters
+    ----------
+    found : FoundEstimate
+        The estimate.
+    again : Repeated or None
+        The same once more.
+    out : Path
+        Results folder.
+
+    Returns
+    -------
+    str
+        Several paragraphs.
+    """
+    row = found.row
+    lines = [
+        f"Estimate {row['id']} of {row['experiment']}",
+        f"{row['estimator']} ({row['kind']}), data set {row['replicate']}, start {_start(row)}",
+        f"{row['status']}: {row['message']}",
+    ]
+    if row.get("converged") is not None:
+        lines.append("It meets the success rule." if row["converged"] else "It does not meet the success rule.")
+    shown = parameters_of(found)
+    if shown:
+        lines += [
+            "",
+            parameter_table(shown),
+            "Monic denominator, descending powers; low and high are estimate -+ 1.96 errors.",
+        ]
+    if row.get("true_delay") is not None:
+        lines.append(f"True delay: {number(row['true_delay'])} s.")
+    lines += [
+        "",
+        f"fit              {number(row['fit_percent'])} % of the data it was estimated from",
+        *(
+            [f"                 {number(row['validation_fit_percent'])} % of the validation part"]
+            if row.get("validation_fit_percent") is not None
+            else []
+        ),
+        f"cost             {number(row['cost'])} (mean squared output error, output unit^2)",
+        f"iterations       {number(row['iterations'])}",
+        f"condition number {number(row['condition_number'], 3)}",
+        f"time             {seconds(row['seconds'])}",
+        "",
+        f"Data (cell {row['cell']}, seed {found.seed}, data set {row['replicate']}):",
+        *_settings(found.data),
+        "Estimator:",
+        *_settings(found.estimator),
+        "",
+    ]
+    if again is None:
+        lines += [
+            "To make this data set and this estimate again and see every iteration:",
+            f"  {redo_command(found, out)}",
+        ]
+    else:
+        lines += [_verdict(again), "", _history(again)]
+    return "\n".join(lines)
+
+
+def redo_command(found: FoundEstimate, out: Path) -> str:
+    """The command that repeats an estimate.
+
+    Parameters
+    ----------
+    found : FoundEstimate
+        The estimate.
+    out : Path
+        Results folder.
+
+    Returns
+    -------
+    str
+        Command line.
+    """
+    return f"ctid show {found.row['id']} --history{out_option(out)}"
+
+
+def repeat(found: FoundEstimate) -> Repeated:
+    """Make the data set of an estimate and the estimate once more.
+
+    Parameters
+    ----------
+    found : FoundEstimate
+        The estimate.
+
+    Returns
+    -------
+    Repeated
+        Its iterations, and how far it is from the stored one.
+    """
+    row = found.row
+    plan = build_plan(spec_from_canonical(read_stored(found.folder).manifest["spec"]))
+    for task in plan.tasks():
+        cell = plan.data_cells[task.cell]
+        if (cell.hash, task.replicate) != (row["cell"], row["replicate"]):
+            continue
+        for key, estimator, start in plan.keys(task):
+            if key.id == row["id"]:
+                record = cell.dataset(task.replicate).record
+                fit = estimator.estimator.prepare(record).fit(start.draw(found.seed, task.replicate))
+                model = {
+                    "numerator": plain(fit.model.numerator),
+                    "denominator": plain(fit.model.denominator),
+                    "delay": float(fit.model.delay),
+                }
+                return Repeated([plain(asdict(entry)) for entry in fit.history], _difference(row, model))
+    raise MismatchError(f"the stored specification of {row['experiment']} does not describe estimate {row['id']}")
+
+
+def _difference(stored: Mapping[str, Any], model: Mapping[str, Any]) -> float | None:
+    if not stored.get("denominator") or not stored.get("numerator"):
+        return None
+    worst = 0.0
+    for name in ("numerator", "denominator", "delay"):
+        then, now = (item if isinstance(item, list) else [item] for item in (stored[name], model[name]))
+        if len(then) != len(now):
+            return float("inf")
+        for a, b in zip(then, now, strict=True):
+            if a is not None and b is not None and a != b:
+                worst = max(worst, abs(a - b) / max(abs(a), abs(b)))
+    return worst
+
+
+def _verdict(again: Repeated) -> str:
+    if again.difference is None:
+        return "Computed once more; there are no stored parameters to compare with."
+    if again.difference == 0:
+        return "Computed once more: the same parameters to the last digit."
+    if again.agrees:
+        return f"Computed once more: the same parameters, up to {again.difference:.1e} of their size."
+    return (
+        f"Computed once more: parameters differ by up to {again.difference:.1e} of their size. "
+        "Another version of the code or another processor computed the stored ones."
+    )
+
+
+def _history(again: Repeated) -> str:
+    rows = [
+        [str(entry["stage"]), str(entry["iteration"]), number(entry["delay"], 8), number(entry["cost"], 8)]
+        + [" ".join(number(value, 5) for value in entry[name]) for name in ("numerator", "denominator")]
+        for entry in again.history
+    ]
+    return text_table(["stage", "iteration", "delay [s]", "cost", "numerator", "denominator"], rows, "lrrrll")
+
+
+def _settings(content: Mapping[str, Any]) -> list[str]:
+    return [f"  {key}: {json.dumps(value, ensure_ascii=False)}" for key, value in content.items()]
+
+
+def _start(row: Mapping[str, Any]) -> str:
+    label = delay_label(row["initial_delay"])
+    return f"{label} ({number(row['start_delay'])} s)" if label == "random" else label

@@ -1,0 +1,264 @@
+"""Results of experiments, read back from the folder that ``ctid run`` wrote them to."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import shlex
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from ctid_cli.errors import UsageError
+from ctid_cli.experiment.folder import experiment_folders
+from ctid_cli.experiment.manifest import FAILURES, Manifest
+from ctid_cli.experiment.store import Stored, read_stored
+from ctid_cli.experiment.summary import summarise
+
+
+@dataclass(frozen=True)
+class Results:
+    """One experiment's results.
+
+    Parameters
+    ----------
+    folder : Path
+        Where they are stored.
+    stored : Stored
+        Plan of the latest run and its estimates.
+    """
+
+    folder: Path
+    stored: Stored
+
+    @property
+    def manifest(self) -> Manifest:
+        """Plan of the latest run as plain data."""
+        return self.stored.manifest
+
+    @property
+    def experiment(self) -> str:
+        """Name of the experiment."""
+        return str(self.manifest["experiment"])
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """Canonical specification of the latest run."""
+        spec: Mapping[str, Any] = self.manifest["spec"]
+        return spec
+
+    @cached_property
+    def rows(self) -> list[dict[str, Any]]:
+        """Stored estimates of the plan."""
+        return self.stored.rows()
+
+    @property
+    def failed(self) -> int:
+        """How many estimates ended in an error."""
+        return sum(row["status"] in FAILURES for row in self.rows)
+
+    @property
+    def mixed(self) -> bool:
+        """Whether other code or another processor computed some of the estimates."""
+        return len(self.stored.origins) > 1
+
+    @property
+    def measured(self) -> bool:
+        """Whether the data are a measured record rather than simulated."""
+        return self.settings.get("data") is not None
+
+    @property
+    def sampling(self) -> str | None:
+        """``regular`` or ``irregular``; None for a measured record."""
+        kind = lookup(self.settings, "sampling.kind")
+        if kind is None:
+            return None
+        return "regular" if kind == "regular" else "irregular"
+
+    def summaries(self, by: Sequence[str]) -> list[dict[str, Any]]:
+        """Counts and percentages in groups, as plain Python.
+
+        Parameters
+        ----------
+        by : sequence of str
+            Columns that make the groups.
+
+        Returns
+        -------
+        list of dict
+            See `ctid_cli.experiment.summary.summarise`; None stands for a missing value.
+        """
+        import pandas as pd
+
+        frame = pd.DataFrame(self.rows, columns=[*by, "status", "converged", "seconds"])
+        frame = frame.astype({"converged": "boolean", "seconds": "float64"})
+        counted = summarise(frame, by)
+        return [
+            {str(key): value for key, value in row.items()}
+            for row in counted.astype(object).where(counted.notna(), None).to_dict("records")
+        ]
+
+
+def out_option(out: Path) -> str:
+    """What a suggested command needs to find a results folder again.
+
+    Parameters
+    ----------
+    out : Path
+        Results folder.
+
+    Returns
+    -------
+    str
+        Empty for the default folder.
+
+    Examples
+    --------
+    >>> "ctid table 1" + out_option(Path("elsewhere"))
+    'ctid table 1 --out elsewhere'
+    """
+    return "" if out == Path("results") else f" --out {shlex.quote(str(out))}"
+
+
+def lookup(settings: Mapping[str, Any], path: str) -> Any:
+    """Value at a key path such as ``noise.snr_db``.
+
+    Parameters
+    ----------
+    settings : mapping
+        Nested settings.
+    path : str
+        Keys joined by dots.
+
+    Returns
+    -------
+    object
+        The value, or None where there is none.
+
+    Examples
+    --------
+    >>> lookup({"noise": {"snr_db": 5.0}}, "noise.snr_db")
+    5.0
+    """
+    value: Any = settings
+    for key in path.split("."):
+        if not isinstance(value, Mapping) or key not in value:
+            return None
+        value = value[key]
+    return value
+
+
+def experiments_in(out: Path) -> list[str]:
+    """Names of the experiments that have results under a folder.
+
+    Parameters
+    ----------
+    out : Path
+        Results folder.
+
+    Returns
+    -------
+    list of str
+        Sorted; folders that ``--fresh`` moved aside do not count.
+    """
+    return [folder.relative_to(out).as_posix() for folder in experiment_folders(out) if folder != out]
+
+
+def find_results(out: Path, experiment: str) -> Results | None:
+    """Results of one experiment, or None if it was never run into this folder.
+
+    Parameters
+    ----------
+    out : Path
+        Results folder.
+    experiment : str
+        Name of the experiment.
+
+    Returns
+    -------
+    Results or None
+        The results.
+    """
+    return read_results(out, experiment) if experiment in experiments_in(out) else None
+
+
+def read_results(out: Path, experiment: str) -> Results:
+    """Results of one experiment.
+
+    Parameters
+    ----------
+    out : Path
+        Results folder.
+    experiment : str
+        Name of the experiment.
+
+    Returns
+    -------
+    Results
+        The results.
+
+    Raises
+    ------
+    UsageError
+        If there are none, with the names of those that exist.
+    """
+    known = experiments_in(out)
+    if experiment not in known:
+        close = difflib.get_close_matches(experiment, known, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise UsageError(
+            f"there are no results of {experiment!r} in {out}{hint}; experiments there: {', '.join(known) or 'none'}"
+        )
+    folder = out / experiment
+    return Results(folder, read_stored(folder))
+
+
+def differences(settings: Mapping[str, Any], reference: Mapping[str, Any], shown: Collection[str]) -> list[str]:
+    """Settings in which results differ from a reference specification.
+
+    Parameters
+    ----------
+    settings, reference : mapping
+        Canonical specifications.
+    shown : collection of str
+        Key paths that the table shows in its rows; a difference there is visible and needs no note.
+
+    Returns
+    -------
+    list of str
+        For example ``["sampling.samples = 500 (not 4000)"]``. The number of data sets, estimators that only one side
+        has, and further fixed initial delays do not count.
+    """
+    left, right = _leaves(settings), _leaves(reference)
+    common = tuple(f"estimators.{name}." for name in set(settings["estimators"]) & set(reference["estimators"]))
+    found = []
+    for path in dict.fromkeys([*right, *left]):
+        if path in shown or path == "monte_carlo.runs":
+            continue
+        if path.startswith("estimators.") and not path.startswith(common):
+            continue
+        ours, theirs = left.get(path), right.get(path)
+        if path == "starts.initial_delay":
+            # Fixed delays are columns of their own; only another random range would go unnoticed.
+            ours, theirs = (_random_only(side) for side in (ours, theirs))
+            if not ours:
+                continue
+        if ours != theirs:
+            found.append(f"{path} = {json.dumps(ours)} (not {json.dumps(theirs)})")
+    return found
+
+
+def _random_only(delays: Any) -> list[Any]:
+    return [delay for delay in delays if isinstance(delay, Mapping)] if isinstance(delays, list) else []
+
+
+def _leaves(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    leaves: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            leaves |= _leaves(value, f"{prefix}{key}.")
+        else:
+            leaves[f"{prefix}{key}"] = value
+    return leaves

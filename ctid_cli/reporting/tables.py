@@ -1,0 +1,322 @@
+"""Tables for people: published studies, experiments, and measured records."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from ctid_cli.reporting.estimate import parameters
+from ctid_cli.reporting.layout import (
+    delay_label,
+    interval,
+    markdown_table,
+    number,
+    percent,
+    seconds,
+    text_table,
+    with_error,
+)
+from ctid_cli.reporting.rows import Row
+from ctid_cli.reporting.study import Study, StudyTable
+
+NOT_RUN = "not run"
+RULE = "Estimates that failed count as not converged. 95 %: Wilson interval of the percentage."
+
+#: Estimators side by side, and estimates of a measured record, before a table continues below.
+GROUPS_PER_BLOCK = 2
+ESTIMATES_PER_BLOCK = 3
+
+_SHORT = {"snr_db": ("SNR", " dB")}
+
+
+def csv_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
+    """Rows as CSV; an empty field where a row lacks a column.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        Rows.
+    columns : sequence of str, optional
+        Columns; all keys in their first order otherwise.
+
+    Returns
+    -------
+    str
+        CSV with a header line.
+    """
+    names = list(columns if columns is not None else dict.fromkeys(key for row in rows for key in row))
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, names, restval="", lineterminator="\n", extrasaction="ignore")
+    writer.writeheader()
+    writer.writerows(rows)
+    return buffer.getvalue()
+
+
+def study_table(study: Study, table: StudyTable, rows: Sequence[Row], style: str = "text") -> str:
+    """A published table with our percentages in it.
+
+    Parameters
+    ----------
+    study : Study
+        The study.
+    table : StudyTable
+        The table.
+    rows : sequence of Row
+        Its cells.
+    style : {"text", "md"}, default "text"
+        Kind of table.
+
+    Returns
+    -------
+    str
+        Heading, table and footnote.
+    """
+    delays = _delays(rows)
+    heading = [f"Table {table.number}. {table.title}", f"Counted: {study.success}."]
+    groups = _group(rows, lambda row: (row.sampling, tuple(row.settings.items()), row.method))
+    labels = list(dict.fromkeys(name for row in rows for name in row.settings))
+    if len(delays) == 1 or style == "md":
+        body = _study_flat(groups, delays, labels, style)
+    else:
+        body = _study_stacked(groups, delays, labels)
+    foot = f"{RULE} Published: {study.published_data_sets} data sets, {study.source}."
+    if style == "md":
+        return "\n".join([f"### {heading[0]}", "", heading[1], "", body, "", foot])
+    return "\n".join([*heading, "", body, "", *_wrap(foot)])
+
+
+def experiment_table(name: str, rows: Sequence[Row], success: str, style: str = "text") -> str:
+    """Percentages of one experiment: swept data and starts down, estimators across.
+
+    Parameters
+    ----------
+    name : str
+        Name of the experiment.
+    rows : sequence of Row
+        Its cells.
+    success : str
+        What its percentages count.
+    style : {"text", "md"}, default "text"
+        Kind of table.
+
+    Returns
+    -------
+    str
+        Heading, tables and footnote.
+    """
+    keys = dict.fromkeys(key for row in rows for key in row.settings)
+    down = [key for key in keys if not any(key in row.estimator_settings for row in rows)]
+
+    def place(row: Row) -> tuple[Any, ...]:
+        return (*(row.settings.get(key) for key in down), row.initial_delay)
+
+    def column(row: Row) -> str:
+        own = [
+            f"{key} {number(row.settings[key])}" for key in row.estimator_settings if row.settings.get(key) is not None
+        ]
+        return ", ".join([row.method, *own])
+
+    lines = list(dict.fromkeys(place(row) for row in rows))
+    columns = list(dict.fromkeys(column(row) for row in rows))
+    cells = {(place(row), column(row)): row for row in rows}
+    draw = text_table if style == "text" else markdown_table
+    blocks = []
+    for first in range(0, len(columns), GROUPS_PER_BLOCK):
+        block = columns[first : first + GROUPS_PER_BLOCK]
+        header = [_title(key) for key in down] + ["initial delay"]
+        for title in block:
+            header += [f"{title}: %", "95 %", "n", "time"]
+        body = []
+        for line in lines:
+            if not any((line, title) in cells for title in block):
+                continue
+            texts = [_setting(key, value) for key, value in zip(down, line[:-1], strict=True)] + [delay_label(line[-1])]
+            for title in block:
+                texts += _four(cells.get((line, title)))
+            body.append(texts)
+        blocks.append(draw(header, body, "l" * (len(down) + 1) + "rrrr" * len(block)))
+    heading = [name, f"Counted: {success}."]
+    foot = f"{RULE} Time: median of one estimate."
+    if style == "md":
+        return "\n\n".join([f"### {heading[0]}", heading[1], *blocks, foot])
+    return "\n".join([*heading, "", "\n\n".join(blocks), "", *_wrap(foot)])
+
+
+def record_table(
+    name: str,
+    estimates: Sequence[Mapping[str, Any]],
+    bounds: Mapping[str, Sequence[float] | None],
+    style: str = "text",
+) -> str:
+    """Estimates on a measured record: parameters with standard errors, and how well the models fit.
+
+    Parameters
+    ----------
+    name : str
+        Name of the experiment.
+    estimates : sequence of mapping
+        Stored estimates.
+    bounds : mapping
+        Delay bounds [s] of each estimator, None where the delay is fixed.
+    style : {"text", "md"}, default "text"
+        Kind of table.
+
+    Returns
+    -------
+    str
+        Heading, tables and footnote.
+    """
+    draw = text_table if style == "text" else markdown_table
+    blocks = []
+    for first in range(0, len(estimates), ESTIMATES_PER_BLOCK):
+        block = estimates[first : first + ESTIMATES_PER_BLOCK]
+        header = ["", "unit"] + [f"{item['estimator']}, start {_start(item['start'])}" for item in block]
+        found = [{p.name: p for p in parameters(item, bounds.get(item["estimator"]))} for item in block]
+        names = dict.fromkeys(parameter for one in found for parameter in one)
+        body = [["id", ""] + [str(item["id"]) for item in block]]
+        body.append(["status", ""] + [str(item["status"]) for item in block])
+        for parameter in names:
+            unit = next(one[parameter].unit for one in found if parameter in one)
+            texts = []
+            for one in found:
+                item = one.get(parameter)
+                if item is None:
+                    texts.append("-")
+                elif item.estimate is None or item.standard_error is None:
+                    texts.append(f"{number(item.estimate)} ({item.status})")
+                else:
+                    texts.append(with_error(item.estimate, item.standard_error))
+            body.append([parameter, unit, *texts])
+        body.append(["fit, estimation part", "%"] + [number(item.get("fit_percent"), 4) for item in block])
+        if any(item.get("validation_fit_percent") is not None for item in estimates):
+            body.append(
+                ["fit, validation part", "%"] + [number(item.get("validation_fit_percent"), 4) for item in block]
+            )
+        body.append(["time", ""] + [seconds(item.get("seconds")) for item in block])
+        blocks.append(draw(header, body, "ll" + "r" * len(block)))
+    foot = "± is one standard error. Fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x."
+    if style == "md":
+        return "\n\n".join([f"### {name}", *blocks, foot])
+    return "\n".join([name, "", "\n\n".join(blocks), "", *_wrap(foot)])
+
+
+def _study_stacked(groups: list[list[Row]], delays: list[Any], labels: list[str]) -> str:
+    """Three lines per method, so that six initial delays fit 100 columns."""
+    header = ["sampling", *(_title(key) for key in labels), "method", "initial delay"]
+    header += [delay_label(delay) for delay in delays]
+    body: list[list[str]] = []
+    last: list[str] = []
+    for group in groups:
+        cells = {row.initial_delay: row for row in group}
+        names = _names(group[0], labels)
+        # A label that the line above has already said is left out, as in a printed table.
+        shown = [name if last[: k + 1] != names[: k + 1] else "" for k, name in enumerate(names)]
+        if last and last[0] != names[0]:
+            body.append([""] * len(header))
+        last = names
+        blank = [""] * len(names)
+        ours = [cells.get(delay) for delay in delays]
+        body.append([*shown, _n(group), *(_percent(row) for row in ours)])
+        if any(row.n for row in group):
+            body.append([*blank, "95 %", *(_interval(row).strip("[]").replace(", ", "-") for row in ours)])
+        if any(row.published_percent is not None for row in group):
+            body.append([*blank, "published", *(_published(row) for row in ours)])
+    align = "l" * (len(labels) + 3) + "r" * len(delays)
+    return text_table(header, body, align)
+
+
+def _study_flat(groups: list[list[Row]], delays: list[Any], labels: list[str], style: str) -> str:
+    header = ["sampling", *(_title(key) for key in labels), "method", "n"]
+    body = []
+    single = len(delays) == 1
+    for group in groups:
+        cells = {row.initial_delay: row for row in group}
+        texts = [*_names(group[0], labels), _n(group).removeprefix("n = ")]
+        for delay in delays:
+            row = cells.get(delay)
+            if single:
+                texts += [_percent(row), _interval(row), _published(row)]
+            else:
+                texts.append(_together(row))
+        body.append(texts)
+    if single:
+        header += ["percent", "95 %", "published"]
+        align = "l" * (len(labels) + 2) + "rrrr"
+    else:
+        header += [delay_label(delay) for delay in delays]
+        align = "l" * (len(labels) + 2) + "r" * (1 + len(delays))
+    return (text_table if style == "text" else markdown_table)(header, body, align)
+
+
+def _names(row: Row, labels: Sequence[str]) -> list[str]:
+    return [row.sampling or "-", *(_setting(key, row.settings.get(key)) for key in labels), row.method]
+
+
+def _together(row: Row | None) -> str:
+    if row is None:
+        return "-"
+    ours = f"{_percent(row)} {_interval(row)}" if row.n else NOT_RUN
+    return ours if row.published_percent is None else f"{ours} (pub {_published(row)})"
+
+
+def _four(row: Row | None) -> list[str]:
+    if row is None:
+        return ["", "", "", ""]
+    return [_percent(row), _interval(row) if row.n else "", str(row.n), seconds(row.median_seconds) if row.n else ""]
+
+
+def _percent(row: Row | None) -> str:
+    if row is None:
+        return ""
+    return percent(row.percent, row.n) if row.n else NOT_RUN
+
+
+def _interval(row: Row | None) -> str:
+    return interval(row.low, row.high, row.n) if row is not None and row.n else ""
+
+
+def _published(row: Row | None) -> str:
+    return "" if row is None or row.published_percent is None else number(row.published_percent)
+
+
+def _n(group: Sequence[Row]) -> str:
+    counts = sorted({row.n for row in group if row.n})
+    if not counts:
+        return "n = 0"
+    return f"n = {counts[0]}" if len(counts) == 1 else f"n = {counts[0]}-{counts[-1]}"
+
+
+def _delays(rows: Sequence[Row]) -> list[Any]:
+    delays = {row.initial_delay for row in rows}
+    numbers = sorted(delay for delay in delays if isinstance(delay, int | float))
+    return [*numbers, *(delay for delay in ("random", None) if delay in delays)]
+
+
+def _group(rows: Sequence[Row], key: Callable[[Row], Any]) -> list[list[Row]]:
+    groups: dict[Any, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return list(groups.values())
+
+
+def _title(key: str) -> str:
+    return _SHORT.get(key, (key, ""))[0]
+
+
+def _setting(key: str, value: Any) -> str:
+    return number(value) + (_SHORT.get(key, ("", ""))[1] if value is not None else "")
+
+
+def _start(label: str) -> str:
+    try:
+        return f"{float(label):g} s"
+    except ValueError:
+        return label
+
+
+def _wrap(text: str, width: int = 98) -> list[str]:
+    import textwrap
+
+    return textwrap.wrap(text, width)

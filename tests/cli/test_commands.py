@@ -1,0 +1,131 @@
+"""What people see: help, progress, summaries, warnings, and errors that nobody expected."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+COMMANDS = ["run", "status", "table", "show", "export", "validate", "schema"]
+
+
+def test_help_names_every_command(ctid):
+    text = ctid("--help").stdout
+    for command in COMMANDS:
+        assert re.search(rf"^  {command} +[A-Z].*\.$", text, re.MULTILINE), command
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself_and_its_options(ctid, command):
+    text = ctid(command, "--help").stdout
+    assert text.startswith(f"Usage: root {command}") or f" {command} " in text.splitlines()[0]
+    if command not in ("validate", "schema"):
+        assert "--out DIR" in text
+    for line in text.splitlines():
+        option = re.match(r"^  (-\w, )?--[\w-]+(  +(\S.*))?$", line)
+        assert option is None or option.group(2) is None or option.group(3)
+
+
+def test_version(ctid):
+    import ctid_cli
+
+    assert ctid("--version").stdout == f"ctid {ctid_cli.__version__}\n"
+
+
+def test_help_imports_nothing_slow():
+    code = (
+        "import sys; from ctid_cli.cli.main import app\n"
+        "try: app(['--help'])\n"
+        "except SystemExit: pass\n"
+        "slow = {'numpy', 'scipy', 'pandas', 'numba', 'h5py', 'joblib', 'pydantic', 'rich'} & set(sys.modules)\n"
+        "assert not slow, slow"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
+
+
+def test_validate_counts_the_work(ctid, tiny):
+    done = ctid("validate", tiny, "--set", "monte_carlo.runs=5")
+    assert "ok, tiny: 10 data sets (2 data cells), 30 estimates" in done.stdout
+    assert done.stderr == ""
+
+
+def test_run_tells_what_it_does_and_what_to_do_next(ctid, tiny, tmp_path):
+    out = tmp_path / "results"
+    done = ctid("run", tiny, "--runs", 1, "--jobs", 1, "--set", "noise.snr_db=20", "--out", out)
+    assert "compiling numerical kernels" in done.stderr
+    assert "tiny: 3 estimates of 1 data set to compute" in done.stderr
+    assert re.search(r"tiny: 1/1 data sets, .*/(s|min), 0 failed$", done.stderr, re.MULTILINE)
+    assert "tiny: 3 of 3 estimates stored" in done.stdout
+    assert f"next: ctid table tiny --out {out}" in done.stdout
+    # another setting leaves the old estimates aside and says so
+    done = ctid("run", tiny, "--runs", 1, "--jobs", 1, "--set", "noise.snr_db=10", "--out", out)
+    assert "3 of other settings left aside" in done.stderr
+    assert "3 stored estimates belong to earlier settings" in ctid("status", "tiny", "--out", out).stdout
+    done = ctid("run", tiny, "--runs", 1, "--set", "noise.snr_db=30", "--dry-run", "--out", out)
+    assert "would compute 3 estimates of 1 data set" in done.stdout
+    assert "6 of other settings left aside" in done.stdout
+
+
+def test_warnings_are_printed_and_the_run_goes_on(ctid, tiny, tmp_path):
+    done = ctid(
+        *("run", tiny, "--runs", 1, "--jobs", 1, "--quiet", "--out", tmp_path / "results"),
+        *("--set", "system.denominator=[1, 80]", "--set", "noise.snr_db=20"),
+    )
+    assert "warning" in done.stderr
+
+
+def test_the_table_of_an_experiment(ctid, done):
+    text = ctid("table", "tiny", "--out", done).stdout
+    assert "within 20 % of the true delay" in text
+    assert "count as not converged" in text
+    assert re.search(r"^10 dB +0.3 s +\d+ +\[\d+, \d+\] +2 +\S+ m?s", text, re.MULTILINE)
+    assert re.search(r"^20 dB +random ", text, re.MULTILINE)
+    assert max(map(len, text.splitlines())) <= 100
+    assert "|:--|" in ctid("table", "tiny", "--format", "md", "--out", done).stdout
+
+
+def test_an_unexpected_error_is_one_line_and_a_file(ctid, done, monkeypatch):
+    from ctid_cli.reporting import report
+
+    def broken(*_):
+        raise ZeroDivisionError("nobody expected this")
+
+    monkeypatch.setattr(report, "build_tables", broken)
+    message = ctid("table", "tiny", "--out", done, code=1).stderr
+    assert message.count("\n") == 1
+    file = re.search(r"report it with (\S+)$", message.strip()).group(1)
+    with open(file, encoding="utf-8") as lines:
+        text = lines.read()
+    os.unlink(file)
+    assert "ZeroDivisionError: nobody expected this" in text
+    assert "Traceback" in text
+
+
+def test_ctrl_c_outside_a_run(ctid, done, monkeypatch):
+    from ctid_cli.reporting import report
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(report, "build_tables", interrupted)
+    ctid("table", "tiny", "--out", done, code=130)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stopped_run_can_be_resumed(ctid, tiny, tmp_path, number, code):
+    command = [sys.executable, "-m", "ctid_cli.cli.main", "run", str(tiny), "--runs", "5000", "--jobs", "1"]
+    command += ["--out", str(tmp_path / "results"), "--json", "--quiet"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    for line in process.stdout:
+        if '"event": "estimate"' in line:
+            break
+    process.send_signal(number)
+    begun = time.monotonic()
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == code, errors
+    assert time.monotonic() - begun < 30
+    assert f'"stopped_by": "{number.name}"' in output.splitlines()[-1]
+    assert "unfinished" in ctid("status", "--out", tmp_path / "results").stdout

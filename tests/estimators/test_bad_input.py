@@ -1,0 +1,114 @@
+"""What the estimators refuse, and how they say it."""
+
+import numpy as np
+import pytest
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators import Lowpass, Srivc, Svf, TdSrivc
+from ctid_cli.signals import HeldSignal, Record
+from tests.estimators.records import make_record
+
+TD = {"delay_bounds": (0, 2)}
+ESTIMATORS = [(Svf, {}), (Srivc, {}), (TdSrivc, TD)]
+NAMES = ["svf", "srivc", "td_srivc"]
+
+
+@pytest.mark.parametrize(("estimator", "more"), ESTIMATORS, ids=NAMES)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"poles": 0}, "poles must be .*1 .*12.*0"),
+        ({"poles": 13}, "poles must be .*1 .*12.*13"),
+        ({"poles": 2.5}, "poles must be .*2.5"),
+        ({"zeros": -1}, "zeros must be .*0.*-1"),
+        ({"zeros": 0.5}, "zeros must be .*0.5"),
+        ({"zeros": 2}, r"fewer than poles \(a strictly proper model\): got 2 zeros and 2 poles"),
+        ({"svf_cutoff": 0.0}, r"svf_cutoff must be a positive number \[rad/s\], not 0.0"),
+        ({"svf_cutoff": np.nan}, "svf_cutoff must be a positive number"),
+        ({"svf_cutoff": "1"}, "svf_cutoff must be a positive number"),
+        ({"hold_output": "linear"}, "hold_output must be .*'foh'.* not 'linear'"),
+    ],
+)
+def test_impossible_options_are_refused(estimator, more, options, message):
+    with pytest.raises(ValueError, match=message):
+        estimator(**{"poles": 2, "zeros": 0, **more, **options})
+
+
+@pytest.mark.parametrize(("estimator", "more"), ESTIMATORS[1:], ids=NAMES[1:])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_iterations": 0}, "max_iterations must be .*1.*0"),
+        ({"max_iterations": 2.5}, "max_iterations must be .*2.5"),
+        ({"tolerance": 0.0}, "tolerance must lie between 0 and 1, not 0.0"),
+        ({"tolerance": 1.0}, "tolerance must lie between 0 and 1, not 1.0"),
+        ({"tolerance": np.nan}, "tolerance must lie between 0 and 1, not nan"),
+        ({"variant": "guardd"}, "variant must be .*'guarded'.*'guardd'"),
+    ],
+)
+def test_impossible_iterations_are_refused(estimator, more, options, message):
+    with pytest.raises(ValueError, match=message):
+        estimator(**{"poles": 2, "zeros": 0, **more, **options})
+
+
+@pytest.mark.parametrize("estimator", [Svf, Srivc])
+@pytest.mark.parametrize("delay", [-0.1, np.nan, np.inf])
+def test_impossible_delays_are_refused(estimator, delay):
+    with pytest.raises(ValueError, match=r"delay must be zero or a positive number \[s\]"):
+        estimator(2, 0, delay=delay)
+
+
+@pytest.mark.parametrize(
+    "bounds", [(3, 2), (2, 2), (-1, 2), (0, np.inf), (0, np.nan), (np.nan, 2), (0, 1, 2), (1,), 3.0]
+)
+def test_impossible_delay_bounds_are_refused(bounds):
+    with pytest.raises(ValueError, match="delay_bounds must be two delays in seconds"):
+        TdSrivc(2, 0, bounds)
+
+
+def record_of(t, u, y):
+    return Record(np.array(t), np.array(y), HeldSignal(np.array(t), np.array(u)), name="motor.csv")
+
+
+T = 0.1 * np.arange(100)
+U, Y = np.sin(3 * T), np.cos(T)
+
+
+@pytest.mark.parametrize(("estimator", "more"), ESTIMATORS, ids=NAMES)
+@pytest.mark.parametrize(
+    ("record", "message"),
+    [
+        (record_of(T, np.full(100, 2.5), Y), r"motor.csv: the input is constant \(2.5\)"),
+        (record_of(T, U, np.full(100, 7.0)), r"motor.csv: the output is constant \(7\) over the samples"),
+        (record_of(T, U, np.where(T < 9.8, np.nan, Y)), r"motor.csv: \d usable samples for \d parameters"),
+    ],
+    ids=["constant input", "constant output", "too few samples"],
+)
+def test_records_that_tell_nothing_are_refused(estimator, more, record, message):
+    with pytest.raises(DataError, match=message):
+        estimator(2, 0, **more).fit(record)
+
+
+@pytest.mark.parametrize("estimator", [Svf, Srivc])
+def test_delay_beyond_the_record_leaves_no_samples(estimator):
+    with pytest.raises(DataError, match=r"motor\.csv: 0 usable samples for 3 parameters"):
+        estimator(2, 0, delay=50.0).fit(record_of(T, U, Y))
+
+
+def test_delay_bounds_beyond_the_record_are_refused():
+    with pytest.raises(DataError, match=r"motor.csv: the greatest delay, 15 s, is not shorter than the record, 9.9 s"):
+        TdSrivc(2, 0, (0, 15)).fit(record_of(T, U, Y))
+    with pytest.raises(DataError, match=r"usable samples for 4 parameters"):
+        TdSrivc(2, 0, (0, 9.7)).fit(record_of(T, U, Y))
+
+
+def test_lowpass_beyond_the_clock_is_refused():
+    with pytest.raises(DataError, match=r"cut-off 90 rad/s is not below half the sampling frequency, 62\.8\d* rad/s"):
+        TdSrivc(2, 0, (0, 15), lowpass=Lowpass(90.0)).fit(make_record(n=1000))
+
+
+@pytest.mark.parametrize(("estimator", "more"), ESTIMATORS, ids=NAMES)
+def test_messages_end_in_what_to_do(estimator, more):
+    n = 22 if more else 3  # two usable samples after the greatest delay, three without a delay
+    with pytest.raises(DataError, match="take a longer record, a smaller model, or a smaller largest delay"):
+        estimator(2, 0, **more).fit(record_of(T[:n], U[:n], Y[:n]))

@@ -1,0 +1,89 @@
+"""An estimate does not depend on the units, nor on the clock on the wall."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ctid_cli.estimators import Srivc, Start, TdSrivc
+from ctid_cli.signals import HeldSignal, Record
+from tests.estimators.records import CASE_1, CASE_2, make_record
+
+RECORDS = {
+    (model, regular): make_record(model, snr_db=10, regular=regular, n=1500, clock_period=0.5)
+    for model in (CASE_1, CASE_2)
+    for regular in (True, False)
+}
+CASES = st.sampled_from(list(RECORDS))
+TOLERANCE = 1e-11
+
+
+def moved(record, *, seconds=1.0, shift=0.0, input_scale=1.0, output_scale=1.0):
+    """The same record in other units, or recorded at another time."""
+    held = HeldSignal(record.input.t * seconds + shift, record.input.values * input_scale, record.input.hold)
+    return Record(record.t * seconds + shift, record.y * output_scale, held)
+
+
+def fit(model, record, seconds=1.0, delay=None):
+    """Both estimators; cut-off, delay and bounds in the time unit of the record."""
+    n, m = model.order, model.numerator.size - 1
+    cutoff = {2: 1.0, 4: 25.0}[n] / seconds
+    td = TdSrivc(n, m, (0.0, 9.0 * seconds), svf_cutoff=cutoff, tolerance=TOLERANCE)
+    fixed = Srivc(n, m, delay=8.0 * seconds, svf_cutoff=cutoff, tolerance=TOLERANCE)
+    return td.fit(record, Start(7.9 * seconds)), fixed.fit(record)
+
+
+REFERENCE = {case: fit(case[0], record) for case, record in RECORDS.items()}
+
+
+def assert_same(fits, reference, seconds=1.0, gain=1.0, output_scale=1.0, tolerance=1e-8):
+    """Same estimates and standard errors after the change of units."""
+    for one, two in zip(fits, reference, strict=True):
+        n, m = two.model.order, two.model.numerator.size - 1
+        factor = {f"a{i}": seconds**-i for i in range(1, n + 1)}
+        factor |= {f"b{j}": gain * seconds ** -(n - m + j) for j in range(m + 1)}
+        factor["delay"] = seconds
+        for name, value in two.parameters.items():
+            np.testing.assert_allclose(one.parameters[name], factor[name] * value, rtol=tolerance)
+            np.testing.assert_allclose(
+                one.standard_errors[name], abs(factor[name]) * two.standard_errors[name], rtol=100 * tolerance
+            )
+        np.testing.assert_allclose(one.cost, output_scale**2 * two.cost, rtol=1e-9)
+        np.testing.assert_allclose(one.fit_percent, two.fit_percent, rtol=1e-8)
+        assert one.status is two.status
+
+
+@settings(max_examples=15)
+@given(CASES, st.one_of(st.sampled_from([1e6, 1e9, 1 / 60, 1 / 86_400]), st.floats(-9, 9).map(lambda x: 10**x)))
+def test_unit_of_time(case, seconds):
+    # From seconds to microseconds, nanoseconds, minutes, days and anything between.
+    assert_same(fit(case[0], moved(RECORDS[case], seconds=seconds), seconds), REFERENCE[case], seconds=seconds)
+
+
+@settings(max_examples=15)
+@given(CASES, st.floats(-12, 12), st.floats(-12, 12), st.sampled_from([1, -1]))
+def test_units_of_the_signals(case, input_decades, output_decades, sign):
+    input_scale, output_scale = sign * 10**input_decades, 10**output_decades
+    record = moved(RECORDS[case], input_scale=input_scale, output_scale=output_scale)
+    gain = output_scale / input_scale
+    assert_same(fit(case[0], record), REFERENCE[case], gain=gain, output_scale=output_scale)
+
+
+@settings(max_examples=15)
+@given(CASES, st.floats(-1e3, 1e3))
+def test_origin_of_time(case, shift):
+    # A clock that reads 1000 s holds 13 digits of the intervals.
+    assert_same(fit(case[0], moved(RECORDS[case], shift=shift)), REFERENCE[case])
+
+
+@settings(max_examples=15)
+@given(CASES, st.integers(0, 2**31))
+def test_samples_that_are_not_used_do_not_matter(case, seed):
+    # Outputs before the longest delay enter no sum; they reach the estimate only through the filters of y, hence
+    # only its path.
+    record = RECORDS[case]
+    y = record.y.copy()
+    early = record.t < 9.0 - 1e-6
+    y[early] += 0.1 * np.random.default_rng(seed).standard_normal(early.sum())
+    changed, _ = fit(case[0], Record(record.t, y, record.input))
+    for name, value in REFERENCE[case][0].parameters.items():
+        np.testing.assert_allclose(changed.parameters[name], value, rtol=1e-7)

@@ -1,0 +1,207 @@
+"""Coefficients and delay together, on whole records."""
+
+import numpy as np
+import pytest
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators import Lowpass, Srivc, Start, TdSrivc
+from ctid_cli.filtering import simulate
+from ctid_cli.inference import Status, cramer_rao_bound
+from ctid_cli.models import TransferFunction
+from ctid_cli.signals import HeldSignal, Record
+from tests.estimators.records import CASE_1, CASE_2, SVF_CUTOFF, assert_same_model, make_record
+
+
+def options(model, **more):
+    degrees = {"poles": model.order, "zeros": model.numerator.size - 1}
+    return {**degrees, "delay_bounds": (0, 15), "svf_cutoff": SVF_CUTOFF[model], **more}
+
+
+@pytest.mark.parametrize(
+    ("model", "regular", "offset"),
+    [
+        *[(CASE_1, regular, offset) for regular in (True, False) for offset in (0.2, -0.2)],
+        # The fast mode, whose period is 0.31 s, puts a local minimum 0.13 s before the true delay where the input is
+        # white: from that side no local search can pass.
+        (CASE_2, True, 0.2),
+        (CASE_2, True, 0.05),
+        (CASE_2, True, -0.05),
+        (CASE_2, False, 0.2),
+        (CASE_2, False, -0.2),
+    ],
+)
+def test_noise_free_data_return_the_true_model_and_delay(model, regular, offset):
+    # Exact input edges, no samples from the start-up.
+    n = 4500 if model is CASE_2 and not regular else None
+    record = make_record(model, regular=regular, n=n)
+    fit = TdSrivc(**options(model, tolerance=1e-12)).fit(record, Start(8.0 + offset))
+    assert fit.status is Status.CONVERGED
+    assert_same_model(fit.model, model, 1e-6)
+
+
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize("offset", [0.2, -0.2])
+def test_published_variant_returns_the_true_model_up_to_its_smallest_step(offset, regular):
+    # It ends at delay steps of 1e-5 of the range, without the joint iterations of the guarded variant.
+    fit = TdSrivc(**options(CASE_1, tolerance=1e-12, variant="plain")).fit(
+        make_record(regular=regular), Start(8 + offset)
+    )
+    assert fit.status is Status.CONVERGED
+    assert abs(fit.model.delay - 8.0) < 1e-5 * 15
+    assert_same_model(fit.model, CASE_1, 1e-3)
+
+
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize("model", [CASE_1, CASE_2])
+def test_delay_off_the_sampling_grid(model, regular):
+    truth = TransferFunction(model.numerator, model.denominator, 7.98765)
+    record = make_record(truth, regular=regular, n=3000, clock_period=0.5)
+    fit = TdSrivc(**options(model, tolerance=1e-12, delay_bounds=(0, 10))).fit(record, Start(8.1))
+    assert_same_model(fit.model, truth, 1e-6)
+
+
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize("model", [CASE_1, CASE_2])
+def test_hold_of_the_output_does_not_move_the_estimate(model, regular):
+    record = make_record(model, snr_db=15, regular=regular, n=4000)
+    fits = [
+        TdSrivc(**options(model, tolerance=1e-11, hold_output=hold)).fit(record, Start(8.05)) for hold in ("foh", "zoh")
+    ]
+    assert fits[0].status is fits[1].status is Status.CONVERGED
+    assert_same_model(fits[0].model, fits[1].model, 1e-8)
+
+
+@pytest.mark.parametrize("model", [CASE_1, CASE_2])
+def test_at_the_estimated_delay_it_is_srivc(model):
+    # SRIVC with that delay solves the same equations for the coefficients, on the same samples.
+    record = make_record(model, snr_db=15)
+    fit = TdSrivc(**options(model, tolerance=1e-11)).fit(record, Start(8.05))
+    from_start = Record(record.t, np.where(record.t < 15 - 1e-9, np.nan, record.y), record.input)
+    more = options(model, tolerance=1e-11)
+    del more["delay_bounds"]
+    fixed = Srivc(**more, delay=fit.model.delay).fit(from_start)
+    assert fixed.count == fit.count
+    assert_same_model(fixed.model, fit.model, 1e-7)
+    assert fixed.cost == pytest.approx(fit.cost, rel=1e-10)
+    # A delay that must be estimated makes the coefficients less certain, never more.
+    assert all(fixed.standard_errors[name] < fit.standard_errors[name] for name in fixed.standard_errors)
+
+
+def test_standard_errors_are_the_bound_at_the_estimate():
+    # The Cramér-Rao formula at the estimated model and noise level.
+    record = make_record(snr_db=15)
+    fit = TdSrivc(**options(CASE_1)).fit(record, Start(7.0))
+    variance = fit.cost * fit.count / (fit.count - 4)
+    bound = cramer_rao_bound(fit.model, record, np.sqrt(variance), 15.0)
+    np.testing.assert_allclose(list(fit.standard_errors.values()), np.sqrt(np.diag(bound)), rtol=1e-9)
+    np.testing.assert_allclose(fit.covariance, bound, rtol=1e-8, atol=1e-12)
+    assert list(fit.standard_errors) == ["a1", "a2", "b0", "delay"]
+
+
+@pytest.mark.parametrize("lowpass", [None, Lowpass(0.202, 2)])
+@pytest.mark.parametrize("snr_db", [5, 15])
+def test_cost_falls_within_every_stage(snr_db, lowpass):
+    fit = TdSrivc(**options(CASE_1, lowpass=lowpass)).fit(make_record(snr_db=snr_db), Start(7.0))
+    stages = {}
+    for entry in fit.history:
+        stages.setdefault(entry.stage, []).append(entry)
+    assert list(stages) == ["search"] + ["refine"] * (lowpass is not None) + ["joint"]
+    for entries in stages.values():
+        assert [entry.iteration for entry in entries] == list(range(len(entries)))
+        costs = np.array([entry.cost for entry in entries])
+        assert (np.diff(costs) <= 1e-12 * costs[0]).all()
+    assert fit.history[-1].cost == pytest.approx(fit.cost, rel=1e-12)
+    assert fit.history[-1].delay == fit.model.delay
+    assert fit.iterations == len(fit.history) - len(stages)
+
+
+@pytest.mark.parametrize("regular", [True, False])
+def test_lowpass_filter_widens_the_region_of_convergence(regular):
+    # From 3 s the plain search is caught by a local minimum; the filtered one finds the true delay.
+    record = make_record(snr_db=15, regular=regular)
+    direct = TdSrivc(**options(CASE_1)).fit(record, Start(3.0))
+    filtered = TdSrivc(**options(CASE_1, lowpass=Lowpass(0.4, 2))).fit(record, Start(3.0))
+    assert abs(direct.model.delay - 8.0) > 1.0
+    assert abs(filtered.model.delay - 8.0) < 0.08
+    assert filtered.cost < 0.5 * direct.cost
+
+
+def test_final_estimate_does_not_depend_on_the_filter():
+    record = make_record(snr_db=15)
+    fits = [
+        TdSrivc(**options(CASE_1, lowpass=lowpass, tolerance=1e-10)).fit(record, Start(7.5))
+        for lowpass in (None, Lowpass(0.5, 2), Lowpass(2.0, 4))
+    ]
+    for fit in fits[1:]:
+        assert_same_model(fit.model, fits[0].model, 1e-7)
+
+
+def test_prepared_record_serves_any_number_of_starts():
+    estimator, record = TdSrivc(**options(CASE_1, lowpass=Lowpass(0.4, 2))), make_record(snr_db=15, n=2000)
+    prepared = estimator.prepare(record)
+    for start in (Start(9.0), Start(3.0), Start(9.0)):
+        one, two = prepared.fit(start), estimator.fit(record, start)
+        assert one.parameters == two.parameters
+        assert one.history == two.history
+
+
+def test_without_a_start_the_middle_of_the_bounds_is_taken():
+    estimator, record = TdSrivc(**options(CASE_1, delay_bounds=(6, 11))), make_record(snr_db=15, n=2000)
+    assert estimator.fit(record).history == estimator.fit(record, Start(8.5)).history
+    assert estimator.fit(record, Start()).history[0].delay == 8.5
+
+
+@pytest.mark.parametrize("bounds", [(0, 7.5), (0, 7.9), (8.1, 12)])
+@pytest.mark.parametrize("variant", ["plain", "guarded"])
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-6])
+def test_true_delay_beyond_a_bound_ends_at_the_bound(tolerance, variant, bounds):
+    # The cost falls all the way to the bound; that is neither convergence nor a stall.
+    bound = bounds[1] if bounds[0] == 0 else bounds[0]
+    start = bound + (0.3 if bounds[0] else -0.3)
+    estimator = TdSrivc(2, 0, bounds, variant=variant, tolerance=tolerance)
+    fit = estimator.fit(make_record(snr_db=15), Start(start))
+    assert fit.model.delay == pytest.approx(bound, abs=2e-3)
+    assert fit.status is Status.DELAY_AT_BOUND
+    assert not fit.status.succeeded
+
+
+@pytest.mark.parametrize("variant", ["plain", "guarded"])
+def test_delay_that_the_data_do_not_determine_is_no_success(variant):
+    # One tone has an amplitude and a phase; a pole, a gain and a delay are one parameter too many.
+    t = 0.05 * np.arange(3000)
+    held = HeldSignal(t, np.sin(1.3 * t))
+    y = simulate(TransferFunction([2.0], [1.0, 2.0], 1.0), held, t)
+    fit = TdSrivc(1, 0, (0, 15), variant=variant).fit(Record(t, y, held), Start(1.2))
+    assert fit.status is Status.SINGULAR
+    assert all(np.isnan(error) for error in fit.standard_errors.values())
+
+
+def test_too_few_iterations_say_so():
+    fit = TdSrivc(2, 0, (0, 15), max_iterations=1, variant="plain").fit(make_record(snr_db=15), Start(7.0))
+    assert fit.status is Status.MAX_ITERATIONS
+
+
+def test_start_outside_the_bounds_is_refused():
+    prepared = TdSrivc(2, 0, (2, 12)).prepare(make_record(n=500))
+    for delay in (1.0, 13.0, np.nan):
+        with pytest.raises(DataError, match=f"initial delay, {delay:g} s, lies outside the bounds 2 to 12 s"):
+            prepared.fit(Start(delay))
+
+
+def test_nothing_of_the_record_changes():
+    record = make_record(snr_db=15, n=1500)
+    before = [a.copy() for a in (record.t, record.y, record.input.t, record.input.values)]
+    TdSrivc(**options(CASE_1, lowpass=Lowpass(0.4))).fit(record, Start(7.0))
+    after = (record.t, record.y, record.input.t, record.input.values)
+    assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+def test_missing_outputs_are_as_good_as_absent_ones():
+    record = make_record(snr_db=15, regular=False)
+    gone = np.zeros(record.n_samples, bool)
+    gone[np.random.default_rng(0).choice(record.n_samples, 400, replace=False)] = True
+    with_nan = Record(record.t, np.where(gone, np.nan, record.y), record.input)
+    absent = Record(record.t[~gone], record.y[~gone], record.input)
+    one, two = (TdSrivc(**options(CASE_1, tolerance=1e-10)).fit(r, Start(7.5)) for r in (with_nan, absent))
+    assert one.count == two.count
+    assert_same_model(one.model, two.model, 1e-9)

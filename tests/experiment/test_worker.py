@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ctid_cli.experiment.manifest import RESULT_FIELDS, Key
+from ctid_cli.experiment.worker import Job, failure, plain, run_job
+from tests.experiment.fakes import STARTS, FakeCell, FakeEstimatorCell, FakeRecord, Prepared, Toy
+
+
+@dataclass(frozen=True)
+class Counting(Toy):
+    """Counts how often records are prepared."""
+
+    def prepare(self, record: FakeRecord) -> Prepared:
+        PREPARED.append(record.replicate)
+        return super().prepare(record)
+
+
+PREPARED: list[int] = []
+
+
+class Broken(FakeCell):
+    def dataset(self, replicate: int) -> Any:
+        raise MemoryError("no room")
+
+
+def job(*toys: Toy, cell: FakeCell | None = None, replicate: int = 2) -> Job:
+    data = cell or FakeCell({"seed": 1, "level": 2.0}, {})
+    cells = [FakeEstimatorCell(f"toy{k}", toy, ()) for k, toy in enumerate(toys)]
+    wanted = tuple(
+        (Key("data", replicate, c.name, label), c, STARTS[label]) for c in cells for label in ("3", "uniform(0, 9)")
+    )
+    return Job(data, replicate, 7, wanted)  # type: ignore[arg-type]
+
+
+def test_a_record_is_prepared_once_for_all_starts() -> None:
+    PREPARED.clear()
+    outcomes = run_job(job(Counting(), Counting(order=3), replicate=4))
+    assert PREPARED == [4, 4]
+    assert [outcome.key.estimator_hash for outcome in outcomes] == ["toy0", "toy0", "toy1", "toy1"]
+
+
+def test_results_do_not_depend_on_what_else_is_wanted() -> None:
+    together = run_job(job(Toy(), Toy(order=3)))
+    alone = run_job(job(Toy()))
+    assert [(o.key, o.result) for o in alone] == [(o.key, o.result) for o in together[:2]]
+
+
+def test_results_are_plain_and_complete() -> None:
+    for outcome in run_job(job(Toy(at=2))):
+        assert tuple(outcome.result) == RESULT_FIELDS
+        assert json.loads(json.dumps(outcome.result, allow_nan=False)) == outcome.result
+        assert outcome.result["standard_errors"] == {"b0": 0.1, "delay": None}
+        assert outcome.seconds is not None
+        assert outcome.seconds > 0
+
+
+def test_one_failing_estimator_leaves_the_others_alone() -> None:
+    outcomes = run_job(job(Toy("raise", at=2), Toy("unusable"), Toy()))
+    assert [outcome.result["status"] for outcome in outcomes] == ["FAILED"] * 4 + ["CONVERGED"] * 2
+    assert outcomes[2].result["message"].startswith("DataError: the input is constant")
+
+
+def test_a_data_set_that_cannot_be_made_fails_every_estimate() -> None:
+    outcomes = run_job(job(Toy(), cell=Broken({}, {})))
+    assert [outcome.result["status"] for outcome in outcomes] == ["FAILED", "FAILED"]
+    assert outcomes[0].result["message"].startswith("MemoryError: no room\n  worker.py:")
+
+
+def test_messages_are_the_same_in_every_process() -> None:
+    def fail() -> None:
+        raise ValueError(f"{object()!r} in {[object()]}")
+
+    def message() -> str:
+        try:
+            fail()
+        except ValueError as error:
+            return str(failure(error)["message"])
+        return ""
+
+    kept = [object() for _ in range(10)]
+    assert message() == message()
+    assert "0x…" in message()
+    assert kept
+
+
+def test_plain_values() -> None:
+    value = {"a": np.array([1.0, np.nan]), "b": (np.float64(np.inf), np.int64(3)), 4: [None, True, "x"]}
+    assert plain(value) == {"a": [1.0, None], "b": [None, 3], "4": [None, True, "x"]}

@@ -1,0 +1,284 @@
+"""The standard rows and their second moments: two routes to each of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctid_cli.filtering import filter_data, second_moments, simulate, standard_rows
+from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, modal_map, split_delay
+from ctid_cli.models import TransferFunction
+from ctid_cli.signals import HeldSignal, Record
+
+CASE_1 = (np.array([1.0, 2.8, 4.0]), np.array([8.0]))
+CASE_2 = (np.array([1.0, 5.0, 408.0, 416.0, 1600.0]), np.array([-6400.0, 1600.0]))
+RELATIVE_DEGREE_ONE = (np.array([1.0, 3.0, 7.0, 5.0]), np.array([2.0, -1.0, 4.0]))
+FIRST_ORDER = (np.array([1.0, 0.5]), np.array([2.0]))
+REPEATED = (np.poly([-2.0, -2.0, -2.0]), np.array([1.0, 1.0]))
+SYSTEMS = [CASE_1, CASE_2, RELATIVE_DEGREE_ONE, FIRST_ORDER, REPEATED]
+#: Partial fractions exist for simple poles only; numerically a triple pole is three close ones.
+FORMS = [(system, "chain") for system in SYSTEMS] + [(system, "modal") for system in SYSTEMS[:-1]]
+HOLDS = st.sampled_from(["zoh", "foh"])
+
+
+@st.composite
+def systems(draw):
+    """Stable systems of order 1 to 5 whose poles lie at least 10 % apart."""
+    poles, magnitude = [], draw(st.floats(0.1, 0.5))
+    order = draw(st.integers(1, 5))
+    while len(poles) < order:
+        magnitude *= draw(st.floats(1.1, 4.0))
+        if len(poles) <= order - 2 and draw(st.booleans()):
+            angle = draw(st.floats(0.51, 0.9)) * np.pi
+            poles += [magnitude * np.exp(1j * angle), magnitude * np.exp(-1j * angle)]
+        else:
+            poles.append(-magnitude)
+    zeros = draw(st.lists(st.floats(-2, 2), min_size=0, max_size=order - 1))
+    return np.poly(poles).real, draw(st.floats(0.5, 3)) * np.atleast_1d(np.poly(zeros))
+
+
+def record(seed, n=400, interval=0.1, hold="zoh", regular=True, own_breaks=False):
+    """Noise in, noise out: the equalities below hold for any data."""
+    rng = np.random.default_rng(seed)
+    t = 3.0 + (interval * np.arange(n) if regular else np.cumsum(rng.uniform(0.2, 1.8, n)) * interval)
+    tu = 3.0 + np.concatenate(([0.0], np.cumsum(rng.uniform(0.5, 9, n // 3)) * interval)) if own_breaks else t
+    return Record(t, rng.standard_normal(n), HeldSignal(tu, rng.standard_normal(tu.size), hold))
+
+
+def assert_close(rows, expected, tolerance, where=""):
+    """Each column to a fraction of its own size."""
+    size = np.abs(expected).max(axis=0)
+    error = np.abs(rows - expected).max(axis=0) / np.where(size > 0, size, 1.0)
+    assert error.max() <= tolerance, f"{where} column {error.argmax()}: {error.max():.1e}"
+
+
+@given(systems(), st.floats(0, 20), HOLDS, HOLDS, st.integers(0, 2**31), st.sampled_from(["auto", "modal", "chain"]))
+def test_irregular_code_on_a_regular_clock_is_the_regular_code(system, delay, hold, hold_output, seed, form):
+    regular = filter_data(record(seed, hold=hold), 2.0, hold_output)
+    irregular = replace(regular, interval=None)
+    assert regular.interval is not None
+    expected = standard_rows(regular, *system, delay, form)
+    assert_close(standard_rows(irregular, *system, delay, form), expected, 1e-10)
+    # An input that is not known to share the clock computes its own exponentials.
+    alone = replace(irregular, common_clock=False)
+    assert_close(standard_rows(alone, *system, delay, form), expected, 1e-10)
+
+
+@given(systems(), st.floats(0, 20), HOLDS, HOLDS, st.integers(0, 2**31), st.booleans())
+def test_partial_fractions_and_the_chain_are_one_filter(system, delay, hold, hold_output, seed, regular):
+    data = filter_data(record(seed, hold=hold, regular=regular, own_breaks=not regular), 0.0, hold_output)
+    expected = standard_rows(data, *system, delay, "chain")
+    assert_close(standard_rows(data, *system, delay, "modal"), expected, 1e-8)
+    # What is taken by default is never the worse one of the two by much.
+    assert_close(standard_rows(data, *system, delay), expected, 1e-9)
+
+
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+@pytest.mark.parametrize("hold_output", ["zoh", "foh"])
+@pytest.mark.parametrize("form", ["auto", "chain"])
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_rows_are_the_signals_that_a_simulation_gives(system, form, hold_output, hold, regular):
+    # Each row is a transfer function applied to the delayed input or to the held output.
+    a, b = system
+    n, delay = a.size - 1, 1.234
+    r = record(1, hold=hold, regular=regular, own_breaks=not regular)
+    data = filter_data(r, 0.0, hold_output)
+    output = HeldSignal(r.t, r.y, hold_output)
+
+    def of_input(numerator, denominator):
+        return simulate(TransferFunction(numerator, denominator, delay), r.input, r.t)
+
+    power = [np.append(1.0, np.zeros(k)) for k in range(n)]
+    x = of_input(b, a)
+    expected = (
+        [of_input(p, a) for p in power]
+        + [of_input([1.0], [1.0])]
+        + [of_input(np.polymul(b, p), np.polymul(a, a)) for p in power]
+        + [simulate(TransferFunction(p, a), output, r.t) for p in power]
+        + [r.y - x, of_input(np.append(b, 0.0), a)]
+    )
+    assert_close(standard_rows(data, a, b, delay, form), np.column_stack(expected), 1e-10)
+
+
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize(("system", "form"), FORMS)
+def test_moments_are_the_products_of_the_rows(system, form, regular):
+    r = record(2, n=700, regular=regular)  # more than a few blocks of the accumulation, and not a whole number
+    y = r.y.copy()
+    y[[0, 5, 6, 300, 699]] = np.nan
+    data = filter_data(Record(r.t, y, r.input), 2.0)
+    rows = standard_rows(data, *system, 1.234, form)
+    assert rows.shape == (data.count, 3 * system[0].size)
+    moments = second_moments(data, *system, 1.234, form)
+    scale = np.sqrt(np.diag(moments))
+    assert np.abs((moments - rows.T @ rows) / np.outer(scale, scale)).max() <= 1e-12
+
+
+@pytest.mark.parametrize("gap", [1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8, 0.0])
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize("partner", [[], [-0.01], [-100.0], [-1 + 3j, -1 - 3j]])
+def test_paths_for_simple_and_for_repeated_poles_agree_near_coalescence(partner, regular, gap):
+    a, b = np.poly([-1.0, -1.0 - gap, *partner]).real, np.array([1.0, 2.0])
+    data = filter_data(record(3, n=2000, regular=regular, hold="foh"))
+    expected = standard_rows(data, a, b, 0.77, "chain")
+    assert_close(standard_rows(data, a, b, 0.77), expected, 1e-6, "default")
+    if gap >= 1e-2:
+        assert_close(standard_rows(data, a, b, 0.77, "modal"), expected, 1e-6, "modal")
+
+
+@pytest.mark.parametrize("poles", [[-1.0, -1.0], [-2.0, -2.0, -2.0], [-1 + 2j, -1 + 2j, -1 - 2j, -1 - 2j]])
+def test_repeated_poles_are_the_limit_of_separate_ones(poles):
+    # The filters are analytic in their poles: the difference falls with the distance, of first order.
+    data = filter_data(record(3))
+    repeated = standard_rows(data, np.poly(poles).real, np.ones(1), 0.77)
+    for gap in (1e-3, 1e-5, 1e-7):
+        scaled = [pole * (1 + gap * (k // 2 if np.iscomplex(pole) else k)) for k, pole in enumerate(poles)]
+        if np.iscomplex(poles[0]):
+            scaled = [poles[0], poles[0] * (1 + gap), poles[2], poles[2] * (1 + gap)]
+        assert_close(standard_rows(data, np.poly(scaled).real, np.ones(1), 0.77), repeated, 30 * gap)
+
+
+@pytest.mark.parametrize("cluster", [1e-1, 1e-3, 1e-5, 1e-7])
+def test_close_fast_poles_beside_a_slow_one_lose_no_accuracy(cluster):
+    # At low frequencies the fast poles hardly show, so that their cancellation must be judged at high ones.
+    a = np.poly([-0.05, -100.0, -100.0 * (1 + cluster)])
+    data = filter_data(record(4, n=4000, interval=0.01, hold="foh"))
+    expected = standard_rows(data, a, a[-1:], 0.123, "chain")
+    assert_close(standard_rows(data, a, a[-1:], 0.123), expected, 1e-6)
+
+
+@pytest.mark.parametrize("slowness", [1e-1, 1e-3, 1e-5])
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+def test_poles_far_slower_than_the_sampling_lose_no_accuracy(hold, regular, slowness):
+    # Against the simulator, which the tests beside this one hold against high-precision arithmetic.
+    a = np.poly([-slowness, -3.0])
+    r = record(5, n=2000, hold=hold, regular=regular)
+    rows = standard_rows(filter_data(r), a, a[-1:], 0.123)
+    expected = [
+        simulate(TransferFunction([1.0], a, 0.123), r.input, r.t),
+        simulate(TransferFunction(a[-1:], np.polymul(a, a), 0.123), r.input, r.t),
+        simulate(TransferFunction([1.0], a), HeldSignal(r.t, r.y, "foh"), r.t),
+    ]
+    assert_close(rows[:, [0, 3, 5]], np.column_stack(expected), 1e-9)
+
+
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize(("system", "form"), FORMS)
+def test_zero_delay_is_no_delay(system, form, regular):
+    # Bit for bit: a delay far below the resolution of the clock, and an input moved by nothing.
+    r = record(6, regular=regular)
+    without = standard_rows(filter_data(r), *system, 0.0, form)
+    assert np.array_equal(standard_rows(filter_data(r), *system, 1e-30, form), without)
+    moved = Record(r.t, r.y, r.input.delayed(0.0))
+    assert np.array_equal(standard_rows(filter_data(moved), *system, 0.0, form), without)
+
+
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+@pytest.mark.parametrize(("system", "form"), FORMS)
+def test_whole_intervals_of_delay_shift_the_rows_of_the_input(system, form, hold):
+    # The same numbers 17 samples later, bit for bit, but for the rows that hold y.
+    n = system[0].size - 1
+    data = filter_data(record(7, hold=hold))
+    without = standard_rows(data, *system, 0.0, form)
+    later = standard_rows(data, *system, 17 * 0.1, form)
+    input_rows = [*range(2 * n + 1), 3 * n + 2]
+    assert np.array_equal(later[17:, input_rows], without[:-17, input_rows])
+    assert not later[:17, input_rows].any()
+
+
+@pytest.mark.parametrize("delay", [0.3, 1.7, 1.234])
+@pytest.mark.parametrize(("system", "form"), FORMS)
+def test_a_delay_is_a_shift_of_the_breaks(system, delay, form):
+    r = record(8, regular=False)
+    data = filter_data(r)
+    moved = filter_data(Record(r.t, r.y, r.input.delayed(delay)))
+    expected = standard_rows(replace(moved, use=data.use), *system, 0.0, form)
+    assert_close(standard_rows(data, *system, delay, form), expected, 1e-10)
+
+
+@pytest.mark.parametrize("interval", [0.01, 0.05, 0.1, 1 / 3])
+def test_whole_delays_are_recognised_however_long(interval):
+    # k * interval / interval is k up to its own rounding, which grows with k.
+    missed = [k for k in range(0, 200_000, 7) if split_delay(k * interval, interval) != (k, 0.0)]
+    assert not missed, f"{len(missed)} of them, the first {missed[0]}"
+
+
+@given(st.floats(0, 1e4), st.floats(1e-3, 10.0))
+def test_split_delays_add_up(delay, interval):
+    shift, fraction = split_delay(delay, interval)
+    assert 0.0 <= fraction < 1.0
+    assert (shift - fraction) * interval == pytest.approx(delay, rel=1e-9, abs=1e-9 * interval)
+
+
+@pytest.mark.parametrize("form", ["modal", "chain"])
+@pytest.mark.parametrize("regular", [True, False])
+def test_masked_samples_are_as_good_as_absent(regular, form):
+    # With a linear hold a masked sample is bridged by the line that its absence would leave.
+    full = record(9, regular=regular)
+    masked = np.zeros(full.n_samples, bool)
+    masked[[3, 4, 5, 77, 210, 211]] = True
+    with_nan = filter_data(Record(full.t, np.where(masked, np.nan, full.y), full.input))
+    absent = filter_data(Record(full.t[~masked], full.y[~masked], full.input))
+    expected = standard_rows(absent, *CASE_2, 1.234, form)
+    assert_close(standard_rows(with_nan, *CASE_2, 1.234, form), expected, 1e-10)
+
+
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize("delay", [0.777, 1.2345])
+@pytest.mark.parametrize("system", [CASE_1, CASE_2, RELATIVE_DEGREE_ONE, FIRST_ORDER])
+def test_rows_are_the_derivatives_of_the_output_error(system, delay, regular):
+    # Central differences of the simulated output, for the delay (off the clock) and each coefficient.
+    a, b = system
+    n = a.size - 1
+    r = record(10, regular=regular)
+    rows = standard_rows(filter_data(r), a, b, delay)
+
+    def error(a, b, delay):
+        return r.y - simulate(TransferFunction(b, a, delay), r.input, r.t)
+
+    def central(plus, minus, step):
+        return (plus - minus) / (2 * step)
+
+    columns, differences = [rows[:, 3 * n + 2]], []
+    h = 1e-6
+    differences.append(central(error(a, b, delay + h), error(a, b, delay - h), h))
+    for i in range(1, n + 1):
+        change = np.zeros(n + 1)
+        change[i] = h * a[i]
+        differences.append(central(error(a + change, b, delay), error(a - change, b, delay), h * a[i]))
+        columns.append(rows[:, n + 1 + n - i])  # d eps/d a_i = p^(n-i)/A x
+    for j in range(b.size):
+        change = np.zeros(b.size)
+        change[j] = h * abs(b[j])
+        differences.append(central(error(a, b + change, delay), error(a, b - change, delay), h * abs(b[j])))
+        columns.append(-rows[:, b.size - 1 - j])  # d eps/d b_j = -p^(m-j)/A u
+    assert_close(np.column_stack(columns), np.column_stack(differences), 1e-5)
+
+
+def test_samples_before_the_longest_delay_are_not_used():
+    r = record(11, n=100)  # from 3 s, every 0.1 s
+    data = filter_data(r, 2.0)
+    assert data.count == 80
+    assert np.array_equal(data.y_used, r.y[20:])
+    later_input = Record(r.t, r.y, HeldSignal(r.t + 1.0, r.input.values))
+    assert filter_data(later_input, 2.0).count == 70
+
+
+def test_laying_out_and_filtering_change_no_data():
+    r = record(12)
+    before = (r.t.copy(), r.y.copy(), r.input.t.copy(), r.input.values.copy())
+    a, b = CASE_2[0].copy(), CASE_2[1].copy()
+    second_moments(filter_data(r), a, b, 0.3)
+    for array, original in zip((r.t, r.y, r.input.t, r.input.values, a, b), (*before, *CASE_2), strict=True):
+        assert np.array_equal(array, original)
+
+
+def test_partial_fractions_know_when_they_fail():
+    assert modal_map(*CASE_1)[0] < MODAL_CONDITION_LIMIT
+    assert modal_map(*CASE_2)[0] < MODAL_CONDITION_LIMIT
+    assert modal_map(np.poly([-1.0, -1.0]), np.ones(1))[0] == np.inf
+    assert modal_map(np.array([1.0, 1.0, 0.0]), np.ones(1))[0] == np.inf

@@ -1,0 +1,92 @@
+"""Low-pass filtering of a record: the filter itself, and that it commutes with the system."""
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from ctid_cli.filtering import Lowpass, simulate
+from ctid_cli.models import TransferFunction
+from ctid_cli.signals import HeldSignal, Record
+
+CASE_1 = TransferFunction([2.0], [0.25, 0.7, 1.0], 0.33)
+
+
+def record(hold="zoh", regular=True, n=1000):
+    rng = np.random.default_rng(0)
+    t = 0.05 * np.arange(n) if regular else np.cumsum(rng.uniform(0.01, 0.09, n))
+    u = rng.standard_normal(n)
+    u[0] = 0.0
+    held = HeldSignal(t, u, hold)
+    return Record(t, simulate(CASE_1, held, t), held, name="a record")
+
+
+@pytest.mark.parametrize("order", [1, 2, 10])
+def test_gain_is_that_of_a_butterworth_filter(order):
+    # |L(jw)|^2 = 1/(1 + (w/wc)^(2 n)): unity at zero frequency and 3 dB down at the cut-off.
+    frequencies = np.array([0.0, 0.1, 0.3, 0.6, 2.0])
+    gain = np.abs(Lowpass(0.3, order).model.frequency_response(frequencies))
+    np.testing.assert_allclose(gain, (1 + (frequencies / 0.3) ** (2 * order)) ** -0.5, rtol=1e-9)
+
+
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+@pytest.mark.parametrize("order", [1, 2, 10])
+def test_filter_commutes_with_the_system_on_a_regular_clock(order, hold):
+    # G L u = L G u: both are linear and time-invariant on the samples (a linear hold must rise from zero).
+    filtered = Lowpass(0.5, order).apply(record(hold))
+    assert filtered.input.hold == hold
+    expected = simulate(CASE_1, filtered.input, filtered.t)
+    np.testing.assert_allclose(filtered.y, expected, atol=1e-12 * np.abs(expected).max())
+
+
+def test_input_is_really_filtered():
+    filtered = Lowpass(0.5, 2).apply(record())
+    sections = signal.butter(2, 0.5, fs=2 * np.pi / 0.05, output="sos")
+    np.testing.assert_allclose(filtered.input.values, signal.sosfilt(sections, record().input.values), rtol=1e-12)
+
+
+def test_irregular_records_pass_through_the_analogue_filter():
+    # The filtered input is the exact response at the samples, and the filtered output that of the interpolated one.
+    r = record(regular=False)
+    filtered = Lowpass(0.5, 3).apply(r)
+    model = Lowpass(0.5, 3).model
+    assert filtered.input.hold == "foh"
+    np.testing.assert_array_equal(filtered.input.values, simulate(model, r.input, r.t))
+    np.testing.assert_array_equal(filtered.y, simulate(model, HeldSignal(r.t, r.y, "foh"), r.t))
+    # The system hardly sees the rest of the error: smooth signals lie close to the lines between their samples.
+    error = simulate(CASE_1, filtered.input, r.t) - filtered.y
+    assert np.abs(error).max() < 2e-3 * np.abs(filtered.y).max()
+
+
+@pytest.mark.parametrize("regular", [True, False])
+def test_masked_samples_stay_masked_and_the_record_unchanged(regular):
+    r = record(regular=regular)
+    y = r.y.copy()
+    y[[0, 10, 11, 999]] = np.nan
+    masked = Record(r.t, y, r.input, name="a record")
+    filtered = Lowpass(0.5).apply(masked)
+    assert np.array_equal(filtered.valid, masked.valid)
+    assert filtered.name == "a record"
+    assert np.array_equal(masked.y, y, equal_nan=True)
+    assert np.array_equal(masked.input.values, r.input.values)
+
+
+def test_cutoff_beyond_the_clock_is_refused():
+    with pytest.raises(ValueError, match=r"70 rad/s is not below half the sampling frequency, 62\.83\d* rad/s"):
+        Lowpass(70.0).apply(record())
+    Lowpass(70.0).apply(record(regular=False))  # no such limit where the filter is an analogue one
+
+
+@pytest.mark.parametrize(
+    ("cutoff", "order", "message"),
+    [
+        (0.0, 2, "must be a positive frequency in rad/s, not 0.0"),
+        (-1.0, 2, "must be a positive frequency"),
+        (np.nan, 2, "must be a positive frequency"),
+        (np.inf, 2, "must be a positive frequency"),
+        (1.0, 0, "order must be between 1 and 20, not 0"),
+        (1.0, 21, "order must be between 1 and 20, not 21"),
+    ],
+)
+def test_impossible_filters_are_refused(cutoff, order, message):
+    with pytest.raises(ValueError, match=message):
+        Lowpass(cutoff, order)

@@ -1,0 +1,68 @@
+"""What a fit reports, and the measures of its quality."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctid_cli.inference import Fit, Status, Structure, fit_percent, r_squared
+from ctid_cli.models import TransferFunction
+
+VALUES = st.lists(st.floats(-100, 100), min_size=3, max_size=20).filter(lambda v: np.ptp(v) > 1e-3)
+
+
+def make_fit(model, names, covariance=None):
+    covariance = np.diag(np.arange(1.0, len(names) + 1) ** 2) if covariance is None else covariance
+    return Fit(model, names, covariance, Status.CONVERGED, 0.1, 90.0, 0.99, 100, 3, 12.0)
+
+
+def test_parameters_and_standard_errors_go_by_name():
+    fit = make_fit(TransferFunction([5.0, 6.0], [1.0, 2.0, 3.0], 0.5), ("a1", "a2", "b0", "b1", "delay"))
+    assert fit.parameters == {"a1": 2.0, "a2": 3.0, "b0": 5.0, "b1": 6.0, "delay": 0.5}
+    assert fit.standard_errors == {"a1": 1.0, "a2": 2.0, "b0": 3.0, "b1": 4.0, "delay": 5.0}
+
+
+def test_coefficient_that_vanished_keeps_its_name():
+    fit = make_fit(TransferFunction([0.0, 6.0], [1.0, 2.0, 3.0]), ("a1", "a2", "b0", "b1"))
+    assert fit.parameters == {"a1": 2.0, "a2": 3.0, "b0": 0.0, "b1": 6.0}
+
+
+def test_undefined_standard_errors_are_nan_without_a_warning():
+    fit = make_fit(TransferFunction([1.0], [1.0, 2.0]), ("a1", "b0"), np.diag([-1.0, np.nan]))
+    assert all(np.isnan(error) for error in fit.standard_errors.values())
+
+
+@pytest.mark.parametrize(("poles", "zeros"), [(1, 0), (3, 1), (4, 3)])
+@pytest.mark.parametrize("delay", [True, False])
+def test_structure_counts_and_names_its_parameters(poles, zeros, delay):
+    structure = Structure(poles, zeros, delay)
+    expected = [f"a{i}" for i in range(1, poles + 1)] + [f"b{j}" for j in range(zeros + 1)] + ["delay"] * delay
+    assert structure.names == tuple(expected)
+    assert structure.size == len(expected) == structure.signs.size == structure.sensitivity_rows.size
+
+
+@given(VALUES, st.integers(0, 2**31))
+def test_measures_of_fit_follow_their_definitions(y, seed):
+    y = np.array(y)
+    x = y + np.random.default_rng(seed).standard_normal(y.size)
+    ratio = np.linalg.norm(y - x) / np.linalg.norm(y - y.mean())
+    assert fit_percent(y, x) == pytest.approx(100 * (1 - ratio), rel=1e-9, abs=1e-9)
+    assert r_squared(y, x) == pytest.approx(1 - ratio**2, rel=1e-9, abs=1e-9)
+    with_gap, beside = np.append(y, np.nan), np.append(x, 1e6)
+    assert fit_percent(with_gap, beside) == fit_percent(y, x)
+
+
+@given(VALUES)
+def test_ends_of_the_scale(y):
+    assert fit_percent(y, y) == 100.0
+    assert fit_percent(y, np.full(len(y), np.mean(y))) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_constant_or_missing_output_has_no_fit():
+    assert np.isnan(fit_percent([1.0, 1.0], [1.0, 2.0]))
+    assert np.isnan(r_squared([np.nan, np.nan], [1.0, 2.0]))
+
+
+def test_only_converged_and_one_shot_estimates_count_as_successes():
+    assert {status for status in Status if status.succeeded} == {Status.CONVERGED, Status.LEAST_SQUARES}
+    assert len({status.value for status in Status}) == len(Status) == 7
