@@ -48,7 +48,11 @@ def described_in_place(annotation):
 def expected(member):
     if hasattr(member, "model_fields"):  # pydantic: the description of a field is its documentation
         return [name for name, field in member.model_fields.items() if not field.description]
-    if inspect.isclass(member) and (issubclass(member, enum.Enum) or not inspect.isfunction(member.__init__)):
+    if inspect.isclass(member) and (
+        issubclass(member, enum.Enum)
+        or getattr(member, "_is_protocol", False)
+        or not inspect.isfunction(member.__init__)
+    ):
         return []
     hints = {}
     if inspect.isfunction(member) and any("Annotated" in str(hint) for hint in member.__annotations__.values()):

@@ -56,10 +56,32 @@ class Problem(Protocol):
     """What the iteration needs to know of an estimation problem."""
 
     def equations(self, theta: Array) -> Equations | None:
-        """Second moments at theta, or None where theta is not admissible."""
+        """Second moments of sensitivities, regressors and output error.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (p,)
+            Parameters.
+
+        Returns
+        -------
+        Equations or None
+            The moments; None where theta is not admissible.
+        """
 
     def admissible(self, theta: Array) -> Array:
-        """The nearest admissible parameter vector (unstable models reflected)."""
+        """Bring parameters into the admissible set: unstable models are reflected.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (p,)
+            Parameters.
+
+        Returns
+        -------
+        ndarray, shape (p,)
+            Admissible parameters.
+        """
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,7 +79,7 @@ class Srivc:
     >>> y = simulate(TransferFunction([3], [1, 2]), u, t) + 0.1 * np.random.default_rng(0).standard_normal(500)
     >>> fit = Srivc(poles=1, zeros=0).fit(Record(t, y, u))
     >>> {name: f"{value:.2f} +- {fit.standard_errors[name]:.2f}" for name, value in fit.parameters.items()}
-    {'a1': '1.98 +- 0.02', 'b0': '2.97 +- 0.02'}
+    {'a1': '2.03 +- 0.02', 'b0': '3.02 +- 0.02'}
     """
 
     kind: ClassVar[str] = "srivc"

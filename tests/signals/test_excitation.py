@@ -197,9 +197,7 @@ def test_file_is_applied_on_its_own_times(input_file):
 
 
 def test_file_with_straight_lines_reaches_the_end_of_the_record(input_file):
-    signal = InputFile(input_file("t,u\n0,0\n10,20\n11,0\n"), hold="foh").generate(
-        np.array([0.0, 4.0]), rng()
-    )
+    signal = InputFile(input_file("t,u\n0,0\n10,20\n11,0\n"), hold="foh").generate(np.array([0.0, 4.0]), rng())
     assert signal.at([0.0, 1.0, 4.0]).tolist() == [0.0, 2.0, 8.0]
 
 

@@ -22,9 +22,7 @@ def test_levels_scale_one_shape(snr_db, replicate):
     noise = WhiteNoise(snr_db=snr_db).generate(OUTPUT, rng(replicate))
     scale = np.sqrt(np.mean(OUTPUT**2) / 10 ** (snr_db / 10))
     np.testing.assert_allclose(noise, scale * reference, rtol=1e-12)
-    np.testing.assert_allclose(
-        WhiteNoise(standard_deviation=scale).generate(OUTPUT, rng(replicate)), noise, rtol=1e-12
-    )
+    np.testing.assert_allclose(WhiteNoise(standard_deviation=scale).generate(OUTPUT, rng(replicate)), noise, rtol=1e-12)
 
 
 def test_snr_is_reached():
