@@ -15,7 +15,7 @@ from typing import Annotated, Any, TypeVar, cast
 
 import typer
 
-from ctid_cli.errors import CtidError
+from ctid_cli.errors import CtidError, SpecError
 
 Command = TypeVar("Command", bound=Callable[..., None])
 
@@ -45,7 +45,8 @@ def guarded(command: Command) -> Command:
         try:
             command(*args, **kwargs)
         except CtidError as error:
-            typer.echo(f"ctid: {error}", err=True)
+            # Problems of a specification begin with file:line:column, which editors turn into links.
+            typer.echo(str(error) if isinstance(error, SpecError) else f"ctid: {error}", err=True)
             raise typer.Exit(error.exit_code) from None
         except KeyboardInterrupt:
             raise typer.Exit(INTERRUPTED) from None

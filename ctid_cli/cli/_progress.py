@@ -68,7 +68,7 @@ class Reporter:
             case events.PlanReady():
                 self._plan(event)
             case events.KernelsCompiling():
-                self._say("compiling numerical kernels (below 30 s the first time, cached afterwards)")
+                self._say("preparing numerical kernels (compiled the first time, which takes below 30 s; then cached)")
             case events.KernelsCompiled():
                 if event.seconds > QUICK:
                     self._say(f"kernels ready after {seconds(event.seconds)}")
@@ -88,7 +88,7 @@ class Reporter:
         if event.reused:
             parts.append(f"{event.reused} already stored")
         if event.left_aside:
-            parts.append(f"{event.left_aside} of other settings left aside")
+            parts.append(f"{event.left_aside} stored ones left aside")
         self._say(", ".join(parts))
         self._began = self._last = self._clock()
         if event.data_sets and sys.stderr.isatty():

@@ -53,6 +53,7 @@ def run(
         for ready in previews:
             typer.echo(json_lines(ready)[0] if as_json else _intention(ready))
         return
+    hopeless = []
     for _, plan in plans:
         with Reporter(plan.experiment) as reporter:
 
@@ -73,13 +74,15 @@ def run(
         if summary.exit_code:
             raise typer.Exit(summary.exit_code)
         if summary.failed == summary.planned:
-            raise TooManyFailuresError(f"{plan.experiment}: all {summary.planned} estimates failed")
+            hopeless.append(f"{plan.experiment}: all {summary.planned} estimates failed")
+    if hopeless:
+        raise TooManyFailuresError("\n".join(hopeless))
 
 
 def _intention(ready: PlanReady) -> str:
     from ctid_cli.reporting.layout import count
 
-    left = f"; {ready.left_aside} of other settings left aside" if ready.left_aside else ""
+    left = f", {ready.left_aside} stored ones left aside" if ready.left_aside else ""
     return (
         f"{ready.experiment}: would compute {count(ready.estimates, 'estimate')}"
         f" of {count(ready.data_sets, 'data set')} into {ready.folder}; {ready.reused} are already stored{left}"

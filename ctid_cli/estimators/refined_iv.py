@@ -23,6 +23,13 @@ Variant = Literal["plain", "guarded"]
 
 #: Halvings of a step before a direction is given up.
 HALVINGS = 12
+#: The guarded variant gives up after this many steps in a row that lower the cost by less than this fraction of what
+#: the linearised problem promises.
+SLOW_STEPS = 8
+NEGLIGIBLE_FALL = 1e-2
+#: The guarded variant takes a step only if the cost falls by this fraction of what its slope promises: a step that
+#: overshoots and lands as high on the other side is halved instead (Armijo's rule).
+SUFFICIENT_FALL = 0.1
 #: A rise of the cost below this fraction is rounding, not a rise.
 ROUNDING = 1e-13
 
@@ -156,7 +163,7 @@ def iterate(
     tolerance : float
         Stop when a step changes the simulated output by less than this fraction of its rms value [-].
     variant : {"plain", "guarded"}
-        ``plain`` takes every full step. ``guarded`` accepts a step only if the output-error cost does not rise, halves
+        ``plain`` takes every full step. ``guarded`` accepts a step only if the output-error cost falls enough, halves
         it otherwise, and falls back on the Gauss-Newton direction, along which the cost must fall.
     on_step : callable, optional
         Called with the parameters and their second moments at the start and after every accepted step.
@@ -172,6 +179,7 @@ def iterate(
         return None
     if on_step:
         on_step(theta, current)
+    slow = 0
     for iteration in range(max_iterations):
         step = scaled_solve(
             current.instrument_regressor,
@@ -199,11 +207,17 @@ def iterate(
             # At the minimum up to rounding no step can lower the cost: that is convergence, not failure.
             done = newton and change <= max(tolerance, 1e-7)
             return Iterated(theta, current, Status.CONVERGED if done else Status.STALLED, iteration)
+        fall = current.squared_error - accepted[1].squared_error
+        expected = change**2 * current.output_power
         theta, current, fraction = accepted
         if on_step:
             on_step(theta, current)
         if fraction == 1.0 and change <= tolerance:
             return Iterated(theta, current, Status.CONVERGED, iteration + 1)
+        # Steps that keep promising more than they give: along a curved valley of equal cost, or across a kink of it.
+        slow = slow + 1 if fall < NEGLIGIBLE_FALL * expected else 0
+        if variant == "guarded" and slow == SLOW_STEPS:
+            return Iterated(theta, current, Status.STALLED, iteration + 1)
     return Iterated(theta, current, Status.MAX_ITERATIONS, max_iterations)
 
 
@@ -249,12 +263,14 @@ def _take(
 ) -> tuple[Array, Equations, float] | None:
     """The first acceptable fraction of a step, or None."""
     fraction = 1.0
+    slope = max(float(step @ current.instrument_error), 0.0)
     for _ in range(HALVINGS if variant == "guarded" else 1):
         candidate = problem.admissible(theta + fraction * step)
         trial = problem.equations(candidate)
         if trial is not None and np.isfinite(trial.squared_error):
             rounding = ROUNDING * (trial.output_power + current.output_power)
-            limit = current.squared_error * (1.0 + ROUNDING) + rounding * ROUNDING
+            promised = 2.0 * fraction * slope
+            limit = current.squared_error * (1.0 + ROUNDING) + rounding * ROUNDING - SUFFICIENT_FALL * promised
             if variant == "plain" or trial.squared_error <= limit:
                 return candidate, trial, fraction
         fraction *= 0.5

@@ -236,16 +236,20 @@ class PreparedTdSrivc:
             polished = self._polish(problem, theta, history)
             if polished is not None:
                 theta, iterations, status = polished.theta, iterations + polished.iterations, polished.status
-        bound = bound_in_the_way(problem, theta)
-        if bound is not None:
+        there = self._at_bound(problem, theta)
+        if there is not None:
             status = Status.DELAY_AT_BOUND
             if options.variant == "guarded":
-                theta = self._at_bound(problem, theta, bound, history)
+                theta = there
+                history.append(history_entry("bound", 0, problem, theta, mean_cost(problem, theta)))
         return finish(problem, theta, status, iterations, history)
 
-    def _at_bound(self, problem: DelayProblem, theta: Array, bound: float, history: list[IterationRecord]) -> Array:
-        """The best coefficients at a bound of the delay, if the cost is no higher there."""
+    def _at_bound(self, problem: DelayProblem, theta: Array) -> Array | None:
+        """The estimate with the delay on a bound, if that is where the cost leads."""
         here = problem.equations(theta)
+        bound = None if here is None else bound_in_the_way(here, float(theta[-1]), problem.bounds)
+        if here is None or bound is None:
+            return None
         coefficients = CoefficientProblem(self.data, self.structure, bound)
         there = iterate(
             coefficients,
@@ -254,12 +258,9 @@ class PreparedTdSrivc:
             tolerance=self.options.tolerance,
             variant="guarded",
         )
-        if here is None or there is None or there.equations.squared_error > here.squared_error:
-            return theta
-        cost = there.equations.squared_error / problem.data.count
-        moved = np.concatenate((there.theta, [bound]))
-        history.append(history_entry("bound", 0, problem, moved, cost))
-        return moved
+        if there is None or there.equations.squared_error > here.squared_error:
+            return None
+        return np.concatenate((there.theta, [bound]))
 
     def _polish(self, problem: DelayProblem, theta: Array, history: list[IterationRecord]) -> Iterated | None:
         """Joint iterations on coefficients and delay: from the right basin they converge in a few steps."""
@@ -279,29 +280,49 @@ class PreparedTdSrivc:
         )
 
 
-def bound_in_the_way(problem: DelayProblem, theta: Array) -> float | None:
-    """The bound that keeps the delay from a lower cost.
+def mean_cost(problem: DelayProblem, theta: Array) -> float:
+    """Mean squared output error of a parameter vector.
 
     Parameters
     ----------
     problem : DelayProblem
         Record, degrees and bounds.
     theta : ndarray, shape (p,)
-        Where the iterations ended, the delay last.
+        Parameters, the delay last.
+
+    Returns
+    -------
+    float
+        The cost [output unit^2]; NaN where theta has no finite response.
+    """
+    equations = problem.equations(theta)
+    return float("nan") if equations is None else equations.squared_error / problem.data.count
+
+
+def bound_in_the_way(equations: Equations, delay: float, bounds: tuple[float, float]) -> float | None:
+    """The bound that keeps the delay from a lower cost.
+
+    Parameters
+    ----------
+    equations : Equations
+        Second moments where the iterations ended, the delay as the last parameter.
+    delay : float
+        Delay there [s].
+    bounds : tuple of float
+        Least and greatest delay [s].
 
     Returns
     -------
     float or None
-        The bound [s] beyond which the next full Gauss-Newton step would lead; None if it stays inside.
+        The bound [s] beyond which the next full Gauss-Newton step would lead; None if it stays inside, or if the data
+        hardly determine the delay, so that the length of the step means nothing.
     """
-    equations = problem.equations(theta)
-    step = None if equations is None else delay_step(equations)
+    step = delay_step(equations, least_curvature=1e-8)
     if step is None:
         return None
-    low, high = problem.bounds
-    if theta[-1] + step < low:
-        return low
-    return high if theta[-1] + step > high else None
+    if delay + step < bounds[0]:
+        return bounds[0]
+    return bounds[1] if delay + step > bounds[1] else None
 
 
 class _DelaySearch:
@@ -383,13 +404,16 @@ class _DelaySearch:
         return Iterated(np.concatenate((current.theta, [delay])), current.equations, status, iterations)
 
 
-def delay_step(equations: Equations) -> float | None:
+def delay_step(equations: Equations, least_curvature: float = 1e-14) -> float | None:
     """Gauss-Newton step of the delay with the coefficients projected out.
 
     Parameters
     ----------
     equations : Equations
         Second moments of the joint problem, the delay last.
+    least_curvature : float, default 1e-14
+        The delay counts as undetermined where projecting the coefficients out leaves less than this fraction of the
+        curvature.
 
     Returns
     -------
@@ -402,6 +426,6 @@ def delay_step(equations: Equations) -> float | None:
     if projection is None:
         return None
     curvature = hessian[-1, -1] - projection @ hessian[:-1, -1]
-    if not curvature > 1e-14 * hessian[-1, -1]:
+    if not curvature > least_curvature * hessian[-1, -1]:
         return None
     return float(gradient[-1] / curvature)

@@ -171,13 +171,15 @@ class MeasuredSource:
             # The remaining samples must not have a say in what the model is made of.
             u = u - u[:count].mean()
             y = y - np.nanmean(y[:count])
-        record = Record(t[:count], y[:count], HeldSignal(t[:count], u[:count], self.hold), name=self.file)
+        # Without its folder: what an estimator says about the record is part of the results.
+        name = Path(self.file).name
+        record = Record(t[:count], y[:count], HeldSignal(t[:count], u[:count], self.hold), name=name)
         if count == t.size:
             return DataSet(record)
         rest = np.where(np.arange(t.size) < count, np.nan, y)
         if not np.isfinite(rest).any():
             return DataSet(record)
-        return DataSet(record, validation=Record(t, rest, HeldSignal(t, u, self.hold), name=self.file))
+        return DataSet(record, validation=Record(t, rest, HeldSignal(t, u, self.hold), name=name))
 
 
 Source = SimulatedSource | MeasuredSource

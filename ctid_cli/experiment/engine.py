@@ -201,7 +201,7 @@ class _Run:
             (self.folder / place.PROVENANCE).mkdir(exist_ok=True)
         except OSError as error:
             raise _cannot_write(self.folder, error) from error
-        self.info = session_info(spec.text, self.origin, self.workers)
+        self.info = session_info(spec.text, spec.folder, self.origin, self.workers)
         self.session = self.log.begin(self.manifest, self.origin, self.started, self.info)
         self._announce()
         self.on_event(
@@ -338,8 +338,7 @@ def _jobs(plan: Plan, stored: set[Key]) -> list[Job]:
     jobs = []
     for task in plan.tasks():
         wanted = {}
-        for identity, estimator, start in plan.keys(task):
-            key = Key(identity.data_hash, identity.replicate, identity.estimator_hash, identity.start)
+        for key, estimator, start in plan.keys(task):
             # Two names for the same estimator share their estimates.
             if key not in stored and key not in wanted:
                 wanted[key] = (key, estimator, start)

@@ -136,33 +136,6 @@ def slots(manifest: Manifest) -> Iterator[Slot]:
                     yield Slot(Key(cell["hash"], replicate, estimator["hash"], start), cell, estimator)
 
 
-def label(slot: Slot, manifest: Manifest) -> dict[str, Any]:
-    """The part of an estimate row that the plan decides.
-
-    Parameters
-    ----------
-    slot : Slot
-        Which estimate.
-    manifest : dict
-        The plan as plain data.
-
-    Returns
-    -------
-    dict
-        From ``id`` to ``initial_delay``.
-    """
-    return {
-        "id": slot.key.id,
-        "experiment": manifest["experiment"],
-        "estimator": slot.estimator["name"],
-        "kind": slot.estimator["kind"],
-        "cell": slot.key.data_hash,
-        "replicate": slot.key.replicate,
-        "start": slot.key.start,
-        "initial_delay": manifest["starts"].get(slot.key.start),
-    }
-
-
 def assemble(slot: Slot, manifest: Manifest, result: Mapping[str, Any], seconds: float | None) -> dict[str, Any]:
     """An estimate row.
 
@@ -182,8 +155,20 @@ def assemble(slot: Slot, manifest: Manifest, result: Mapping[str, Any], seconds:
     dict
         See the top of this module.
     """
-    row = label(slot, manifest) | {name: result.get(name) for name in RESULT_FIELDS} | {"seconds": seconds}
-    return row | dict(slot.cell["swept"]) | dict(slot.estimator["swept"])
+    return {
+        "id": slot.key.id,
+        "experiment": manifest["experiment"],
+        "estimator": slot.estimator["name"],
+        "kind": slot.estimator["kind"],
+        "cell": slot.key.data_hash,
+        "replicate": slot.key.replicate,
+        "start": slot.key.start,
+        "initial_delay": manifest["starts"].get(slot.key.start),
+        **{name: result.get(name) for name in RESULT_FIELDS},
+        "seconds": seconds,
+        **slot.cell["swept"],
+        **slot.estimator["swept"],
+    }
 
 
 def swept_names(manifest: Manifest) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import math
 from collections.abc import Iterable, Mapping
@@ -12,8 +11,9 @@ from typing import Any, cast
 from ctid_cli.errors import UsageError
 from ctid_cli.estimators import Start
 from ctid_cli.experiment.dataset import DataSet, SimulatedSource, Source
+from ctid_cli.experiment.manifest import Key
 from ctid_cli.experiment.sections import MAX_COMBINATIONS, Variant, variants
-from ctid_cli.experiment.spec import Spec, UniformStart, content_hash
+from ctid_cli.experiment.spec import Spec, UniformStart, content_hash, located
 from ctid_cli.experiment.yaml_source import KeyPath
 from ctid_cli.signals import stream
 
@@ -147,34 +147,6 @@ NO_START = StartPoint("none", None)
 
 
 @dataclass(frozen=True)
-class EstimateKey:
-    """Identity of an estimate.
-
-    Parameters
-    ----------
-    data_hash : str
-        Of the data cell.
-    replicate : int
-        Which data set of the cell.
-    estimator_hash : str
-        Of the estimator cell.
-    start : str
-        Label of the start.
-    """
-
-    data_hash: str
-    replicate: int
-    estimator_hash: str
-    start: str
-
-    @property
-    def id(self) -> str:
-        """Short name of the estimate."""
-        text = f"{self.data_hash}/{self.replicate}/{self.estimator_hash}/{self.start}"
-        return hashlib.sha256(text.encode()).hexdigest()[:12]
-
-
-@dataclass(frozen=True)
 class Task:
     """One data set.
 
@@ -232,7 +204,7 @@ class Plan:
         """
         return [Task(cell, replicate) for replicate in range(self.runs) for cell in range(len(self.data_cells))]
 
-    def keys(self, task: Task) -> list[tuple[EstimateKey, EstimatorCell, StartPoint]]:
+    def keys(self, task: Task) -> list[tuple[Key, EstimatorCell, StartPoint]]:
         """The estimates wanted of a data set.
 
         Parameters
@@ -242,12 +214,12 @@ class Plan:
 
         Returns
         -------
-        list of (EstimateKey, EstimatorCell, StartPoint)
+        list of (Key, EstimatorCell, StartPoint)
             Those of one estimator next to each other.
         """
         data_hash = self.data_cells[task.cell].hash
         return [
-            (EstimateKey(data_hash, task.replicate, cell.hash, start.label), cell, start)
+            (Key(data_hash, task.replicate, cell.hash, start.label), cell, start)
             for cell in self.estimators
             for start in (self._given_starts if cell.estimator.uses_start else (NO_START,))
         ]
@@ -329,16 +301,18 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
     if spec.data is not None:
         # The seed decides where random starts lie; the record itself is in the content as a hash.
         content = {"data": _without_place(spec.data.model_dump(mode="json")), "seed": seed}
-        return (DataCell(content, content_hash(content), {}, spec.data.source()),)
+        return (DataCell(content, content_hash(content), {}, spec.data.source(spec.folder.resolve())),)
     assert seed is not None
+    # Absolute, because worker processes may have been started in another working directory.
+    folder = spec.folder.resolve()
     cells = []
     for point in itertools.product(*parts.values()):
         chosen = dict(zip(parts, point, strict=True))
         content = {name: _without_place(variant.values) for name, variant in chosen.items()}
-        content = {"noise": None} | content | {"seed": seed}
+        content |= {"noise": content.get("noise"), "seed": seed}
         source = SimulatedSource(
             system=chosen["system"].options,
-            excitation=chosen["excitation"].options,
+            excitation=located(chosen["excitation"].options, folder),
             sampling=chosen["sampling"].options,
             noise=chosen["noise"].options if "noise" in chosen else None,
             seed=seed,

@@ -17,13 +17,15 @@ def now() -> str:
     return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def session_info(spec_text: str, origin: Origin, jobs: int) -> dict[str, Any]:
+def session_info(spec_text: str, spec_folder: Path, origin: Origin, jobs: int) -> dict[str, Any]:
     """Describe the run that is about to start.
 
     Parameters
     ----------
     spec_text : str
         The specification as the user wrote it.
+    spec_folder : Path
+        Folder that its file names are relative to.
     origin : Origin
         Code and platform.
     jobs : int
@@ -45,6 +47,7 @@ def session_info(spec_text: str, origin: Origin, jobs: int) -> dict[str, Any]:
         "numeric_platform": origin.platform,
         "packages": {"python": platform.python_version(), **package_versions()},
         "git_commit": git_commit(Path(__file__).resolve().parents[2]),
+        "spec_folder": str(spec_folder.resolve()),
         "spec": spec_text,
     }
 

@@ -7,6 +7,7 @@ written; hashes of parts of it are the identity of data and estimators.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import itertools
 import json
@@ -172,15 +173,21 @@ class MeasuredSection(Section):
         default=None, description="Identify on the first so many samples and judge on the rest; null identifies on all"
     )
 
-    def source(self) -> MeasuredSource:
+    def source(self, folder: Path) -> MeasuredSource:
         """Reader of the record.
+
+        Parameters
+        ----------
+        folder : Path
+            Folder that the name of the file is relative to.
 
         Returns
         -------
         MeasuredSource
             With the content hash of the section, or of the file as it is now.
         """
-        return MeasuredSource(**(self.model_dump() | {"sha256": self.sha256 or file_sha256(self.file)}))
+        file = _joined(folder, self.file)
+        return MeasuredSource(**(self.model_dump() | {"file": file, "sha256": self.sha256 or file_sha256(file)}))
 
 
 class UniformStart(Section):
@@ -334,6 +341,7 @@ class Spec(Section):
 
     _warnings: tuple[str, ...] = PrivateAttr(default=())
     _text: str = PrivateAttr(default="")
+    _folder: Path = PrivateAttr(default=Path())
 
     @classmethod
     def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
@@ -390,13 +398,18 @@ class Spec(Section):
         """The specification as the user wrote it; the canonical form where there is no file."""
         return self._text or canonical_json(self.canonical())
 
+    @property
+    def folder(self) -> Path:
+        """Folder that the names of data files are relative to."""
+        return self._folder
+
     def canonical(self) -> dict[str, Any]:
         """The specification with all defaults, as plain data.
 
         Returns
         -------
         dict
-            JSON-able. File names are relative to the working directory, and content hashes stand beside them.
+            JSON-able. File names are as the user wrote them, and content hashes stand beside them.
         """
         return self.model_dump(mode="json")
 
@@ -448,7 +461,7 @@ def load_spec(path: Path, overrides: Sequence[str] = ()) -> Spec:
     Returns
     -------
     Spec
-        Names of data files in it are joined with the folder of the specification.
+        Content hashes of data files are filled in.
 
     Raises
     ------
@@ -469,7 +482,8 @@ def load_spec(path: Path, overrides: Sequence[str] = ()) -> Spec:
         message = f"the file must hold a mapping that begins with 'experiment: name', not {shown(tree)}"
         raise SpecError([Problem(source.file, 1, 1, "", "the file is empty" if tree is None else message)])
     spec, complaints = _validated(tree)
-    spec, about_files = _with_files(spec, Path(path).parent)
+    spec._folder = Path(path).parent
+    spec, about_files = _with_files(spec)
     joint = _joint_complaints(spec, files_are_good=not about_files)
     complaints += [(where, message, False) for where, message in (*about_files, *joint)]
     if complaints:
@@ -481,13 +495,15 @@ def load_spec(path: Path, overrides: Sequence[str] = ()) -> Spec:
     return spec
 
 
-def spec_from_canonical(canonical: Mapping[str, Any]) -> Spec:
+def spec_from_canonical(canonical: Mapping[str, Any], folder: Path | None = None) -> Spec:
     """A specification from its canonical form.
 
     Parameters
     ----------
     canonical : mapping
         What `Spec.canonical` gave.
+    folder : Path, optional
+        Folder that file names in it are relative to; the working directory by default.
 
     Returns
     -------
@@ -503,7 +519,32 @@ def spec_from_canonical(canonical: Mapping[str, Any]) -> Spec:
     if complaints:
         name = "(canonical specification)"
         raise SpecError([Problem(name, 1, 1, path_text(path), message) for path, message, _ in complaints])
+    spec._folder = folder or Path()
     return spec
+
+
+def located(options: Any, folder: Path) -> Any:
+    """An excitation with the name of its file, if it reads one, as seen from the working directory.
+
+    Parameters
+    ----------
+    options : Any
+        Option dataclass of an excitation.
+    folder : Path
+        Folder that the name of the file is relative to.
+
+    Returns
+    -------
+    Any
+        The same, or a copy.
+    """
+    if not isinstance(options, InputFile):
+        return options
+    return dataclasses.replace(options, file=_joined(folder, options.file))
+
+
+def _joined(folder: Path, file: str) -> str:
+    return Path(os.path.normpath(folder / file)).as_posix()
 
 
 def json_schema() -> dict[str, Any]:
@@ -570,26 +611,25 @@ def _validated(tree: dict[str, Any]) -> tuple[Spec, list[tuple[KeyPath, str, boo
     return _Remainder.model_validate(good), complaints
 
 
-def _with_files(spec: Spec, folder: Path) -> tuple[Spec, list[Complaint]]:
-    """The specification with file names joined and content hashes filled in, and what is wrong with the files."""
+def _with_files(spec: Spec) -> tuple[Spec, list[Complaint]]:
+    """The specification with content hashes filled in, and what is wrong with the files."""
     update: dict[str, Any] = {}
     problems: list[Complaint] = []
     for name in ("data", "excitation"):
         section = getattr(spec, name)
         if not hasattr(section, "sha256"):
             continue
-        file = Path(os.path.normpath(folder / section.file)).as_posix()
+        file = _joined(spec.folder, section.file)
         try:
             content = file_sha256(file)
             if section.sha256 not in (None, content):
                 problems.append(((name, "sha256"), f"the SHA-256 of {file} is {content}; is it another file?"))
                 continue
-            section = section.model_copy(update={"file": file, "sha256": content})
-            update[name] = section
+            update[name] = section.model_copy(update={"sha256": content})
             if name == "excitation":
-                check_input_file(variants(section)[0].options)
+                check_input_file(located(variants(section)[0].options, spec.folder))
             else:
-                section.source().dataset(0)
+                section.source(spec.folder).dataset(0)
         except DataError as error:
             problems.append(((name, "file"), str(error)))
     return spec.model_copy(update=update), problems
@@ -613,7 +653,7 @@ class _Extent:
 
 def _extents(spec: Spec) -> list[_Extent]:
     if spec.data is not None:
-        record = spec.data.source().dataset(0).record
+        record = spec.data.source(spec.folder).dataset(0).record
         interval = record.duration / max(record.n_samples - 1, 1)
         return [_Extent({}, interval, record.n_samples, (record.t - record.t[0])[record.valid])]
     return [
@@ -700,7 +740,7 @@ def _simulation_complaints(spec: Spec, extents: Sequence[_Extent]) -> Iterator[C
             continue
         try:
             times = sampling.options.times(stream(seed, "sampling", 0))
-            excitation.options.generate(times, stream(seed, "input", 0))
+            located(excitation.options, spec.folder).generate(times, stream(seed, "input", 0))
         except DataError as error:
             failures.append((("excitation",), str(error), combination))
     yield from grouped(failures, len(pairs))

@@ -24,7 +24,7 @@ from ctid_cli.experiment.folder import (
     who_runs,
     write_safely,
 )
-from ctid_cli.experiment.manifest import FAILURES, Key, Manifest, assemble, slots, swept_names, true_delay
+from ctid_cli.experiment.manifest import FAILURES, Key, Manifest, Slot, assemble, slots, swept_names, true_delay
 from ctid_cli.experiment.summary import is_converged
 from ctid_cli.experiment.version import Origin
 
@@ -70,17 +70,30 @@ class Stored:
     results: Mapping[Key, dict[str, Any]]
     seconds: Mapping[Key, float | None]
 
+    def slots(self) -> list[Slot]:
+        """Places of the stored estimates, in the order of the sealed file."""
+        return [slot for slot in slots(self.manifest) if slot.key in self.results]
+
+    def row(self, slot: Slot) -> dict[str, Any]:
+        """The estimate row of one place, with ``true_delay`` and ``converged``.
+
+        Parameters
+        ----------
+        slot : Slot
+            One of ``slots()``.
+
+        Returns
+        -------
+        dict
+            See `ctid_cli.experiment.manifest`.
+        """
+        row = assemble(slot, self.manifest, self.results[slot.key], self.seconds.get(slot.key))
+        delay = true_delay(slot.cell)
+        return row | {"converged": is_converged(row, self.manifest["success"], delay), "true_delay": delay}
+
     def rows(self) -> list[dict[str, Any]]:
-        """Estimate rows in the order of the sealed file, with ``true_delay`` and ``converged``."""
-        success = self.manifest["success"]
-        rows = []
-        for slot in slots(self.manifest):
-            result = self.results.get(slot.key)
-            if result is not None:
-                row = assemble(slot, self.manifest, result, self.seconds.get(slot.key))
-                delay = true_delay(slot.cell)
-                rows.append(row | {"converged": is_converged(row, success, delay), "true_delay": delay})
-        return rows
+        """All estimate rows, in the order of the sealed file."""
+        return [self.row(slot) for slot in self.slots()]
 
 
 @dataclass(frozen=True)
@@ -365,18 +378,14 @@ def find_estimate(results: Path, prefix: str) -> FoundEstimate:
         except InUseError as error:
             in_use = f"; it may come later: {error}"
             continue
-        manifest = stored.manifest
-        for slot in slots(manifest):
-            if slot.key in stored.results and slot.key.id.startswith(prefix) and slot.key.id not in matches:
-                row = assemble(slot, manifest, stored.results[slot.key], stored.seconds.get(slot.key))
-                delay = true_delay(slot.cell)
-                row |= {"converged": is_converged(row, manifest["success"], delay), "true_delay": delay}
+        for slot in stored.slots():
+            if slot.key.id.startswith(prefix) and slot.key.id not in matches:
                 matches[slot.key.id] = FoundEstimate(
                     folder,
-                    row,
+                    stored.row(slot),
                     dict(slot.cell["content"]),
                     dict(slot.estimator["content"]),
-                    manifest["seed"],
+                    stored.manifest["seed"],
                     stored.origins,
                 )
     if not matches:
@@ -387,6 +396,31 @@ def find_estimate(results: Path, prefix: str) -> FoundEstimate:
         some = ", ".join(sorted(matches)[:5])
         raise UsageError(f"{len(matches)} estimates have an id that begins with {prefix!r}: {some}…; give more of it")
     return next(iter(matches.values()))
+
+
+def spec_folder(folder: Path) -> Path | None:
+    """Folder of the specification that an experiment was last run with.
+
+    Parameters
+    ----------
+    folder : Path
+        The experiment's folder.
+
+    Returns
+    -------
+    Path or None
+        Absolute; None where the journal that knows it is missing.
+
+    Raises
+    ------
+    RefusedError
+        If a newer ctid wrote the journal, or a run goes on.
+    StorageError
+        If the journal is damaged.
+    """
+    with lock(folder, shared=True), reading_journal(folder) as log:
+        sessions = [] if log is None else log.sessions()
+    return Path(sessions[-1]["spec_folder"]) if sessions else None
 
 
 def experiment_status(folder: Path) -> ExperimentStatus:

@@ -11,7 +11,7 @@ from typing import Any
 from ctid_cli.errors import MismatchError
 from ctid_cli.experiment.plan import build_plan
 from ctid_cli.experiment.spec import spec_from_canonical
-from ctid_cli.experiment.store import FoundEstimate, read_stored
+from ctid_cli.experiment.store import FoundEstimate, read_stored, spec_folder
 from ctid_cli.experiment.worker import plain
 from ctid_cli.reporting.estimate import Parameter, as_object, parameter_table, parameters
 from ctid_cli.reporting.layout import delay_label, number, seconds, text_table
@@ -182,7 +182,8 @@ def repeat(found: FoundEstimate) -> Repeated:
         Its iterations, and how far it is from the stored one.
     """
     row = found.row
-    plan = build_plan(spec_from_canonical(read_stored(found.folder).manifest["spec"]))
+    spec = spec_from_canonical(read_stored(found.folder).manifest["spec"], spec_folder(found.folder))
+    plan = build_plan(spec)
     for task in plan.tasks():
         cell = plan.data_cells[task.cell]
         if (cell.hash, task.replicate) != (row["cell"], row["replicate"]):

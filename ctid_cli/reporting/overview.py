@@ -125,7 +125,8 @@ def status_text(status: ExperimentStatus, estimates: Sequence[Mapping[str, Any]]
     if len(failures) > LISTED:
         lines.append(f"  and {len(failures) - LISTED} more")
     if status.left_aside:
-        lines += ["", f"{status.left_aside} stored estimates belong to earlier settings; tables leave them out."]
+        reason = "the latest run asked for other settings or fewer data sets"
+        lines += ["", f"{status.left_aside} stored estimates are left aside: {reason}."]
     option = out_option(out)
     if status.todo and not status.running:
         lines += [

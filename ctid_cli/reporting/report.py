@@ -211,7 +211,7 @@ def _unknown(name: str, out: Path) -> str:
     study = load_study()
     known = [*(str(k) for k in study.tables), study.name, *experiments_in(out)]
     close = difflib.get_close_matches(name, known, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
+    hint = f"; did you mean {close[0]!r}?" if close else "."
     return f"{name!r} is neither a table nor an experiment with results in {out}{hint} Known: {', '.join(known)}"
 
 

@@ -207,10 +207,9 @@ def read_results(out: Path, experiment: str) -> Results:
     known = experiments_in(out)
     if experiment not in known:
         close = difflib.get_close_matches(experiment, known, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise UsageError(
-            f"there are no results of {experiment!r} in {out}{hint}; experiments there: {', '.join(known) or 'none'}"
-        )
+        hint = f"; did you mean {close[0]!r}?" if close else "."
+        there = ", ".join(known) or "none"
+        raise UsageError(f"there are no results of {experiment!r} in {out}{hint} Experiments there: {there}")
     folder = out / experiment
     return Results(folder, read_stored(folder))
 

@@ -9,6 +9,9 @@ from typing import Any
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.reporting.study import InitialDelay, Study, StudyTable
 
+#: Settings that are keys of every row, and their key path in a specification.
+ALWAYS = {"snr_db": "noise.snr_db"}
+
 
 @dataclass(frozen=True)
 class Row:
@@ -90,7 +93,7 @@ def experiment_rows(results: Results, table: int | str, fields: Mapping[str, str
     table : int or str
         What the rows carry as their table.
     fields : mapping of str to str, optional
-        Settings that become keys even where they are not swept, with their key path.
+        Settings that become keys even where they are not swept, with their key path; default is the SNR.
 
     Returns
     -------
@@ -99,7 +102,7 @@ def experiment_rows(results: Results, table: int | str, fields: Mapping[str, str
     """
     manifest = results.manifest
     down, across = _swept(manifest["data_cells"]), _swept(manifest["estimators"])
-    constant = {name: lookup(results.settings, path) for name, path in (fields or {}).items()}
+    constant = {name: lookup(results.settings, path) for name, path in (fields or ALWAYS).items()}
     groups = results.summaries(["cell", "estimator", *across, "start"])
     counted = {tuple(group[name] for name in ("cell", "estimator", *across, "start")): group for group in groups}
     rows = []

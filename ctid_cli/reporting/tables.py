@@ -106,7 +106,7 @@ def experiment_table(name: str, rows: Sequence[Row], success: str, style: str = 
     str
         Heading, tables and footnote.
     """
-    keys = dict.fromkeys(key for row in rows for key in row.settings)
+    keys = dict.fromkeys(key for row in rows for key, value in row.settings.items() if value is not None)
     down = [key for key in keys if not any(key in row.estimator_settings for row in rows)]
 
     def place(row: Row) -> tuple[Any, ...]:

@@ -1,6 +1,6 @@
 """Records, held signals, excitations, sampling schemes and noise."""
 
-from ctid_cli.signals.csv_file import read_columns, read_held_signal, read_record
+from ctid_cli.signals.csv_file import read_held_signal, read_record
 from ctid_cli.signals.excitation import (
     EXCITATIONS,
     TAPS,
@@ -13,6 +13,7 @@ from ctid_cli.signals.excitation import (
     maximal_length_sequence,
 )
 from ctid_cli.signals.held import COINCIDENCE, HeldSignal, Hold
+from ctid_cli.signals.measurement import Measurement, read_measurement
 from ctid_cli.signals.noise import NOISES, Noise, WhiteNoise
 from ctid_cli.signals.record import Record, regular_interval
 from ctid_cli.signals.sampling import SAMPLINGS, InputRecord, RegularSampling, Sampling, UniformIntervals
@@ -31,6 +32,7 @@ __all__ = [
     "Hold",
     "InputFile",
     "InputRecord",
+    "Measurement",
     "Multisine",
     "Noise",
     "Prbs",
@@ -42,8 +44,8 @@ __all__ = [
     "UniformIntervals",
     "WhiteNoise",
     "maximal_length_sequence",
-    "read_columns",
     "read_held_signal",
+    "read_measurement",
     "read_record",
     "regular_interval",
     "stream",

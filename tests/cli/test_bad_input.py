@@ -1,5 +1,6 @@
 """Whatever is wrong with what the user gives: one clear message, exit 2, nothing written or changed."""
 
+import re
 import shutil
 import sqlite3
 
@@ -57,6 +58,8 @@ def test_specification(case, tiny, refused):
     message = refused(change(tiny, old, new))
     for part in expected:
         assert part in message
+    # every line begins with its place, as editors and terminals expect it
+    assert all(re.match(rf"{re.escape(str(tiny))}:\d+:\d+: ", line) for line in message.splitlines())
 
 
 def test_fewer_samples_than_parameters(tiny, refused):

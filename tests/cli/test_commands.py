@@ -55,18 +55,34 @@ def test_validate_counts_the_work(ctid, tiny):
 def test_run_tells_what_it_does_and_what_to_do_next(ctid, tiny, tmp_path):
     out = tmp_path / "results"
     done = ctid("run", tiny, "--runs", 1, "--jobs", 1, "--set", "noise.snr_db=20", "--out", out)
-    assert "compiling numerical kernels" in done.stderr
+    assert "preparing numerical kernels (compiled the first time" in done.stderr
     assert "tiny: 3 estimates of 1 data set to compute" in done.stderr
     assert re.search(r"tiny: 1/1 data sets, .*/(s|min), 0 failed$", done.stderr, re.MULTILINE)
     assert "tiny: 3 of 3 estimates stored" in done.stdout
     assert f"next: ctid table tiny --out {out}" in done.stdout
     # another setting leaves the old estimates aside and says so
     done = ctid("run", tiny, "--runs", 1, "--jobs", 1, "--set", "noise.snr_db=10", "--out", out)
-    assert "3 of other settings left aside" in done.stderr
-    assert "3 stored estimates belong to earlier settings" in ctid("status", "tiny", "--out", out).stdout
+    assert "3 stored ones left aside" in done.stderr
+    assert "3 stored estimates are left aside: " in ctid("status", "tiny", "--out", out).stdout
     done = ctid("run", tiny, "--runs", 1, "--set", "noise.snr_db=30", "--dry-run", "--out", out)
     assert "would compute 3 estimates of 1 data set" in done.stdout
-    assert "6 of other settings left aside" in done.stdout
+    assert "6 stored ones left aside" in done.stdout
+
+
+def test_an_experiment_that_fails_wholly_does_not_stop_the_next_one(ctid, tiny, measured, tmp_path, monkeypatch):
+    from ctid_cli.experiment import engine
+
+    ran = []
+
+    def failing(plan, folder, **_):
+        ran.append(plan.experiment)
+        failed = 3 if plan.experiment == "tiny" else 0
+        return engine.RunSummary(plan.experiment, folder, 3, 0, 3, failed, 0, False, None, 1.0, None)
+
+    monkeypatch.setattr(engine, "run_experiment", failing)
+    done = ctid("run", tiny, measured, "--out", tmp_path / "results", code=4)
+    assert ran == ["tiny", "measured-tiny"]
+    assert done.stderr.endswith("ctid: tiny: all 3 estimates failed\n")
 
 
 def test_warnings_are_printed_and_the_run_goes_on(ctid, tiny, tmp_path):

@@ -192,6 +192,21 @@ def test_a_measured_record(ctid, done):
     assert "±" in text
 
 
+def test_a_record_is_found_again_from_another_folder(ctid, measured, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ctid("run", measured.name, "--jobs", 1, "--quiet", "--out", "here")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    ctid("run", f"../{measured.name}", "--jobs", 1, "--quiet", "--out", "there")
+    sealed = "measured-tiny/runs.h5"
+    assert (tmp_path / "here" / sealed).read_bytes() == (tmp_path / "elsewhere" / "there" / sealed).read_bytes()
+    (estimate,) = json.loads(ctid("export", "measured-tiny", "--format", "json", "--out", "../here").stdout)
+    again = ("show", estimate["id"], "--history", "--json", "--out", "../here")
+    assert json.loads(ctid(*again).stdout)["difference"] == 0
+    (tmp_path / "record.csv").unlink()
+    assert f"{tmp_path}/record.csv: there is no such file" in ctid(*again, code=2).stderr
+
+
 def test_schema_is_a_json_schema(ctid):
     schema = json.loads(ctid("schema").stdout)
     assert {"experiment", "estimators"} <= schema["properties"].keys()

@@ -37,6 +37,14 @@ def test_one_data_set_fills_its_cells(ctid, out, case, sampling, tables):
     assert max(map(len, text.split("Estimates that failed")[0].splitlines())) <= 100
 
 
+def test_a_table_names_the_specification_that_would_fill_it(ctid, tmp_path, monkeypatch):
+    command = "ctid run {}configs/useful_redundancy/case1_regular.yaml --out"
+    monkeypatch.chdir(ROOT)
+    assert command.format("") in ctid("table", "1", "--out", tmp_path).stdout
+    monkeypatch.chdir(tmp_path)
+    assert command.format(f"{ROOT}/") in ctid("table", "1", "--out", tmp_path).stdout
+
+
 def test_settings_that_differ_from_the_published_ones_are_noted(ctid, tmp_path):
     ctid(
         *("run", CONFIGS / "case1_regular.yaml", "--runs", 1, "--jobs", 1, "--quiet", "--out", tmp_path),

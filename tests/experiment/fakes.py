@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.errors import DataError
+from ctid_cli.experiment.manifest import Key
 
 
 class FakeStatus(Enum):
@@ -160,14 +161,6 @@ STARTS = {
 
 
 @dataclass(frozen=True)
-class FakeKey:
-    data_hash: str
-    replicate: int
-    estimator_hash: str
-    start: str
-
-
-@dataclass(frozen=True)
 class FakeTask:
     cell: int
     replicate: int
@@ -177,6 +170,7 @@ class FakeTask:
 class FakeSpec:
     content: dict[str, Any]
     text: str
+    folder: Path = Path()
 
     def canonical(self) -> dict[str, Any]:
         return self.content
@@ -219,10 +213,10 @@ class FakePlan:
     def tasks(self) -> list[FakeTask]:
         return [FakeTask(cell, replicate) for replicate in range(self.runs) for cell in range(len(self.data_cells))]
 
-    def keys(self, task: FakeTask) -> list[tuple[FakeKey, FakeEstimatorCell, FakeStartPoint]]:
+    def keys(self, task: FakeTask) -> list[tuple[Key, FakeEstimatorCell, FakeStartPoint]]:
         data_hash = self.data_cells[task.cell].hash
         return [
-            (FakeKey(data_hash, task.replicate, cell.hash, label), cell, STARTS[label])
+            (Key(data_hash, task.replicate, cell.hash, label), cell, STARTS[label])
             for cell in self.estimators
             for label in cell.starts
         ]

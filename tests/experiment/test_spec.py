@@ -341,7 +341,9 @@ def test_hashes_are_what_they_were():
 def test_a_measured_record(tmp_path):
     (tmp_path / "record.csv").write_text(RECORD)
     spec = load(tmp_path, MEASURED)
-    assert spec.data.file == (tmp_path / "record.csv").as_posix()
+    # as it was written: results must not depend on where the command was typed
+    assert (spec.data.file, spec.folder) == ("record.csv", tmp_path)
+    assert spec.data.source(spec.folder).file == (tmp_path / "record.csv").as_posix()
     assert len(spec.data.sha256) == 64
     assert spec.warnings == ()
 

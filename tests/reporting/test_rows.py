@@ -62,6 +62,15 @@ def test_a_setting_that_is_not_swept_still_finds_its_row(make_results, estimate)
     assert [(r.settings["snr_db"], r.initial_delay, r.n, r.published_percent) for r in rows] == [(15.0, 0.0, 1, 69.0)]
 
 
+def test_the_snr_is_a_key_of_an_experiment_that_does_not_sweep_it(make_results, estimate):
+    results = make_results({(15.0, "0.0"): [estimate(8.0)]}, snrs=(15.0,), swept=False)
+    assert {row.as_dict()["snr_db"] for row in experiment_rows(results, "e")} == {15.0}
+    results.settings["noise"]["snr_db"] = None
+    rows = experiment_rows(results, "e")
+    assert {row.as_dict()["snr_db"] for row in rows} == {None}
+    assert "SNR" not in experiment_table("e", rows, "percent of something")
+
+
 def test_values_beyond_the_published_ones_get_rows_without_a_published_value(make_results, estimate):
     results = make_results({(10.0, "0.0"): [estimate(8.0)]}, snrs=(10.0,))
     study = load_study()

@@ -1,0 +1,182 @@
+"""Confidence interval of the delay from the profile of the cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import f as f_distribution
+
+#: The rise of the cost two standard errors away is called quadratic if its square root is right to this share.
+QUADRATIC_TOLERANCE = 0.1
+
+
+@dataclass(frozen=True)
+class DelayInterval:
+    """Delays that the data do not reject.
+
+    Parameters
+    ----------
+    low, high : float
+        Ends [s].
+    open_low, open_high : bool
+        Whether the search bound was reached first: the delays beyond that end were not searched and may be as good.
+    """
+
+    low: float
+    high: float
+    open_low: bool
+    open_high: bool
+
+
+def profile_likelihood_interval(
+    squared_error_at: Callable[[float], float],
+    estimate: float,
+    squared_error: float,
+    count: int,
+    parameters: int,
+    bounds: tuple[float, float],
+    level: float = 0.95,
+    *,
+    inflation: float = 1.0,
+) -> DelayInterval:
+    r"""Interval of delays around the estimate whose best fits are not significantly worse.
+
+    Parameters
+    ----------
+    squared_error_at : callable
+        Sum of squared output errors [output unit^2] at a given delay [s], smallest over all other parameters. A value
+        that is not finite counts as significantly worse.
+    estimate : float
+        Delay with the smallest sum [s].
+    squared_error : float
+        The sum there [output unit^2].
+    count : int
+        Number of samples N.
+    parameters : int
+        Number of estimated parameters p, the delay included.
+    bounds : tuple of float
+        Smallest and largest delay to consider [s].
+    level : float, default 0.95
+        Confidence level [-].
+    inflation : float, default 1.0
+        Variance of the delay by the sandwich over that for white noise [-]: widens the interval for coloured noise.
+
+    Returns
+    -------
+    DelayInterval
+        The connected part that holds the estimate; its ends are NaN where ``N <= p`` or the inflation is not finite.
+
+    Raises
+    ------
+    ValueError
+        If the estimate lies outside the bounds.
+
+    Notes
+    -----
+    The delays with
+
+    .. math:: S(\tau) \le S_{\min} \Big(1 + c \, \frac{F_{1, N - p}(level)}{N - p}\Big),
+
+    c the inflation: the F version of ``N ln(S/S_min) <= chi2_1(level)``, which it becomes for large N. Where S is a
+    parabola, this is the t interval ``estimate +- t se`` exactly. Each end is bracketed by steps that grow from a small
+    one outward, then found by Brent's method to 1e-6 of its distance from the estimate. A second basin further away is
+    not looked for.
+    """
+    low, high = bounds
+    if not low <= estimate <= high:
+        raise ValueError(f"the estimate {estimate} lies outside the bounds {low} to {high}")
+    freedom = count - parameters
+    if freedom <= 0 or not np.isfinite(inflation) or not squared_error >= 0:
+        return DelayInterval(float("nan"), float("nan"), False, False)
+    allowed = inflation * float(f_distribution.ppf(level, 1, freedom)) / freedom
+
+    def excess(delay: float) -> float:
+        value = squared_error_at(delay)
+        if not np.isfinite(value):
+            return 1.0
+        if squared_error == 0:
+            return 1.0 if value > 0 else -1.0
+        # The square root is linear in the delay where the cost is quadratic: Brent's method then needs a step or two.
+        return float(np.sqrt(max(value / squared_error - 1.0, 0.0) / allowed)) - 1.0
+
+    first, at_low = _crossing(excess, estimate, low)
+    last, at_high = _crossing(excess, estimate, high)
+    return DelayInterval(first, last, at_low, at_high)
+
+
+def _crossing(excess: Callable[[float], float], start: float, bound: float) -> tuple[float, bool]:
+    """First point from the start towards the bound at which the excess becomes positive, or the bound and True."""
+    room = bound - start
+    if room == 0:
+        return bound, True
+    step = 1e-3
+    while excess(start + step * room) > 0:
+        step /= 4.0
+        if abs(step * room) <= 1e-12 * max(abs(start), abs(room)):
+            return start, False
+    inside = step
+    while inside < 1.0:
+        outside = min(1.6 * inside, 1.0)
+        if excess(start + outside * room) > 0:
+            share = float(brentq(lambda s: excess(start + s * room), inside, outside, xtol=1e-6 * inside, rtol=1e-6))
+            return start + share * room, False
+        inside = outside
+    return bound, True
+
+
+def quadratic_is_doubtful(
+    squared_error_at: Callable[[float], float],
+    estimate: float,
+    standard_error: float,
+    squared_error: float,
+    count: int,
+    parameters: int,
+    bounds: tuple[float, float],
+    *,
+    inflation: float = 1.0,
+) -> bool:
+    r"""Whether the interval ``estimate +- z se`` of the delay should not be trusted.
+
+    Parameters
+    ----------
+    squared_error_at : callable
+        Sum of squared output errors [output unit^2] at a given delay [s], smallest over all other parameters.
+    estimate : float
+        Delay with the smallest sum [s].
+    standard_error : float
+        Of the delay [s].
+    squared_error : float
+        The sum at the estimate [output unit^2].
+    count : int
+        Number of samples N.
+    parameters : int
+        Number of estimated parameters p, the delay included.
+    bounds : tuple of float
+        Smallest and largest delay to consider [s].
+    inflation : float, default 1.0
+        Variance of the delay by the sandwich over that for white noise [-], if ``standard_error`` is the sandwich's.
+
+    Returns
+    -------
+    bool
+        True where the standard error is not defined, two of them reach a bound, or the cost is not quadratic so far.
+
+    Notes
+    -----
+    A quadratic profile rises by ``c (2 se)^2 s^2 / se^2 = 4 c s^2`` at ``estimate +- 2 se``, ``s^2 = S_min / (N - p)``,
+    c the inflation. The interval is doubtful if the square root of the actual rise, which is the length of the
+    interval, differs from that by more than 10 % on either side: a 95 % interval would cover below 93 % or above 97 %.
+    """
+    if count <= parameters or not (np.isfinite(standard_error) and standard_error > 0 and inflation > 0):
+        return True
+    expected = 4.0 * inflation * squared_error / (count - parameters)
+    for delay in (estimate - 2 * standard_error, estimate + 2 * standard_error):
+        if not bounds[0] <= delay <= bounds[1]:
+            return True
+        rise = squared_error_at(delay) - squared_error
+        if not (rise > 0 and expected > 0 and abs(np.sqrt(rise / expected) - 1.0) <= QUADRATIC_TOLERANCE):
+            return True
+    return False

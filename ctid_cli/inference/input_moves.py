@@ -1,0 +1,112 @@
+"""How the input of a record moves: constant, in a few steps, between levels, or continuously."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.signals import HeldSignal, Record
+
+Array = NDArray[np.float64]
+
+#: An input with at most this many changes gives single answers in time and no averages over frequency.
+FEW_CHANGES = 3
+#: An input that takes at most this many values moves between levels.
+FEW_LEVELS = 20
+#: Spread of a measured level, and share of the samples that make one, both as a fraction of the whole.
+LEVEL_WIDTH = 0.1
+LEVEL_SHARE = 0.02
+
+
+@dataclass(frozen=True)
+class InputMoves:
+    """What the input does over the time of a record.
+
+    Parameters
+    ----------
+    kind : {"constant", "steps", "levels", "continuous"}
+        ``steps`` changes at most three times, ``levels`` more often, and keeps or returns to its values.
+    levels : tuple of float
+        The values it returns to [input unit], at most 20 of them; empty where there are more.
+    changes : ndarray, shape (n,)
+        Instants of the changes after the beginning of the record [s]; empty for a continuous input.
+    shortest_hold : float
+        Shortest time between two changes [s]; nan with fewer than two.
+    noisy : bool
+        Whether the values scatter about their levels, as those of a measured input do.
+    """
+
+    kind: Literal["constant", "steps", "levels", "continuous"]
+    levels: tuple[float, ...]
+    changes: Array
+    shortest_hold: float
+    noisy: bool = False
+
+
+def input_moves(record: Record) -> InputMoves:
+    """How the input moves between the first and the last output sample.
+
+    Parameters
+    ----------
+    record : Record
+        The record.
+
+    Returns
+    -------
+    InputMoves
+        Its kind, its levels and its changes.
+
+    Notes
+    -----
+    A measured input counts as moving between levels when nine samples in ten lie in a few narrow heaps; its
+    changes are then those between heaps. An input known at the instants of the output only is taken to change there.
+    """
+    t, u = _within(record.input, record.t[0], record.t[-1])
+    spread = float(np.ptp(u))
+    if spread <= 1e-9 * float(np.abs(u).max()):
+        return InputMoves("constant", (float(u[0]),), np.empty(0), np.nan)
+    values, exact = np.unique(u, return_inverse=True)
+    label = np.asarray(exact, dtype=np.int64)
+    heaps = _heaps(u, spread)
+    noisy = False
+    # Where the values flicker about their levels, the changes that count are those between levels.
+    if heaps is not None and _changes(heaps) < _changes(label) / 3:
+        label, noisy = heaps, True
+        values = np.array([float(np.median(u[label == k])) for k in np.unique(label)])
+    elif values.size > FEW_LEVELS and np.mean(u[1:] == u[:-1]) < 0.5:
+        return InputMoves("continuous", (), np.empty(0), np.nan)
+    changes = t[1:][label[1:] != label[:-1]]
+    hold = float(np.diff(changes).min()) if changes.size > 1 else np.nan
+    levels = tuple(float(value) for value in values) if values.size <= FEW_LEVELS else ()
+    return InputMoves("steps" if changes.size <= FEW_CHANGES else "levels", levels, changes, hold, noisy)
+
+
+def _within(signal: HeldSignal, first: float, last: float) -> tuple[Array, Array]:
+    """Breaks of the signal during the record, the value that it begins with included."""
+    inside = (signal.t > first) & (signal.t <= last)
+    return np.append(first, signal.t[inside]), np.append(signal.at([first]), signal.values[inside])
+
+
+def _changes(label: NDArray[np.int64]) -> int:
+    return int(np.count_nonzero(label[1:] != label[:-1]))
+
+
+def _heaps(u: Array, spread: float) -> NDArray[np.int64] | None:
+    """Number of the heap that each value lies in or came from; None where the values do not lie in narrow heaps."""
+    bins = np.minimum((50 * (u - u.min()) / spread).astype(np.int64), 49)
+    # A heap may straddle the border of two bins, so sparse neighbours of a full bin belong to it.
+    counts = np.bincount(bins, minlength=50) / u.size
+    full = counts >= LEVEL_SHARE
+    heap_of_bin = np.where(full, np.cumsum(full & ~np.append(False, full[:-1])), 0)
+    heap = heap_of_bin[bins]
+    if heap.max() < 2 or np.mean(heap > 0) < 0.9 - LEVEL_WIDTH:
+        return None
+    widths = [np.ptp(u[heap == k]) for k in range(1, int(heap.max()) + 1)]
+    if max(widths) > 2 * LEVEL_WIDTH * spread or len(widths) > FEW_LEVELS:
+        return None
+    known = np.flatnonzero(heap > 0)
+    last = known[np.maximum(np.searchsorted(known, np.arange(u.size), side="right") - 1, 0)]
+    return np.asarray(heap[last], dtype=np.int64)

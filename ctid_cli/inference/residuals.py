@@ -1,0 +1,262 @@
+"""Tests of the residuals: whether they are white, and whether they still depend on the input."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.signal import correlate
+from scipy.stats import chi2, norm
+
+from ctid_cli.inference.noise_model import fit_noise_model
+
+Array = NDArray[np.float64]
+
+#: Directions of the lagged inputs with less than this share of the largest variance are repetitions of the others.
+NEGLIGIBLE_VARIANCE = 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualTests:
+    """Correlations of the residuals with themselves and with the input, with what they mean.
+
+    Parameters
+    ----------
+    count : int
+        Number of samples N.
+    lags : int
+        Largest lag L [samples].
+    level : float
+        Confidence level of both tests and of the bands [-].
+    autocorrelation : ndarray, shape (L,)
+        Of the residuals, at the lags 1 … L [-].
+    autocorrelation_band : float
+        A white sequence stays within plus or minus this at each single lag, with probability ``level`` [-].
+    whiteness_statistic : float
+        Ljung and Box's portmanteau statistic [-].
+    whiteness_degrees_of_freedom : int
+        Of its chi-square distribution.
+    whiteness_p_value : float
+        Probability of a larger statistic if the residuals are white [-]; NaN where it cannot be computed.
+    white : bool
+        Whether whiteness is not rejected at ``level``.
+    cross_correlation : ndarray, shape (2 L + 1,)
+        Between ``residual(t)`` and ``input(t - k)``, k = -L … L [-].
+    cross_correlation_band : float
+        Residuals of their colour that are independent of the input stay within plus or minus this at each single
+        lag, with probability ``level`` [-].
+    cross_statistic : float
+        Portmanteau statistic of all these lags [-].
+    cross_degrees_of_freedom : int
+        Of its chi-square distribution.
+    cross_p_value : float
+        Probability of a larger statistic if the residuals are independent of the input [-]; NaN where it cannot be
+        computed.
+    uncorrelated : bool
+        Whether independence is not rejected at ``level``.
+    sentence : str
+        The outcome in words.
+    """
+
+    count: int
+    lags: int
+    level: float
+    autocorrelation: Array = field(repr=False)
+    autocorrelation_band: float
+    whiteness_statistic: float
+    whiteness_degrees_of_freedom: int
+    whiteness_p_value: float
+    white: bool
+    cross_correlation: Array = field(repr=False)
+    cross_correlation_band: float
+    cross_statistic: float
+    cross_degrees_of_freedom: int
+    cross_p_value: float
+    uncorrelated: bool
+    sentence: str
+
+
+def residual_tests(
+    residuals: ArrayLike,
+    inputs: ArrayLike,
+    *,
+    level: float = 0.95,
+    lags: int | None = None,
+    sensitivities: ArrayLike | None = None,
+) -> ResidualTests:
+    r"""Test the residuals of an output-error model for whiteness and for correlation with the input.
+
+    Parameters
+    ----------
+    residuals : array_like, shape (N,)
+        Measured minus simulated output [output unit], missing samples left out.
+    inputs : array_like, shape (N,)
+        Input at the same instants [input unit]. Pass the delayed input ``u(t - delay)`` for a model with a delay: only
+        then do the lags 0 … L lie where its response begins.
+    level : float, default 0.95
+        Confidence level [-]; a sound model fails each test with probability ``1 - level``.
+    lags : int, optional
+        Largest lag L [samples]; ``min(25, N // 4)`` by default.
+    sensitivities : array_like, shape (N, p), optional
+        Sensitivities psi of the simulated output to the parameters estimated from this record [output unit per
+        parameter unit], in the order of the residuals. Without them the model counts as known beforehand: the level
+        is then not right for its own estimation data.
+
+    Returns
+    -------
+    ResidualTests
+        The outcome.
+
+    Raises
+    ------
+    ValueError
+        If the arrays differ in length, or the lags do not fit into the record.
+
+    Notes
+    -----
+    Whiteness: ``r(k) = sum e(t) e(t-k) / sum e(t)^2``, not centred, so that a constant error is not white; the band is
+    ``z / sqrt(N)``; ``Q = N (N + 2) sum_k r(k)^2 / (N - k)`` is chi-square with L degrees of freedom [1]_. The
+    parameters of an output-error model take none away, as its sensitivities do not depend on the noise.
+
+    Cross-correlation: ``c(k) = sum_t e(t) u(t-k) / (N s_e s_u)`` of the centred sequences. If e is independent of u,
+
+    .. math:: N \operatorname{cov}(c(k), c(l)) = \sum_m \rho_e(m) \rho_u(m + k - l),
+
+    on whose diagonal P, the sum of the products of both autocorrelations, the band ``z sqrt(P/N)`` is built [2]_. The
+    autocorrelation of e is that of an autoregressive model of the residuals. The statistic is ``c' cov(c)^+ c``, with
+    the exact sums over this input, and its degrees of freedom are the rank of ``cov(c)``. Estimation removes from the
+    residuals a combination of psi; with ``sensitivities`` the lagged inputs are replaced by what is left of them
+    beside psi, on which that has no effect.
+
+    Samples are taken as equally spaced; with an irregular clock the lags count samples.
+
+    References
+    ----------
+    .. [1] G. M. Ljung and G. E. P. Box, On a measure of lack of fit in time series models, Biometrika 65 (1978)
+       297-303. https://doi.org/10.1093/biomet/65.2.297
+    .. [2] L. Ljung, *System Identification: Theory for the User*, 2nd ed., Prentice Hall, 1999, section 16.6.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> u = rng.choice([-1.0, 1.0], 500)
+    >>> noise = rng.standard_normal(500)
+    >>> tests = residual_tests(noise, u)
+    >>> tests.white, tests.uncorrelated
+    (True, True)
+
+    A model that misses a part of the response:
+
+    >>> residual_tests(noise + 0.5 * np.roll(u, 3), u).uncorrelated
+    False
+    """
+    e = np.asarray(residuals, dtype=float)
+    u = np.asarray(inputs, dtype=float)
+    if e.ndim != 1 or e.shape != u.shape:
+        raise ValueError("residuals and inputs must be one-dimensional and of the same length")
+    count = e.size
+    if lags is None:
+        lags = min(25, count // 4)
+    if not 1 <= lags < count:
+        raise ValueError(f"lags must be between 1 and the number of samples less one, {count - 1}; got {lags}")
+    quantile = float(norm.ppf(0.5 + level / 2))
+
+    power = float(e @ e)
+    autocorrelation = np.full(lags, np.nan)
+    statistic = whiteness_p = float("nan")
+    if power > 0:
+        autocorrelation = np.array([e[k:] @ e[:-k] for k in range(1, lags + 1)]) / power
+        statistic = float(count * (count + 2) * np.sum(autocorrelation**2 / (count - np.arange(1, lags + 1))))
+        whiteness_p = float(chi2.sf(statistic, lags))
+
+    psi = None if sensitivities is None else np.asarray(sensitivities, dtype=float)
+    cross, band, cross_statistic, freedom = _cross_correlation(e, u, lags, quantile, psi)
+    cross_p = float(chi2.sf(cross_statistic, freedom)) if freedom else float("nan")
+
+    # No evidence is no rejection; the sentence says that there was nothing to test.
+    white = not whiteness_p < 1 - level
+    uncorrelated = not cross_p < 1 - level
+    return ResidualTests(
+        count=count,
+        lags=lags,
+        level=level,
+        autocorrelation=autocorrelation,
+        autocorrelation_band=quantile / float(np.sqrt(count)),
+        whiteness_statistic=statistic,
+        whiteness_degrees_of_freedom=lags,
+        whiteness_p_value=whiteness_p,
+        white=white,
+        cross_correlation=cross,
+        cross_correlation_band=band,
+        cross_statistic=cross_statistic,
+        cross_degrees_of_freedom=freedom,
+        cross_p_value=cross_p,
+        uncorrelated=uncorrelated,
+        sentence=_sentence(level, whiteness_p, white, cross_p, uncorrelated, cross),
+    )
+
+
+def _cross_correlation(
+    e: Array, u: Array, lags: int, quantile: float, psi: Array | None
+) -> tuple[Array, float, float, int]:
+    """Cross-correlation at -lags … lags, its band, the portmanteau statistic and the rank of its covariance."""
+    e, u = e - e.mean(), u - u.mean()
+    count = e.size
+    # A constant leaves rounding behind when its mean is taken off.
+    scale = float(np.sqrt((e @ e) * (u @ u)))
+    undefined = np.full(2 * lags + 1, np.nan), float("nan"), float("nan"), 0
+    if not scale > 0 or np.ptp(u) <= 1e-12 * np.abs(u).max(initial=0.0):
+        return undefined
+    shifted = np.zeros((count, 2 * lags + 1))
+    for column, k in enumerate(range(-lags, lags + 1)):
+        if k >= 0:
+            shifted[k:, column] = u[: count - k]
+        else:
+            shifted[:k, column] = u[-k:]
+    cross = shifted.T @ e / scale
+
+    noise = fit_noise_model(e)
+    colour = noise.autocovariance(count) / noise.first_autocovariances[0]
+    input_autocorrelation = correlate(u, u, method="fft")[count - 1 :] / float(u @ u)
+    # sum over all lags, both signs
+    spread = 2.0 * float(colour @ input_autocorrelation) - 1.0
+    band = quantile * float(np.sqrt(max(spread, 0.0) / count))
+
+    # Beside the constant and psi, whatever was subtracted from the noise along them does not count.
+    used = np.ones((count, 1)) if psi is None else np.column_stack((np.ones(count), psi))
+    used = used / np.maximum(np.linalg.norm(used, axis=0), np.finfo(float).tiny)
+    shifted = shifted - used @ np.linalg.lstsq(used, shifted, rcond=None)[0]
+    covariance = shifted.T @ noise.covariance_times(shifted) * count / max(count - used.shape[1], 1)
+    values, vectors = np.linalg.eigh(covariance)
+    kept = values > NEGLIGIBLE_VARIANCE * values[-1]
+    statistic = float(np.sum((vectors[:, kept].T @ (shifted.T @ e)) ** 2 / values[kept]))
+    return cross, band, statistic, int(kept.sum())
+
+
+def _sentence(level: float, whiteness_p: float, white: bool, cross_p: float, uncorrelated: bool, cross: Array) -> str:
+    percent = f"{100 * level:g} %"
+    if np.isnan(whiteness_p):
+        return "The residuals are exactly zero: there is nothing to test."
+    if white:
+        first = f"The residuals pass as white at the {percent} level (p = {whiteness_p:.2g})."
+    else:
+        first = (
+            f"The residuals are not white at the {percent} level (p = {whiteness_p:.2g}): the noise is coloured, so "
+            "that standard errors for white noise do not hold."
+        )
+    if np.isnan(cross_p):
+        second = "Their correlation with the input cannot be tested: the input does not vary enough."
+    elif uncorrelated:
+        second = f"They are not correlated with the input (p = {cross_p:.2g}): no missing dynamics are seen."
+    elif int(np.argmax(np.abs(cross))) < cross.size // 2:
+        second = (
+            f"They are correlated with the input (p = {cross_p:.2g}), most with later inputs: there is feedback from "
+            "the output to the input, the delay is too long, or the clocks of input and output differ."
+        )
+    else:
+        second = (
+            f"They are correlated with the input (p = {cross_p:.2g}): the model misses a part of the response; "
+            "more poles or zeros, another delay, or a nonlinear model may be needed."
+        )
+    return f"{first} {second}"

@@ -1,0 +1,168 @@
+"""Columns from MATLAB files that hold plain arrays."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.signals.csv_file import require_file
+from ctid_cli.signals.table import Table
+
+#: What MATLAB calls arrays of real numbers.
+NUMERIC = ("double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
+
+
+def read_mat_table(path: str | os.PathLike[str]) -> Table:
+    """Variables of a MATLAB file.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A ``.mat`` file of any version from 4 to 7.3.
+
+    Returns
+    -------
+    Table
+        The variables that are arrays, and the fields of structs as ``struct.field``. Objects such as ``iddata`` are
+        stored in a form that only MATLAB reads; where there are any, the hint of the table says how to export them.
+
+    Raises
+    ------
+    DataError
+        If the file is missing or is no MATLAB file. A variable that is not a vector of real numbers is refused when
+        it is asked for.
+
+    Notes
+    -----
+    MATLAB writes version 7.3 as HDF5, where strings, structs and objects are told apart by attributes.
+    """
+    import scipy.io
+
+    file = require_file(path)
+    if Path(path).stat().st_size == 0:
+        raise DataError(f"{file}: the file is empty; {_how_to_save(path)}")
+    try:
+        with warnings.catch_warnings():
+            # Two objects in one file share a placeholder name, which is no concern of the arrays beside them.
+            warnings.simplefilter("ignore")
+            content = scipy.io.loadmat(path)
+        arrays, objects = _flat(content)
+    except NotImplementedError:
+        arrays, objects = _read_hdf5(path, file)
+    except OSError as error:
+        raise DataError(f"{file}: cannot be read: {error.strerror or error}") from None
+    except Exception:  # the reader meets damaged files with whatever its parser stumbles over
+        raise DataError(f"{file}: this is not a MATLAB file, or a damaged one; {_how_to_save(path)}") from None
+    hint = " ".join(_how_to_export(path, name, kind) for name, kind in objects.items())
+    if not arrays:
+        raise DataError(f"{file}: {hint}" if hint else f"{file}: the file holds no arrays; {_how_to_save(path)}")
+
+    def convert(name: str) -> NDArray[np.float64]:
+        return _vector(file, name, arrays[name])
+
+    return Table(file, tuple(arrays), convert, lines=None, noun="variable", hint=hint)
+
+
+def _flat(content: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Arrays by name, and the classes of objects by name."""
+    from scipy.io.matlab import MatlabObject, MatlabOpaque
+
+    arrays: dict[str, Any] = {}
+    objects: dict[str, str] = {}
+
+    def visit(name: str, value: Any) -> None:
+        if isinstance(value, MatlabOpaque):
+            objects[_text(value.flat[0]["s0"]) or name] = _text(value.flat[0]["s2"])
+        elif isinstance(value, MatlabObject):
+            objects[name] = str(value.classname)
+        elif isinstance(value, np.ndarray) and value.dtype.names is not None and value.size == 1:
+            for field in value.dtype.names:
+                visit(f"{name}.{field}", value.flat[0][field])
+        else:
+            arrays[name] = value
+
+    for name, value in content.items():
+        if not name.startswith("__"):
+            visit(name, value)
+    return arrays, objects
+
+
+def _read_hdf5(path: str | os.PathLike[str], file: str) -> tuple[dict[str, Any], dict[str, str]]:
+    import h5py
+
+    arrays: dict[str, Any] = {}
+    objects: dict[str, str] = {}
+
+    def members(group: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+        for name, item in group.items():
+            if not name.startswith("#"):  # MATLAB's own store of what objects and cells refer to
+                yield prefix + name, item
+
+    def visit(name: str, item: Any) -> None:
+        kind = _text(item.attrs.get("MATLAB_class", b"double"))
+        if "MATLAB_object_decode" in item.attrs:
+            objects[name] = kind
+        elif isinstance(item, h5py.Group):
+            for field, part in members(item, f"{name}."):
+                visit(field, part)
+        elif "MATLAB_empty" in item.attrs:
+            arrays[name] = np.empty((0, 0))
+        else:
+            arrays[name] = item[()] if kind in NUMERIC else np.array(kind, dtype=object)
+
+    try:
+        with h5py.File(path, "r") as store:
+            for name, item in members(store, ""):
+                visit(name, item)
+    except OSError:
+        raise DataError(f"{file}: this is not a MATLAB file, or a damaged one; {_how_to_save(path)}") from None
+    return arrays, objects
+
+
+def _vector(file: str, name: str, value: Any) -> NDArray[np.float64]:
+    array = np.asarray(value)
+    if hasattr(value, "toarray"):
+        array = value.toarray()  # a sparse matrix
+    if array.dtype.kind not in "biufc":
+        raise DataError(f"{file}: variable {name!r} does not hold numbers; time, input and output must be vectors")
+    if array.size == 0:
+        raise DataError(f"{file}: variable {name!r} is empty")
+    if array.size != max(array.shape, default=1):
+        shape = "x".join(str(n) for n in array.shape)
+        raise DataError(
+            f"{file}: variable {name!r} is a {shape} array; time, input and output must each be one vector, "
+            "so save the columns you mean as vectors of their own"
+        )
+    if array.dtype.kind == "c":
+        if np.any(array.imag != 0):
+            raise DataError(f"{file}: variable {name!r} holds complex numbers")
+        array = array.real
+    return np.array(array, dtype=float).reshape(-1)
+
+
+def _how_to_save(path: str | os.PathLike[str]) -> str:
+    return f"in MATLAB, save plain vectors: save('{Path(path).stem}.mat', 't', 'u', 'y', '-v7')"
+
+
+def _how_to_export(path: str | os.PathLike[str], name: str, kind: str) -> str:
+    if kind != "iddata":
+        return f"{name!r} is a MATLAB {kind} object, which only MATLAB can read; {_how_to_save(path)}"
+    target = f"{Path(path).stem}_plain.mat"
+    return (
+        f"{name!r} is a MATLAB iddata object, which only MATLAB can read; there, write its arrays to {target} with\n"
+        f"  s = struct('t', {name}.SamplingInstants, 'u', {name}.InputData, 'y', {name}.OutputData); "
+        f"save('{target}', '-struct', 's', '-v7')"
+    )
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        value = value.item() if value.size == 1 else ""
+    return value.decode("latin1") if isinstance(value, bytes) else str(value)

@@ -1,0 +1,285 @@
+"""A measured record as it is: which columns it comes from, their units, and what was assumed in reading it."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NoReturn, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.signals.checks import require_choice
+from ctid_cli.signals.csv_file import read_csv_table
+from ctid_cli.signals.held import HeldSignal, Hold
+from ctid_cli.signals.mat_file import read_mat_table
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.table import Table, closest, listing, refuse_missing, refuse_nameless, wrong_separator
+
+Role = Literal["time", "input", "output"]
+
+ROLES: tuple[Role, ...] = get_args(Role)
+
+#: Names by which a column is recognised when nobody says which one it is, the most telling first; case is ignored.
+USUAL_NAMES: dict[Role, tuple[str, ...]] = {
+    "time": ("t", "time", "times", "seconds", "timestamp", "samplinginstants", "ts", "sampletime"),
+    "input": ("u", "input", "inputs", "inputdata"),
+    "output": ("y", "output", "outputs", "outputdata"),
+}
+#: How the names of files that hold text end.
+TEXT_EXTENSIONS = (".csv", ".txt", ".dat", "")
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A record and what is known of the file that it comes from.
+
+    Parameters
+    ----------
+    record : Record
+        Times, output and held input, in the units of the file.
+    time_unit, input_unit, output_unit : str or None
+        Units as labels; None where the file names none. Nothing is ever converted: a record in ms gives delays in ms
+        and coefficients in powers of 1/ms.
+    time, input, output : str
+        The columns that were read, as they stand in the file.
+    notes : tuple of str
+        What was assumed, one sentence each.
+    """
+
+    record: Record
+    time_unit: str | None
+    input_unit: str | None
+    output_unit: str | None
+    time: str
+    input: str
+    output: str
+    notes: tuple[str, ...] = ()
+
+
+def read_measurement(
+    path: str | os.PathLike[str],
+    *,
+    time: str | None = None,
+    input: str | None = None,
+    output: str | None = None,
+    hold: Hold = "zoh",
+    start: float | None = None,
+    stop: float | None = None,
+    units: Mapping[Role, str] | None = None,
+) -> Measurement:
+    """Record from a comma-separated or MATLAB file, with its units.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A text file (``.csv``, ``.txt``, ``.dat``) whose first line names its comma-separated columns, or a ``.mat``
+        file with vectors, which may be fields of a struct.
+    time, input, output : str, optional
+        Columns, by the whole text of their header or without its unit. One that is not given is recognised by its
+        usual name (``t``, ``time``; ``u``, ``input``; ``y``, ``output``), and in a text file of three columns by
+        its position; the notes say so. A MATLAB file may give the sampling interval in the place of the times.
+    hold : {"zoh", "foh"}, default "zoh"
+        How the input behaves between its samples.
+    start, stop : float, optional
+        First and last instant that is used [time unit], in the record's own time, which is not shifted.
+    units : mapping of str to str, optional
+        Units of ``time``, ``input`` and ``output`` in place of those in the header, such as ``t [ms]`` or ``u (V)``.
+
+    Returns
+    -------
+    Measurement
+        The record; a missing output sample (an empty field or NaN) is masked.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be used; the message names the file, the line and what to do.
+
+    Notes
+    -----
+    A window is read as if the file had no other lines: the input before it is not used, since the state that it
+    left behind is estimated with the model where that is asked for.
+    """
+    require_choice("hold", hold, get_args(Hold))
+    extension = Path(path).suffix.lower()
+    if extension == ".mat":
+        table = read_mat_table(path)
+    elif extension in TEXT_EXTENSIONS:
+        table = read_csv_table(path)
+    else:
+        raise DataError(
+            f"{os.fspath(path)}: files ending in {extension} are not read; export the record as comma-separated text "
+            "(.csv) whose first line names the columns, or from MATLAB as vectors (.mat)"
+        )
+    asked: dict[Role, str | None] = {"time": time, "input": input, "output": output}
+    columns, notes = _choose(table, asked)
+    unit = {role: (units or {}).get(role) or _split(name)[1] for role, name in columns.items()}
+
+    y = table.numbers(columns["output"])
+    u = table.numbers(columns["input"])
+    t = table.numbers(columns["time"])
+    label = unit["time"] or "s"
+    if t.size == 1 and y.size > 1:
+        t, note = _clock(table, columns["time"], float(t[0]), y.size, label)
+        notes.append(note)
+    for role, values in (("time", t), ("input", u)):
+        if values.size != y.size:
+            raise DataError(
+                f"{table.file}: {role} {columns[_role(role)]!r} has {values.size} values and "
+                f"output {columns['output']!r} has {y.size}; they must be equally many"
+            )
+    table.check_times(columns["time"], t, label)
+    first, last = _window(table, t, start, stop, label)
+    if last - first < t.size:
+        notes.append(
+            f"Only the {last - first} of {t.size} samples from {t[first]:.6g} to {t[last - 1]:.6g} {label} are used; "
+            "the input before them is not."
+        )
+    t = t[first:last]
+    u = table.check_input(columns["input"], u[first:last], first)
+    y = table.check_output(columns["output"], y[first:last], first)
+    record = Record(t, y, HeldSignal(t, u, hold), name=table.file)
+    return Measurement(
+        record,
+        unit["time"],
+        unit["input"],
+        unit["output"],
+        columns["time"],
+        columns["input"],
+        columns["output"],
+        tuple(notes),
+    )
+
+
+def _choose(table: Table, asked: Mapping[Role, str | None]) -> tuple[dict[Role, str], list[str]]:
+    """The column of each role, and what was assumed."""
+    chosen: dict[Role, str] = {}
+    for role in ROLES:
+        if (wanted := asked[role]) is not None:
+            chosen[role] = _named(table, wanted)
+    refuse_nameless(table)
+    by_position: list[Role] = []
+    for role in ROLES:
+        if role not in chosen:
+            found = _recognised(table, role, chosen)
+            if found is None:
+                by_position.append(role)
+            else:
+                chosen[role] = found
+    notes = []
+    if by_position:
+        if table.lines is None or len(table.names) != 3 or len(set(chosen.values())) + len(by_position) != 3:
+            _refuse_unrecognised(table, by_position[0])
+        left = [name for name in table.names if name not in chosen.values()]
+        chosen.update(zip(by_position, left, strict=True))
+        taken = [f"{chosen[role]!r} as the {role}" for role in by_position]
+        notes.append(f"Columns were taken by their position: {_enumerated(taken)}.")
+    for one, other in (("time", "input"), ("time", "output"), ("input", "output")):
+        if chosen[_role(one)] == chosen[_role(other)]:
+            raise DataError(f"{table.head}: {chosen[_role(one)]!r} cannot be both the {one} and the {other}")
+    unused = [name for name in table.names if name not in chosen.values()]
+    if unused and table.lines is not None:
+        verb = "is" if len(unused) == 1 else "are"
+        notes.append(
+            f"Column{'s' if len(unused) > 1 else ''} {_enumerated([repr(name) for name in unused])} {verb} not used."
+        )
+    return chosen, notes
+
+
+def _role(name: str) -> Role:
+    return next(role for role in ROLES if role == name)
+
+
+def _named(table: Table, wanted: str) -> str:
+    """The column whose header is ``wanted``, with or without its unit."""
+    if wanted in table.names:
+        return wanted
+    matching = [name for name in table.names if _split(name)[0] == wanted]
+    if len(matching) != 1:
+        refuse_missing(table, wanted)
+    return matching[0]
+
+
+def _recognised(table: Table, role: Role, chosen: Mapping[Role, str]) -> str | None:
+    """The column with the most telling of the usual names of a role."""
+    homes = {name.rpartition(".")[0] for name in chosen.values()}
+    candidates = [name for name in table.names if name not in chosen.values()]
+    for usual in USUAL_NAMES[role]:
+        matching = [name for name in candidates if _leaf(table, name).lower() == usual]
+        # What lies in the same struct as the columns that are known belongs to them.
+        close = [name for name in matching if table.lines is None and name.rpartition(".")[0] in homes]
+        matching = close or matching
+        if len(matching) > 1:
+            raise DataError(
+                f"{table.head}: {_enumerated([repr(name) for name in matching])} may all be the {role}; "
+                f"say which one (option {role})"
+            )
+        if matching:
+            return matching[0]
+    return None
+
+
+def _leaf(table: Table, name: str) -> str:
+    return _split(name)[0] if table.lines is not None else name.rpartition(".")[2]
+
+
+def _split(header: str) -> tuple[str, str | None]:
+    """Name and unit of a header such as ``t [s]``."""
+    found = re.fullmatch(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))", header)
+    if found is None:
+        return header, None
+    name, square, round_ = found.groups()
+    return name, (square or round_ or "").strip() or None
+
+
+def _refuse_unrecognised(table: Table, role: Role) -> NoReturn:
+    if separated := wrong_separator(table):
+        raise DataError(f"{table.head}: the file has one column. {separated}")
+    if len(table.names) < len(ROLES) and not table.hint:
+        raise DataError(
+            f"{table.head}: {listing(table)} and nothing else; a record needs a time, an input and an output"
+        )
+    usual = " or ".join(map(repr, USUAL_NAMES[role][:2]))
+    message = (
+        f"{table.head}: no {table.noun} is called {usual}; {listing(table)}. "
+        f"Say which one is the {role} (option {role})"
+    )
+    if close := next((match for name in USUAL_NAMES[role][1:] if (match := closest(name, table.names))), None):
+        message += f"; did you mean {close!r}?"
+    if table.hint:
+        message += f". {table.hint}"
+    raise DataError(message)
+
+
+def _clock(table: Table, name: str, interval: float, samples: int, unit: str) -> tuple[NDArray[np.float64], str]:
+    if not (np.isfinite(interval) and interval > 0):
+        raise DataError(f"{table.file}: {name!r} is {interval:g}; a sampling interval must be a positive number")
+    note = f"{name!r} is one number: it was taken as the sampling interval, {interval:g} {unit}, from 0 {unit} on."
+    return interval * np.arange(samples, dtype=float), note
+
+
+def _window(
+    table: Table, t: NDArray[np.float64], start: float | None, stop: float | None, unit: str
+) -> tuple[int, int]:
+    """First row of the window and the first after it."""
+    low = -np.inf if start is None else start
+    high = np.inf if stop is None else stop
+    if not low < high:
+        raise DataError(f"{table.file}: the window from {low:g} to {high:g} {unit} ends before it begins")
+    first = int(np.searchsorted(t, low, side="left"))
+    last = int(np.searchsorted(t, high, side="right"))
+    if first >= last:
+        raise DataError(
+            f"{table.file}: no sample lies between {low:g} and {high:g} {unit}; "
+            f"the record runs from {t[0]:.9g} to {t[-1]:.9g} {unit}"
+        )
+    return first, last
+
+
+def _enumerated(words: Sequence[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
