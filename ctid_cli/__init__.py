@@ -6,11 +6,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ctid_cli.estimators import DelayProfile as DelayProfile
     from ctid_cli.estimators import Lowpass as Lowpass
     from ctid_cli.estimators import Srivc as Srivc
     from ctid_cli.estimators import Start as Start
     from ctid_cli.estimators import Svf as Svf
     from ctid_cli.estimators import TdSrivc as TdSrivc
+    from ctid_cli.estimators import identify as identify
     from ctid_cli.filtering import simulate as simulate
     from ctid_cli.inference import Fit as Fit
     from ctid_cli.inference import Status as Status
@@ -25,6 +27,7 @@ __version__ = "0.1.0"
 
 # Imported when first asked for: `ctid --help` must not wait for numpy and numba.
 _HOME = {
+    "DelayProfile": "estimators",
     "Fit": "inference",
     "HeldSignal": "signals",
     "Lowpass": "estimators",
@@ -37,6 +40,7 @@ _HOME = {
     "TransferFunction": "models",
     "cramer_rao_bound": "inference",
     "fit_percent": "inference",
+    "identify": "estimators",
     "read_record": "signals",
     "simulate": "filtering",
 }

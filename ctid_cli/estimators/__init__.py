@@ -4,6 +4,8 @@ from typing import Any
 
 from ctid_cli.estimators.common import Start
 from ctid_cli.estimators.compilation import compile_kernels
+from ctid_cli.estimators.identification import Identification, identify
+from ctid_cli.estimators.measured import DelayProfile, MeasuredFit
 from ctid_cli.estimators.srivc import Srivc
 from ctid_cli.estimators.svf import Svf
 from ctid_cli.estimators.td_srivc import TdSrivc
@@ -12,4 +14,16 @@ from ctid_cli.filtering.lowpass import Lowpass
 #: Every estimator by the name that a specification gives it.
 ESTIMATORS: dict[str, type[Any]] = {estimator.kind: estimator for estimator in (Svf, Srivc, TdSrivc)}
 
-__all__ = ["ESTIMATORS", "Lowpass", "Srivc", "Start", "Svf", "TdSrivc", "compile_kernels"]
+__all__ = [
+    "ESTIMATORS",
+    "DelayProfile",
+    "Identification",
+    "Lowpass",
+    "MeasuredFit",
+    "Srivc",
+    "Start",
+    "Svf",
+    "TdSrivc",
+    "compile_kernels",
+    "identify",
+]

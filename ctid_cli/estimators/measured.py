@@ -16,9 +16,9 @@ from ctid_cli.estimators.problems import CoefficientProblem, least_squares_start
 from ctid_cli.estimators.refined_iv import Equations, Iterated, iterate
 from ctid_cli.estimators.td_srivc import bound_in_the_way
 from ctid_cli.filtering.bank import FilterData, filter_data
+from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
 from ctid_cli.inference.fit import Fit, IterationRecord
-from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
 from ctid_cli.models.transfer_function import TransferFunction
@@ -34,7 +34,9 @@ Offset = Literal["none", "remove", "estimate"]
 MINIMA = 3
 #: SRIVC iterations and tolerance at each delay of the grid.
 GRID_ITERATIONS = 15
-GRID_TOLERANCE = 1e-3
+GRID_TOLERANCE = 1e-2
+#: Trials of a step on the grid. Far from the true delay a pole may run to infinity, where no number of them helps.
+GRID_HALVINGS = 4
 #: Delays on the grid: between these numbers, whatever the bandwidth asks for.
 FEWEST_DELAYS = 24
 MOST_DELAYS = 2000
@@ -193,6 +195,28 @@ class MeasuredFit(Fit):
 
     Parameters
     ----------
+    model : TransferFunction
+        The estimate: monic denominator, descending powers, delay [s].
+    parameter_names : tuple of str
+        Names of the free parameters, in the order of ``covariance``.
+    covariance : ndarray, shape (p, p)
+        Asymptotic covariance for white residuals; NaN where it is not defined.
+    status : Status
+        How the iterations ended.
+    cost : float
+        Mean squared output error over the used samples [output unit^2].
+    fit_percent : float
+        ``100 (1 - ||y - x|| / ||y - mean y||)`` over the used samples of all experiments, means by experiment [%].
+    r2 : float
+        ``1 - ||y - x||^2 / ||y - mean y||^2`` [-].
+    count : int
+        Number of samples used.
+    iterations : int
+        Iterations of the refinement.
+    condition_number : float
+        Of the scaled ``sum psi psi'`` [-].
+    history : tuple of IterationRecord
+        The accepted iterations of the refinement.
     theta : ndarray, shape (p,)
         All free parameters, in the order of ``parameter_names``.
     initial_states : tuple of ndarray
@@ -226,6 +250,50 @@ class MeasuredFit(Fit):
         return dict(zip(self.parameter_names, self.theta.tolist(), strict=True))
 
 
+class _CoefficientSearch(CoefficientProblem):
+    """Coefficients at a fixed delay by Gauss-Newton: a direction of descent also where the delay is wrong."""
+
+    def __init__(self, data: FilterData, structure: Structure, delay: float) -> None:
+        super().__init__(data, structure, delay)
+        self.structure = structure  # with its index tables, which would cost as much as a short record
+
+    def equations(self, theta: Array) -> Equations | None:
+        moments = self.moments(theta)
+        if moments is None:
+            return None
+        structure, n = self.structure, self.structure.poles
+        hessian = structure.hessian(moments)
+        return Equations(
+            hessian,
+            structure.instrument_error(moments),
+            hessian,
+            structure.squared_error(moments),
+            structure.output_power(moments, theta[n:]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class AppliedModel:
+    """A given model on records that it need not have been estimated from.
+
+    Parameters
+    ----------
+    residuals : tuple of ndarray
+        Output errors at the used samples of each experiment [output unit].
+    used : tuple of ndarray of bool
+        Which samples of each record were used, shape (N,).
+    initial_states : tuple of ndarray
+        Coefficients of C for each experiment; empty arrays where the state was not estimated.
+    offsets : tuple of float
+        Output offset of each experiment [output unit].
+    """
+
+    residuals: tuple[Array, ...] = field(repr=False)
+    used: tuple[NDArray[np.bool_], ...] = field(repr=False)
+    initial_states: tuple[Array, ...]
+    offsets: tuple[float, ...]
+
+
 class PreparedProfile:
     """Records checked and laid out for :class:`DelayProfile`.
 
@@ -243,6 +311,7 @@ class PreparedProfile:
         self.options = options
         low, high = options.delay_bounds
         self.structure = Structure(options.poles, options.zeros, delay=low < high)
+        self.coefficients = Structure(options.poles, options.zeros)
         self.layout = Layout(
             self.structure, len(records), options.initial_state == "estimate", options.offset == "estimate"
         )
@@ -259,8 +328,13 @@ class PreparedProfile:
                 )
             if low < high and np.ptp(record.input.values) == 0.0:
                 raise DataError(
-                    f"{where}the input is constant ({record.input.values[0]:g}) over the whole record: it holds no event "
-                    "from which a delay could be read; give a known delay, and an initial state to be estimated"
+                    f"{where}the input is constant ({record.input.values[0]:g}) over the whole record: it holds no "
+                    "event from which a delay could be read; give a known delay, and an initial state to be estimated"
+                )
+            if np.ptp(record.input.values) == 0.0 and options.initial_state != "estimate":
+                raise DataError(
+                    f"{where}the input is constant ({record.input.values[0]:g}) over the whole record; only with an "
+                    "estimated initial state (initial_state 'estimate') can a model be read from the free response"
                 )
             centred, u0, y0 = _without_means(record) if options.offset == "remove" else (record, 0.0, 0.0)
             self.records.append(centred)
@@ -314,7 +388,9 @@ class PreparedProfile:
         if np.isnan(costs).all():
             raise DataError(Status.SINGULAR.value)
         if options.initial_state == "periodic":
-            self._make_periodic(candidates[int(np.nanargmin(costs))])
+            candidate = candidates[int(np.nanargmin(costs))]
+            assert candidate is not None
+            self._make_periodic(candidate.theta[: options.poles])
         problem = OutputErrorProblem(self.data, self.layout, low, (low, high))
         history: list[IterationRecord] = []
         best: Iterated | None = None
@@ -326,6 +402,106 @@ class PreparedProfile:
             raise DataError(Status.SINGULAR.value)
         profile = Profile(delays, costs / problem.count, self.bandwidth) if delays.size > 1 else None
         return self._finish(problem, best, history, profile)
+
+    def squared_error_at(self, theta: Array, delay: float) -> float:
+        """Least sum of squared output errors at a given delay, in the basin of an estimate.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (p,)
+            The estimate of these records, its delay free.
+        delay : float
+            Delay [s].
+
+        Returns
+        -------
+        float
+            The sum, minimised over all other parameters [output unit^2]; NaN where it is not finite.
+        """
+        layout = replace(self.layout, structure=replace(self.structure, delay=False))
+        problem = OutputErrorProblem(self.data, layout, delay)
+        result = self._iterated(problem, np.delete(theta, self.structure.size - 1))
+        return float("nan") if result is None else result.equations.squared_error
+
+    def squared_error_with(self, fit: MeasuredFit, *, initial_state: bool = False, offset: bool = False) -> float:
+        """Least sum of squared output errors if an initial state or an offset were estimated too.
+
+        Parameters
+        ----------
+        fit : MeasuredFit
+            The estimate of these records, from which the iterations start.
+        initial_state : bool, default False
+            Whether to add the initial state of each experiment.
+        offset : bool, default False
+            Whether to add the output offset of each experiment.
+
+        Returns
+        -------
+        float
+            The sum [output unit^2]; NaN where the data do not determine so many parameters.
+        """
+        layout = replace(
+            self.layout,
+            initial_state=self.layout.initial_state or initial_state,
+            offset=self.layout.offset or offset,
+        )
+        problem = OutputErrorProblem(self.data, layout, fit.model.delay, self.options.delay_bounds)
+        shared = np.concatenate((fit.theta[: self.structure.size], np.zeros(layout.size - self.structure.size)))
+        theta = problem.with_best_own(shared)
+        result = None if theta is None else self._iterated(problem, theta)
+        return float("nan") if result is None else result.equations.squared_error
+
+    def errors_of(self, model: TransferFunction) -> AppliedModel:
+        """Errors of a given model on these records, each with its own best initial state and offset.
+
+        Parameters
+        ----------
+        model : TransferFunction
+            The model, with the numbers of poles and zeros of the options, or fewer zeros.
+
+        Returns
+        -------
+        AppliedModel
+            Output errors, states and offsets.
+
+        Raises
+        ------
+        DataError
+            If the records do not determine the initial state and the offset.
+        """
+        if self.options.initial_state == "periodic":
+            self._make_periodic(model.denominator[1:])
+        layout = replace(self.layout, structure=replace(self.structure, delay=False))
+        problem = OutputErrorProblem(self.data, layout, model.delay)
+        b = np.concatenate((np.zeros(self.structure.zeros + 1 - model.numerator.size), model.numerator))
+        own = np.zeros(layout.size - layout.structure.size)
+        theta = problem.with_best_own(np.concatenate((model.denominator[1:], b, own)))
+        parts = None if theta is None else problem.sensitivities(theta)
+        if theta is None or parts is None:
+            raise DataError("the record does not determine the initial state and the offset of a given model")
+        estimated = [problem.own(theta, k) for k in range(len(self.data))]
+        return AppliedModel(
+            residuals=tuple(eps for _, eps in parts),
+            used=self._used(problem),
+            initial_states=tuple(state for state, _ in estimated),
+            offsets=tuple(y0 + c for y0, (_, c) in zip(self.offsets, estimated, strict=True)),
+        )
+
+    def _iterated(self, problem: OutputErrorProblem, theta: Array) -> Iterated | None:
+        """Gauss-Newton with the options' tolerance."""
+        return iterate(
+            problem,
+            theta,
+            max_iterations=self.options.max_iterations,
+            tolerance=self.options.tolerance,
+            variant="guarded",
+        )
+
+    def _used(self, problem: OutputErrorProblem) -> tuple[NDArray[np.bool_], ...]:
+        """Which samples of each record enter the sums, without those of periods put before it."""
+        return tuple(
+            data.use[data.use.size - record.t.size :] for data, record in zip(problem.data, self.records, strict=True)
+        )
 
     def _grid(self) -> Array:
         """Delays of the search: the spacing is at most a quarter period of the output's bandwidth."""
@@ -389,14 +565,14 @@ class PreparedProfile:
     def _least_squares(self, delay: float, cutoffs: Sequence[float]) -> list[Array]:
         """Denominators (a_1 … a_n) of least-squares starts; the output's mean is left to the offset."""
         structure = Structure(self.structure.poles, min(self.structure.zeros, self.structure.poles - 1))
-        starts = []
+        starts: list[Array] = []
         for cutoff in cutoffs:
             theta = least_squares_start(self._centred[0], structure, delay, cutoff * self.bandwidth)
             if theta is not None:
                 starts.append(theta[: structure.poles])
         if not starts:
             # A system of the right speed, whatever the data say: a start for Gauss-Newton.
-            starts.append(np.poly(np.full(structure.poles, -0.5 * self.bandwidth))[1:])
+            starts.append(np.asarray(np.poly(np.full(structure.poles, -0.5 * self.bandwidth))[1:], dtype=float))
         return starts
 
     @property
@@ -408,17 +584,25 @@ class PreparedProfile:
 
     def _coefficients(self, delay: float, a: Array) -> Iterated | None:
         """Minimise the cost at a fixed delay."""
-        fixed = Structure(self.structure.poles, self.structure.zeros)
+        fixed = self.coefficients
+        problem: CoefficientProblem | OutputErrorProblem
+        start: Array | None
         if self.layout.own == 0 and len(self.data) == 1 and fixed.zeros < fixed.poles:
-            problem = CoefficientProblem(self.data[0], fixed, delay)
-            theta = refit_numerator(self.data[0], fixed, np.concatenate((a, np.zeros(fixed.zeros + 1))), delay)
-            return iterate(problem, theta, max_iterations=GRID_ITERATIONS, tolerance=GRID_TOLERANCE, variant="guarded")
-        layout = replace(self.layout, structure=fixed)
-        joint = OutputErrorProblem(self.data, layout, delay)
-        start = joint.linear_start(np.concatenate(([1.0], a)), delay)
+            problem = _CoefficientSearch(self.data[0], fixed, delay)
+            start = refit_numerator(self.data[0], fixed, np.concatenate((a, np.zeros(fixed.zeros + 1))), delay)
+        else:
+            problem = OutputErrorProblem(self.data, replace(self.layout, structure=fixed), delay)
+            start = problem.linear_start(np.concatenate(([1.0], a)), delay)
         if start is None:
             return None
-        return iterate(joint, start, max_iterations=GRID_ITERATIONS, tolerance=GRID_TOLERANCE, variant="guarded")
+        return iterate(
+            problem,
+            start,
+            max_iterations=GRID_ITERATIONS,
+            tolerance=GRID_TOLERANCE,
+            variant="guarded",
+            halvings=GRID_HALVINGS,
+        )
 
     def _refine(
         self, problem: OutputErrorProblem, a: Array, delay: float
@@ -463,13 +647,7 @@ class PreparedProfile:
         fixed = OutputErrorProblem(
             self.data, replace(self.layout, structure=replace(self.structure, delay=False)), bound
         )
-        there = iterate(
-            fixed,
-            np.delete(result.theta, place),
-            max_iterations=self.options.max_iterations,
-            tolerance=self.options.tolerance,
-            variant="guarded",
-        )
+        there = self._iterated(fixed, np.delete(result.theta, place))
         if there is None or there.equations.squared_error > equations.squared_error:
             return result
         theta = np.insert(there.theta, place, bound)
@@ -477,10 +655,9 @@ class PreparedProfile:
         assert at_bound is not None
         return Iterated(theta, at_bound, Status.DELAY_AT_BOUND, result.iterations + there.iterations)
 
-    def _make_periodic(self, candidate: Iterated | None) -> None:
-        """Put enough periods before each record for the free response of the model found so far to be gone."""
-        assert candidate is not None
-        model = TransferFunction([1.0], np.concatenate(([1.0], candidate.theta[: self.options.poles])))
+    def _make_periodic(self, a: Array) -> None:
+        """Put enough periods before each record for the free response of a model (a_1 … a_n) to be gone."""
+        model = TransferFunction([1.0], np.concatenate(([1.0], a)))
         slowest = float(np.abs(model.poles.real).min())
         for k, record in enumerate(self.records):
             period = _period(record)
@@ -524,10 +701,7 @@ class PreparedProfile:
             profile=profile,
             residuals=tuple(eps for _, eps in parts),
             sensitivities=tuple(psi for psi, _ in parts),
-            used=tuple(
-                data.use[data.use.size - record.t.size :]
-                for data, record in zip(problem.data, self.records, strict=True)
-            ),
+            used=self._used(problem),
         )
 
 
@@ -566,4 +740,4 @@ def _repeated(record: Record, periods: int) -> Record:
     return Record(t, y, HeldSignal(tu, u, signal.hold), name=record.name)
 
 
-__all__ = ["DelayProfile", "MeasuredFit", "PreparedProfile", "Profile"]
+__all__ = ["AppliedModel", "DelayProfile", "MeasuredFit", "PreparedProfile", "Profile"]

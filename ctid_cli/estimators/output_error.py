@@ -281,6 +281,28 @@ class OutputErrorProblem:
         if self.structure.delay:
             theta[self.structure.size - 1] = delay
             free[self.structure.size - 1] = False
+        return self._solved(theta, free)
+
+    def with_best_own(self, theta: Array) -> Array | None:
+        """Best initial states and offsets for a given model, by linear least squares.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (p,)
+            Parameters; those of the experiments are not looked at.
+
+        Returns
+        -------
+        ndarray, shape (p,) or None
+            Parameters; None if the data do not determine them.
+        """
+        free = np.arange(self.layout.size) >= self.structure.size
+        return self._solved(np.where(free, 0.0, theta), free)
+
+    def _solved(self, theta: Array, free: NDArray[np.bool_]) -> Array | None:
+        """Minimise over parameters that are zero and that the output depends on linearly."""
+        if not free.any():
+            return theta
         equations = self.equations(theta)
         if equations is None:
             return None

@@ -261,7 +261,7 @@ def least_squares_start(data: FilterData, structure: Structure, delay: float, sv
     filter_denominator = np.asarray(np.poly(np.full(n, -svf_cutoff)), dtype=np.float64)
     # With a zero numerator the "output error" row is y itself.
     moments = second_moments(data, filter_denominator, np.zeros(1), delay)
-    rows = Structure(n, m).regressor_rows
+    rows = structure.regressor_rows[: n + m + 1]
     signs = np.ones(n + m + 1)
     signs[:n] = -1.0
     gram = moments[np.ix_(rows, rows)] * np.outer(signs, signs)
@@ -299,7 +299,7 @@ def refit_numerator(data: FilterData, structure: Structure, theta: Array, delay:
     """
     n, m = structure.poles, structure.zeros
     moments = second_moments(data, np.concatenate(([1.0], theta[:n])), np.zeros(1), delay)
-    rows = Structure(n, m).sensitivity_rows[n:]
+    rows = structure.sensitivity_rows[n : n + m + 1]
     gram = moments[np.ix_(rows, rows)]
     diagonal = np.diag(gram)
     numerator = scaled_solve(gram, moments[rows, 3 * n + 1], diagonal, diagonal)

@@ -148,6 +148,7 @@ def iterate(
     max_iterations: int,
     tolerance: float,
     variant: Variant,
+    halvings: int = HALVINGS,
     on_step: Callable[[Array, Equations], None] | None = None,
 ) -> Iterated | None:
     """Run the refined instrumental variable iteration.
@@ -165,6 +166,8 @@ def iterate(
     variant : {"plain", "guarded"}
         ``plain`` takes every full step. ``guarded`` accepts a step only if the output-error cost falls enough, halves
         it otherwise, and falls back on the Gauss-Newton direction, along which the cost must fall.
+    halvings : int, default 12
+        Trials of the guarded variant before a direction is given up.
     on_step : callable, optional
         Called with the parameters and their second moments at the start and after every accepted step.
 
@@ -187,18 +190,20 @@ def iterate(
             np.diag(current.hessian),
             np.abs(np.diag(current.instrument_regressor)),
         )
-        newton = step is None and variant == "guarded"
+        # Where instruments are regressors the step is Gauss-Newton's already: a second trial would repeat the first.
+        same = step is not None and current.instrument_regressor is current.hessian
+        newton = same and variant == "guarded"
         if step is None and variant == "plain":
             return Iterated(theta, current, Status.SINGULAR, iteration)
         accepted = None
         if step is not None:
-            accepted = _take(problem, theta, current, step, variant)
-        if accepted is None and variant == "guarded":
+            accepted = _take(problem, theta, current, step, variant, halvings)
+        if accepted is None and variant == "guarded" and not same:
             newton = True
             step = gauss_newton_step(current)
             if step is None:
                 return Iterated(theta, current, Status.SINGULAR, iteration)
-            accepted = _take(problem, theta, current, step, variant)
+            accepted = _take(problem, theta, current, step, variant, halvings)
         assert step is not None
         change = relative_change(current, step)
         if accepted is None:
@@ -259,12 +264,12 @@ def relative_change(equations: Equations, step: Array) -> float:
 
 
 def _take(
-    problem: Problem, theta: Array, current: Equations, step: Array, variant: Variant
+    problem: Problem, theta: Array, current: Equations, step: Array, variant: Variant, halvings: int
 ) -> tuple[Array, Equations, float] | None:
     """The first acceptable fraction of a step, or None."""
     fraction = 1.0
     slope = max(float(step @ current.instrument_error), 0.0)
-    for _ in range(HALVINGS if variant == "guarded" else 1):
+    for _ in range(halvings if variant == "guarded" else 1):
         candidate = problem.admissible(theta + fraction * step)
         trial = problem.equations(candidate)
         if trial is not None and np.isfinite(trial.squared_error):

@@ -8,24 +8,28 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ctid_cli.inference.faults import outliers
 from ctid_cli.inference.input_moves import InputMoves, input_moves
-from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.signals import Record
 
 Array = NDArray[np.float64]
 
 #: Share of the power of the answer that its band holds.
 SHARE = 0.95
-#: Bands of the spectra are at least this many bins of the whole record wide, and at most this many per octave.
-BINS = 8
+#: Bands of the spectra are at least this many bins of the whole record wide, and at most so many per octave. Narrow
+#: ones resolve resonances, wide ones average over more noise; those that show more of the answer count.
+BINS = (8, 24)
 BANDS_PER_OCTAVE = 6
 #: Neighbouring bins under a Hann window are not independent: n of them count as n over this number.
 HANN_OVERLAP = 1.9
 #: Chance of a coherence like this without any answer, for a band that is sure by itself and for one of a pair.
 SURE, LIKELY = 1e-6, 1e-2
 #: Where the input has less than this fraction of its greatest density, the gain is no more than noise.
-EXCITED = 1e-4
+EXCITED = 1e-3
 #: Input and output are compared at this many alignments in time.
 ALIGNMENTS = 3
+#: Longer pauses between output samples, in median intervals, are not interpolated.
+HOLE = 3.0
 #: Records are analysed on at most this many grid points.
 LONGEST_GRID = 1 << 19
 #: Bandwidth times time constant of a first-order system for 95 % of the power of its impulse response.
@@ -49,12 +53,15 @@ class Grid:
     u : ndarray, shape (n,)
         Input [input unit].
     y : ndarray, shape (n,)
-        Output [output unit], interpolated across missing samples.
+        Output [output unit], interpolated; zero in holes.
+    known : ndarray of bool, shape (n,)
+        False in holes: where no output was measured for more than three intervals.
     """
 
     interval: float
     u: Array
     y: Array
+    known: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -166,9 +173,10 @@ def analyse_answer(record: Record, moves: InputMoves | None = None) -> Answer:
     if moves.kind == "steps":
         return _after_a_step(record, moves, nothing)
     alignments = _peaks(np.abs(_cross_correlation(grid.u, grid.y, grid.u.size // 2)[grid.u.size // 2 :]))
-    spectra = [_Spectra.of(grid, shift) for shift in alignments]
+    spectra = [_Spectra.of(grid, shift, bins) for shift in alignments for bins in BINS]
     best = max(spectra, key=lambda s: s.explained)
-    # Whatever alignment shows the answer at the highest frequency is right there.
+    # Of those that show the answer at all, whatever alignment shows it at the highest frequency is right there.
+    spectra = [s for s in spectra if s.explained > 0.5 * best.explained]
     bandwidth = max((b for s in spectra for b in s.bandwidths), default=math.nan)
     found = math.isfinite(bandwidth)
     delay, period, before = _first_answer(grid, best.bandwidths if found else (nyquist, nyquist), moves)
@@ -198,30 +206,22 @@ def regular_grid(record: Record) -> Grid:
 
     Notes
     -----
-    The output is joined by straight lines between its samples. Of an input that changes between the grid points
-    the mean over one interval about each of them is taken, so that its edges keep their place on average.
+    Outliers are left out. The output is joined by straight lines between its samples. An input that changes between
+    the grid points changes late, by half an interval on average.
     """
     t, y = record.t[record.valid], record.y[record.valid]
+    # One wild sample is worth hundreds of others in a sum of squares.
+    wild = outliers(y)
+    t, y = np.delete(t, wild), np.delete(y, wild)
     interval = float(np.median(np.diff(record.t))) if record.n_samples > 1 else 1.0
     n = int(min(max(math.floor(record.duration / interval + 1e-6) + 1, 2), LONGEST_GRID))
     times = record.t[0] + interval * np.arange(n)
-    if record.input_on_grid:
-        u = record.input.values[:n]
-    else:
-        edges = np.append(times - interval / 2, times[-1] + interval / 2)
-        u = np.diff(_integral(record.input, edges)) / interval
-    return Grid(interval, _detrended(u), _detrended(np.interp(times, t, y)))
-
-
-def _integral(signal: HeldSignal, times: Array) -> Array:
-    """Integral of a held signal from its first break on; before that it has its first value."""
-    t, v = signal.t, signal.values
-    steps = np.diff(t)
-    slopes = np.append(np.diff(v) / steps if signal.hold == "foh" else np.zeros(t.size - 1), 0.0)
-    total = np.concatenate(([0.0], np.cumsum(steps * (v[:-1] + slopes[:-1] * steps / 2))))
-    k = np.clip(np.searchsorted(t, times, side="right") - 1, 0, t.size - 1)
-    since = times - t[k]
-    return np.asarray(total[k] + since * (v[k] + np.where(since > 0, slopes[k], 0.0) * since / 2), dtype=float)
+    after = np.searchsorted(t, times)
+    span = t[np.minimum(after, t.size - 1)] - t[np.maximum(after - 1, 0)]
+    known = span <= HOLE * interval
+    # Rounding must not take a grid point to just before the break that it coincides with.
+    u = record.input.at(times + 1e-6 * interval)
+    return Grid(interval, _detrended(u), np.where(known, _detrended(np.interp(times, t, y)), 0.0), known)
 
 
 def _detrended(x: Array) -> Array:
@@ -245,8 +245,8 @@ class _Spectra:
     answer: Array
 
     @classmethod
-    def of(cls, grid: Grid, shift: int) -> _Spectra:
-        """Spectra of the input and of the output ``shift`` samples later.
+    def of(cls, grid: Grid, shift: int, narrowest: int) -> _Spectra:
+        """Spectra of the input and of the output ``shift`` samples later, in bands of ``narrowest`` bins or more.
 
         Without the shift, a delay of a good part of the averaging time would hide the coherence.
         """
@@ -257,9 +257,9 @@ class _Spectra:
         Y = np.fft.rfft(window * (y - y.mean()))
         bins = [1]
         while bins[-1] < U.size:
-            bins.append(max(bins[-1] + BINS, int(bins[-1] * 2 ** (1 / BANDS_PER_OCTAVE))))
+            bins.append(max(bins[-1] + narrowest, int(bins[-1] * 2 ** (1 / BANDS_PER_OCTAVE))))
         # What is left at the end is too narrow to average over, so the last band takes it in.
-        bins = [*[k for k in bins if k <= U.size - BINS], U.size]
+        bins = [*[k for k in bins if k <= U.size - narrowest or k == 1], U.size]
         edges = np.array(bins)
         first = edges[:-1]
         uu = np.add.reduceat(np.abs(U) ** 2, first)
@@ -350,6 +350,10 @@ def _first_answer(
     hold = 1 if math.isnan(moves.shortest_hold) else math.ceil(moves.shortest_hold / h)
     whitener = _whitener(grid.u, max(2, min(max(64, 3 * hold), n // 8, 2048)))
     u, y = _filtered(grid.u, whitener), _filtered(grid.y, whitener)
+    if not grid.known.all():
+        # The filter smears the edge of a hole over its length; most of it lies within a few samples.
+        holes = np.convolve(~grid.known, np.ones(8), mode="full")[:n] > 0
+        y = np.where(holes, 0.0, y)
     power = math.sqrt(float(np.mean(u**2) * np.mean(y**2)))
     if power == 0.0:
         return None, math.nan, math.nan
@@ -361,7 +365,7 @@ def _first_answer(
     r = _cross_correlation(u, y, longest) / power
     reference = slice(longest, None) if period else slice(None, longest)
     slowest = math.pi / (4 * min(bandwidths) * h)
-    found: _Picture | None = None
+    pictures: list[_Picture] = []
     for scale in (0.25, 0.5, 1.0, 2.0, 4.0):
         width = 2 * (int(scale * slowest) // 2) + 1
         if width > max(longest // 4, 1):
@@ -369,13 +373,14 @@ def _first_answer(
         z = np.convolve(r, np.full(width, 1.0 / width), mode="same")
         quiet = _quietest(z[reference]) if period else _deviation(z[reference])
         if quiet > 0:
-            picture = _Picture(z / quiet, longest, width)
-            if found is None or picture.strength > found.strength:
-                found = picture
-    if found is None:
+            pictures.append(_Picture(z / quiet, longest, width))
+    if not pictures:
         return None, period * h or math.nan, math.nan
+    # The sharpest picture that is clear enough, else the clearest.
+    clearest = max(pictures, key=lambda picture: picture.strength)
+    found = next((p for p in pictures if p.strength > max(2 * CERTAIN, 0.5 * clearest.strength)), clearest)
     before = math.nan if period else found.before
-    hint = found.onset(math.ceil(slowest), h) if found.strength >= CERTAIN else None
+    hint = found.onset(4 * math.ceil(slowest), h) if found.strength >= CERTAIN else None
     return hint, period * h or math.nan, before
 
 
@@ -411,10 +416,11 @@ class _Picture:
         """Where the answer that holds the peak begins, which no pause of ``pause`` lags interrupts."""
         peak = int(np.argmax(self.after))
         sure = _first_of_run(self.after > max(CERTAIN, CERTAIN_FRACTION * self.strength), peak, pause)
-        begin = _first_of_run(self.after > DOUBTFUL, sure, max(2, pause // 2))
+        begin = _first_of_run(self.after > DOUBTFUL, sure, max(2, pause // 4))
         # A smooth answer rises out of the noise late, the later the slower it is.
-        margin = max(self.width / 2 + 1, 0.25 * (peak - begin))
-        return DelayHint(max(begin - margin, 0.0) * interval, (sure + 1) * interval, self.strength)
+        margin = max(self.width / 2 + 1, 0.5 * (peak - begin))
+        late = (sure + self.width // 2 + 1) * interval
+        return DelayHint(max(begin - margin, 0.0) * interval, late, self.strength)
 
 
 def _first_of_run(above: NDArray[np.bool_], k: int, pause: int) -> int:
@@ -447,8 +453,9 @@ def _after_a_step(record: Record, moves: InputMoves, nothing: Answer) -> Answer:
         return nothing
     first = int(onset[0])
     doubled = first + int(np.argmax(moved[first:] > 2 * threshold))
-    # Traced back along a parabola through the two: the slowest beginning that is usual.
-    early = max(0.0, float(t[first] - (t[doubled] - t[first]) / (math.sqrt(2) - 1)))
+    # Traced back along a parabola through the two, twice as far: the level at rest is not known exactly.
+    before = float(t[first - 1]) if first else 0.0
+    early = max(0.0, float(before - 2 * (t[doubled] - t[first]) / (math.sqrt(2) - 1)))
     settled = float(np.median(moved[-max(3, moved.size // 20) :]))
     rise = float(t[int(np.argmax(moved > 0.632 * settled))] - t[first])
     nyquist = nothing.bandwidth

@@ -97,10 +97,18 @@ def _changes(label: NDArray[np.int64]) -> int:
 def _heaps(u: Array, spread: float) -> NDArray[np.int64] | None:
     """Number of the heap that each value lies in or came from; None where the values do not lie in narrow heaps."""
     bins = np.minimum((50 * (u - u.min()) / spread).astype(np.int64), 49)
-    # A heap may straddle the border of two bins, so sparse neighbours of a full bin belong to it.
-    counts = np.bincount(bins, minlength=50) / u.size
-    full = counts >= LEVEL_SHARE
-    heap_of_bin = np.where(full, np.cumsum(full & ~np.append(False, full[:-1])), 0)
+    full = np.flatnonzero(np.bincount(bins, minlength=50) >= LEVEL_SHARE * u.size)
+    if not full.size:
+        return None
+    # Coarsely quantised values leave bins empty between them: full bins less than three apart make one heap.
+    number = 1 + np.cumsum(np.diff(full, prepend=full[0]) > 2)
+    heap_of_bin = np.zeros(50, dtype=np.int64)
+    for first, last, k in zip(full[:-1], full[1:], number[1:], strict=True):
+        heap_of_bin[first : last + 1] = np.where(last - first > 2, 0, k)
+    heap_of_bin[full] = number
+    for _ in range(3):  # the rare values at the skirts of a heap
+        beside = np.maximum(np.append(0, heap_of_bin[:-1]), np.append(heap_of_bin[1:], 0))
+        heap_of_bin = np.where(heap_of_bin == 0, beside, heap_of_bin)
     heap = heap_of_bin[bins]
     if heap.max() < 2 or np.mean(heap > 0) < 0.9 - LEVEL_WIDTH:
         return None

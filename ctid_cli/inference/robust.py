@@ -63,21 +63,22 @@ def sandwich_covariance(
 
     Examples
     --------
-    One parameter, the mean of five samples:
+    The mean of 4000 samples ``v(k) = 0.9 v(k-1) + e(k)`` has the standard error ``1/(1 - 0.9)/sqrt(4000) = 0.158``:
 
-    >>> eps = np.array([1.0, -1.0, 0.5, -1.5, 1.0])
-    >>> round(sandwich_covariance(np.ones((5, 1)), eps, regular=True).item(), 4)
-    0.0578
+    >>> v = lfilter([1.0], [1.0, -0.9], np.random.default_rng(1).standard_normal(4000))
+    >>> covariance = sandwich_covariance(np.ones((4000, 1)), v - v.mean(), regular=True)
+    >>> bool(0.13 < covariance.item() ** 0.5 < 0.19)
+    True
     """
     sensitivities = [psi] if isinstance(psi, np.ndarray) else list(psi)
     errors = [residuals] if isinstance(residuals, np.ndarray) else list(residuals)
     if [block.shape[0] for block in sensitivities] != [block.size for block in errors]:
         raise ValueError("psi and residuals must have one block per experiment, of the same number of samples")
-    present = [np.isfinite(block) for block in errors]
-    sensitivities = [block[use] for block, use in zip(sensitivities, present, strict=True)]
-    errors = [block[use] for block, use in zip(errors, present, strict=True)]
-    count = sum(block.size for block in errors)
     size = sensitivities[0].shape[1]
+    present = [np.isfinite(block) for block in errors]
+    sensitivities = [block[use] for block, use in zip(sensitivities, present, strict=True) if use.any()]
+    errors = [block[use] for block, use in zip(errors, present, strict=True) if use.any()]
+    count = sum(block.size for block in errors)
     undefined = np.full((size, size), np.nan)
 
     hessian = sum((block.T @ block for block in sensitivities), np.zeros((size, size)))
@@ -89,7 +90,7 @@ def sandwich_covariance(
     if regular:
         noise = fit_noise_model(errors)
         sigma = np.zeros((size, size))
-        for block in filter(len, sensitivities):
+        for block in sensitivities:
             sigma += block.T @ noise.covariance_times(block)
         variance = float(noise.first_autocovariances[0])
         left = 1.0 - float(np.trace(inverse @ sigma)) / (count * variance) if variance > 0 else 1.0

@@ -32,6 +32,80 @@ ESTIMATE_KEYS = (
 NORMAL_95 = 1.959963984540054
 
 
+#: Seconds in a unit of time, by the labels that files use.
+SECONDS = {
+    **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
+    **dict.fromkeys(("ms", "millisecond", "milliseconds"), 1e-3),
+    **dict.fromkeys(("us", "µs", "μs", "microsecond", "microseconds"), 1e-6),
+    **dict.fromkeys(("ns", "nanosecond", "nanoseconds"), 1e-9),
+    **dict.fromkeys(("min", "minute", "minutes"), 60.0),
+    **dict.fromkeys(("h", "hr", "hour", "hours"), 3600.0),
+    **dict.fromkeys(("d", "day", "days"), 86400.0),
+}
+
+
+@dataclass(frozen=True)
+class Units:
+    """Units of a record, and those that follow for the parameters of a model.
+
+    Parameters
+    ----------
+    time : str, default "s"
+        Unit of time.
+    input, output : str
+        Units of input and output; ``in`` and ``out`` where they are not known.
+
+    Examples
+    --------
+    >>> units = Units("min", "%", "degC")
+    >>> units.of("b0", poles=2, zeros=1), units.of("a2", poles=2, zeros=1), units.gain
+    ('degC/%/min', '1/min^2', 'degC/%')
+    """
+
+    time: str = "s"
+    input: str = "in"
+    output: str = "out"
+
+    @property
+    def gain(self) -> str:
+        """Unit of a static gain."""
+        return f"{self.output}/{self.input}"
+
+    @property
+    def seconds(self) -> float | None:
+        """Seconds in the unit of time; None where the label is not known."""
+        return SECONDS.get(self.time)
+
+    def of(self, name: str, poles: int, zeros: int) -> str:
+        """Unit of a parameter.
+
+        Parameters
+        ----------
+        name : str
+            ``b0 …``, ``a1 …``, ``x1 …`` (initial state), ``offset``, ``delay``; a number of the experiment may follow.
+        poles, zeros : int
+            Degrees of the model.
+
+        Returns
+        -------
+        str
+            The unit.
+        """
+        if name == "delay":
+            return self.time
+        if name.startswith("offset"):
+            return self.output
+        kind, k = name[0], int(name[1:].split("_")[0])
+        if kind == "a":
+            return self._over_time("1", k)
+        return self._over_time(self.gain, poles - zeros + k) if kind == "b" else self._over_time(self.output, k - 1)
+
+    def _over_time(self, unit: str, power: int) -> str:
+        if power == 0:
+            return unit
+        return f"{unit}/{self.time}" if power == 1 else f"{unit}/{self.time}^{power}"
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One parameter of an estimate.
@@ -49,9 +123,9 @@ class Parameter:
     low, high : float or None
         95 % confidence interval, in ``unit``.
     unit : str
-        Its unit, with the units of input and output written ``in`` and ``out``.
+        Its unit; unknown units of input and output are written ``in`` and ``out``.
     status : str
-        ``free``, ``fixed`` or ``at bound``.
+        ``free``, ``fixed``, ``at bound``, or ``undetermined``: the data do not tell its value.
     """
 
     name: str
@@ -94,13 +168,13 @@ def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None
     if not numerator or not denominator:
         return []
     errors = estimate.get("standard_errors") or {}
-    order = len(denominator) - 1
-    found = []
-    for k, value in enumerate(numerator):
-        power = order - (len(numerator) - 1 - k)
-        found.append(_parameter(f"b{k}", value, errors.get(f"b{k}"), "out/in" + _per_second(power, "/"), "free"))
-    for k, value in enumerate(denominator[1:], start=1):
-        found.append(_parameter(f"a{k}", value, errors.get(f"a{k}"), _per_second(k, "1/"), "free"))
+    poles, zeros, units = len(denominator) - 1, len(numerator) - 1, Units()
+    values = {f"b{k}": value for k, value in enumerate(numerator)}
+    values |= {f"a{k}": value for k, value in enumerate(denominator[1:], start=1)}
+    found = [
+        _parameter(name, value, errors.get(name), units.of(name, poles, zeros), "free")
+        for name, value in values.items()
+    ]
     delay = estimate.get("delay")
     status = "fixed"
     if delay_bounds is not None:
@@ -133,8 +207,8 @@ def parameter_table(found: Iterable[Parameter], style: str = "text") -> str:
             number(item.estimate),
             number(item.standard_error, 3),
             number(item.relative_percent, 2),
-            number(item.low),
-            number(item.high),
+            number(item.low, 5),
+            number(item.high, 5),
             item.unit,
             item.status,
         ]
@@ -166,9 +240,3 @@ def _parameter(name: str, value: float | None, error: float | None, unit: str, s
         return Parameter(name, value, error, None, None, None, unit, status)
     relative = 100 * error / abs(value) if value else None
     return Parameter(name, value, error, relative, value - NORMAL_95 * error, value + NORMAL_95 * error, unit, status)
-
-
-def _per_second(power: int, prefix: str) -> str:
-    if power == 0:
-        return ""
-    return f"{prefix}s" if power == 1 else f"{prefix}s^{power}"

@@ -47,6 +47,8 @@ class Measurement:
         and coefficients in powers of 1/ms.
     time, input, output : str
         The columns that were read, as they stand in the file.
+    start, stop : float or None
+        The window that was asked for [time unit].
     notes : tuple of str
         What was assumed, one sentence each.
     """
@@ -58,6 +60,8 @@ class Measurement:
     time: str
     input: str
     output: str
+    start: float | None = None
+    stop: float | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -118,7 +122,7 @@ def read_measurement(
         )
     asked: dict[Role, str | None] = {"time": time, "input": input, "output": output}
     columns, notes = _choose(table, asked)
-    unit = {role: (units or {}).get(role) or _split(name)[1] for role, name in columns.items()}
+    unit = {role: (units or {}).get(role) or split_header(name)[1] for role, name in columns.items()}
 
     y = table.numbers(columns["output"])
     u = table.numbers(columns["input"])
@@ -152,6 +156,8 @@ def read_measurement(
         columns["time"],
         columns["input"],
         columns["output"],
+        start,
+        stop,
         tuple(notes),
     )
 
@@ -173,9 +179,11 @@ def _choose(table: Table, asked: Mapping[Role, str | None]) -> tuple[dict[Role, 
                 chosen[role] = found
     notes = []
     if by_position:
-        if table.lines is None or len(table.names) != 3 or len(set(chosen.values())) + len(by_position) != 3:
-            _refuse_unrecognised(table, by_position[0])
         left = [name for name in table.names if name not in chosen.values()]
+        # A column with a usual name is not put in another place than its name says.
+        named = any(_leaf(table, name).lower() in names for name in left for names in USUAL_NAMES.values())
+        if table.lines is None or len(table.names) != 3 or len(left) != len(by_position) or named:
+            _refuse_unrecognised(table, by_position[0], chosen)
         chosen.update(zip(by_position, left, strict=True))
         taken = [f"{chosen[role]!r} as the {role}" for role in by_position]
         notes.append(f"Columns were taken by their position: {_enumerated(taken)}.")
@@ -199,7 +207,7 @@ def _named(table: Table, wanted: str) -> str:
     """The column whose header is ``wanted``, with or without its unit."""
     if wanted in table.names:
         return wanted
-    matching = [name for name in table.names if _split(name)[0] == wanted]
+    matching = [name for name in table.names if split_header(name)[0] == wanted]
     if len(matching) != 1:
         refuse_missing(table, wanted)
     return matching[0]
@@ -225,11 +233,29 @@ def _recognised(table: Table, role: Role, chosen: Mapping[Role, str]) -> str | N
 
 
 def _leaf(table: Table, name: str) -> str:
-    return _split(name)[0] if table.lines is not None else name.rpartition(".")[2]
+    return split_header(name)[0] if table.lines is not None else name.rpartition(".")[2]
 
 
-def _split(header: str) -> tuple[str, str | None]:
-    """Name and unit of a header such as ``t [s]``."""
+def split_header(header: str) -> tuple[str, str | None]:
+    """Name and unit in the header of a column.
+
+    Parameters
+    ----------
+    header : str
+        Text such as ``t [s]`` or ``flow (l/min)``.
+
+    Returns
+    -------
+    name : str
+        The text without the unit.
+    unit : str or None
+        The unit; None where there is none.
+
+    Examples
+    --------
+    >>> split_header("t [ms]"), split_header("level")
+    (('t', 'ms'), ('level', None))
+    """
     found = re.fullmatch(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))", header)
     if found is None:
         return header, None
@@ -237,7 +263,7 @@ def _split(header: str) -> tuple[str, str | None]:
     return name, (square or round_ or "").strip() or None
 
 
-def _refuse_unrecognised(table: Table, role: Role) -> NoReturn:
+def _refuse_unrecognised(table: Table, role: Role, chosen: Mapping[Role, str]) -> NoReturn:
     if separated := wrong_separator(table):
         raise DataError(f"{table.head}: the file has one column. {separated}")
     if len(table.names) < len(ROLES) and not table.hint:
@@ -245,8 +271,9 @@ def _refuse_unrecognised(table: Table, role: Role) -> NoReturn:
             f"{table.head}: {listing(table)} and nothing else; a record needs a time, an input and an output"
         )
     usual = " or ".join(map(repr, USUAL_NAMES[role][:2]))
+    other = "other " if any(_leaf(table, name).lower() in USUAL_NAMES[role] for name in chosen.values()) else ""
     message = (
-        f"{table.head}: no {table.noun} is called {usual}; {listing(table)}. "
+        f"{table.head}: no {other}{table.noun} is called {usual}; {listing(table)}. "
         f"Say which one is the {role} (option {role})"
     )
     if close := next((match for name in USUAL_NAMES[role][1:] if (match := closest(name, table.names))), None):
@@ -275,10 +302,16 @@ def _window(
     last = int(np.searchsorted(t, high, side="right"))
     if first >= last:
         raise DataError(
-            f"{table.file}: no sample lies between {low:g} and {high:g} {unit}; "
+            f"{table.file}: no sample lies {_span(start, stop, unit)}; "
             f"the record runs from {t[0]:.9g} to {t[-1]:.9g} {unit}"
         )
     return first, last
+
+
+def _span(start: float | None, stop: float | None, unit: str) -> str:
+    if stop is None:
+        return f"at {start:g} {unit} or later"
+    return f"at {stop:g} {unit} or earlier" if start is None else f"between {start:g} and {stop:g} {unit}"
 
 
 def _enumerated(words: Sequence[str]) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import platform
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -216,8 +217,10 @@ def markdown(summary: pd.DataFrame) -> str:
 
 def outside(summary: pd.DataFrame) -> pd.DataFrame:
     """Lines of the required rows, with the formula meant for them, whose coverage lies outside the band."""
-    judged = [ROWS[key].required and ROWS[key].formulas[0] == f for key, f in zip(summary["row"], summary["formula"])]
-    return summary[np.array(judged) & ~summary["percent"].between(*BAND)]
+    judged = summary.apply(
+        lambda line: ROWS[line["row"]].required and line["formula"] == ROWS[line["row"]].formulas[0], axis=1
+    )
+    return summary[judged & ~summary["percent"].between(*BAND)]
 
 
 def main() -> None:
@@ -228,7 +231,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/coverage"), help="folder of the results")
     arguments = parser.parse_args()
 
-    begin = time.perf_counter()
+    begin, code = time.perf_counter(), code_version()
     summary = summarise(study(arguments.rows, arguments.runs, arguments.jobs))
     environment = {
         "finished": now(),
@@ -237,7 +240,7 @@ def main() -> None:
         "seed": SEED,
         "jobs": arguments.jobs,
         "seconds": round(time.perf_counter() - begin, 1),
-        "code_version": code_version(),
+        "code_version": code,
         "numeric_platform": numeric_platform(),
         "packages": {"python": platform.python_version(), **package_versions()},
     }
@@ -245,9 +248,11 @@ def main() -> None:
     summary.to_csv(arguments.out / "coverage.csv", index=False, float_format="%.6g")
     (arguments.out / "coverage.md").write_text(markdown(summary), encoding="utf-8")
     (arguments.out / "environment.json").write_text(json.dumps(environment, indent=2) + "\n", encoding="utf-8")
-    print(markdown(summary), end="")
     missed = outside(summary)
-    print(f"\n{len(missed)} intervals of the rows that must cover lie outside {BAND[0]:g} to {BAND[1]:g} %")
+    sys.stdout.write(
+        f"{markdown(summary)}\n{len(missed)} intervals of the rows that must cover lie outside "
+        f"{BAND[0]:g} to {BAND[1]:g} %\n"
+    )
     if len(missed):
         raise SystemExit(1)
 

@@ -1,0 +1,122 @@
+"""``ctid fit``."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ctid_cli.cli._common import Json, guarded
+
+
+class InitialStateOption(StrEnum):
+    """State of the system before the record."""
+
+    rest = "rest"
+    estimate = "estimate"
+    periodic = "periodic"
+
+
+class OffsetOption(StrEnum):
+    """Constant offset of the output."""
+
+    none = "none"
+    remove = "remove"
+    estimate = "estimate"
+
+
+class HoldOption(StrEnum):
+    """The input between its samples."""
+
+    zoh = "zoh"
+    foh = "foh"
+
+
+@guarded
+def fit(
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat); each is one experiment.")
+    ],
+    poles: Annotated[int, typer.Option("--poles", help="Number of poles, 1 to 12.")],
+    zeros: Annotated[int, typer.Option("--zeros", help="Number of zeros, fewer than poles.")] = 0,
+    delay: Annotated[
+        str, typer.Option("--delay", metavar="LOW:HIGH|VALUE", help="Range to search, or the known delay [time unit].")
+    ] = "0",
+    initial_state: Annotated[
+        InitialStateOption, typer.Option("--initial-state", help="State before the record.")
+    ] = InitialStateOption.rest,
+    offset: Annotated[OffsetOption, typer.Option("--offset", help="Constant offset.")] = OffsetOption.none,
+    hold: Annotated[HoldOption, typer.Option("--hold", help="The input between its samples.")] = HoldOption.zoh,
+    time: Annotated[str | None, typer.Option("--time", metavar="NAME", help="Column of the times.")] = None,
+    input: Annotated[str | None, typer.Option("--input", metavar="NAME", help="Column of the input.")] = None,
+    output: Annotated[str | None, typer.Option("--output", metavar="NAME", help="Column of the output.")] = None,
+    start: Annotated[float | None, typer.Option("--from", metavar="TIME", help="First instant to use.")] = None,
+    stop: Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")] = None,
+    validate: Annotated[
+        Path | None, typer.Option("--validate", metavar="FILE", help="Judge the model on this record, all of it.")
+    ] = None,
+    as_json: Json = False,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for fit.json and fit.svg.")] = Path("."),
+) -> None:
+    """Fit a transfer function with a delay to measured records.
+
+    Prints the parameters with their standard errors and what tells whether to believe them, and writes fit.json and
+    fit.svg. The delay is searched over its whole range: no start is needed.
+    """
+    import json
+    from functools import partial
+
+    from ctid_cli.errors import UsageError
+    from ctid_cli.estimators.identification import identify
+    from ctid_cli.estimators.measured import DelayProfile
+    from ctid_cli.reporting.identification import common_units, identification_object, identification_text
+    from ctid_cli.reporting.identification_plot import identification_svg
+    from ctid_cli.signals.measurement import read_measurement
+
+    bounds = _delay_bounds(delay)
+    try:
+        options = DelayProfile(poles, zeros, bounds, initial_state=initial_state.value, offset=offset.value)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    read = partial(read_measurement, time=time, input=input, output=output, hold=hold.value)
+    measurements = [read(file, start=start, stop=stop) for file in files]
+    other = None if validate is None else read(validate)
+    units = common_units(measurements if other is None else [*measurements, other])
+    result = identify(options, [item.record for item in measurements], None if other is None else other.record)
+    text = json.dumps(identification_object(result, measurements, units, other), allow_nan=False)
+    _write(out, {"fit.json": text.encode() + b"\n", "fit.svg": identification_svg(result, measurements, units)})
+    if as_json:
+        typer.echo(text)
+    else:
+        typer.echo(identification_text(result, measurements, units))
+        typer.echo(f"\nWritten: {out / 'fit.json'}, {out / 'fit.svg'}")
+
+
+def _delay_bounds(text: str) -> tuple[float, float]:
+    from ctid_cli.errors import UsageError
+
+    low, colon, high = text.partition(":")
+    allowed = (
+        "--delay must be LOW:HIGH, a range to search, or one known VALUE, in the record's unit of time and not "
+        "negative, for example 0:2 or 0.3"
+    )
+    try:
+        bounds = float(low), float(high if colon else low)
+    except ValueError:
+        raise UsageError(f"{allowed}; got {text!r}") from None
+    if not 0 <= bounds[0] <= bounds[1] < float("inf"):
+        raise UsageError(f"{allowed}; got {text!r}")
+    return bounds
+
+
+def _write(folder: Path, files: dict[str, bytes]) -> None:
+    from ctid_cli.errors import StorageError
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in files.items():
+            (folder / name).write_bytes(content)
+    except OSError as error:
+        raise StorageError(f"{error.filename or folder} cannot be written: {error.strerror or error}") from error

@@ -1,0 +1,356 @@
+"""What ``ctid fit`` answers: a fit to measured records as text and as an object for JSON."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators.identification import Identification
+from ctid_cli.experiment.worker import plain
+from ctid_cli.inference.derived import DerivedParameter
+from ctid_cli.reporting.estimate import Parameter, Units, parameter_table
+from ctid_cli.reporting.layout import count, number, text_table
+from ctid_cli.signals.measurement import Measurement
+
+#: Width of paragraphs.
+WIDTH = 100
+FIT_DEFINITION = "100 (1 - ||y - x|| / ||y - mean y||)"
+R2_DEFINITION = "1 - ||y - x||^2 / ||y - mean y||^2"
+
+#: What was done about the initial state and the offset, in words.
+TREATMENTS = {
+    "rest": "at rest before the record",
+    "estimate": "estimated with the model",
+    "periodic": "steady state of an input that repeats the record",
+    "none": "none",
+    "remove": "means of input and output subtracted",
+}
+
+
+def common_units(measurements: Sequence[Measurement]) -> Units:
+    """Units that all records share.
+
+    Parameters
+    ----------
+    measurements : sequence of Measurement
+        The records.
+
+    Returns
+    -------
+    Units
+        Their units; a record that names none takes those of the others.
+
+    Raises
+    ------
+    DataError
+        If two records name different units.
+    """
+    found: dict[str, str] = {}
+    for role in ("time", "input", "output"):
+        for measurement in measurements:
+            unit = getattr(measurement, f"{role}_unit")
+            if unit is not None and found.setdefault(role, unit) != unit:
+                raise DataError(
+                    f"{measurement.record.name}: the {role} is in {unit}, that of another file in {found[role]}; "
+                    "files of one command must have the same units"
+                )
+    return Units(**found)
+
+
+def parameters_of(result: Identification, units: Units) -> list[Parameter]:
+    """Parameters with their uncertainty and units.
+
+    Parameters
+    ----------
+    result : Identification
+        The fit.
+    units : Units
+        Units of the records.
+
+    Returns
+    -------
+    list of Parameter
+        One for each parameter; None where a number is not defined.
+    """
+    found = []
+    for item in result.estimates:
+        value = item.value
+        relative = 100 * item.standard_error / abs(value) if value else None
+        unit = units.of(item.name, result.options.poles, result.options.zeros)
+        error, relative, low, high = plain([item.standard_error, relative, item.low, item.high])
+        found.append(Parameter(item.name, value, error, relative, low, high, unit, item.status))
+    return found
+
+
+def derived_of(result: Identification, units: Units) -> list[DerivedParameter]:
+    """Derived quantities in the units of the records; frequencies that are called Hz are in Hz.
+
+    Parameters
+    ----------
+    result : Identification
+        The fit.
+    units : Units
+        Units of the records.
+
+    Returns
+    -------
+    list of DerivedParameter
+        Those of the fit; without those in Hz where the unit of time is not known.
+    """
+    names = {"s": units.time, "rad/s": f"rad/{units.time}", "output unit/input unit": units.gain}
+    found = []
+    for row in result.derived:
+        if row.unit != "Hz":
+            found.append(replace(row, unit=names.get(row.unit, row.unit)))
+        elif (seconds := units.seconds) is not None:
+            values = (row.estimate, row.standard_error, row.low, row.high)
+            estimate, error, low, high = (value / seconds for value in values)
+            found.append(replace(row, estimate=estimate, standard_error=error, low=low, high=high))
+    return found
+
+
+def identification_object(
+    result: Identification, measurements: Sequence[Measurement], units: Units, validation: Measurement | None = None
+) -> dict[str, Any]:
+    """A fit for ``fit.json`` and ``ctid fit --json``.
+
+    Parameters
+    ----------
+    result : Identification
+        The fit.
+    measurements : sequence of Measurement
+        The records it is from.
+    units : Units
+        Their units.
+    validation : Measurement, optional
+        The validation record.
+
+    Returns
+    -------
+    dict
+        The documented keys; numbers that are not finite are None.
+    """
+    fit, options, criteria = result.fit, result.options, result.criteria
+    interval, profile, judged = result.delay_interval, fit.profile, result.validation
+    content = {
+        "model": {
+            "numerator": [item.value for item in result.estimates if item.name.startswith("b")],
+            "denominator": fit.model.denominator,
+            "delay": fit.model.delay,
+        },
+        "parameters": [item.as_dict() for item in parameters_of(result, units)],
+        "fit_percent": fit.fit_percent,
+        "r2": fit.r2,
+        "cost": fit.cost,
+        "status": fit.status.name,
+        "message": fit.status.value,
+        "initial_state": {"treatment": options.initial_state, "values": fit.initial_states},
+        "offset": {"treatment": options.offset, "output": fit.offsets, "input": fit.input_offsets},
+        "modes": _modes(result, units),
+        "warnings": result.warnings,
+        "notes": [note for measurement in measurements for note in measurement.notes],
+        "derived": [asdict(row) for row in derived_of(result, units)],
+        "covariance": {
+            "kind": "robust" if result.robust else "white",
+            "names": fit.parameter_names,
+            "values": result.covariance,
+        },
+        "delay_interval": "profile likelihood" if interval is not None else "quadratic",
+        "criteria": {
+            **{name: getattr(criteria, name) for name in ("aic", "aicc", "bic", "fpe")},
+            "yic": result.yic,
+            "r_t_squared": result.r_t_squared,
+            "samples": criteria.count,
+            "parameters": criteria.parameters,
+        },
+        "condition_number": fit.condition_number,
+        "iterations": fit.iterations,
+        "residual_tests": [
+            {
+                "white": test.white,
+                "whiteness_p_value": test.whiteness_p_value,
+                "uncorrelated": test.uncorrelated,
+                "cross_p_value": test.cross_p_value,
+                "level": test.level,
+                "lags": test.lags,
+                "sentence": test.sentence,
+            }
+            for test in result.tests
+        ],
+        "profile": None if profile is None else {"delays": profile.delays, "costs": profile.costs},
+        "validation": judged
+        and {
+            "file": judged.name,
+            "fit_percent": judged.fit_percent,
+            "r2": judged.r2,
+            "samples": judged.count,
+            "initial_state": judged.applied.initial_states[0],
+            "offset": judged.applied.offsets[0],
+            "notes": () if validation is None else validation.notes,
+        },
+        "records": [_record_object(item, use) for item, use in zip(measurements, fit.used, strict=True)],
+        "units": asdict(units),
+        "settings": asdict(options) | {"hold": measurements[0].record.input.hold},
+    }
+    cleaned: dict[str, Any] = plain(content)
+    return cleaned
+
+
+def identification_text(result: Identification, measurements: Sequence[Measurement], units: Units) -> str:
+    """A fit for people, within 100 columns.
+
+    Parameters
+    ----------
+    result : Identification
+        The fit.
+    measurements : sequence of Measurement
+        The records it is from.
+    units : Units
+        Their units.
+
+    Returns
+    -------
+    str
+        Several paragraphs.
+    """
+    fit, options, criteria, judged = result.fit, result.options, result.criteria, result.validation
+    lines: list[str] = []
+    for measurement, use in zip(measurements, fit.used, strict=True):
+        lines += _wrapped(_record_line(measurement, int(np.count_nonzero(use)), units))
+        lines += [line for note in measurement.notes for line in _wrapped(note, "  ")]
+    low, high = options.delay_bounds
+    searched = f"searched from {low:g} to {high:g} {units.time}" if low < high else f"known, {low:g} {units.time}"
+    lines += [
+        "",
+        f"model            {count(options.poles, 'pole')}, {count(options.zeros, 'zero')}; delay {searched}",
+        f"initial state    {TREATMENTS[options.initial_state]} (--initial-state {options.initial_state})",
+        *_wrapped(f"offset           {_offset(result, units)} (--offset {options.offset})", hanging=17),
+        f"input            {'constant' if measurements[0].record.input.hold == 'zoh' else 'straight lines'} between "
+        f"its samples (--hold {measurements[0].record.input.hold})",
+        "",
+        parameter_table(parameters_of(result, units)),
+        *_wrapped(_covariance_line(result)),
+        "",
+        _derived_table(derived_of(result, units)),
+        "",
+        f"fit              {number(fit.fit_percent, 5)} % = {FIT_DEFINITION}",
+        f"R2               {number(fit.r2, 6)} = {R2_DEFINITION}",
+        "                 y measured, x simulated, over the samples used",
+    ]
+    if judged is not None:
+        lines += [
+            *_wrapped(
+                f"validation       fit {number(judged.fit_percent, 5)} %, R2 {number(judged.r2, 6)} on {judged.name}, "
+                f"{count(judged.count, 'sample')}; initial state and offset treated in the same way",
+                hanging=17,
+            )
+        ]
+    lines += [
+        f"cost             {number(fit.cost)} ({units.output})^2, mean squared output error",
+        f"AIC              {number(criteria.aic)} = N ln cost + 2 p with N = {criteria.count} samples and "
+        f"p = {criteria.parameters} parameters",
+        f"AICc             {number(criteria.aicc)} = AIC + 2 (p + 1)(p + 2) / (N - p - 2)",
+        f"BIC              {number(criteria.bic)} = N ln cost + p ln N",
+        f"FPE              {number(criteria.fpe)} ({units.output})^2 = cost (N + p) / (N - p)",
+        f"YIC, R_T^2       {number(result.yic, 5)}, {number(result.r_t_squared, 6)}",
+        f"condition number {number(fit.condition_number, 3)}",
+    ]
+    for k, test in enumerate(result.tests, start=1):
+        label = "residuals" if len(measurements) == 1 else f"residuals {k}"
+        lines += _wrapped(f"{label:16} {test.sentence}", hanging=17)
+    # What the line of the residuals says need not be said again.
+    told = tuple(test.sentence for test in result.tests)
+    warnings = [warning for warning in result.warnings if not warning.endswith(told)]
+    if warnings:
+        lines += ["", "Warnings:"]
+        lines += [line for warning in warnings for line in _wrapped(f"- {warning}", hanging=2)]
+    return "\n".join(lines)
+
+
+def _wrapped(text: str, indent: str = "", hanging: int = 0) -> list[str]:
+    # Blanks at the beginning and between label and text are kept.
+    return textwrap.wrap(
+        text,
+        WIDTH,
+        initial_indent=indent,
+        subsequent_indent=indent + " " * hanging,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def _record_line(measurement: Measurement, used: int, units: Units) -> str:
+    record = measurement.record
+    some = "" if used == record.n_samples else f" ({used} used)"
+    clock = "regular clock" if record.interval is not None else "irregular clock"
+    return (
+        f"{record.name}: {count(record.n_samples, 'sample')}{some} from {record.t[0]:.6g} to {record.t[-1]:.6g} "
+        f"{units.time}, {clock}; input {measurement.input} [{units.input}], output {measurement.output} "
+        f"[{units.output}]"
+    )
+
+
+def _offset(result: Identification, units: Units) -> str:
+    fit, options = result.fit, result.options
+    if options.offset != "remove":
+        return TREATMENTS[options.offset]
+    pairs = zip(fit.input_offsets, fit.offsets, strict=True)
+    means = "; ".join(f"{u:.6g} {units.input}, {y:.6g} {units.output}" for u, y in pairs)
+    return f"{TREATMENTS['remove']}: {means}"
+
+
+def _covariance_line(result: Identification) -> str:
+    if result.robust:
+        text = "Standard errors are robust (sandwich), because the residuals are not white"
+    elif result.tests:
+        text = "Standard errors are those for white residuals, as the residuals pass the test"
+    else:
+        text = "Standard errors are those for white residuals"
+    text += "; intervals are estimate -+ 1.96 of them"
+    if result.delay_interval is not None:
+        text += ", that of the delay from the profile of the cost, which is not quadratic there"
+    return text + ". Monic denominator, descending powers."
+
+
+def _derived_table(rows: Sequence[DerivedParameter]) -> str:
+    header = ["derived", "estimate", "standard error", "95 % low", "95 % high", "unit"]
+    cells = [
+        [row.name, number(row.estimate), number(row.standard_error, 3), number(row.low), number(row.high), row.unit]
+        for row in rows
+    ]
+    reasons = dict.fromkeys(row.reason for row in rows if row.reason)
+    return "\n".join([text_table(header, cells, "lrrrrl"), *(line for text in reasons for line in _wrapped(text))])
+
+
+def _modes(result: Identification, units: Units) -> list[dict[str, float | None]]:
+    """Natural frequency and damping of every real pole and every pair."""
+    rows = {row.name: row.estimate for row in result.derived}
+    modes: list[dict[str, float | None]] = []
+    for k in range(1, result.options.poles + 1):
+        if f"damping_{k}" in rows:
+            frequency, damping = rows[f"natural_frequency_{k}"], rows[f"damping_{k}"]
+        elif f"pole_{k}" in rows:
+            frequency, damping = abs(rows[f"pole_{k}"]), float(-np.sign(rows[f"pole_{k}"]))
+        else:
+            break
+        hertz = None if units.seconds is None else frequency / (2 * np.pi * units.seconds)
+        modes.append({"frequency_hz": hertz, "damping": damping})
+    return modes
+
+
+def _record_object(measurement: Measurement, use: Any) -> dict[str, Any]:
+    record = measurement.record
+    return {
+        "file": record.name,
+        "samples": record.n_samples,
+        "used": int(np.count_nonzero(use)),
+        "start": float(record.t[0]),
+        "stop": float(record.t[-1]),
+        "regular": record.interval is not None,
+        "columns": {"time": measurement.time, "input": measurement.input, "output": measurement.output},
+    }

@@ -1,0 +1,122 @@
+"""The figure of ``ctid fit``: output, residuals, their correlation, and the search over the delay."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.estimators.identification import Identification
+from ctid_cli.reporting.estimate import Units
+from ctid_cli.signals.measurement import Measurement
+
+Array = NDArray[np.float64]
+
+#: Experiments that are drawn; the others would leave no room.
+MOST_DRAWN = 3
+#: Colours that differ in lightness too, so that a grey print can be read.
+MEASURED, SIMULATED, BAND = "#b0b0b0", "#08306b", "#d9d9d9"
+
+
+def identification_svg(result: Identification, measurements: Sequence[Measurement], units: Units) -> bytes:
+    """Figure of a fit; the same fit always gives the same bytes.
+
+    Parameters
+    ----------
+    result : Identification
+        The fit.
+    measurements : sequence of Measurement
+        The records it is from.
+    units : Units
+        Their units.
+
+    Returns
+    -------
+    bytes
+        An SVG file: measured and simulated output, residuals, their autocorrelation with its 95 % band, and the cost
+        against the delay.
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    drawn = measurements[:MOST_DRAWN]
+    style: dict[Any, Any] = {"svg.hashsalt": "ctid", "font.size": 9.0, "axes.grid": True, "grid.color": "#eeeeee"}
+    with matplotlib.rc_context(style):
+        figure = Figure(figsize=(8.0, 3.4 * len(drawn) + 2.8), layout="constrained")
+        grid = figure.add_gridspec(2 * len(drawn) + 1, 2, height_ratios=[2, 1.2] * len(drawn) + [2])
+        for k, measurement in enumerate(drawn):
+            output = figure.add_subplot(grid[2 * k, :])
+            error = figure.add_subplot(grid[2 * k + 1, :], sharex=output)
+            _draw_record(output, error, result, measurement, k, units)
+            if len(measurements) > 1:
+                output.set_title(f"experiment {k + 1} of {len(measurements)}", loc="left")
+        _draw_correlation(figure.add_subplot(grid[-1, 0]), result, measurements)
+        _draw_profile(figure.add_subplot(grid[-1, 1]), result, units)
+        file = io.BytesIO()
+        figure.savefig(file, format="svg", metadata={"Date": None})
+    return file.getvalue()
+
+
+def _draw_record(
+    output: Any, error: Any, result: Identification, measurement: Measurement, k: int, units: Units
+) -> None:
+    record, use = measurement.record, result.fit.used[k]
+    residuals = result.fit.residuals[k]
+    output.plot(record.t, record.y, color=MEASURED, linewidth=2.2, label="measured")
+    output.plot(
+        *_with_gaps(record.t, use, record.y[use] - residuals), color=SIMULATED, linewidth=0.9, label="simulated"
+    )
+    output.set_ylabel(f"{measurement.output} [{units.output}]")
+    output.legend(loc="lower right", ncols=2, fontsize=8)
+    output.tick_params(labelbottom=False)
+    output.margins(x=0.0)
+    low, high = output.get_ylim()
+    output.set_ylim(low - 0.18 * (high - low), high)  # room for the legend below the curves
+    error.plot(*_with_gaps(record.t, use, residuals), color=SIMULATED, linewidth=0.7)
+    error.axhline(0.0, color="black", linewidth=0.6)
+    error.set_ylabel(f"residual [{units.output}]")
+    error.set_xlabel(f"{measurement.time} [{units.time}]")
+
+
+def _with_gaps(t: Array, use: NDArray[np.bool_], values: Array) -> tuple[Array, Array]:
+    """Values at the used instants, with breaks in the line where samples are missing."""
+    full = np.full(t.size, np.nan)
+    full[use] = values
+    return t, full
+
+
+def _draw_correlation(axes: Any, result: Identification, measurements: Sequence[Measurement]) -> None:
+    axes.set_xlabel("lag [samples]")
+    axes.set_ylabel("autocorrelation\nof the residuals [-]")
+    if not result.tests:
+        axes.text(0.5, 0.5, "too few residuals", ha="center", va="center", transform=axes.transAxes)
+        return
+    styles = ("o-", "s--", "^:")
+    for k, (test, style) in enumerate(zip(result.tests[:MOST_DRAWN], styles, strict=False), start=1):
+        lags = np.arange(1, test.lags + 1)
+        label = f"experiment {k}" if len(measurements) > 1 else None
+        axes.plot(lags, test.autocorrelation, style, color=SIMULATED, markersize=3, linewidth=0.8, label=label)
+    band = result.tests[0].autocorrelation_band
+    axes.axhspan(-band, band, color=BAND, zorder=0, label=f"{100 * result.tests[0].level:.3g} % band if white")
+    axes.axhline(0.0, color="black", linewidth=0.6)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.25 * (high - low))
+    axes.legend(loc="upper right", fontsize=8)
+
+
+def _draw_profile(axes: Any, result: Identification, units: Units) -> None:
+    profile, delay = result.fit.profile, result.fit.model.delay
+    axes.set_xlabel(f"delay [{units.time}]")
+    axes.set_ylabel(f"cost [({units.output})²]")
+    if profile is None:
+        axes.plot([delay], [result.fit.cost], "o", color=SIMULATED, label=f"known delay {delay:.4g} {units.time}")
+    else:
+        axes.plot(profile.delays, profile.costs, ".-", color=SIMULATED, linewidth=0.8, markersize=4, label="profile")
+        label = f"minimum at {delay:.4g} {units.time}"
+        axes.plot([delay], [result.fit.cost], "v", color="black", markersize=7, label=label)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.35 * (high - low))
+    axes.legend(loc="upper right", fontsize=8)

@@ -1,0 +1,189 @@
+"""``ctid fit``: from files to a model, or to one sentence."""
+
+import json
+
+import numpy as np
+import pytest
+
+from ctid_cli import HeldSignal, TransferFunction, simulate
+
+SYSTEM = TransferFunction([3.0], [1.0, 1.2, 4.0], 0.73)
+
+
+def rows(seed=0, n=500, noise=0.02, offset=0.0):
+    rng = np.random.default_rng(seed)
+    t = 0.1 * np.arange(n)
+    u = np.repeat(rng.choice([-1.0, 1.0], n // 5), 5)
+    y = simulate(SYSTEM, HeldSignal(t, u), t) + offset + noise * rng.standard_normal(n)
+    return np.column_stack((t, u, y))
+
+
+def write(file, values, header="t,u,y"):
+    lines = [header, *(",".join(f"{value:.12g}" for value in row) for row in values)]
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def record(tmp_path):
+    return write(tmp_path / "record.csv", rows())
+
+
+def check_model(model, tolerance=0.05):
+    assert model["numerator"] == pytest.approx([3.0], rel=tolerance)
+    assert model["denominator"] == pytest.approx([1.0, 1.2, 4.0], rel=tolerance)
+    assert model["delay"] == pytest.approx(0.73, rel=tolerance)
+
+
+def test_fit_prints_a_table_and_writes_two_files(ctid, record, tmp_path):
+    out = tmp_path / "new" / "folder"
+    text = ctid("fit", record, "--poles", 2, "--zeros", 0, "--delay", "0:3", "--out", out).stdout
+    assert sorted(path.name for path in out.iterdir()) == ["fit.json", "fit.svg"]
+    content = json.loads((out / "fit.json").read_text(encoding="utf-8"))
+    check_model(content["model"])
+    assert content["settings"]["delay_bounds"] == [0, 3]
+    for part in ("standard error", "delay", "at rest before the record", str(out / "fit.svg")):
+        assert part in text
+    assert (out / "fit.svg").read_bytes().startswith(b"<?xml")
+
+
+def test_json_is_what_is_written(ctid, record, tmp_path):
+    done = ctid("fit", record, "--poles", 2, "--delay", "0:3", "--json", "--out", tmp_path)
+    assert done.stdout == (tmp_path / "fit.json").read_text(encoding="utf-8")
+    keys = {
+        "model",
+        "parameters",
+        "fit_percent",
+        "r2",
+        "cost",
+        "status",
+        "initial_state",
+        "offset",
+        "modes",
+        "warnings",
+    }
+    content = json.loads(done.stdout)
+    assert keys <= content.keys()
+    assert {"name", "estimate", "standard_error", "low", "high", "unit", "status"} <= content["parameters"][0].keys()
+    again = ctid("fit", record, "--poles", 2, "--delay", "0:3", "--json", "--out", tmp_path / "again")
+    assert again.stdout == done.stdout
+
+
+def test_the_current_folder_is_the_default(ctid, record, tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    ctid("fit", record, "--poles", 2, "--delay", "0:3")
+    assert (tmp_path / "here" / "fit.json").exists()
+
+
+def test_every_option_reaches_the_fit(ctid, tmp_path):
+    values = rows(offset=5.0)
+    file = write(tmp_path / "named.csv", values[:, [2, 0, 1]], "speed [rpm],clock [s],drive [V]")
+    options = ("--time", "clock", "--input", "drive", "--output", "speed", "--from", 1, "--to", 40, "--hold", "foh")
+    options += ("--initial-state", "estimate", "--offset", "estimate", "--delay", 0.73, "--zeros", 1, "--poles", 2)
+    content = json.loads(ctid("fit", file, *options, "--json", "--out", tmp_path).stdout)
+    (used,) = content["records"]
+    assert (used["start"], used["stop"]) == (1.0, 40.0)
+    assert used["columns"] == {"time": "clock [s]", "input": "drive [V]", "output": "speed [rpm]"}
+    settings = content["settings"]
+    assert (settings["hold"], settings["initial_state"], settings["offset"]) == ("foh", "estimate", "estimate")
+    parameters = {item["name"]: item for item in content["parameters"]}
+    assert list(parameters) == ["b0", "b1", "a1", "a2", "delay", "x1", "x2", "offset"]
+    assert parameters["b0"]["unit"] == "rpm/V/s"
+    assert parameters["delay"]["status"] == "fixed"
+    assert content["offset"]["output"] == [parameters["offset"]["estimate"]]
+    assert content["offset"]["output"][0] == pytest.approx(5.0, abs=0.1)
+
+
+def test_several_files_and_a_validation_record(ctid, record, tmp_path):
+    second = write(tmp_path / "second.csv", rows(seed=1))
+    third = write(tmp_path / "third.csv", rows(seed=2))
+    arguments = ("--poles", 2, "--delay", "0:3", "--validate", third, "--json", "--out", tmp_path)
+    content = json.loads(ctid("fit", record, second, *arguments).stdout)
+    check_model(content["model"], 0.02)
+    assert [item["file"] for item in content["records"]] == [str(record), str(second)]
+    assert content["validation"]["file"] == str(third)
+    assert content["validation"]["r2"] > 0.99
+
+
+def test_microseconds(ctid, record, tmp_path):
+    values = rows()
+    values[:, 0] *= 1e6
+    scaled = write(tmp_path / "scaled.csv", values, "t [us],u,y")
+    base = json.loads(ctid("fit", record, "--poles", 2, "--delay", "0:3", "--json", "--out", tmp_path).stdout)
+    other = json.loads(ctid("fit", scaled, "--poles", 2, "--delay", "0:3e6", "--json", "--out", tmp_path).stdout)
+    assert other["model"]["delay"] == pytest.approx(1e6 * base["model"]["delay"], rel=1e-8)
+    assert other["modes"] == [pytest.approx(mode, rel=1e-7) for mode in base["modes"]]
+    assert other["parameters"][-1]["unit"] == "us"
+
+
+def test_an_offset_that_nobody_asked_for_is_a_warning(ctid, tmp_path):
+    file = write(tmp_path / "offset.csv", rows(offset=1.0))
+    text = ctid("fit", file, "--poles", 2, "--delay", "0:3", "--out", tmp_path).stdout
+    assert "use --offset estimate" in " ".join(text.split())
+
+
+# --- bad input -------------------------------------------------------------------------------------
+
+FLAT = [[0.1 * k, 1.0, float(k % 3)] for k in range(50)]
+FILES = {
+    "empty file": ("", ["bad.csv", "empty"]),
+    "only a header": ("t,u,y\n", ["bad.csv"]),
+    "one column": ("t\n0\n1\n2\n", ["bad.csv:1", "input"]),
+    "text in a column": ("t,u,y\n0,1,2\n1,x,2\n2,1,3\n", ["bad.csv:3", "'x'"]),
+    "constant input": ("t,u,y\n" + "".join(f"{t},{u},{y}\n" for t, u, y in FLAT), ["bad.csv", "constant"]),
+    "zero input": ("t,u,y\n" + "".join(f"{t},0,{y}\n" for t, _, y in FLAT), ["bad.csv", "constant"]),
+    "NaN everywhere": ("t,u,y\n" + "".join(f"{t},{t % 3},nan\n" for t in range(50)), ["bad.csv", "finite"]),
+    "fewer samples than parameters": ("t,u,y\n0,1,0\n5,-1,1\n10,1,2\n", ["bad.csv", "samples", "parameters"]),
+    "unsorted time": ("t,u,y\n0,1,0\n2,0,1\n1,1,1\n3,0,1\n", ["bad.csv:4", "increase"]),
+    "repeated time": ("t,u,y\n0,1,0\n1,0,1\n1,1,1\n3,0,1\n", ["bad.csv:4", "increase"]),
+}
+
+
+def refused(ctid, tmp_path, *arguments):
+    before = sorted(tmp_path.rglob("*"))
+    done = ctid("fit", *arguments, "--out", tmp_path / "out", code=2)
+    assert sorted(tmp_path.rglob("*")) == before
+    assert done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("ctid: ")
+    return line
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_a_bad_record_is_one_sentence(case, ctid, tmp_path):
+    text, expected = FILES[case]
+    (tmp_path / "bad.csv").write_text(text, encoding="utf-8")
+    message = refused(ctid, tmp_path, tmp_path / "bad.csv", "--poles", 2, "--delay", "0:1")
+    for part in expected:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("--poles", 2, "--delay", "0:200"), ["record.csv", "greatest delay"]),
+        (("--poles", 2, "--delay", "0-3"), ["--delay", "LOW:HIGH", "'0-3'"]),
+        (("--poles", 2, "--delay", "3:0"), ["--delay", "LOW:HIGH"]),
+        (("--poles", 2, "--delay=-1:2"), ["--delay", "not negative"]),
+        (("--poles", 2, "--delay", "nan"), ["--delay"]),
+        (("--poles", 2, "--delay", "0:inf"), ["--delay"]),
+        (("--poles", 2, "--zeros", 2, "--delay", "0:3"), ["zeros", "delay"]),
+        (("--poles", 2, "--zeros", 3), ["zeros"]),
+        (("--poles", 0), ["poles"]),
+        (("--poles", 2, "--from", 90), ["record.csv", "49.9"]),
+        (("--poles", 2, "--output", "z"), ["record.csv", "'z'"]),
+        (("--poles", 2, "--validate", "nowhere.csv"), ["nowhere.csv"]),
+    ],
+)
+def test_a_bad_option_is_one_sentence(arguments, expected, ctid, record, tmp_path):
+    message = refused(ctid, tmp_path, record, *arguments)
+    for part in expected:
+        assert part in message
+
+
+@pytest.mark.parametrize("arguments", [("fit",), ("fit", "x.csv"), ("fit", "x.csv", "--poles", "two")])
+def test_usage(ctid, arguments, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "Error" in ctid(*arguments, code=2).stderr
+    assert list(tmp_path.iterdir()) == []

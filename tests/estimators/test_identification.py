@@ -1,0 +1,173 @@
+"""A fit with its uncertainty and diagnostics, from measured records."""
+
+import numpy as np
+import pytest
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators.identification import identify
+from ctid_cli.estimators.measured import DelayProfile
+from ctid_cli.filtering import simulate
+from ctid_cli.inference.robust import sandwich_covariance
+from ctid_cli.inference.status import Status
+from ctid_cli.models import TransferFunction
+from ctid_cli.signals import HeldSignal, Record
+
+FIRST_ORDER = TransferFunction([1.0], [1.0, 2.0], 0.55)
+OPTIONS = DelayProfile(1, 0, (0, 3))
+
+
+def record_of(model=FIRST_ORDER, *, n=1000, seed=0, noise=0.05, colour=0.0, offset=0.0, past=0, every=5):
+    rng = np.random.default_rng(seed)
+    t = 0.1 * np.arange(n)
+    values = np.repeat(rng.choice([-1.0, 1.0], n // every + 1), every)[:n]
+    signal = HeldSignal(t, values)
+    e = noise * rng.standard_normal(n)
+    for k in range(1, n):
+        e[k] += colour * e[k - 1]
+    y = simulate(model, signal, t) + e + offset
+    return Record(t[past:], y[past:], HeldSignal(t[past:], values[past:]), name=f"record {seed}")
+
+
+def by_name(result):
+    return {item.name: item for item in result.estimates}
+
+
+def test_white_residuals_keep_the_classical_covariance():
+    record = record_of()
+    result = identify(OPTIONS, [record])
+    assert not result.robust
+    np.testing.assert_array_equal(result.covariance, result.fit.covariance)
+    items = by_name(result)
+    assert list(items) == ["b0", "a1", "delay"]
+    for name, item in items.items():
+        assert item.value == result.fit.parameters[name]
+        assert item.standard_error == result.fit.standard_errors[name]
+        assert item.status == "free"
+        if name != "delay":
+            assert item.high - item.value == pytest.approx(1.959964 * item.standard_error)
+    assert result.warnings == ()
+    assert result.criteria.aic == pytest.approx(1000 * np.log(result.fit.cost) + 6)
+    gain = next(row for row in result.derived if row.name == "static_gain")
+    assert abs(gain.estimate - 0.5) < 4 * gain.standard_error
+
+
+def test_coloured_residuals_take_the_sandwich():
+    result = identify(OPTIONS, [record_of(colour=0.9)])
+    assert result.robust
+    expected = sandwich_covariance(result.fit.sensitivities, result.fit.residuals, regular=True)
+    np.testing.assert_allclose(result.covariance, expected, rtol=1e-9)
+    assert by_name(result)["b0"].standard_error > 1.5 * result.fit.standard_errors["b0"]
+    assert any("not white" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize(("jitter", "regular"), [(0.002, True), (0.04, False)])
+def test_a_clock_that_jitters_a_little_counts_as_regular(jitter, regular):
+    record = record_of(colour=0.9)
+    t = record.t + np.random.default_rng(2).uniform(-jitter, jitter, record.n_samples)
+    moved = Record(t, record.y, HeldSignal(t, record.input.values))
+    result = identify(OPTIONS, [moved])
+    expected = sandwich_covariance(result.fit.sensitivities, result.fit.residuals, regular=regular)
+    np.testing.assert_allclose(result.covariance, expected, rtol=1e-9)
+    other = sandwich_covariance(result.fit.sensitivities, result.fit.residuals, regular=not regular)
+    assert not np.allclose(expected, other, rtol=1e-3)
+
+
+def test_a_delay_at_its_bound_has_no_standard_error():
+    result = identify(DelayProfile(1, 0, (0, 0.4)), [record_of()])
+    assert result.fit.status is Status.DELAY_AT_BOUND
+    delay = by_name(result)["delay"]
+    assert (delay.value, delay.status) == (0.4, "at bound")
+    assert np.isnan(delay.standard_error)
+    assert delay.high == 0.4
+    assert np.isfinite(by_name(result)["a1"].standard_error)
+    assert any("no standard error" in warning for warning in result.warnings)
+
+
+def test_a_zero_beside_a_delay_is_undetermined():
+    """A small zero shifts the response like a delay: the two are singular at b0 = 0."""
+    smooth = TransferFunction([4.0], [1.0, 4.0, 4.0], 0.5)
+    result = identify(DelayProfile(2, 1, (0, 3)), [record_of(smooth, noise=0.02)])
+    items = by_name(result)
+    assert items["b0"].status == "undetermined"
+    assert all(np.isnan([items["b0"].standard_error, items["b0"].low, items["b0"].high]))
+    assert any("b0" in warning for warning in result.warnings)
+
+
+def test_equations_without_information_leave_everything_undetermined():
+    t = np.arange(60.0)
+    record = Record.from_arrays(t, np.full(60, 2.0), 3.0 + np.exp(-0.2 * t))
+    options = DelayProfile(1, 0, (0, 0), initial_state="estimate", offset="estimate")
+    result = identify(options, [record])
+    statuses = {item.name: item.status for item in result.estimates}
+    # A constant input and a constant offset have the same effect.
+    assert statuses["b0"] == statuses["offset"] == "undetermined"
+    assert statuses["delay"] == "fixed"
+    assert all(np.isnan(row.standard_error) for row in result.derived)
+
+
+def test_the_delay_has_a_profile_interval_where_the_cost_is_not_quadratic():
+    # A held input puts kinks into the cost, and noise makes the interval reach over them.
+    result = identify(OPTIONS, [record_of(n=60, noise=0.3, every=7)])
+    interval = result.delay_interval
+    assert interval is not None
+    delay = by_name(result)["delay"]
+    assert (delay.low, delay.high) == (interval.low, interval.high)
+    assert interval.low <= delay.value <= interval.high
+
+
+@pytest.mark.parametrize(
+    ("changes", "option", "silent"),
+    [
+        ({"offset": 0.5}, "--offset estimate", {"offset": "estimate"}),
+        ({"past": 105, "every": 60, "n": 400}, "--initial-state estimate", {"initial_state": "estimate"}),
+    ],
+)
+def test_what_should_be_estimated_too_is_named(changes, option, silent):
+    record = record_of(**changes)
+    assert any(option in warning for warning in identify(OPTIONS, [record]).warnings)
+    better = identify(DelayProfile(1, 0, (0, 3), **silent), [record])
+    assert not any(option in warning for warning in better.warnings)
+
+
+def test_validation_from_rest_is_a_simulation():
+    record, other = record_of(), record_of(seed=1)
+    result = identify(OPTIONS, [record], other)
+    x = simulate(result.fit.model, other.input, other.t)
+    spread = np.sum((other.y - other.y.mean()) ** 2)
+    assert result.validation.r2 == pytest.approx(1 - np.sum((other.y - x) ** 2) / spread)
+    assert result.validation.fit_percent == pytest.approx(100 * (1 - np.sqrt(np.sum((other.y - x) ** 2) / spread)))
+    assert result.validation.count == 1000
+
+
+def test_a_model_that_does_not_carry_over_is_said():
+    other = record_of(TransferFunction([-1.0], [1.0, 2.0], 0.55), seed=1)
+    result = identify(OPTIONS, [record_of()], other)
+    assert result.validation.r2 < 0
+    assert any("does not carry over" in warning for warning in result.warnings)
+
+
+def test_validation_estimates_its_own_state_and_offset():
+    options = DelayProfile(1, 0, (0, 3), initial_state="estimate", offset="estimate")
+    result = identify(options, [record_of(offset=3.0)], record_of(seed=1, offset=-7.0, past=50))
+    assert result.validation.applied.offsets[0] == pytest.approx(-7.0, abs=0.02)
+    assert result.validation.r2 > 0.9
+
+
+def test_two_experiments_are_tested_one_by_one():
+    result = identify(OPTIONS, [record_of(), record_of(seed=1, colour=0.9)])
+    assert [test.white for test in result.tests] == [True, False]
+    assert result.tests[0].level == pytest.approx(0.975)
+    assert result.robust
+    assert any(warning.startswith("Experiment 2: ") for warning in result.warnings)
+
+
+def test_too_few_residuals_are_not_tested():
+    result = identify(DelayProfile(1, 0, (0.55, 0.55)), [record_of(n=16, every=2)])
+    assert result.tests == ()
+    assert any("too few to test" in warning for warning in result.warnings)
+
+
+def test_a_bad_validation_record_is_refused():
+    flat = Record.from_arrays(0.1 * np.arange(50), np.ones(50), np.arange(50.0))
+    with pytest.raises(DataError, match=r"validation record: .*constant"):
+        identify(OPTIONS, [record_of()], flat)

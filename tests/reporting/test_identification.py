@@ -1,0 +1,161 @@
+"""A fit as text, as an object, and as a figure."""
+
+import json
+import math
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators.identification import identify
+from ctid_cli.estimators.measured import DelayProfile
+from ctid_cli.filtering import simulate
+from ctid_cli.models import TransferFunction
+from ctid_cli.reporting.estimate import Units
+from ctid_cli.reporting.identification import (
+    common_units,
+    derived_of,
+    identification_object,
+    identification_text,
+    parameters_of,
+)
+from ctid_cli.reporting.identification_plot import identification_svg
+from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.signals.measurement import Measurement
+
+SYSTEM = TransferFunction([3.0], [1.0, 1.2, 4.0], 0.73)
+UNITS = Units("ms", "V", "mA")
+
+
+def measurement(seed=0, *, n=800, units=("ms", "V", "mA"), notes=()):
+    rng = np.random.default_rng(seed)
+    t = 0.1 * np.arange(n)
+    signal = HeldSignal(t, np.repeat(rng.choice([-1.0, 1.0], n // 5), 5))
+    y = simulate(SYSTEM, signal, t) + 0.1 * rng.standard_normal(n)
+    return Measurement(Record(t, y, signal, name=f"file{seed}.csv"), *units, "t", "u", "y", notes=notes)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    one = measurement(notes=("A note.",))
+    other = measurement(1)
+    return identify(DelayProfile(2, 0, (0, 3)), [one.record], other.record), [one], other
+
+
+def test_parameters_carry_the_units_of_the_record(fitted):
+    result, _, _ = fitted
+    units = {item.name: item.unit for item in parameters_of(result, UNITS)}
+    assert units == {"b0": "mA/V/ms^2", "a1": "1/ms", "a2": "1/ms^2", "delay": "ms"}
+
+
+def test_units_of_states_and_offsets():
+    assert [Units().of(name, 3, 1) for name in ("x1", "x2_2", "x3", "offset_1", "b1")] == [
+        "out",
+        "out/s",
+        "out/s^2",
+        "out",
+        "out/in/s^3",
+    ]
+
+
+def test_frequencies_called_hertz_are_in_hertz(fitted):
+    result, _, _ = fitted
+    rows = {row.name: row for row in derived_of(result, UNITS)}
+    radians = rows["natural_frequency_1"]
+    assert radians.unit == "rad/ms"
+    hertz = rows["natural_frequency_1_hz"]
+    assert (hertz.estimate, hertz.unit) == (pytest.approx(1000 * radians.estimate / (2 * math.pi)), "Hz")
+    assert hertz.standard_error == pytest.approx(1000 * radians.standard_error / (2 * math.pi))
+    assert rows["static_gain"].unit == "mA/V"
+    assert "natural_frequency_1_hz" not in {row.name for row in derived_of(result, Units("fortnight"))}
+
+
+def test_the_object_holds_the_numbers_of_the_fit(fitted):
+    result, measurements, other = fitted
+    content = identification_object(result, measurements, UNITS, other)
+    assert json.loads(json.dumps(content, allow_nan=False)) == content
+    fit = result.fit
+    assert content["model"] == {
+        "numerator": fit.model.numerator.tolist(),
+        "denominator": fit.model.denominator.tolist(),
+        "delay": fit.model.delay,
+    }
+    assert (content["fit_percent"], content["r2"], content["cost"]) == (fit.fit_percent, fit.r2, fit.cost)
+    assert content["status"] == "CONVERGED"
+    assert content["initial_state"] == {"treatment": "rest", "values": [[]]}
+    assert content["offset"] == {"treatment": "none", "output": [0.0], "input": [0.0]}
+    (mode,) = content["modes"]
+    assert mode["frequency_hz"] == pytest.approx(1000 * math.sqrt(fit.model.denominator[2]) / (2 * math.pi))
+    assert mode["damping"] == pytest.approx(fit.model.denominator[1] / 2 / math.sqrt(fit.model.denominator[2]))
+    assert content["validation"]["r2"] == result.validation.r2
+    assert content["notes"] == ["A note."]
+    assert content["criteria"]["bic"] == pytest.approx(800 * math.log(fit.cost) + 4 * math.log(800))
+    for item in content["parameters"]:
+        assert item["low"] < item["estimate"] < item["high"]
+
+
+def test_what_is_not_finite_is_null_and_a_dash():
+    one = measurement()
+    result = identify(DelayProfile(2, 0, (0, 0.5)), [one.record])
+    content = identification_object(result, [one], UNITS)
+    delay = next(item for item in content["parameters"] if item["name"] == "delay")
+    assert (delay["standard_error"], delay["relative_percent"], delay["status"]) == (None, None, "at bound")
+    assert content["validation"] is None
+    (line,) = (line for line in identification_text(result, [one], UNITS).splitlines() if line.startswith("delay "))
+    assert line.split()[1:4] == ["0.5", "-", "-"]
+
+
+def test_real_poles_are_modes_too():
+    one = measurement()
+    model = identify(DelayProfile(1, 0, (0, 3)), [one.record])
+    (mode,) = identification_object(model, [one], Units())["modes"]
+    assert mode == {"frequency_hz": pytest.approx(model.fit.model.denominator[1] / (2 * math.pi)), "damping": 1.0}
+
+
+def test_the_text_says_everything_within_100_columns(fitted):
+    result, measurements, _ = fitted
+    text = identification_text(result, measurements, UNITS)
+    assert max(map(len, text.splitlines())) <= 100
+    for part in (
+        "file0.csv: 800 samples",
+        "A note.",
+        "--initial-state rest",
+        "--offset none",
+        "mA/V/ms^2",
+        "100 (1 - ||y - x|| / ||y - mean y||)",
+        "1 - ||y - x||^2 / ||y - mean y||^2",
+        "validation",
+        "N = 800 samples and p = 4 parameters",
+        "natural_frequency_1_hz",
+        "The residuals pass as white at the 95 % level",
+    ):
+        assert part in text
+    assert "Warnings" not in text
+
+
+def test_units_of_several_files():
+    assert common_units([measurement(), measurement(units=(None, None, None))]) == UNITS
+    assert common_units([measurement(units=(None, None, None))]) == Units("s", "in", "out")
+    with pytest.raises(DataError, match=r"file1.csv: the time is in s, that of another file in ms"):
+        common_units([measurement(), measurement(1, units=("s", "V", "mA"))])
+
+
+def test_the_figure_is_the_same_every_time_and_names_its_axes(fitted):
+    result, measurements, _ = fitted
+    figure = identification_svg(result, measurements, UNITS)
+    assert figure == identification_svg(result, measurements, UNITS)
+    root = ElementTree.fromstring(figure)
+    assert root.tag.endswith("svg")
+    # Text is drawn as outlines; what it says stands in comments beside them.
+    for label in ("y [mA]", "t [ms]", "residual [mA]", "delay [ms]", "lag [samples]"):
+        assert f"<!-- {label} -->".encode() in figure
+
+
+def test_the_figure_of_several_experiments_and_a_known_delay():
+    files = [measurement(seed) for seed in range(4)]
+    result = identify(DelayProfile(2, 0, (0.73, 0.73)), [item.record for item in files])
+    figure = identification_svg(result, files, UNITS)
+    assert b"<!-- experiment 3 of 4 -->" in figure
+    assert b"experiment 4" not in figure
+    assert b"known delay 0.73 ms" in figure

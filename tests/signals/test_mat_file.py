@@ -1,0 +1,209 @@
+"""MATLAB files: plain arrays of every version, and objects that only MATLAB can read."""
+
+import struct
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from scipy.io.matlab import MatlabObject
+
+from ctid_cli.errors import DataError
+from ctid_cli.signals import read_measurement
+
+T = 0.1 * np.arange(5)
+U = np.array([1.0, -1.0, 1.0, 1.0, -1.0])
+Y = np.array([0.0, 0.5, np.nan, 0.25, 0.125])
+
+
+def check(measurement):
+    assert np.array_equal(measurement.record.t, T)
+    assert np.array_equal(measurement.record.input.values, U)
+    assert np.array_equal(measurement.record.y, Y, equal_nan=True)
+
+
+def opaque(variable, kind):
+    """A version 5 file with one object, laid out as MATLAB does it."""
+
+    def element(code, data):
+        return struct.pack("<II", code, len(data)) + data + b"\0" * (-len(data) % 8)
+
+    flags = element(6, struct.pack("<II", 17, 0))
+    names = b"".join(element(1, text) for text in (variable, b"MCOS", kind))
+    inner = element(14, element(6, struct.pack("<II", 13, 0)) + element(5, struct.pack("<ii", 1, 1)) + element(1, b"")
+                    + element(6, struct.pack("<I", 0xDD000000)))  # fmt: skip
+    head = b"MATLAB 5.0 MAT-file".ljust(116) + b"\0" * 8 + struct.pack("<HH", 0x0100, 0x4D49)
+    return head + element(14, flags + names + inner)
+
+
+def save_v73(path, groups):
+    """A version 7.3 file: HDF5 behind a MATLAB header; arrays lie transposed."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, (kind, value) in groups.items():
+            item = file.create_group(name) if value is None else file.create_dataset(name, data=value)
+            item.attrs["MATLAB_class"] = np.bytes_(kind)
+    with open(path, "r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(116) + b"\0" * 8 + struct.pack("<HH", 0x0200, 0x4D49))
+
+
+# --- what is read ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("version", ["4", "5"])
+@pytest.mark.parametrize("shape", ["row", "column"])
+def test_plain_vectors(tmp_path, version, shape):
+    path = tmp_path / "rig.mat"
+    scipy.io.savemat(path, {"t": T, "u": U, "y": Y}, format=version, oned_as=shape)
+    check(read_measurement(path))
+
+
+def test_version_7_3(tmp_path):
+    path = tmp_path / "rig.mat"
+    columns = {name: (b"double", value[None, :]) for name, value in (("t", T), ("u", U), ("y", Y))}
+    save_v73(path, {**columns, "#refs#": (b"cell", None), "note": (b"char", np.array([[104], [105]], np.uint16))})
+    check(read_measurement(path))
+
+
+def test_fields_of_a_struct(tmp_path):
+    path = tmp_path / "rig.mat"
+    scipy.io.savemat(path, {"z": {"t": T, "u": U, "y": Y, "name": "rig"}, "x": 3.0})
+    measurement = read_measurement(path)
+    check(measurement)
+    assert (measurement.time, measurement.input, measurement.output) == ("z.t", "z.u", "z.y")
+
+
+def test_fields_of_a_struct_in_version_7_3(tmp_path):
+    path = tmp_path / "rig.mat"
+    columns = {f"z/{name}": (b"double", value[None, :]) for name, value in (("t", T), ("u", U), ("y", Y))}
+    save_v73(path, {"z": (b"struct", None), **columns})
+    check(read_measurement(path))
+
+
+def test_of_two_structs_one_must_be_chosen(tmp_path):
+    path = tmp_path / "rig.mat"
+    scipy.io.savemat(path, {"est": {"t": T, "u": U, "y": Y}, "val": {"t": T, "u": -U, "y": Y}})
+    with pytest.raises(DataError, match=r"'est\.t' and 'val\.t' may all be the time; say which one"):
+        read_measurement(path)
+    chosen = read_measurement(path, output="val.y", time="val.t")
+    assert np.array_equal(chosen.record.input.values, -U)
+
+
+def test_numbers_of_other_types_are_converted_and_names_may_be_given(tmp_path):
+    path = tmp_path / "rig.mat"
+    scipy.io.savemat(path, {"k": np.arange(5, dtype=np.int32), "valve": U.astype(np.float32), "level": Y})
+    measurement = read_measurement(path, time="k", input="valve", output="level", start=1, stop=3)
+    assert measurement.record.t.tolist() == [1.0, 2.0, 3.0]
+    assert measurement.record.input.values.tolist() == [-1.0, 1.0, 1.0]
+
+
+def test_a_sampling_interval_stands_for_the_times(tmp_path):
+    path = tmp_path / "rig.mat"
+    scipy.io.savemat(path, {"Ts": 0.1, "u": U, "y": Y})
+    measurement = read_measurement(path)
+    check(measurement)
+    assert measurement.notes == ("'Ts' is one number: it was taken as the sampling interval, 0.1 s, from 0 s on.",)
+    scipy.io.savemat(path, {"Ts": -0.1, "u": U, "y": Y})
+    with pytest.raises(DataError, match=r"'Ts' is -0\.1; a sampling interval must be a positive number"):
+        read_measurement(path)
+
+
+# --- what is refused ------------------------------------------------------------------------------
+
+LINE = (
+    "s = struct('t', z.SamplingInstants, 'u', z.InputData, 'y', z.OutputData); "
+    "save('rig_plain.mat', '-struct', 's', '-v7')"
+)
+
+
+def save_object(path, version):
+    if version == "old object":
+        fields = np.zeros((1, 1), dtype=[("InputData", object), ("OutputData", object)])
+        fields[0, 0] = (U, Y)
+        scipy.io.savemat(path, {"z": MatlabObject(fields, "iddata")})
+    elif version == "opaque":
+        path.write_bytes(opaque(b"z", b"iddata"))
+    else:
+        save_v73(path, {"z": (b"iddata", np.array([[3707764736, 2, 1, 1, 1, 1]], np.uint32))})
+        with h5py.File(path, "r+") as file:
+            file["z"].attrs["MATLAB_object_decode"] = np.int32(3)
+
+
+@pytest.mark.parametrize("version", ["old object", "opaque", "7.3"])
+def test_iddata_is_answered_with_the_line_that_exports_it(tmp_path, version):
+    path = tmp_path / "rig.mat"
+    save_object(path, version)
+    with pytest.raises(DataError) as error:
+        read_measurement(path)
+    assert str(error.value).startswith(f"{path}: 'z' is a MATLAB iddata object, which only MATLAB can read")
+    assert str(error.value).splitlines()[1].strip() == LINE
+
+
+def test_arrays_beside_an_object_are_read_and_the_line_is_given_where_they_do_not_suffice(tmp_path):
+    path = tmp_path / "rig.mat"
+    scipy.io.savemat(path, {"t": T, "u": U, "y": Y})
+    path.write_bytes(path.read_bytes() + opaque(b"z", b"iddata")[128:])
+    check(read_measurement(path))
+    scipy.io.savemat(path, {"t": T})
+    path.write_bytes(path.read_bytes() + opaque(b"z", b"iddata")[128:])
+    with pytest.raises(DataError, match="no variable is called 'u' or 'input'") as error:
+        read_measurement(path)
+    assert LINE in str(error.value)
+
+
+def test_other_objects_are_named(tmp_path):
+    path = tmp_path / "rig.mat"
+    path.write_bytes(opaque(b"tt", b"timetable"))
+    with pytest.raises(DataError, match=r"'tt' is a MATLAB timetable object.*save\('rig\.mat', 't', 'u', 'y', '-v7'\)"):
+        read_measurement(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "options", "message"),
+    [
+        ({"t": T, "u": np.ones((5, 2)), "y": Y}, {}, "variable 'u' is a 5x2 array; time, input and output must each"),
+        ({"t": T, "u": "held", "y": Y}, {}, "variable 'u' does not hold numbers"),
+        ({"t": T, "u": np.array([U, Y], dtype=object), "y": Y}, {}, "variable 'u' does not hold numbers"),
+        ({"t": T, "u": U * 1j, "y": Y}, {}, "variable 'u' holds complex numbers"),
+        ({"t": T, "u": np.empty((0, 0)), "y": Y}, {}, "variable 'u' is empty"),
+        ({"t": T, "u": U[:4], "y": Y}, {}, "input 'u' has 4 values and output 'y' has 5; they must be equally many"),
+        ({"t": T[:4], "u": U, "y": Y}, {}, "time 't' has 4 values and output 'y' has 5"),
+        ({"t": T[::-1], "u": U, "y": Y}, {}, "sample 2: time 't' goes back to 0.3 s after 0.4 s on sample 1"),
+        ({"t": T, "u": U, "y": Y * np.nan}, {}, "sample 1: no sample of the output 'y' is a finite number"),
+        ({"t": T, "valve": U, "y": Y}, {}, "no variable is called 'u' or 'input'; the file has 't', 'valve', 'y'"),
+        ({"t": T, "valve": U, "y": Y}, {"input": "valv"}, "there is no variable 'valv'; the file has"),
+        ({"t": T, "valve": U, "y": Y}, {"input": "valv"}, "Did you mean 'valve'?"),
+        ({}, {}, "the file holds no arrays; in MATLAB, save plain vectors"),
+    ],
+)
+def test_one_sentence(tmp_path, content, options, message):
+    path = tmp_path / "rig.mat"
+    scipy.io.savemat(path, content)
+    with pytest.raises(DataError) as error:
+        read_measurement(path, **options)
+    assert str(error.value).startswith(f"{path}:")
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"t,u,y\n0,1,2\n", b"\x89PNG\r\n" * 40, b"MATLAB 5.0 MAT-file".ljust(124)])
+def test_what_is_no_matlab_file(tmp_path, content):
+    path = tmp_path / "rig.mat"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"rig\.mat: (this is not a MATLAB file|the file is empty|the file holds no)"):
+        read_measurement(path)
+
+
+def test_a_cut_file_is_refused_or_incomplete_but_never_a_traceback(tmp_path):
+    path = tmp_path / "rig.mat"
+    scipy.io.savemat(path, {"t": T, "u": U, "y": Y})
+    whole = path.read_bytes()
+    for length in range(100, len(whole) - 1, 16):
+        path.write_bytes(whole[:length])
+        with pytest.raises(DataError, match=r"rig\.mat"):
+            read_measurement(path)
+
+
+def test_importing_signals_imports_neither_scipy_io_nor_h5py():
+    code = "import sys, ctid_cli.signals; sys.exit(bool({'scipy.io', 'h5py', 'pandas'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
