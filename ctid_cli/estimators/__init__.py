@@ -12,7 +12,7 @@ from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.lowpass import Lowpass
 
 #: Every estimator by the name that a specification gives it.
-ESTIMATORS: dict[str, type[Any]] = {estimator.kind: estimator for estimator in (Svf, Srivc, TdSrivc)}
+ESTIMATORS: dict[str, type[Any]] = {estimator.kind: estimator for estimator in (Svf, Srivc, TdSrivc, DelayProfile)}
 
 __all__ = [
     "ESTIMATORS",

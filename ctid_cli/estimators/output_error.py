@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ctid_cli.estimators.problems import is_hurwitz, reflect_unstable
+from ctid_cli.estimators.problems import with_stable_denominator
 from ctid_cli.estimators.refined_iv import Equations, scaled_solve
 from ctid_cli.filtering.bank import FilterData, standard_rows
 from ctid_cli.inference.sensitivity import Structure
@@ -177,11 +177,7 @@ class OutputErrorProblem:
         ndarray, shape (p,)
             Parameters of a stable model.
         """
-        n = self.structure.poles
-        a = np.concatenate(([1.0], theta[:n]))
-        if not np.isfinite(theta).all() or is_hurwitz(a):
-            return theta
-        return np.concatenate((reflect_unstable(a)[1:], theta[n:]))
+        return with_stable_denominator(theta, self.structure.poles)
 
     def sensitivities(self, theta: Array) -> list[tuple[Array, Array]] | None:
         """Derivatives of the simulated output, and the output error, of each experiment.

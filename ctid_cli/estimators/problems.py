@@ -72,6 +72,27 @@ def reflect_unstable(a: Array) -> Array:
     return np.asarray(np.real(np.poly(-damping + 1j * roots.imag)), dtype=float)
 
 
+def with_stable_denominator(theta: Array, poles: int) -> Array:
+    """Reflect the denominator at the head of a parameter vector if it is unstable.
+
+    Parameters
+    ----------
+    theta : ndarray, shape (p,)
+        Parameters, ``a_1 … a_n`` first.
+    poles : int
+        n.
+
+    Returns
+    -------
+    ndarray, shape (p,)
+        Parameters of a stable model; unchanged where they are stable or not finite.
+    """
+    a = np.concatenate(([1.0], theta[:poles]))
+    if not np.isfinite(theta).all() or is_hurwitz(a):
+        return theta
+    return np.concatenate((reflect_unstable(a)[1:], theta[poles:]))
+
+
 class CoefficientProblem:
     """Coefficients at a fixed delay: ``theta = (a_1 … a_n, b_0 … b_m)``.
 
@@ -119,11 +140,7 @@ class CoefficientProblem:
         ndarray, shape (p,)
             Parameters of a stable model.
         """
-        n = self.structure.poles
-        a = np.concatenate(([1.0], theta[:n]))
-        if not np.isfinite(theta).all() or is_hurwitz(a):
-            return theta
-        return np.concatenate((reflect_unstable(a)[1:], theta[n:]))
+        return with_stable_denominator(theta, self.structure.poles)
 
     def moments(self, theta: Array) -> Array | None:
         """Second moments of the standard rows.
@@ -204,21 +221,6 @@ class DelayProblem(CoefficientProblem):
         """
         n = self.structure.poles
         return np.concatenate(([1.0], theta[:n])), theta[n:-1], float(theta[-1])
-
-    def admissible(self, theta: Array) -> Array:
-        """Reflect unstable denominators; a delay outside the bounds stays and is refused by :meth:`moments`.
-
-        Parameters
-        ----------
-        theta : ndarray, shape (p,)
-            Parameters.
-
-        Returns
-        -------
-        ndarray, shape (p,)
-            Parameters of a stable model.
-        """
-        return np.concatenate((super().admissible(theta[:-1]), theta[-1:]))
 
     def moments(self, theta: Array) -> Array | None:
         """Second moments of the standard rows.

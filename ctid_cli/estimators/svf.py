@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, get_args
 
 from ctid_cli.errors import DataError
@@ -150,4 +150,4 @@ class PreparedSvf:
         problem = CoefficientProblem(self.data, self.structure, options.delay)
         fit = finish(problem, theta, Status.LEAST_SQUARES, 1, [], accurate=False)
         entry = history_entry("least squares", 0, problem, theta, fit.cost)
-        return finish(problem, theta, Status.LEAST_SQUARES, 1, [entry], accurate=False)
+        return replace(fit, history=(entry,))
