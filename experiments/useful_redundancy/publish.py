@@ -1,7 +1,6 @@
 """Copy the tables of a finished reproduction to results/published, with the environment that made them.
 
-    make reproduce
-    .venv/bin/python experiments/useful_redundancy/publish.py
+After ``make reproduce``: ``.venv/bin/python experiments/useful_redundancy/publish.py``.
 """
 
 import argparse
@@ -10,7 +9,7 @@ import shutil
 from pathlib import Path
 
 #: What is kept of a session: nothing that names a machine, a user or a folder.
-KEPT = ("started", "stopped", "computed", "failed", "jobs", "processors", "code_version", "numeric_platform", "packages")
+KEPT = ("started", "stopped", "computed", "failed", "jobs", "processors", "code_version", "numeric_platform")
 
 
 def main() -> None:
@@ -26,7 +25,7 @@ def main() -> None:
     for folder in sorted((arguments.results / "useful-redundancy").iterdir()):
         for file in sorted((folder / "provenance").glob("*.json")):
             session = json.loads(file.read_text(encoding="utf-8"))
-            sessions.setdefault(folder.name, []).append({key: session[key] for key in KEPT})
+            sessions.setdefault(folder.name, []).append({key: session[key] for key in (*KEPT, "packages")})
     text = json.dumps(sessions, indent=2) + "\n"
     (arguments.out / "environment.json").write_text(text, encoding="utf-8")
 
