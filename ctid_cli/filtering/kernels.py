@@ -194,6 +194,17 @@ def shortest_gap(t: Array, tu: Array) -> float:
 
 
 @njit(cache=True, nogil=True)
+def _longest_lag(t: Array, delay: float, slack: float) -> int:
+    """Most samples by which the delayed input is behind the output when it takes a step."""
+    lag, j = 1, 0
+    for k in range(t.size):
+        while j + 1 < t.size and t[j + 1] <= t[k] - delay + slack:
+            lag = max(lag, k - j)
+            j += 1
+    return lag
+
+
+@njit(cache=True, nogil=True)
 def _step_functions(x: complex) -> tuple[complex, complex, complex]:
     """``exp(x)``, ``f(x) = (exp(x) - 1 - x)/x^2`` and ``f'(x)``.
 
@@ -322,9 +333,11 @@ def modal_pass(
             for k, weight in enumerate(_step_weights(poles[i], interval * fraction)):
                 at_sample[i, k] = weight
     share = common_clock and not regular
-    memory = np.zeros((n_samples if share else 0, modes, 6), np.complex128)
     # Instants that differ by rounding only are one instant.
     slack = ROUNDING_GAP * shortest_gap(t, tu)
+    # Weights of the output's steps serve the input when it gets there: a ring that spans the delay, not the record.
+    ring = 1 + _longest_lag(t, delay, slack) if share else 0
+    memory = np.zeros((ring, modes, 6), np.complex128)
     filled, written = 0, 0
     keep_rows = gram.size > 0 or rows.size > 0
     j = -1  # the last break that has been reached
@@ -337,7 +350,7 @@ def modal_pass(
                     if regular:
                         weights = _weights(at_break[i])
                     elif share:
-                        weights = _weights(memory[j, i])
+                        weights = _weights(memory[j % ring, i])
                     else:
                         weights = _step_weights(poles[i], tu[j + 1] - tu[j])
                     z[i], w[i] = _modal_step(weights, z[i], w[i], u[j], change)
@@ -390,7 +403,7 @@ def modal_pass(
                 weights = _weights(at_break[i]) if regular else _step_weights(poles[i], t[k + 1] - t[k])
                 if share:
                     for m, weight in enumerate(weights):
-                        memory[k, i, m] = weight
+                        memory[k % ring, i, m] = weight
                 zy[i] = weights[0] * zy[i] + (weights[2] * y[k] + weights[3] * change)
     _emit(block, filled, written, rows, gram)
     _mirror(gram)
