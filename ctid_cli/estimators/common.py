@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
+from ctid_cli.estimators.output_error import OutputErrorProblem
 from ctid_cli.estimators.problems import CoefficientProblem
 from ctid_cli.filtering.bank import FilterData
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
+from ctid_cli.inference.diagnostics import percent_from_r_squared
 from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
@@ -105,7 +107,7 @@ def check_record(record: Record, data: FilterData, parameters: int) -> None:
 
 
 def history_entry(
-    stage: str, iteration: int, problem: CoefficientProblem, theta: Array, cost: float
+    stage: str, iteration: int, problem: CoefficientProblem | OutputErrorProblem, theta: Array, cost: float
 ) -> IterationRecord:
     """Describe one accepted iteration.
 
@@ -115,7 +117,7 @@ def history_entry(
         Part of the algorithm.
     iteration : int
         Counted from 0 within the stage.
-    problem : CoefficientProblem
+    problem : CoefficientProblem or OutputErrorProblem
         Knows how theta splits.
     theta : ndarray, shape (p,)
         Parameters.
@@ -191,7 +193,7 @@ def finish(
         covariance=covariance,
         status=status,
         cost=squared_error / count,
-        fit_percent=100.0 * (1.0 - float(np.sqrt(max(1.0 - r2, 0.0)))),
+        fit_percent=percent_from_r_squared(r2),
         r2=r2,
         count=count,
         iterations=iterations,

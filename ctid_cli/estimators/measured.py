@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.common import Start, check_iteration, check_record
+from ctid_cli.estimators.common import Start, check_iteration, check_record, history_entry
 from ctid_cli.estimators.output_error import Layout, OutputErrorProblem
 from ctid_cli.estimators.problems import CoefficientProblem, least_squares_start, refit_numerator
 from ctid_cli.estimators.refined_iv import Equations, Iterated, iterate
@@ -18,6 +19,7 @@ from ctid_cli.estimators.td_srivc import bound_in_the_way
 from ctid_cli.filtering.bank import FilterData, filter_data
 from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
+from ctid_cli.inference.diagnostics import percent_from_r_squared
 from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
@@ -253,23 +255,9 @@ class MeasuredFit(Fit):
 class _CoefficientSearch(CoefficientProblem):
     """Coefficients at a fixed delay by Gauss-Newton: a direction of descent also where the delay is wrong."""
 
-    def __init__(self, data: FilterData, structure: Structure, delay: float) -> None:
-        super().__init__(data, structure, delay)
-        self.structure = structure  # with its index tables, which would cost as much as a short record
-
     def equations(self, theta: Array) -> Equations | None:
-        moments = self.moments(theta)
-        if moments is None:
-            return None
-        structure, n = self.structure, self.structure.poles
-        hessian = structure.hessian(moments)
-        return Equations(
-            hessian,
-            structure.instrument_error(moments),
-            hessian,
-            structure.squared_error(moments),
-            structure.output_power(moments, theta[n:]),
-        )
+        equations = super().equations(theta)
+        return None if equations is None else replace(equations, instrument_regressor=equations.hessian)
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,7 +305,6 @@ class PreparedProfile:
         )
         self.offsets: list[float] = []
         self.input_offsets: list[float] = []
-        self.padding: list[int] = []
         self.records: list[Record] = []
         for record in records:
             where = f"{record.name}: " if record.name else ""
@@ -487,7 +474,12 @@ class PreparedProfile:
             offsets=tuple(y0 + c for y0, (_, c) in zip(self.offsets, estimated, strict=True)),
         )
 
-    def _iterated(self, problem: OutputErrorProblem, theta: Array) -> Iterated | None:
+    def _iterated(
+        self,
+        problem: OutputErrorProblem,
+        theta: Array,
+        on_step: Callable[[Array, Equations], None] | None = None,
+    ) -> Iterated | None:
         """Gauss-Newton with the options' tolerance."""
         return iterate(
             problem,
@@ -495,6 +487,7 @@ class PreparedProfile:
             max_iterations=self.options.max_iterations,
             tolerance=self.options.tolerance,
             variant="guarded",
+            on_step=on_step,
         )
 
     def _used(self, problem: OutputErrorProblem) -> tuple[NDArray[np.bool_], ...]:
@@ -567,7 +560,7 @@ class PreparedProfile:
         structure = Structure(self.structure.poles, min(self.structure.zeros, self.structure.poles - 1))
         starts: list[Array] = []
         for cutoff in cutoffs:
-            theta = least_squares_start(self._centred[0], structure, delay, cutoff * self.bandwidth)
+            theta = least_squares_start(self._centred, structure, delay, cutoff * self.bandwidth)
             if theta is not None:
                 starts.append(theta[: structure.poles])
         if not starts:
@@ -575,12 +568,12 @@ class PreparedProfile:
             starts.append(np.asarray(np.poly(np.full(structure.poles, -0.5 * self.bandwidth))[1:], dtype=float))
         return starts
 
-    @property
-    def _centred(self) -> list[FilterData]:
-        """Records without their means, for starts that know no offset and no initial state."""
+    @cached_property
+    def _centred(self) -> FilterData:
+        """The first record without its means, for starts that know no offset and no initial state."""
         if self.options.offset != "estimate":
-            return self.data
-        return [self._lay_out(_without_means(record)[0]) for record in self.records]
+            return self.data[0]
+        return self._lay_out(_without_means(self.records[0])[0])
 
     def _coefficients(self, delay: float, a: Array) -> Iterated | None:
         """Minimise the cost at a fixed delay."""
@@ -611,22 +604,12 @@ class PreparedProfile:
         steps: list[IterationRecord] = []
 
         def record_step(theta: Array, equations: Equations) -> None:
-            a, b, tau = problem.split(theta)
-            cost = equations.squared_error / problem.count
-            steps.append(IterationRecord("refine", len(steps), tau, cost, tuple(a.tolist()), tuple(b.tolist())))
+            steps.append(history_entry("refine", len(steps), problem, theta, equations.squared_error / problem.count))
 
         theta = problem.linear_start(np.concatenate(([1.0], a)), delay)
         if theta is None:
             return None, steps
-        options = self.options
-        result = iterate(
-            problem,
-            theta,
-            max_iterations=options.max_iterations,
-            tolerance=options.tolerance,
-            variant="guarded",
-            on_step=record_step,
-        )
+        result = self._iterated(problem, theta, record_step)
         if result is None or not self.structure.delay:
             return result, steps
         return self._mind_the_bounds(problem, result), steps
@@ -688,7 +671,7 @@ class PreparedProfile:
             covariance=covariance,
             status=status,
             cost=squared_error / count,
-            fit_percent=100.0 * (1.0 - float(np.sqrt(max(1.0 - r2, 0.0)))),
+            fit_percent=percent_from_r_squared(r2),
             r2=r2,
             count=count,
             iterations=result.iterations,

@@ -108,7 +108,8 @@ class CoefficientProblem:
 
     def __init__(self, data: FilterData, structure: Structure, delay: float) -> None:
         self.data = data
-        self.structure = Structure(structure.poles, structure.zeros)
+        # A structure carries index tables, which cost as much as a pass over a short record: take it as it is.
+        self.structure = Structure(structure.poles, structure.zeros) if structure.delay else structure
         self.delay = delay
 
     def split(self, theta: Array) -> tuple[Array, Array, float]:

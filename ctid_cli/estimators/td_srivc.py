@@ -240,12 +240,12 @@ class PreparedTdSrivc:
         if there is not None:
             status = Status.DELAY_AT_BOUND
             if options.variant == "guarded":
-                theta = there
-                history.append(history_entry("bound", 0, problem, theta, mean_cost(problem, theta)))
+                theta, squared_error = there
+                history.append(history_entry("bound", 0, problem, theta, squared_error / self.data.count))
         return finish(problem, theta, status, iterations, history)
 
-    def _at_bound(self, problem: DelayProblem, theta: Array) -> Array | None:
-        """The estimate with the delay on a bound, if that is where the cost leads."""
+    def _at_bound(self, problem: DelayProblem, theta: Array) -> tuple[Array, float] | None:
+        """The estimate with the delay on a bound and its sum of squares, if that is where the cost leads."""
         here = problem.equations(theta)
         bound = None if here is None else bound_in_the_way(here, float(theta[-1]), problem.bounds)
         if here is None or bound is None:
@@ -260,7 +260,7 @@ class PreparedTdSrivc:
         )
         if there is None or there.equations.squared_error > here.squared_error:
             return None
-        return np.concatenate((there.theta, [bound]))
+        return np.concatenate((there.theta, [bound])), there.equations.squared_error
 
     def _polish(self, problem: DelayProblem, theta: Array, history: list[IterationRecord]) -> Iterated | None:
         """Joint iterations on coefficients and delay: from the right basin they converge in a few steps."""
@@ -278,25 +278,6 @@ class PreparedTdSrivc:
             variant="guarded",
             on_step=record_step,
         )
-
-
-def mean_cost(problem: DelayProblem, theta: Array) -> float:
-    """Mean squared output error of a parameter vector.
-
-    Parameters
-    ----------
-    problem : DelayProblem
-        Record, degrees and bounds.
-    theta : ndarray, shape (p,)
-        Parameters, the delay last.
-
-    Returns
-    -------
-    float
-        The cost [output unit^2]; NaN where theta has no finite response.
-    """
-    equations = problem.equations(theta)
-    return float("nan") if equations is None else equations.squared_error / problem.data.count
 
 
 def bound_in_the_way(equations: Equations, delay: float, bounds: tuple[float, float]) -> float | None:

@@ -119,15 +119,13 @@ def filter_data(record: Record, start: float = 0.0, hold_output: Hold = "foh") -
     FilterData
         Arrays for the compiled passes.
     """
-    valid = record.valid
-    y = record.y if valid.all() else np.interp(record.t, record.t[valid], record.y[valid])
     slack = 1e-9 * (record.interval or 0.0)
-    use = valid & (record.t >= record.input.t[0] + start - slack)
+    use = record.valid & (record.t >= record.input.t[0] + start - slack)
     on_grid = record.input_on_grid
     same = record.input.t.size == record.t.size and bool(np.array_equal(record.input.t, record.t))
     return FilterData(
         t=plain_array(record.t),
-        y=plain_array(y),
+        y=plain_array(record.bridged_y),
         use=use,
         tu=plain_array(record.input.t),
         u=plain_array(record.input.values),
@@ -139,8 +137,21 @@ def filter_data(record: Record, start: float = 0.0, hold_output: Hold = "foh") -
 
 
 @njit(cache=True, nogil=True)
-def _scaled(coefficients: Array, w0: float) -> Array:
-    """Coefficients of A in the time unit 1/w0."""
+def scaled_denominator(coefficients: Array, w0: float) -> Array:
+    """Coefficients of a monic denominator in the time unit 1/w0.
+
+    Parameters
+    ----------
+    coefficients : ndarray, shape (n + 1,)
+        Monic, descending powers.
+    w0 : float
+        Characteristic frequency [rad/s].
+
+    Returns
+    -------
+    ndarray, shape (n + 1,)
+        ``a_k / w0^k``.
+    """
     scaled = np.empty(coefficients.size)
     for k in range(coefficients.size):
         scaled[k] = coefficients[k] / w0**k
@@ -172,7 +183,7 @@ def double_chain(a: Array, b: Array) -> tuple[float, Array, Array, Array, Array]
     n = a.size - 1
     m = b.size - 1
     w0 = time_scale(a)
-    single, entry, powers = chain(polynomial_roots(_scaled(a, w0)))
+    single, entry, powers = chain(polynomial_roots(scaled_denominator(a, w0)))
     for k in range(n):
         for i in range(n):
             powers[k, i] *= w0 ** (k - n)
@@ -372,7 +383,7 @@ def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Ar
     """
     n = a.size - 1
     w0 = time_scale(a)
-    roots = polynomial_roots(_scaled(a, w0)) * w0
+    roots = polynomial_roots(scaled_denominator(a, w0)) * w0
     modes = 0
     for i in range(n):
         if roots[i].imag >= 0.0:

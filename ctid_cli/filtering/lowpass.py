@@ -70,8 +70,7 @@ class Lowpass:
         other clock the held signals pass through the analogue filter exactly, and the smooth results are taken as
         linear between the samples.
         """
-        valid = record.valid
-        y = record.y if valid.all() else np.interp(record.t, record.t[valid], record.y[valid])
+        y = record.bridged_y
         if record.interval is not None and record.input_on_grid:
             from scipy import signal  # slow to import, needed only here
 
@@ -87,4 +86,4 @@ class Lowpass:
             instants = np.union1d(record.t, record.input.t[record.input.t <= record.t[-1]])
             filtered_u = HeldSignal(instants, simulate(self.model, record.input, instants), "foh")
             filtered_y = simulate(self.model, HeldSignal(record.t, y, "foh"), record.t)
-        return Record(record.t, np.where(valid, filtered_y, np.nan), filtered_u, name=record.name)
+        return Record(record.t, np.where(record.valid, filtered_y, np.nan), filtered_u, name=record.name)

@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.bank import plain_array, split_delay
+from ctid_cli.filtering.bank import plain_array, scaled_denominator, split_delay
 from ctid_cli.filtering.exponential import held_step
 from ctid_cli.filtering.kernels import irregular_chain_pass, regular_chain_pass
 from ctid_cli.filtering.sections import chain, polynomial_roots, time_scale
@@ -91,10 +91,7 @@ def _response(
     """Compiled body of :func:`simulate`; ``interval`` is 0 on an irregular clock, ``b`` has n entries."""
     n = a.size - 1
     w0 = time_scale(a)
-    scaled = np.empty(n + 1)
-    for k in range(n + 1):
-        scaled[k] = a[k] / w0**k
-    dynamics, gain, powers = chain(polynomial_roots(scaled))
+    dynamics, gain, powers = chain(polynomial_roots(scaled_denominator(a, w0)))
     output_map = np.zeros(n)
     for i in range(n):
         for j in range(n):

@@ -11,7 +11,7 @@ from ctid_cli.inference.criteria import (
 )
 from ctid_cli.inference.delay_interval import DelayInterval, profile_likelihood_interval, quadratic_is_doubtful
 from ctid_cli.inference.derived import DerivedParameter, derived_parameters, pole_jacobian
-from ctid_cli.inference.diagnostics import fit_percent, r_squared
+from ctid_cli.inference.diagnostics import fit_percent, percent_from_r_squared, r_squared
 from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
 from ctid_cli.inference.residuals import ResidualTests, residual_tests
@@ -36,6 +36,7 @@ __all__ = [
     "fit_noise_model",
     "fit_percent",
     "information_criteria",
+    "percent_from_r_squared",
     "pole_jacobian",
     "profile_likelihood_interval",
     "quadratic_is_doubtful",

@@ -26,7 +26,23 @@ def fit_percent(y: ArrayLike, x: ArrayLike) -> float:
     >>> fit_percent([0.0, 1.0, 2.0], [0.0, 1.0, 2.0])
     100.0
     """
-    return 100.0 * (1.0 - float(np.sqrt(1.0 - r_squared(y, x))))
+    return percent_from_r_squared(r_squared(y, x))
+
+
+def percent_from_r_squared(r2: float) -> float:
+    """Fit that belongs to a coefficient of determination: ``100 (1 - sqrt(1 - R^2))``.
+
+    Parameters
+    ----------
+    r2 : float
+        R squared, at most 1 up to rounding [-].
+
+    Returns
+    -------
+    float
+        Fit [%].
+    """
+    return 100.0 * (1.0 - float(np.sqrt(max(1.0 - r2, 0.0))))
 
 
 def r_squared(y: ArrayLike, x: ArrayLike) -> float:

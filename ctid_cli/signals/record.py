@@ -116,6 +116,13 @@ class Record:
         return np.isfinite(self.y)
 
     @cached_property
+    def bridged_y(self) -> NDArray[np.float64]:
+        """Outputs with missing samples bridged by straight lines [output unit], shape (N,)."""
+        if self.valid.all():
+            return self.y
+        return np.asarray(np.interp(self.t, self.t[self.valid], self.y[self.valid]), dtype=float)
+
+    @cached_property
     def interval(self) -> float | None:
         """Sampling interval [s] if the output clock is regular, else None."""
         return regular_interval(self.t)
