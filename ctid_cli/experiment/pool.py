@@ -158,8 +158,8 @@ def _round(
 def _no_failed_callback(record: logging.LogRecord) -> bool:
     """Whether a log record is anything but a callback that met a pool being torn down.
 
-    joblib starts the next job from such a callback. When a run ends early the pool may be gone by then; the backend logs
-    a traceback, although nothing is wrong and the outcome of every job reaches us as a result.
+    joblib starts the next job from such a callback. When a run ends early the pool may be gone by then; the backend
+    logs a traceback, although nothing is wrong and the outcome of every job reaches us as a result.
     """
     return not str(record.msg).startswith("exception calling callback")
 
