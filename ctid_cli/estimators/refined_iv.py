@@ -187,8 +187,8 @@ def iterate(
         step = scaled_solve(
             current.instrument_regressor,
             current.instrument_error,
-            np.diag(current.hessian),
-            np.abs(np.diag(current.instrument_regressor)),
+            current.hessian.diagonal(),
+            np.abs(current.instrument_regressor.diagonal()),
         )
         # Where instruments are regressors the step is Gauss-Newton's already: a second trial would repeat the first.
         same = step is not None and current.instrument_regressor is current.hessian
@@ -239,7 +239,7 @@ def gauss_newton_step(equations: Equations) -> Array | None:
     ndarray, shape (p,) or None
         ``[sum psi psi']^-1 sum psi eps``; None if singular.
     """
-    diagonal = np.diag(equations.hessian)
+    diagonal = equations.hessian.diagonal()
     return scaled_solve(equations.hessian, equations.instrument_error, diagonal, diagonal)
 
 
