@@ -1,6 +1,7 @@
 # make demo       install into .venv, run the quickstart, print its table
 # make test       everything that CI runs
-# make reproduce  the whole study; stop it and run it again at will, it goes on where it was
+# make reproduce  the whole study, its tables and figures, compared with the committed ones; stop it and run it again at
+#                 will, it goes on where it was
 # make bench      speed, measured against other tools
 # make clean      remove what the other targets built (never results)
 
@@ -33,7 +34,9 @@ reproduce: $(VENV)/.installed
 	set -e; for config in $(STUDY); do $(BIN)/ctid run "$$config" --runs $(RUNS) --jobs $(JOBS) --out "$(OUT)"; done
 	$(BIN)/ctid table --format md --out "$(OUT)" > "$(OUT)/useful_redundancy.md"
 	$(BIN)/ctid table --format csv --out "$(OUT)" > "$(OUT)/useful_redundancy.csv"
+	$(BIN)/ctid figure useful-redundancy --out "$(OUT)"
 	$(BIN)/ctid table --out "$(OUT)"
+	$(BIN)/ctid table --check --out "$(OUT)"
 
 bench: $(VENV)/.test-installed
 	set -e; for benchmark in benchmarks/bench_*.py; do $(BIN)/python "$$benchmark"; done

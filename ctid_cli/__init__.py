@@ -12,7 +12,9 @@ if TYPE_CHECKING:
     from ctid_cli.estimators import Start as Start
     from ctid_cli.estimators import Svf as Svf
     from ctid_cli.estimators import TdSrivc as TdSrivc
+    from ctid_cli.estimators import UsefulRedundancy as UsefulRedundancy
     from ctid_cli.estimators import identify as identify
+    from ctid_cli.estimators import minimise_redundantly as minimise_redundantly
     from ctid_cli.filtering import simulate as simulate
     from ctid_cli.inference import Fit as Fit
     from ctid_cli.inference import Status as Status
@@ -38,9 +40,11 @@ _HOME = {
     "Svf": "estimators",
     "TdSrivc": "estimators",
     "TransferFunction": "models",
+    "UsefulRedundancy": "estimators",
     "cramer_rao_bound": "inference",
     "fit_percent": "inference",
     "identify": "estimators",
+    "minimise_redundantly": "estimators",
     "read_record": "signals",
     "simulate": "filtering",
 }

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 import ctid_cli
+from ctid_cli.cli._checks import CheckCommand
 from ctid_cli.cli.check import check
 from ctid_cli.cli.export import export
 from ctid_cli.cli.fit import fit
@@ -44,11 +45,13 @@ def _root(
 
     `ctid check` and `ctid fit` take a measured record. A YAML file describes one experiment: `ctid validate` checks
     it, `ctid run` computes it (again to resume), `ctid table` prints the percentages. Exit codes: 0 done, 1 internal
-    error, 2 bad input, 3 refused, 4 too many failures, 5 stopped early, 6 storage error, 130 Ctrl-C, 143 terminated.
+    error, 2 bad input, 3 refused, 4 too many failures, 5 stopped early, 6 storage error, 7 difference found,
+    130 Ctrl-C, 143 terminated.
     """
 
 
-for _command in (check, fit, run, status, table, show, export, validate, schema):
+app.command(cls=CheckCommand)(check)
+for _command in (fit, run, status, table, show, export, validate, schema):
     app.command()(_command)
 
 

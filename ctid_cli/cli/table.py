@@ -27,6 +27,14 @@ def table(
         typer.Argument(metavar="[NAME]...", help="Table (1, useful-redundancy/3) or experiment (quickstart)."),
     ] = None,
     style: Annotated[TableFormat, typer.Option("--format", help="Form of the output.")] = TableFormat.text,
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="Compare with the committed tables and the paper; exit code 7 if they differ."),
+    ] = False,
+    reference: Annotated[
+        Path | None,
+        typer.Option("--reference", metavar="FILE", help="With --check: these tables (CSV) for the committed ones."),
+    ] = None,
     out: Out = Path("results"),
 ) -> None:
     """Print tables of convergence percentages.
@@ -35,8 +43,18 @@ def table(
 
     Without a name: all tables of the useful-redundancy study. Cells that were not run say so.
     """
+    from ctid_cli.errors import MismatchError, UsageError
+    from ctid_cli.reporting.comparison import check_tables, mismatch_sentence, write_comparison
     from ctid_cli.reporting.report import build_tables, write_tables
 
+    if reference is not None and not check:
+        raise UsageError("--reference goes with --check")
     if not out.is_dir():
         typer.echo(f"ctid: there is no folder {out}, so nothing was run yet (--out names the results folder)", err=True)
-    typer.echo(write_tables(build_tables(names or [], out), style.value))
+    if not check:
+        typer.echo(write_tables(build_tables(names or [], out), style.value))
+        return
+    comparison = check_tables(names or [], out, reference)
+    typer.echo(write_comparison(comparison, style.value))
+    if comparison.mismatches:
+        raise MismatchError(mismatch_sentence(comparison))

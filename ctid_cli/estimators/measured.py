@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.common import Start, check_iteration, check_record, history_entry
+from ctid_cli.estimators.delay_search import bound_in_the_way
 from ctid_cli.estimators.output_error import Layout, OutputErrorProblem
 from ctid_cli.estimators.problems import CoefficientProblem, least_squares_start, refit_numerator
 from ctid_cli.estimators.refined_iv import Equations, Iterated, iterate
-from ctid_cli.estimators.td_srivc import bound_in_the_way
 from ctid_cli.filtering.bank import FilterData, filter_data
 from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance

@@ -17,8 +17,9 @@ from ctid_cli.estimators.common import (
     finish,
     history_entry,
 )
+from ctid_cli.estimators.delay_search import Descent, Minimum, bound_in_the_way, delay_step, descend
 from ctid_cli.estimators.problems import CoefficientProblem, DelayProblem
-from ctid_cli.estimators.refined_iv import Equations, Iterated, Variant, iterate, scaled_solve
+from ctid_cli.estimators.refined_iv import Equations, Iterated, Variant, iterate
 from ctid_cli.estimators.srivc import initial_coefficients
 from ctid_cli.filtering.bank import FilterData, filter_data
 from ctid_cli.filtering.lowpass import Lowpass
@@ -35,8 +36,6 @@ Array = NDArray[np.float64]
 INNER_ITERATIONS = 20
 #: Tolerance of the guarded variant while it searches.
 SEARCH_TOLERANCE = 1e-3
-#: The smallest delay step, as a fraction of the range of the delay.
-SMALLEST_STEP = 1e-5
 
 
 @dataclass(frozen=True)
@@ -218,20 +217,40 @@ class PreparedTdSrivc:
         delay = 0.5 * (low + high) if start is None or start.delay is None else start.delay
         if not low <= delay <= high:
             raise DataError(f"the initial delay, {delay:g} s, lies outside the bounds {low:g} to {high:g} s")
-        search = _DelaySearch(self.search_data, self.structure, options, "search")
-        result = search.run(delay, None)
-        if result is None:
+        history: list[IterationRecord] = []
+        found = _SampleCost(self.search_data, self.structure, options).descend(delay, None, "search", history)
+        if found is None:
             raise DataError(Status.SINGULAR.value)
-        iterations, history = result.iterations, search.history
-        if options.lowpass is not None:
-            refinement = _DelaySearch(self.data, self.structure, options, "refine")
-            refined = refinement.run(float(result.theta[-1]), result.theta[:-1])
-            if refined is not None:
-                result = refined
-                iterations += refined.iterations
-                history += refinement.history
+        if options.lowpass is None:
+            return self._finish(found, history, found.iterations)
+        return self.refine(found, history)
+
+    def refine(self, found: Descent, history: list[IterationRecord]) -> Fit:
+        """Go on from a delay and coefficients that a search on filtered data has found.
+
+        Parameters
+        ----------
+        found : Descent
+            Result of the search.
+        history : list of IterationRecord
+            Its accepted steps; those of the refinement are added.
+
+        Returns
+        -------
+        Fit
+            The estimate.
+        """
+        cost = _SampleCost(self.data, self.structure, self.options)
+        refined = cost.descend(found.minimum.delay, found.minimum.theta, "refine", history)
+        if refined is None:
+            return self._finish(found, history, found.iterations)
+        return self._finish(refined, history, found.iterations + refined.iterations)
+
+    def _finish(self, found: Descent, history: list[IterationRecord], iterations: int) -> Fit:
+        """Polish, mind the bounds, and report."""
+        options = self.options
         problem = DelayProblem(self.data, self.structure, options.delay_bounds)
-        theta, status = result.theta, result.status
+        theta, status = np.concatenate((found.minimum.theta, [found.minimum.delay])), found.status
         if options.variant == "guarded":
             polished = self._polish(problem, theta, history)
             if polished is not None:
@@ -280,46 +299,18 @@ class PreparedTdSrivc:
         )
 
 
-def bound_in_the_way(equations: Equations, delay: float, bounds: tuple[float, float]) -> float | None:
-    """The bound that keeps the delay from a lower cost.
+class _SampleCost:
+    """The cost of a record's samples; SRIVC estimates the coefficients."""
 
-    Parameters
-    ----------
-    equations : Equations
-        Second moments where the iterations ended, the delay as the last parameter.
-    delay : float
-        Delay there [s].
-    bounds : tuple of float
-        Least and greatest delay [s].
-
-    Returns
-    -------
-    float or None
-        The bound [s] beyond which the next full Gauss-Newton step would lead; None if it stays inside, or if the data
-        hardly determine the delay, so that the length of the step means nothing.
-    """
-    step = delay_step(equations, least_curvature=1e-8)
-    if step is None:
-        return None
-    if delay + step < bounds[0]:
-        return bounds[0]
-    return bounds[1] if delay + step > bounds[1] else None
-
-
-class _DelaySearch:
-    """Gauss-Newton on the delay, the coefficients re-estimated by SRIVC at every trial delay."""
-
-    def __init__(self, data: FilterData, structure: Structure, options: TdSrivc, stage: str) -> None:
+    def __init__(self, data: FilterData, structure: Structure, options: TdSrivc) -> None:
         self.data = data
         self.structure = structure
         self.options = options
-        self.stage = stage
         self.joint = DelayProblem(data, structure, options.delay_bounds)
-        self.history: list[IterationRecord] = []
         # The guarded variant ends with joint iterations: its search only has to find the basin.
         self.tolerance = options.tolerance if options.variant == "plain" else max(options.tolerance, SEARCH_TOLERANCE)
 
-    def coefficients(self, delay: float, theta: Array | None) -> Iterated | None:
+    def minimise(self, delay: float, theta: Array | None) -> Minimum | None:
         """SRIVC at one delay, from given coefficients or from the least-squares start."""
         problem = CoefficientProblem(self.data, self.structure, delay)
         options = self.options
@@ -334,79 +325,30 @@ class _DelaySearch:
             tolerance=self.tolerance,
             variant=options.variant,
         )
-        return result if result is not None and np.isfinite(result.theta).all() else None
-
-    def log(self, delay: float, result: Iterated) -> None:
-        """Remember an accepted trial delay."""
-        theta = np.concatenate((result.theta, [delay]))
-        cost = result.equations.squared_error / self.data.count
-        self.history.append(history_entry(self.stage, len(self.history), self.joint, theta, cost))
-
-    def run(self, delay: float, theta: Array | None) -> Iterated | None:
-        """Search from a delay; ``theta`` of the result holds the coefficients and the delay."""
-        options = self.options
-        low, high = options.delay_bounds
-        smallest = SMALLEST_STEP * (high - low)
-        current = self.coefficients(delay, theta)
-        if current is None:
+        if result is None or not np.isfinite(result.theta).all():
             return None
-        self.log(delay, current)
-        status = Status.MAX_ITERATIONS
-        iterations = 0
-        equations: Equations | None = None
-        for _ in range(options.max_iterations):
-            equations = self.joint.equations(np.concatenate((current.theta, [delay])))
-            step = None if equations is None else delay_step(equations)
-            if step is None:
-                status = Status.SINGULAR
-                break
-            accepted = None
-            while accepted is None:
-                while not low <= delay + step <= high:
-                    step *= 0.5
-                if abs(step) <= smallest:
-                    break
-                trial = self.coefficients(delay + step, current.theta)
-                if trial is not None and trial.equations.squared_error < current.equations.squared_error:
-                    accepted = trial
-                else:
-                    step *= 0.5
-            if accepted is None:
-                status = Status.CONVERGED
-                break
-            fall = 1.0 - accepted.equations.squared_error / current.equations.squared_error
-            delay += step
-            current = accepted
-            iterations += 1
-            self.log(delay, current)
-            if fall < self.tolerance:
-                status = Status.CONVERGED
-                break
-        return Iterated(np.concatenate((current.theta, [delay])), current.equations, status, iterations)
+        return Minimum(delay, result.theta, result.equations.squared_error)
 
+    def step(self, minimum: Minimum) -> float | None:
+        """Gauss-Newton step of the delay."""
+        equations = self.joint.equations(np.concatenate((minimum.theta, [minimum.delay])))
+        return None if equations is None else delay_step(equations)
 
-def delay_step(equations: Equations, least_curvature: float = 1e-14) -> float | None:
-    """Gauss-Newton step of the delay with the coefficients projected out.
+    def descend(self, delay: float, theta: Array | None, stage: str, history: list[IterationRecord]) -> Descent | None:
+        """Search from a delay; the accepted steps go to the history."""
+        first = len(history)
 
-    Parameters
-    ----------
-    equations : Equations
-        Second moments of the joint problem, the delay last.
-    least_curvature : float, default 1e-14
-        The delay counts as undetermined where projecting the coefficients out leaves less than this fraction of the
-        curvature.
+        def log(minimum: Minimum) -> None:
+            joint = np.concatenate((minimum.theta, [minimum.delay]))
+            cost = minimum.squared_error / self.data.count
+            history.append(history_entry(stage, len(history) - first, self.joint, joint, cost))
 
-    Returns
-    -------
-    float or None
-        Step [s]; None if the data do not determine the delay.
-    """
-    hessian, gradient = equations.hessian, equations.instrument_error
-    diagonal = np.diag(hessian)[:-1]
-    projection = scaled_solve(hessian[:-1, :-1], hessian[:-1, -1], diagonal, diagonal)
-    if projection is None:
-        return None
-    curvature = hessian[-1, -1] - projection @ hessian[:-1, -1]
-    if not curvature > least_curvature * hessian[-1, -1]:
-        return None
-    return float(gradient[-1] / curvature)
+        return descend(
+            self,
+            delay,
+            theta,
+            self.options.delay_bounds,
+            max_iterations=self.options.max_iterations,
+            tolerance=self.tolerance,
+            on_step=log,
+        )

@@ -536,7 +536,7 @@ def _irregular_chain(
 
 
 @njit(cache=True, nogil=True)
-def _dispatch(
+def standard_moments(
     a: Array,
     b: Array,
     delay: float,
@@ -552,7 +552,30 @@ def _dispatch(
     want_rows: bool,
     limit: float,
 ) -> Array:
-    """One compiled entry, so that a call from Python costs one crossing."""
+    """Second moments of the standard rows, or the rows: one compiled entry, so that a call costs one crossing.
+
+    Parameters
+    ----------
+    a : ndarray, shape (n + 1,)
+        Monic denominator, descending powers.
+    b : ndarray, shape (m + 1,)
+        Numerator, ``m < n``.
+    delay : float
+        Delay of the input [s].
+    interval : float
+        Common interval of a regular clock [s]; 0 on any other.
+    tu, u, input_foh, t, y, y_foh, common_clock, use : ndarray, bool
+        The record, see :class:`FilterData`.
+    want_rows : bool
+        Whether the rows are wanted in the place of their moments.
+    limit : float
+        Amplification of rounding up to which partial fractions are used.
+
+    Returns
+    -------
+    ndarray
+        Moments, shape (3 n + 3, 3 n + 3), or rows, shape (count, 3 n + 3).
+    """
     condition, poles, residues, mapping = modal_map(a, b)
     if condition < limit:
         return _modal(
@@ -565,7 +588,7 @@ def _dispatch(
 
 def _run(data: FilterData, a: Array, b: Array, delay: float, want_rows: bool, form: Form) -> Array:
     limit = {"chain": 0.0, "modal": np.inf, "auto": MODAL_CONDITION_LIMIT}[form]
-    moments: Array = _dispatch(
+    moments: Array = standard_moments(
         plain_array(a),
         plain_array(b),
         float(delay),

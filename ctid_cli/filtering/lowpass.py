@@ -87,3 +87,32 @@ class Lowpass:
             filtered_u = HeldSignal(instants, simulate(self.model, record.input, instants), "foh")
             filtered_y = simulate(self.model, HeldSignal(record.t, y, "foh"), record.t)
         return Record(record.t, np.where(record.valid, filtered_y, np.nan), filtered_u, name=record.name)
+
+    def resample(self, record: Record, per_period: float = 6.0) -> Record:
+        """Filter a record and keep only as many samples as its slow signals need.
+
+        Parameters
+        ----------
+        record : Record
+            The record, of any clock; it is not changed.
+        per_period : float, default 8.0
+            Samples for each period of the cut-off frequency; never more than the record has.
+
+        Returns
+        -------
+        Record
+            Filtered input and output on one regular clock, linear between its samples; masked where the original is.
+
+        Notes
+        -----
+        The held input and the linearly interpolated output pass through the analogue filter exactly, from rest. At the
+        cut-off straight lines between 8 samples for each period lose up to 5 % of the amplitude, at half of it 1.3 %:
+        good enough to search on, not to estimate from.
+        """
+        first, last = min(record.t[0], record.input.t[0]), record.t[-1]
+        interval = max(2.0 * np.pi / (self.cutoff * per_period), float(np.median(np.diff(record.t))))
+        t = first + interval * np.arange(int((last - first) / interval) + 1)
+        u = simulate(self.model, record.input, t)
+        y = simulate(self.model, HeldSignal(record.t, record.bridged_y, "foh"), t)
+        inside = np.interp(t, record.t, record.valid.astype(float), left=0.0) > 1.0 - 1e-9
+        return Record(t, np.where(inside, y, np.nan), HeldSignal(t, u, "foh"), name=record.name)

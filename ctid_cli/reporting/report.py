@@ -12,7 +12,7 @@ from typing import Any
 from ctid_cli.errors import UsageError
 from ctid_cli.experiment.folder import InUseError
 from ctid_cli.experiment.spec import load_spec
-from ctid_cli.reporting.results import Results, differences, experiments_in, find_results, out_option
+from ctid_cli.reporting.results import Results, differences, experiments_in, find_results, out_option, shown_path
 from ctid_cli.reporting.rows import Row, experiment_rows, study_rows
 from ctid_cli.reporting.study import DEFAULT_STUDY, Study, data_folder, load_study
 from ctid_cli.reporting.tables import csv_text, experiment_table, record_table, study_table
@@ -144,6 +144,7 @@ def success_sentence(settings: Mapping[str, Any]) -> str:
 def _study(study: Study, number: int, out: Path) -> Table:
     table = study.tables[number]
     notes = []
+    known: set[str] = set()
     found: dict[str, Results | None] = {}
     for name in dict.fromkeys(row.experiment for row in table.rows):
         config = data_folder("configs") / study.experiments[name].config
@@ -154,17 +155,24 @@ def _study(study: Study, number: int, out: Path) -> Table:
             continue
         if results is None:
             # An installed package carries the tables, but not the specifications.
-            hint = f" To fill its rows: ctid run {_shown(config)}{out_option(out)}" if config.is_file() else ""
+            hint = f" To fill its rows: ctid run {shown_path(config)}{out_option(out)}" if config.is_file() else ""
             notes.append(f"{name} was not run.{hint}")
             continue
         if config.is_file():
-            changed = differences(results.settings, load_spec(config).canonical(), set(study.fields.values()))
+            specification = load_spec(config).canonical()
+            known |= specification["estimators"].keys()
+            absent = [method for method in specification["estimators"] if method not in results.settings["estimators"]]
+            if absent:
+                add = f"to add it: ctid run {shown_path(config)}{out_option(out)}"
+                notes.append(f"{name} was run without the estimator {_listed(absent)} of its specification; {add}")
+            changed = differences(results.settings, specification, set(study.fields.values()))
             if changed:
                 notes.append(f"{name} was run with other settings than the published ones: {'; '.join(changed)}")
         notes += _notes(results, out)
     rows = study_rows(study, table, found)
-    planned = {name for results in found.values() if results for name in results.settings["estimators"]}
-    missing = [method for method in study.methods if planned and method not in planned]
+    known |= {name for results in found.values() if results for name in results.settings["estimators"]}
+    published = {method for row in table.rows for method in row.published}
+    missing = [method for method in study.methods if known and method in published - known]
     if missing:
         notes.append(f"no experiment has the estimator {_listed(missing)} yet; its rows show the published values only")
     text, markdown = (study_table(study, table, rows, style) for style in ("text", "md"))
@@ -217,13 +225,6 @@ def _unknown(name: str, out: Path) -> str:
 
 def _listed(items: Any) -> str:
     return ", ".join(str(item) for item in items)
-
-
-def _shown(file: Path) -> str:
-    try:
-        return str(file.relative_to(Path.cwd()))
-    except ValueError:
-        return str(file)
 
 
 def _csv_value(value: Any) -> Any:

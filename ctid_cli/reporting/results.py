@@ -122,6 +122,25 @@ def out_option(out: Path) -> str:
     return "" if out == Path("results") else f" --out {shlex.quote(str(out))}"
 
 
+def shown_path(file: Path) -> str:
+    """A file as a message names it.
+
+    Parameters
+    ----------
+    file : Path
+        Absolute.
+
+    Returns
+    -------
+    str
+        Relative to the working directory where it lies below that.
+    """
+    try:
+        return str(file.relative_to(Path.cwd()))
+    except ValueError:
+        return str(file)
+
+
 def lookup(settings: Mapping[str, Any], path: str) -> Any:
     """Value at a key path such as ``noise.snr_db``.
 

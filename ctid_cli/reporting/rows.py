@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -133,7 +133,7 @@ def experiment_rows(results: Results, table: int | str, fields: Mapping[str, str
 
 
 def study_rows(study: Study, table: StudyTable, found: Mapping[str, Results | None]) -> list[Row]:
-    """Cells of one published table: the published ones first, then what was run beyond them.
+    """Cells of one published table, published or run.
 
     Parameters
     ----------
@@ -147,15 +147,17 @@ def study_rows(study: Study, table: StudyTable, found: Mapping[str, Results | No
     Returns
     -------
     list of Row
-        Every published cell appears, run or not. Cells that were run with further values of a field, further
-        estimators or further starts follow in the row order of their experiment.
+        Every published cell appears, run or not, and so does what was run beyond them: further values of a field,
+        further estimators, further starts. In the order of experiments and settings of the table and of the study's
+        methods; what these do not name follows. Estimators that were given no initial delay have one estimate per
+        data set, whatever the initial delays of the table: their cells belong to every table.
     """
     rows: list[Row] = []
     random = table.initial_delays == ("random",)
     for name in dict.fromkeys(row.experiment for row in table.rows):
         results = found.get(name)
         ours = experiment_rows(results, table.number, study.fields) if results else []
-        ours = [row for row in ours if (row.initial_delay == "random") == random]
+        ours = [row for row in ours if row.initial_delay is None or (row.initial_delay == "random") == random]
         placed: set[int] = set()
         for published in table.rows:
             if published.experiment != name:
@@ -186,7 +188,107 @@ def study_rows(study: Study, table: StudyTable, found: Mapping[str, Results | No
         rows += [row for k, row in enumerate(ours) if k not in placed]
     # Every row of a table carries the same keys.
     keys = list(dict.fromkeys(key for row in rows for key in row.settings))
-    return [replace(row, settings={key: row.settings.get(key) for key in keys}) for row in rows]
+    rows = [replace(row, settings={key: row.settings.get(key) for key in keys}) for row in rows]
+    return _ordered(study, table, rows)
+
+
+@dataclass(frozen=True)
+class PooledRow:
+    """One method's percentage over all cells of a published table.
+
+    Parameters
+    ----------
+    method : str
+        Name of the estimator.
+    settings : mapping
+        The estimator's swept options and their values.
+    cells, cells_run : int
+        Cells of the table, and how many of them have estimates. A method without initial delays has one cell per row.
+    n, converged : int
+        Estimates in these cells, and how many of them met the success rule.
+    percent : float or None
+        100 converged / n [%].
+    published_percent : float or None
+        Mean of the published percentages of the cells that have estimates, or of all cells where none has [%].
+    least_seconds, greatest_seconds : float or None
+        Range of the cells' median times of one estimate [s].
+
+    Notes
+    -----
+    There is no interval: cells of one row share their data sets, so their estimates are not independent trials.
+    """
+
+    method: str
+    settings: Mapping[str, Any]
+    cells: int
+    cells_run: int
+    n: int
+    converged: int
+    percent: float | None
+    published_percent: float | None
+    least_seconds: float | None
+    greatest_seconds: float | None
+
+
+def pooled_rows(study: Study, table: StudyTable, rows: Sequence[Row]) -> list[PooledRow]:
+    """Each method over all cells of a published table.
+
+    Parameters
+    ----------
+    study : Study
+        The study.
+    table : StudyTable
+        One of its tables.
+    rows : sequence of Row
+        Its cells, as from `study_rows`. Those with settings or initial delays that the table has not do not count.
+
+    Returns
+    -------
+    list of PooledRow
+        In the order of the cells.
+    """
+    places = {(row.experiment, *(row.settings[field] for field in study.fields)) for row in table.rows}
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        own = tuple((key, row.settings[key]) for key in row.estimator_settings if row.settings[key] is not None)
+        published = (row.experiment, *(row.settings[field] for field in study.fields)) in places
+        if published and (row.initial_delay is None or row.initial_delay in table.initial_delays):
+            groups.setdefault((row.method, row.initial_delay is None, own), []).append(row)
+    pooled = []
+    for (method, startless, own), group in groups.items():
+        run = [row for row in group if row.n and row.converged is not None]
+        n, converged = sum(row.n for row in run), sum(row.converged or 0 for row in run)
+        published_values = [row.published_percent for row in run or group if row.published_percent is not None]
+        times = [row.median_seconds for row in run if row.median_seconds is not None]
+        pooled.append(
+            PooledRow(
+                method=method,
+                settings=dict(own),
+                cells=len(places) * (1 if startless else len(table.initial_delays)),
+                cells_run=len(run),
+                n=n,
+                converged=converged,
+                percent=100 * converged / n if n else None,
+                published_percent=sum(published_values) / len(published_values) if published_values else None,
+                least_seconds=min(times, default=None),
+                greatest_seconds=max(times, default=None),
+            )
+        )
+    return pooled
+
+
+def _ordered(study: Study, table: StudyTable, rows: list[Row]) -> list[Row]:
+    def setting(settings: Mapping[str, Any]) -> tuple[Any, ...]:
+        return tuple(settings[field] for field in study.fields)
+
+    experiments = list(dict.fromkeys(row.experiment for row in table.rows))
+    settings = list(dict.fromkeys([*(setting(r.settings) for r in table.rows), *(setting(r.settings) for r in rows)]))
+    methods = list(dict.fromkeys([*study.methods, *(row.method for row in rows)]))
+
+    def place(row: Row) -> tuple[int, int, int]:
+        return experiments.index(row.experiment), settings.index(setting(row.settings)), methods.index(row.method)
+
+    return sorted(rows, key=place)
 
 
 def _swept(parts: list[dict[str, Any]]) -> tuple[str, ...]:

@@ -94,7 +94,9 @@ class Study:
     published_data_sets : int
         Data sets behind each published percentage.
     methods : mapping of str to str
-        Estimator names of the tables and what they are.
+        Estimator names of the tables and what they are, published or not.
+    must_reach : tuple of str
+        Methods whose published percentages ours must not fall below.
     fields : mapping of str to str
         Table columns that are settings, with their key in the specification.
     experiments : mapping of str to StudyExperiment
@@ -109,6 +111,7 @@ class Study:
     success: str
     published_data_sets: int
     methods: Mapping[str, str]
+    must_reach: tuple[str, ...]
     fields: Mapping[str, str]
     experiments: Mapping[str, StudyExperiment]
     tables: Mapping[int, StudyTable]
@@ -195,6 +198,7 @@ def _study(content: dict[str, Any]) -> Study:
         success=content["success"],
         published_data_sets=content["published_data_sets"],
         methods=content["methods"],
+        must_reach=tuple(content["must_reach"]),
         fields=content["fields"],
         experiments={name: StudyExperiment(name, **item) for name, item in content["experiments"].items()},
         tables=tables,

@@ -18,11 +18,12 @@ from ctid_cli.reporting.layout import (
     text_table,
     with_error,
 )
-from ctid_cli.reporting.rows import Row
+from ctid_cli.reporting.rows import Row, pooled_rows
 from ctid_cli.reporting.study import Study, StudyTable
 
 NOT_RUN = "not run"
 RULE = "Estimates that failed count as not converged. 95 %: Wilson interval of the percentage."
+TIME = "Time: median of one estimate."
 
 #: Estimators side by side, and estimates of a measured record, before a table continues below.
 GROUPS_PER_BLOCK = 2
@@ -54,6 +55,50 @@ def csv_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = 
     return buffer.getvalue()
 
 
+def setting_title(key: str) -> str:
+    """A swept field as a column title.
+
+    Parameters
+    ----------
+    key : str
+        Name of the field.
+
+    Returns
+    -------
+    str
+        Text.
+
+    Examples
+    --------
+    >>> setting_title("snr_db"), setting_title("cutoff")
+    ('SNR', 'cutoff')
+    """
+    return _SHORT.get(key, (key, ""))[0]
+
+
+def setting_text(key: str, value: Any) -> str:
+    """The value of a swept field, with its unit where the title does not say it.
+
+    Parameters
+    ----------
+    key : str
+        Name of the field.
+    value : object
+        Its value; None where it has none.
+
+    Returns
+    -------
+    str
+        Text.
+
+    Examples
+    --------
+    >>> setting_text("snr_db", 5.0), setting_text("cutoff", 0.2), setting_text("snr_db", None)
+    ('5 dB', '0.2', '-')
+    """
+    return number(value) + (_SHORT.get(key, ("", ""))[1] if value is not None else "")
+
+
 def study_table(study: Study, table: StudyTable, rows: Sequence[Row], style: str = "text") -> str:
     """A published table with our percentages in it.
 
@@ -71,20 +116,34 @@ def study_table(study: Study, table: StudyTable, rows: Sequence[Row], style: str
     Returns
     -------
     str
-        Heading, table and footnote.
+        Heading, table, percentages over the whole table, and footnote.
     """
     delays = _delays(rows)
     heading = [f"Table {table.number}. {table.title}", f"Counted: {study.success}."]
-    groups = _group(rows, lambda row: (row.sampling, tuple(row.settings.items()), row.method))
+    groups = _group(
+        rows, lambda row: (row.sampling, tuple(row.settings.items()), row.method, row.initial_delay is None)
+    )
     labels = list(dict.fromkeys(name for row in rows for name in row.settings))
     if len(delays) == 1 or style == "md":
         body = _study_flat(groups, delays, labels, style)
     else:
         body = _study_stacked(groups, delays, labels)
-    foot = f"{RULE} Published: {study.published_data_sets} data sets, {study.source}."
+    pooled = _pooled(study, table, rows, style)
+    foot = f"{RULE} {TIME[:-1]}; of several cells, the least to the greatest."
+    foot += f" Published: {study.published_data_sets} data sets, {study.source}."
+    startless = list(dict.fromkeys(row.method for row in rows if row.initial_delay is None))
+    if startless:
+        verb = "was" if len(startless) == 1 else "were"
+        foot += f" {_listed(startless)} {verb} given no initial delay: one estimate per data set, "
+        foot += "shown under every initial delay."
+    shown = dict.fromkeys(row.method for row in rows)
+    legend = "; ".join(f"{name}: {study.methods[name]}" for name in shown if name in study.methods) + "."
     if style == "md":
-        return "\n".join([f"### {heading[0]}", "", heading[1], "", body, "", foot])
-    return "\n".join([*heading, "", body, "", *_wrap(foot)])
+        return "\n\n".join(
+            [f"### {heading[0]}", heading[1], body, "All cells of the table together:", pooled, foot, legend]
+        )
+    parts = [[*heading], [body], ["All cells of the table together:", pooled], [*_wrap(foot), *_wrap(legend)]]
+    return "\n\n".join("\n".join(part) for part in parts)
 
 
 def experiment_table(name: str, rows: Sequence[Row], success: str, style: str = "text") -> str:
@@ -125,20 +184,22 @@ def experiment_table(name: str, rows: Sequence[Row], success: str, style: str = 
     blocks = []
     for first in range(0, len(columns), GROUPS_PER_BLOCK):
         block = columns[first : first + GROUPS_PER_BLOCK]
-        header = [_title(key) for key in down] + ["initial delay"]
+        header = [setting_title(key) for key in down] + ["initial delay"]
         for title in block:
             header += [f"{title}: %", "95 %", "n", "time"]
         body = []
         for line in lines:
             if not any((line, title) in cells for title in block):
                 continue
-            texts = [_setting(key, value) for key, value in zip(down, line[:-1], strict=True)] + [delay_label(line[-1])]
+            texts = [setting_text(key, value) for key, value in zip(down, line[:-1], strict=True)] + [
+                delay_label(line[-1])
+            ]
             for title in block:
                 texts += _four(cells.get((line, title)))
             body.append(texts)
         blocks.append(draw(header, body, "l" * (len(down) + 1) + "rrrr" * len(block)))
     heading = [name, f"Counted: {success}."]
-    foot = f"{RULE} Time: median of one estimate."
+    foot = f"{RULE} {TIME}"
     if style == "md":
         return "\n\n".join([f"### {heading[0]}", heading[1], *blocks, foot])
     return "\n".join([*heading, "", "\n\n".join(blocks), "", *_wrap(foot)])
@@ -203,55 +264,72 @@ def record_table(
 
 
 def _study_stacked(groups: list[list[Row]], delays: list[Any], labels: list[str]) -> str:
-    """Three lines per method, so that six initial delays fit 100 columns."""
-    header = ["sampling", *(_title(key) for key in labels), "method", "initial delay"]
+    """Four lines per method, so that six initial delays fit 100 columns."""
+    header = ["sampling", *(setting_title(key) for key in labels), "method", "initial delay"]
     header += [delay_label(delay) for delay in delays]
     body: list[list[str]] = []
     last: list[str] = []
     for group in groups:
-        cells = {row.initial_delay: row for row in group}
         names = _names(group[0], labels)
         # A label that the line above has already said is left out, as in a printed table.
         shown = [name if last[: k + 1] != names[: k + 1] else "" for k, name in enumerate(names)]
-        if last and last[0] != names[0]:
+        if last and last[:-1] != names[:-1]:
             body.append([""] * len(header))
         last = names
         blank = [""] * len(names)
-        ours = [cells.get(delay) for delay in delays]
-        body.append([*shown, _n(group), *(_percent(row) for row in ours)])
-        if any(row.n for row in group):
-            body.append([*blank, "95 %", *(_interval(row).strip("[]").replace(", ", "-") for row in ours)])
+        ours = _across(group, delays)
+        run = any(row.n for row in group)
+        percents = [_percent(row) if row is None or row.n else "-" for row in ours]
+        body.append([*shown, _n(group) if run else NOT_RUN, *percents])
+        if run:
+            body.append([*blank, "95 %", *(_whole_interval(row) for row in ours)])
         if any(row.published_percent is not None for row in group):
             body.append([*blank, "published", *(_published(row) for row in ours)])
+        if run:
+            body.append([*blank, "time", *(_time(row) for row in ours)])
     align = "l" * (len(labels) + 3) + "r" * len(delays)
     return text_table(header, body, align)
 
 
 def _study_flat(groups: list[list[Row]], delays: list[Any], labels: list[str], style: str) -> str:
-    header = ["sampling", *(_title(key) for key in labels), "method", "n"]
+    header = ["sampling", *(setting_title(key) for key in labels), "method", "n"]
     body = []
     single = len(delays) == 1
     for group in groups:
-        cells = {row.initial_delay: row for row in group}
         texts = [*_names(group[0], labels), _n(group).removeprefix("n = ")]
-        for delay in delays:
-            row = cells.get(delay)
+        for row in _across(group, delays):
             if single:
                 texts += [_percent(row), _interval(row), _published(row)]
             else:
                 texts.append(_together(row))
-        body.append(texts)
-    if single:
-        header += ["percent", "95 %", "published"]
-        align = "l" * (len(labels) + 2) + "rrrr"
-    else:
-        header += [delay_label(delay) for delay in delays]
-        align = "l" * (len(labels) + 2) + "r" * (1 + len(delays))
+        times = [row.median_seconds for row in group if row.n and row.median_seconds is not None]
+        body.append([*texts, _span(min(times, default=None), max(times, default=None))])
+    header += ["percent", "95 %", "published"] if single else [delay_label(delay) for delay in delays]
+    header.append("time")
+    align = "l" * (len(labels) + 2) + "r" * (len(header) - len(labels) - 2)
     return (text_table if style == "text" else markdown_table)(header, body, align)
 
 
+def _pooled(study: Study, table: StudyTable, rows: Sequence[Row], style: str) -> str:
+    header = ["method", "cells", "n", "percent", "published", "time"]
+    body = []
+    for row in pooled_rows(study, table, rows):
+        name = ", ".join([row.method, *(f"{key} {number(value)}" for key, value in row.settings.items())])
+        cells = str(row.cells) if row.cells_run == row.cells else f"{row.cells_run} of {row.cells}"
+        ours = NOT_RUN if row.percent is None else f"{row.percent:.1f}"
+        published = "" if row.published_percent is None else f"{row.published_percent:.1f}"
+        body.append([name, cells, str(row.n), ours, published, _span(row.least_seconds, row.greatest_seconds)])
+    return (text_table if style == "text" else markdown_table)(header, body, "lrrrrr")
+
+
+def _across(group: Sequence[Row], delays: Sequence[Any]) -> list[Row | None]:
+    """A group's cell at every initial delay: the same one where there was none to start from."""
+    cells = {row.initial_delay: row for row in group}
+    return [cells.get(delay, cells.get(None)) for delay in delays]
+
+
 def _names(row: Row, labels: Sequence[str]) -> list[str]:
-    return [row.sampling or "-", *(_setting(key, row.settings.get(key)) for key in labels), row.method]
+    return [row.sampling or "-", *(setting_text(key, row.settings.get(key)) for key in labels), row.method]
 
 
 def _together(row: Row | None) -> str:
@@ -277,6 +355,23 @@ def _interval(row: Row | None) -> str:
     return interval(row.low, row.high, row.n) if row is not None and row.n else ""
 
 
+def _whole_interval(row: Row | None) -> str:
+    """Ends to whole percents, so that the columns stay narrow with more than 100 data sets as well."""
+    if row is None or not row.n or row.low is None or row.high is None:
+        return ""
+    return f"{row.low:.0f}-{row.high:.0f}"
+
+
+def _time(row: Row | None) -> str:
+    return seconds(row.median_seconds) if row is not None and row.n else ""
+
+
+def _span(least: float | None, greatest: float | None) -> str:
+    """Range of the cells' median times."""
+    ends = list(dict.fromkeys(seconds(end) for end in (least, greatest) if end is not None))
+    return " to ".join(ends)
+
+
 def _published(row: Row | None) -> str:
     return "" if row is None or row.published_percent is None else number(row.published_percent)
 
@@ -291,7 +386,7 @@ def _n(group: Sequence[Row]) -> str:
 def _delays(rows: Sequence[Row]) -> list[Any]:
     delays = {row.initial_delay for row in rows}
     numbers = sorted(delay for delay in delays if isinstance(delay, int | float))
-    return [*numbers, *(delay for delay in ("random", None) if delay in delays)]
+    return [*numbers, *(["random"] if "random" in delays else [])]
 
 
 def _group(rows: Sequence[Row], key: Callable[[Row], Any]) -> list[list[Row]]:
@@ -301,19 +396,15 @@ def _group(rows: Sequence[Row], key: Callable[[Row], Any]) -> list[list[Row]]:
     return list(groups.values())
 
 
-def _title(key: str) -> str:
-    return _SHORT.get(key, (key, ""))[0]
-
-
-def _setting(key: str, value: Any) -> str:
-    return number(value) + (_SHORT.get(key, ("", ""))[1] if value is not None else "")
-
-
 def _start(label: str) -> str:
     try:
         return f"{float(label):g} s"
     except ValueError:
         return label
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def _wrap(text: str, width: int = 98) -> list[str]:

@@ -1,4 +1,4 @@
-"""Copy the tables of a finished reproduction to results/published, with the environment that made them.
+"""Copy a finished reproduction to results/published: tables, figures, what failed, and the environment that made them.
 
 After ``make reproduce``: ``.venv/bin/python experiments/useful_redundancy/publish.py``.
 """
@@ -6,28 +6,63 @@ After ``make reproduce``: ``.venv/bin/python experiments/useful_redundancy/publi
 import argparse
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
+
+from ctid_cli.reporting.failures import FAILING_COLUMNS, failing_estimates
+from ctid_cli.reporting.results import experiments_in, read_results
+from ctid_cli.reporting.study import load_study
+from ctid_cli.reporting.tables import csv_text
 
 #: What is kept of a session: nothing that names a machine, a user or a folder.
 KEPT = ("started", "stopped", "computed", "failed", "jobs", "processors", "code_version", "numeric_platform")
+#: Methods whose failures are not listed one by one: from most initial delays this one is meant to fail.
+UNLISTED = ("existing",)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and copy."""
-    parser = argparse.ArgumentParser(description="Publish the tables of a finished reproduction.")
+    parser = argparse.ArgumentParser(description="Publish a finished reproduction.")
     parser.add_argument("--results", type=Path, default=Path("results"))
     parser.add_argument("--out", type=Path, default=Path("results/published/useful_redundancy"))
-    arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    chosen = parser.parse_args(arguments)
+    chosen.out.mkdir(parents=True, exist_ok=True)
     for suffix in ("md", "csv"):
-        shutil.copyfile(arguments.results / f"useful_redundancy.{suffix}", arguments.out / f"tables.{suffix}")
-    sessions = {}
-    for folder in sorted((arguments.results / "useful-redundancy").iterdir()):
-        for file in sorted((folder / "provenance").glob("*.json")):
+        shutil.copyfile(chosen.results / f"useful_redundancy.{suffix}", chosen.out / f"tables.{suffix}")
+    (chosen.out / "failures.csv").write_text(failures(chosen.results), encoding="utf-8")
+    (chosen.out / "environment.json").write_text(environment(chosen.results), encoding="utf-8")
+    copy_figures(chosen.results / "useful_redundancy_figures", chosen.out / "figures")
+
+
+def failures(results: Path) -> str:
+    """Every data set that a listed method failed on, as CSV with a header, empty or not."""
+    study = load_study()
+    methods = [method for method in study.methods if method not in UNLISTED]
+    found = [read_results(results, name) for name in study.experiments if name in experiments_in(results)]
+    rows = failing_estimates(found, methods)
+    return csv_text(rows, list(dict.fromkeys([*FAILING_COLUMNS, *(name for row in rows for name in row)])))
+
+
+def environment(results: Path) -> str:
+    """Sessions of every experiment, as JSON."""
+    sessions: dict[str, list[dict[str, object]]] = {}
+    for name in sorted(load_study().experiments):
+        for file in sorted((results / name / "provenance").glob("*.json")):
             session = json.loads(file.read_text(encoding="utf-8"))
-            sessions.setdefault(folder.name, []).append({key: session[key] for key in (*KEPT, "packages")})
-    text = json.dumps(sessions, indent=2) + "\n"
-    (arguments.out / "environment.json").write_text(text, encoding="utf-8")
+            sessions.setdefault(name.rpartition("/")[2], []).append({key: session[key] for key in (*KEPT, "packages")})
+    return json.dumps(sessions, indent=2) + "\n"
+
+
+def copy_figures(source: Path, target: Path) -> None:
+    """The figures in place of those of an earlier reproduction; nothing where none were drawn."""
+    figures = sorted(source.glob("*.svg"))
+    if not figures:
+        return
+    target.mkdir(exist_ok=True)
+    for old in target.glob("*.svg"):
+        old.unlink()
+    for figure in figures:
+        shutil.copyfile(figure, target / figure.name)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,17 @@
 """One cell of each published table, from one data set, through the whole program."""
 
+import csv
 import json
 from pathlib import Path
 
 import pytest
+import yaml
+from typer.testing import CliRunner
+
+from ctid_cli.experiment.plan import build_plan
+from ctid_cli.experiment.spec import load_spec
+from ctid_cli.reporting.study import load_study
+from experiments.useful_redundancy import publish
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "configs" / "useful_redundancy"
@@ -23,15 +31,21 @@ def test_one_data_set_fills_its_cells(ctid, out, case, sampling, tables):
     )
     rows = json.loads(ctid("table", *tables, "--format", "json", "--out", out).stdout)
     mine = [row for row in rows if row["sampling"] == sampling and row["n"]]
+    plan = build_plan(load_spec(CONFIGS / f"{case}_{sampling}.yaml"))
+    starts = {cell.name: cell.estimator.uses_start for cell in plan.estimators}
+    methods = sorted(starts, key=list(load_study().methods).index)
     assert [(row["table"], row["snr_db"], row["initial_delay"], row["method"]) for row in mine] == [
-        (int(tables[0]), 15, 7, "existing"),
-        (int(tables[1]), 15, "random", "existing"),
+        (int(table), 15, delay if starts[method] else None, method)
+        for table, delay in zip(tables, (7, "random"), strict=True)
+        for method in methods
     ]
+    published = [method for method in methods if method in ("existing", "proposed")]
+    assert "existing" in published
     for row in mine:
         assert row["n"] == 1
         assert row["percent"] in (0, 100)
-        assert 0 <= row["published_percent"] <= 100
         assert row["median_seconds"] > 0
+        assert (row["published_percent"] is not None) == (row["method"] in published)
     text = ctid("table", *tables, "--out", out).stdout
     assert "other settings than the published ones" not in text
     assert max(map(len, text.split("Estimates that failed")[0].splitlines())) <= 100
@@ -52,3 +66,122 @@ def test_settings_that_differ_from_the_published_ones_are_noted(ctid, tmp_path):
     )
     text = ctid("table", "1", "--out", tmp_path).stdout
     assert "sampling.samples = 1000 (not 4000)" in text
+
+
+@pytest.fixture(scope="module")
+def profiled(tmp_path_factory):
+    """Results of one experiment of the study: the existing method, and one that takes no start and never succeeds."""
+    from ctid_cli.cli.main import app
+
+    folder = tmp_path_factory.mktemp("profiled")
+    content = yaml.safe_load((CONFIGS / "case1_regular.yaml").read_text(encoding="utf-8"))
+    blind = {"kind": "delay_profile", "poles": 2, "zeros": 0, "delay_bounds": [0, 5]}
+    content["estimators"] = {"existing": content["estimators"]["existing"], "delay_profile": blind}
+    content["noise"]["snr_db"] = [15]
+    content["starts"]["initial_delay"] = [7, {"uniform": [0, 9]}]
+    content["monte_carlo"]["runs"] = 2
+    file = folder / "case1_regular.yaml"
+    file.write_text(yaml.safe_dump(content), encoding="utf-8")
+    results = folder / "results"
+    done = CliRunner().invoke(app, ["run", str(file), "--jobs", "1", "--quiet", "--out", str(results)])
+    assert done.exit_code == 0, done.output
+    return results
+
+
+def test_a_method_without_a_start_stands_in_both_tables_with_the_same_numbers(ctid, profiled):
+    rows = json.loads(ctid("table", "1", "2", "--format", "json", "--out", profiled).stdout)
+    mine = [row for row in rows if row["method"] == "delay_profile"]
+    assert [(row["table"], row["initial_delay"], row["n"], row["percent"]) for row in mine] == [
+        (1, None, 2, 0),
+        (2, None, 2, 0),
+    ]
+    assert {key: value for key, value in mine[0].items() if key != "table"} == {
+        key: value for key, value in mine[1].items() if key != "table"
+    }
+    for number in ("1", "2"):
+        text = ctid("table", number, "--out", profiled).stdout
+        assert "delay_profile was given no initial delay" in text
+        assert max(map(len, text.split("Estimates that failed")[0].splitlines())) <= 100
+
+
+def test_the_same_tables_agree_and_others_do_not(ctid, profiled, tmp_path):
+    reference = tmp_path / "reference.csv"
+    reference.write_text(ctid("table", "1", "--format", "csv", "--out", profiled).stdout, encoding="utf-8")
+    check = ("table", "--check", "--reference", reference, "--out", profiled)
+    content = json.loads(ctid(*check, "1", "--format", "json").stdout)
+    assert (content["agrees"], content["compared"], content["identical"]) == (True, 2, 2)
+    # the start does not matter to the method without one: table 2 has its cell as well
+    content = json.loads(ctid(*check, "2", "--format", "json").stdout)
+    assert (content["compared"], content["not_in_reference"]) == (1, 1)
+    text = ctid(*check).stdout
+    assert text.startswith("No difference beyond sampling error in 2 comparisons: 2 cells with")
+
+    with reference.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        if row["method"] == "delay_profile":
+            row |= {"n": 100, "converged": 100, "percent": 100.0}
+    with reference.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    done = ctid(*check, code=7)
+    assert "1 of 2 comparisons differs by more than sampling error explains" in done.stderr
+    (line,) = [line for line in done.stdout.splitlines() if "none" in line and "delay_profile" in line]
+    assert line.split()[:5] == ["1", "regular", "15", "dB", "none"]
+    assert line.split()[-5:-1] == ["0", "2", "100", "100"]
+    content = json.loads(ctid(*check, "--format", "json", code=7).stdout)
+    assert [cell["method"] for cell in content["cells"] if cell["mismatch"]] == ["delay_profile"]
+
+
+def test_a_check_without_anything_to_compare_says_what_to_do(ctid, profiled, tmp_path):
+    message = ctid("table", "--check", "3", "--out", profiled, code=2).stderr
+    assert "none of these cells was run" in message
+    assert "ctid run" in message
+    other = tmp_path / "other.csv"
+    header, first = ctid("table", "3", "--format", "csv", "--out", profiled).stdout.splitlines()[:2]
+    other.write_text(f"{header}\n{first}\n", encoding="utf-8")
+    message = ctid("table", "--check", "1", "--reference", other, "--out", profiled, code=2).stderr
+    assert f"{other} has none of their cells" in message
+    assert "--format csv >" in message
+    assert "--check" in ctid("table", "1", "--reference", other, "--out", profiled, code=2).stderr
+    assert (
+        "cannot be read" in ctid("table", "--check", "--reference", tmp_path / "no", "--out", profiled, code=2).stderr
+    )
+
+
+def test_any_experiment_can_be_checked_against_its_own_table(ctid, done, tmp_path):
+    reference = tmp_path / "tiny.csv"
+    reference.write_text(ctid("table", "tiny", "--format", "csv", "--out", done).stdout, encoding="utf-8")
+    text = ctid("table", "tiny", "--check", "--reference", reference, "--out", done).stdout
+    assert "6 cells with" in text
+    assert "6 of them with the same counts" in " ".join(text.split())
+
+
+def test_publishing_copies_tables_and_figures_and_lists_every_failure(ctid, profiled, tmp_path):
+    for style in ("md", "csv"):
+        shown = ctid("table", "--format", style, "--out", profiled).stdout
+        (profiled / f"useful_redundancy.{style}").write_text(shown, encoding="utf-8")
+    target = tmp_path / "published"
+    arguments = ["--results", str(profiled), "--out", str(target)]
+    publish.main(arguments)
+    assert {file.name for file in target.iterdir()} == {"tables.md", "tables.csv", "failures.csv", "environment.json"}
+    assert [*json.loads((target / "environment.json").read_text(encoding="utf-8"))] == ["case1-regular"]
+    with (target / "failures.csv").open(encoding="utf-8", newline="") as file:
+        failures = list(csv.DictReader(file))
+    assert [(row["method"], row["snr_db"], row["initial_delay"], row["replicate"]) for row in failures] == [
+        ("delay_profile", "15.0", "", "0"),
+        ("delay_profile", "15.0", "", "1"),
+    ]
+    for row in failures:
+        shown = json.loads(ctid("show", row["id"], "--json", "--out", profiled).stdout)
+        assert (shown["delay"], shown["status"]) == (float(row["delay"]), row["status"])
+        assert (shown["replicate"], shown["seed"]) == (int(row["replicate"]), int(row["seed"]))
+
+    figures = profiled / "useful_redundancy_figures"
+    figures.mkdir()
+    (figures / "one.svg").write_text("<svg/>", encoding="utf-8")
+    (target / "figures").mkdir()
+    (target / "figures" / "old.svg").write_text("<svg/>", encoding="utf-8")
+    publish.main(arguments)
+    assert [file.name for file in (target / "figures").iterdir()] == ["one.svg"]

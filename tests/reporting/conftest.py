@@ -34,6 +34,27 @@ def estimate():
 
 
 @pytest.fixture
+def add_estimator():
+    """Give results one more estimator, from the delays that it found by SNR and start; a start None takes none."""
+
+    def add(results, name, found):
+        manifest, stored = results.manifest, results.stored
+        labels = {start: "none" if start is None else start for _, start in found}
+        manifest["estimators"].append(
+            manifest["estimators"][0] | {"name": name, "hash": name, "starts": list(labels.values())}
+        )
+        manifest["spec"]["estimators"][name] = manifest["spec"]["estimators"]["existing"]
+        if None in labels:
+            manifest["starts"]["none"] = None
+        for (snr, start), values in found.items():
+            for replicate, value in enumerate(values):
+                key = Key(f"cell{snr:g}", replicate, name, labels[start])
+                stored.results[key], stored.seconds[key] = value, 0.5
+
+    return add
+
+
+@pytest.fixture
 def make_results(tmp_path):
     """Results of a case with SNR 5 and 15 dB and one estimator, from the delay that each estimate found."""
 

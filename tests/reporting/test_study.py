@@ -1,8 +1,13 @@
 import pytest
 
 from ctid_cli.errors import UsageError
+from ctid_cli.reporting.failures import FAILING_COLUMNS, failing_estimates
 from ctid_cli.reporting.report import build_tables, write_tables
+from ctid_cli.reporting.rows import pooled_rows, study_rows
 from ctid_cli.reporting.study import load_study
+from ctid_cli.reporting.tables import study_table
+
+RANDOM = "uniform(0, 9)"
 
 # Ha, Welsh and Alamir, arXiv:1703.09344, Tables 1 and 3 (initial delays 0, 1, 3, 5, 7, 9 s) and 2 and 4 (random),
 # existing method: case, sampling, SNR, six fixed delays, random delay.
@@ -67,3 +72,124 @@ def test_the_whole_study_is_the_default(tmp_path):
 def test_unknown_names_are_refused(tmp_path, name):
     with pytest.raises(UsageError):
         build_tables([name], tmp_path)
+
+
+@pytest.fixture
+def mixed(make_results, add_estimator, estimate):
+    """Of one experiment: the existing method in part, the proposed one, and two that take no start."""
+    good, bad = estimate(8.0), estimate(5.0, "STALLED")
+    results = make_results({(5.0, "0.0"): [good, bad, bad, bad], (5.0, RANDOM): [good, bad], (15.0, "0.0"): [good]})
+    add_estimator(results, "delay_profile_time", {(5.0, None): [good, good, good, bad], (15.0, None): [good] * 4})
+    add_estimator(results, "proposed", {(5.0, "0.0"): [good] * 4, (5.0, RANDOM): [good] * 3 + [bad]})
+    add_estimator(results, "delay_profile", {(5.0, None): [good] * 4, (15.0, None): [good] * 3 + [bad]})
+    return results
+
+
+def tabulated(results, number, style="text"):
+    study = load_study()
+    rows = study_rows(study, study.tables[number], {results.experiment: results})
+    return rows, study_table(study, study.tables[number], rows, style)
+
+
+def test_methods_stand_in_the_order_of_the_study_below_each_setting(mixed):
+    for number in (1, 2):
+        rows, text = tabulated(mixed, number)
+        regular = [row for row in rows if (row.sampling, row.settings["snr_db"]) == ("regular", 5.0)]
+        methods = ["existing", "proposed", "delay_profile", "delay_profile_time"]
+        assert list(dict.fromkeys(row.method for row in regular)) == methods
+        first = text.split("15 dB")[0]
+        assert sorted(methods, key=lambda method: first.index(f"{method} ")) == methods
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_an_estimator_without_a_start_is_in_every_table_with_one_estimate_per_data_set(mixed, number):
+    rows, text = tabulated(mixed, number)
+    mine = [row for row in rows if row.method == "delay_profile_time"]
+    assert [(row.settings["snr_db"], row.initial_delay, row.n, row.percent) for row in mine] == [
+        (5.0, None, 4, 75.0),
+        (15.0, None, 4, 100.0),
+    ]
+    assert "delay_profile and delay_profile_time were given no initial delay: one estimate per data set" in " ".join(
+        text.split()
+    )
+    if number == 1:
+        line = next(line for line in text.splitlines() if "delay_profile_time" in line)
+        assert line.split()[-9:] == ["n", "=", "4"] + ["75"] * 6
+        assert "none" not in text.split("All cells")[0]
+
+
+def test_without_such_an_estimator_nothing_is_said_about_it(make_results, estimate):
+    _, text = tabulated(make_results({(5.0, "0.0"): [estimate(8.0)]}), 1)
+    assert "no initial delay" not in text
+    assert "delay_profile" not in text
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_all_methods_fit_100_columns_also_with_many_data_sets(make_results, add_estimator, estimate, number):
+    found = [estimate(8.0)] * 299 + [estimate(3.0)]
+    results = make_results({(5.0, "0.0"): found, (5.0, RANDOM): found})
+    for method in ("proposed", "proposed_spectral"):
+        add_estimator(results, method, {(5.0, "0.0"): found, (5.0, RANDOM): found})
+    for method in ("delay_profile", "delay_profile_time"):
+        add_estimator(results, method, {(5.0, None): found})
+    for cell in results.manifest["data_cells"]:
+        cell["replicates"] = 300
+    text = tabulated(results, number)[1]
+    assert text.count("99.7") >= 10
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_times_stand_in_text_and_markdown(mixed):
+    for style in ("text", "md"):
+        for number in (1, 2):
+            text = tabulated(mixed, number, style)[1]
+            assert "20 ms" in text
+            assert "500 ms" in text
+
+
+def test_the_pooled_percentage_is_that_of_all_estimates_in_the_cells_of_the_table(mixed):
+    study = load_study()
+    rows, text = tabulated(mixed, 1)
+    pooled = {row.method: row for row in pooled_rows(study, study.tables[1], rows)}
+    existing = pooled["existing"]
+    # 1 of 4 at 5 dB, 1 of 1 at 15 dB; published from 0 s 65 and 69
+    assert (existing.cells, existing.cells_run, existing.n, existing.converged) == (24, 2, 5, 2)
+    assert (existing.percent, existing.published_percent) == (40.0, 67.0)
+    assert (pooled["delay_profile"].cells, pooled["delay_profile"].cells_run) == (4, 2)
+    assert (pooled["delay_profile"].percent, pooled["delay_profile"].published_percent) == (87.5, None)
+    line = next(line for line in text.split("All cells")[1].splitlines() if line.startswith("existing"))
+    assert line.split() == ["existing", "2", "of", "24", "5", "40.0", "67.0", "20", "ms"]
+
+
+def test_what_was_run_beyond_the_table_is_not_pooled(make_results, estimate):
+    study = load_study()
+    results = make_results({(10.0, "0.0"): [estimate(8.0)], (5.0, "0.0"): [estimate(3.0)]}, snrs=(5.0, 10.0))
+    results.manifest["starts"]["0.0"] = 2.0
+    rows, _ = tabulated(results, 1)
+    assert sum(row.n for row in rows) == 2
+    assert all(row.n == 0 for row in pooled_rows(study, study.tables[1], rows))
+    results.manifest["starts"]["0.0"] = 0.0
+    (existing, _) = pooled_rows(study, study.tables[1], tabulated(results, 1)[0])
+    assert (existing.n, existing.converged) == (1, 0)
+
+
+def test_without_results_the_pooled_published_percentage_is_the_mean_of_the_table(empty):
+    values = [value for case, _, _, fixed, _ in EXISTING if case == 1 for value in fixed]
+    line = next(line for line in empty[1].text.split("All cells")[1].splitlines() if line.startswith("existing"))
+    assert line.split() == ["existing", "0", "of", "24", "0", "not", "run", f"{sum(values) / len(values):.1f}"]
+
+
+def test_failing_estimates_are_listed_with_what_makes_them_again(mixed):
+    rows = failing_estimates([mixed], ["proposed", "delay_profile", "delay_profile_time"])
+    assert [(r["method"], r["snr_db"], r["initial_delay"], r["replicate"], r["delay"]) for r in rows] == [
+        ("delay_profile_time", 5.0, None, 3, 5.0),
+        ("proposed", 5.0, "random", 3, 5.0),
+        ("delay_profile", 15.0, None, 3, 5.0),
+    ]
+    assert {(r["experiment"], r["sampling"], r["seed"], r["status"], r["true_delay"]) for r in rows} == {
+        ("useful-redundancy/case1-regular", "regular", 1, "STALLED", 8.0)
+    }
+    assert all(tuple(row) == FAILING_COLUMNS for row in rows)
+    stored = {row["id"]: row for row in mixed.rows}
+    assert all(not stored[row["id"]]["converged"] for row in rows)
+    assert len({row["id"] for row in rows}) == 3

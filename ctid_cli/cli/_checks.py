@@ -1,0 +1,56 @@
+"""``ctid check``: a command of its own for a FILE, and a group of further checks beside it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import typer
+from typer.core import TyperCommand
+
+from ctid_cli.cli.check_filters import check_filters
+
+_further = typer.Typer(rich_markup_mode=None, context_settings={"help_option_names": ["-h", "--help"]})
+# A further check is registered here, under its name.
+_further.command("filters")(check_filters)
+
+
+class CheckCommand(TyperCommand):
+    """``ctid check FILE``, which hands over if the first word names a further check: such a file is ``./filters``."""
+
+    further = typer.main.get_group(_further).commands
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        """Parse the command line.
+
+        Parameters
+        ----------
+        info_name : str or None
+            Name under which the command was called.
+        args : list of str
+            The words after it.
+        parent : context or None, default None
+            Of the program.
+        **extra : Any
+            Settings of the context.
+
+        Returns
+        -------
+        context
+            Of this command, or of the further check that the first word names.
+        """
+        if args and args[0] in self.further:
+            return self.further[args[0]].make_context(f"{info_name} {args[0]}", args[1:], parent, **extra)
+        return super().make_context(info_name, args, parent, **extra)
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Write the end of the help: the further checks.
+
+        Parameters
+        ----------
+        ctx : context
+            Of this command.
+        formatter : formatter
+            To write to.
+        """
+        with formatter.section("Further checks"):
+            formatter.write_dl([(name, command.get_short_help_str(80)) for name, command in self.further.items()])

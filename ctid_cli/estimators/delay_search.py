@@ -1,0 +1,229 @@
+r"""Gauss-Newton on the delay, the coefficients estimated anew at every trial delay (separable least squares).
+
+With ``eps = y - B/A u(t - tau)``, ``d eps/d tau = p B/A u(t - tau)`` and psi the sensitivities to the coefficients, the
+cost minimised over the coefficients has the gradient ``g = eps_tau' eps`` and the curvature
+``H = eps_tau' eps_tau - eps_tau' psi (psi' psi)^-1 psi' eps_tau``; the step is ``-g/H``. Which data the cost is made
+of, filtered or not, samples or spectra, is the business of the *cost*.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.estimators.refined_iv import Equations, scaled_solve
+from ctid_cli.inference.status import Status
+
+Array = NDArray[np.float64]
+
+#: The smallest delay step, as a fraction of the range of the delay.
+SMALLEST_STEP = 1e-5
+#: The delay counts as undetermined where projecting the coefficients out leaves less of the curvature.
+LEAST_CURVATURE = 1e-14
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Least cost at one delay.
+
+    Parameters
+    ----------
+    delay : float
+        Delay [s].
+    theta : ndarray, shape (n + m + 1,)
+        Coefficients there, ``(a_1 … a_n, b_0 … b_m)``.
+    squared_error : float
+        Sum of squared output errors [output unit^2].
+    step : float or None
+        Gauss-Newton step of the delay [s]; None where it is not known yet or the data do not determine it.
+    """
+
+    delay: float
+    theta: Array
+    squared_error: float
+    step: float | None = None
+
+
+class DelayCost(Protocol):
+    """A cost as a function of the delay, minimised over the coefficients."""
+
+    def minimise(self, delay: float, theta: Array | None) -> Minimum | None:
+        """Minimise over the coefficients at one delay.
+
+        Parameters
+        ----------
+        delay : float
+            Delay [s].
+        theta : ndarray, shape (n + m + 1,) or None
+            Coefficients to start from; None for the cost's own start.
+
+        Returns
+        -------
+        Minimum or None
+            The minimum; None where the equations are singular.
+        """
+
+    def step(self, minimum: Minimum) -> float | None:
+        """Gauss-Newton step of the delay from a minimum of this cost.
+
+        Parameters
+        ----------
+        minimum : Minimum
+            As :meth:`minimise` returned it.
+
+        Returns
+        -------
+        float or None
+            Step [s]; None if the data do not determine the delay.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """Where a descent ended.
+
+    Parameters
+    ----------
+    minimum : Minimum
+        The last accepted minimum over the coefficients.
+    status : Status
+        How it ended.
+    iterations : int
+        Number of accepted delay steps.
+    """
+
+    minimum: Minimum
+    status: Status
+    iterations: int
+
+
+def descend(
+    cost: DelayCost,
+    delay: float,
+    theta: Array | None,
+    bounds: tuple[float, float],
+    *,
+    max_iterations: int,
+    tolerance: float,
+    largest_step: float = np.inf,
+    on_step: Callable[[Minimum], None] | None = None,
+) -> Descent | None:
+    """Gauss-Newton on the delay from one start.
+
+    Parameters
+    ----------
+    cost : DelayCost
+        What is minimised.
+    delay : float
+        Initial delay [s], within the bounds.
+    theta : ndarray or None
+        Initial coefficients; None for the cost's own start.
+    bounds : tuple of float
+        Least and greatest delay [s].
+    max_iterations : int
+        Largest number of delay steps.
+    tolerance : float
+        Stop when a step lowers the cost by less than this fraction.
+    largest_step : float, optional
+        Longest step [s]; longer ones are shortened to it.
+    on_step : callable, optional
+        Called with the minimum at the start and after every accepted step.
+
+    Returns
+    -------
+    Descent or None
+        Where it ended; None if nothing can be computed at the start.
+
+    Notes
+    -----
+    A step is halved while it leaves the bounds or does not lower the cost, and the search ends where that makes it
+    shorter than 1e-5 of the range of the delay.
+    """
+    low, high = bounds
+    smallest = SMALLEST_STEP * (high - low)
+    current = cost.minimise(delay, theta)
+    if current is None:
+        return None
+    if on_step:
+        on_step(current)
+    for iteration in range(max_iterations):
+        step = cost.step(current)
+        if step is None:
+            return Descent(current, Status.SINGULAR, iteration)
+        if abs(step) > largest_step:
+            step = largest_step if step > 0 else -largest_step
+        accepted = None
+        while accepted is None:
+            while not low <= current.delay + step <= high:
+                step *= 0.5
+            if abs(step) <= smallest:
+                return Descent(current, Status.CONVERGED, iteration)
+            trial = cost.minimise(current.delay + step, current.theta)
+            if trial is not None and trial.squared_error < current.squared_error:
+                accepted = trial
+            else:
+                step *= 0.5
+        fall = 1.0 - accepted.squared_error / current.squared_error
+        current = accepted
+        if on_step:
+            on_step(current)
+        if fall < tolerance:
+            return Descent(current, Status.CONVERGED, iteration + 1)
+    return Descent(current, Status.MAX_ITERATIONS, max_iterations)
+
+
+def delay_step(equations: Equations, least_curvature: float = LEAST_CURVATURE) -> float | None:
+    """Gauss-Newton step of the delay with the coefficients projected out.
+
+    Parameters
+    ----------
+    equations : Equations
+        Second moments of the joint problem, the delay last.
+    least_curvature : float, default 1e-14
+        The delay counts as undetermined where projecting the coefficients out leaves less than this fraction of the
+        curvature.
+
+    Returns
+    -------
+    float or None
+        Step [s]; None if the data do not determine the delay.
+    """
+    hessian, gradient = equations.hessian, equations.instrument_error
+    diagonal = np.diag(hessian)[:-1]
+    projection = scaled_solve(hessian[:-1, :-1], hessian[:-1, -1], diagonal, diagonal)
+    if projection is None:
+        return None
+    curvature = hessian[-1, -1] - projection @ hessian[:-1, -1]
+    if not curvature > least_curvature * hessian[-1, -1]:
+        return None
+    return float(gradient[-1] / curvature)
+
+
+def bound_in_the_way(equations: Equations, delay: float, bounds: tuple[float, float]) -> float | None:
+    """The bound that keeps the delay from a lower cost.
+
+    Parameters
+    ----------
+    equations : Equations
+        Second moments where the iterations ended, the delay as the last parameter.
+    delay : float
+        Delay there [s].
+    bounds : tuple of float
+        Least and greatest delay [s].
+
+    Returns
+    -------
+    float or None
+        The bound [s] beyond which the next full Gauss-Newton step would lead; None if it stays inside, or if the data
+        hardly determine the delay, so that the length of the step means nothing.
+    """
+    step = delay_step(equations, least_curvature=1e-8)
+    if step is None:
+        return None
+    if delay + step < bounds[0]:
+        return bounds[0]
+    return bounds[1] if delay + step > bounds[1] else None

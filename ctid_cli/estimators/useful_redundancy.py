@@ -1,0 +1,431 @@
+r"""Delay and coefficients by useful redundancy: Gauss-Newton paths on a set of low-pass-filtered costs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import ClassVar, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators.common import Start, check_iteration, check_structure
+from ctid_cli.estimators.delay_search import Descent, Minimum, descend
+from ctid_cli.estimators.filtered_costs import FilteredCost, sampled_costs
+from ctid_cli.estimators.redundancy import Path, RedundantMinimum, Visit, minimise_redundantly
+from ctid_cli.estimators.td_srivc import TdSrivc
+from ctid_cli.filtering.filter_set import FilterSet
+from ctid_cli.inference.answer import output_bandwidth
+from ctid_cli.inference.fit import Fit, IterationRecord
+from ctid_cli.inference.status import Status
+from ctid_cli.signals.checks import require_choice, require_integer, require_positive
+from ctid_cli.signals.held import Hold
+from ctid_cli.signals.record import Record
+
+Array = NDArray[np.float64]
+Search = Literal["time", "spectral"]
+
+#: J0 is evaluated on a lattice of delays of this fraction of the shortest period, so that candidates that agree share
+#: it, and so do searches of the same data from different initial delays.
+LATTICE = 0.05
+#: The longest Gauss-Newton step, as a fraction of the range of the delay.
+LARGEST_STEP = 0.5
+#: J0 of a filter in which nothing can be computed [%].
+NOTHING = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class FilterPath:
+    """One solver path: Gauss-Newton on the delay with one filter.
+
+    Parameters
+    ----------
+    round : int
+        Round of the search, counted from 1.
+    filter : int
+        Index of the filter, 0 for that of the longest period.
+    delays : ndarray, shape (K,)
+        Accepted trial delays [s], the incumbent it started from first.
+    costs : ndarray, shape (K,)
+        ``100 ||y - x|| / ||y - mean y||`` of the filtered data there [%].
+    """
+
+    round: int
+    filter: int
+    delays: Array
+    costs: Array
+
+
+@dataclass(frozen=True, eq=False)
+class RedundantFit(Fit):
+    """A fit with the search that led to it.
+
+    Parameters
+    ----------
+    model, parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number, history
+        As in :class:`~ctid_cli.inference.fit.Fit`.
+    search : RedundantMinimum or None
+        Incumbents, candidates and switches: points are delays [s], costs are J0 [%].
+    filters : FilterSet or None
+        The filters of the search.
+    paths : tuple of FilterPath
+        Every solver path in the order in which they were followed.
+    """
+
+    search: RedundantMinimum[float] | None = field(default=None, repr=False)
+    filters: FilterSet | None = field(default=None, repr=False)
+    paths: tuple[FilterPath, ...] = field(default=(), repr=False)
+
+    @property
+    def switches(self) -> tuple[Visit[float], ...]:
+        """Where the search went on with another filter."""
+        return () if self.search is None else self.search.switches
+
+
+@dataclass(frozen=True)
+class UsefulRedundancy:
+    """Delay and coefficients by useful redundancy over a set of low-pass filters.
+
+    Parameters
+    ----------
+    poles : int
+        Degree of the denominator, 1 to 12.
+    zeros : int
+        Degree of the numerator, below ``poles``.
+    delay_bounds : tuple of float
+        Least and greatest delay [s]. Samples earlier than the greatest delay after the first input are not used.
+    bandwidth : float, optional
+        Bandwidth of the system [rad/s], its last -3 dB crossing; by default estimated from the record.
+    filters : int, default 10
+        Number of filters.
+    beta : float, default 10.0
+        Ratio of the longest to the shortest period of the filters [-].
+    order : int, default 10
+        Order of the Butterworth filters.
+    svf_cutoff : float, optional
+        Cut-off of the state-variable filter of the starts [rad/s]; by default the bandwidth.
+    search : {"time", "spectral"}, default "time"
+        Whether the search runs on samples of the filtered signals or on their spectra. The final estimate always
+        comes from the unfiltered samples.
+    max_iterations : int, default 10
+        Largest number of Gauss-Newton iterations on each path.
+    tolerance : float, default 1e-3
+        A path stops when its cost falls by less than this fraction, and the search when an incumbent moves by less
+        than this fraction of its delay, or of the shortest period if that is longer [-].
+    max_rounds : int, default 20
+        Largest number of rounds over all filters.
+    hold_output : {"foh", "zoh"}, default "foh"
+        Interpolation of the measured output between samples; changes the path, not the converged estimate.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+
+    Notes
+    -----
+    Algorithm IV of the reference. In each round, for every filter, Gauss-Newton on the delay runs from the incumbent to
+    a minimum of the filtered cost; the candidate of least J0 becomes the incumbent, itself a candidate. J0 is the mean
+    over the filters of ``100 ||y_k - x_k|| / ||y_k - mean y_k||``, each with its own coefficients at that delay (45).
+    Those come from the filter next to it, first from the widest band to the narrowest and then back, the cheaper kept;
+    the filter of widest band starts from least squares. Gauss-Newton steps are no longer than half the shortest
+    period. Estimates end on the unfiltered data: Gauss-Newton on the delay, then on all parameters together.
+
+    The search fails where no filter's path leads to a lower J0; :func:`~ctid_cli.filtering.check_filters` says for
+    which initial errors a set of filters can be trusted.
+
+    References
+    ----------
+    H. Ha, J. S. Welsh and M. Alamir, "Useful redundancy in parameter and time delay estimation for continuous-time
+    models", arXiv:1703.09344 (2017). doi:10.48550/arXiv.1703.09344
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli import HeldSignal, Record, TransferFunction, UsefulRedundancy, simulate
+    >>> from ctid_cli.estimators import Start
+    >>> t = 0.05 * np.arange(2000)
+    >>> u = HeldSignal(t, np.random.default_rng(0).choice([-1.0, 1.0], t.size))
+    >>> y = simulate(TransferFunction([2], [0.25, 0.7, 1], delay=8), u, t)
+    >>> y += 0.1 * np.random.default_rng(1).standard_normal(t.size)
+    >>> fit = UsefulRedundancy(2, 0, delay_bounds=(0, 15), bandwidth=2.0).fit(Record(t, y, u), Start(delay=0.0))
+    >>> round(fit.model.delay, 2)
+    8.0
+    """
+
+    kind: ClassVar[str] = "useful_redundancy"
+    uses_start: ClassVar[bool] = True
+
+    poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})
+    zeros: int = field(metadata={"doc": "Number of zeros, fewer than poles"})
+    delay_bounds: tuple[float, float] = field(metadata={"doc": "Least and greatest delay", "unit": "s"})
+    bandwidth: float | None = field(
+        default=None, metadata={"doc": "Bandwidth of the system, its last -3 dB crossing", "unit": "rad/s"}
+    )
+    filters: int = field(default=10, metadata={"doc": "Number of low-pass filters"})
+    beta: float = field(default=10.0, metadata={"doc": "Ratio of the longest to the shortest period of the filters"})
+    order: int = field(default=10, metadata={"doc": "Order of the Butterworth filters"})
+    svf_cutoff: float | None = field(
+        default=None, metadata={"doc": "Cut-off of the state-variable filter of the starts", "unit": "rad/s"}
+    )
+    search: Search = field(
+        default="time", metadata={"doc": "Search on samples of the filtered signals or on their spectra"}
+    )
+    max_iterations: int = field(default=10, metadata={"doc": "Largest number of Gauss-Newton iterations on each path"})
+    tolerance: float = field(
+        default=1e-3, metadata={"doc": "Relative tolerance of the cost on a path, and of the delay between rounds"}
+    )
+    max_rounds: int = field(default=20, metadata={"doc": "Largest number of rounds over all filters"})
+    hold_output: Hold = field(default="foh", metadata={"doc": "Interpolation of the measured output between samples"})
+
+    def __post_init__(self) -> None:
+        check_structure(self.poles, self.zeros)
+        require_choice("search", self.search, get_args(Search))
+        check_iteration(self.max_iterations, self.tolerance)
+        require_integer("max_rounds", self.max_rounds, 1)
+        if self.svf_cutoff is not None:
+            require_positive("svf_cutoff", self.svf_cutoff, "rad/s")
+        FilterSet(self.bandwidth or 1.0, self.filters, self.beta, self.order)
+        if self.bandwidth is not None:
+            require_positive("bandwidth", self.bandwidth, "rad/s")
+        object.__setattr__(self, "delay_bounds", self.refinement.delay_bounds)
+
+    @property
+    def refinement(self) -> TdSrivc:
+        """The estimator that ends the estimation on unfiltered data."""
+        return TdSrivc(self.poles, self.zeros, self.delay_bounds, hold_output=self.hold_output)
+
+    def prepare(self, record: Record) -> PreparedUsefulRedundancy:
+        """Check a record, lay it out and filter it, once for any number of starts.
+
+        Parameters
+        ----------
+        record : Record
+            The record.
+
+        Returns
+        -------
+        PreparedUsefulRedundancy
+            Ready to fit from any start.
+
+        Raises
+        ------
+        DataError
+            If nothing can be estimated from the record.
+        """
+        return PreparedUsefulRedundancy(self, record)
+
+    def fit(self, record: Record, start: Start | None = None) -> RedundantFit:
+        """Estimate coefficients and delay.
+
+        Parameters
+        ----------
+        record : Record
+            The record.
+        start : Start, optional
+            Initial delay; the middle of the bounds by default.
+
+        Returns
+        -------
+        RedundantFit
+            The estimate.
+
+        Raises
+        ------
+        DataError
+            If nothing can be estimated from the record, or the start lies outside the bounds.
+        """
+        return self.prepare(record).fit(start)
+
+
+class PreparedUsefulRedundancy:
+    """A record checked, laid out and filtered for :class:`UsefulRedundancy`.
+
+    Parameters
+    ----------
+    options : UsefulRedundancy
+        The estimator.
+    record : Record
+        The record.
+    """
+
+    def __init__(self, options: UsefulRedundancy, record: Record) -> None:
+        self.options = options
+        self.refinement = options.refinement.prepare(record)
+        bandwidth = options.bandwidth or output_bandwidth(record)
+        self.filters = FilterSet(bandwidth, options.filters, options.beta, options.order)
+        self.period = float(self.filters.periods[-1])
+        self.costs: list[FilteredCost] = list(
+            sampled_costs(
+                record,
+                self.filters.lowpasses,
+                self.refinement.structure,
+                options.delay_bounds[1],
+                options.svf_cutoff or bandwidth,
+            )
+        )
+        self._known: dict[int, tuple[float, list[Minimum | None]]] = {}
+
+    def member_costs(self, delay: float) -> Array:
+        """Costs of all filters at a delay, each with its own coefficients.
+
+        Parameters
+        ----------
+        delay : float
+            Delay [s].
+
+        Returns
+        -------
+        ndarray, shape (filters,)
+            ``100 ||y_k - x_k|| / ||y_k - mean y_k||`` [%], of the filter of longest period first.
+        """
+        return np.array([self._percent(k, minimum) for k, minimum in enumerate(self._minima(delay))])
+
+    def reference_cost(self, delay: float) -> float:
+        """J0 at the nearest point of a lattice of a twentieth of the shortest period: the mean of all members' costs.
+
+        Parameters
+        ----------
+        delay : float
+            Delay [s].
+
+        Returns
+        -------
+        float
+            J0 [%].
+        """
+        return self._at(delay)[0]
+
+    def fit(self, start: Start | None = None) -> RedundantFit:
+        """Estimate coefficients and delay from one start.
+
+        Parameters
+        ----------
+        start : Start, optional
+            Initial delay; the middle of the bounds by default.
+
+        Returns
+        -------
+        RedundantFit
+            The estimate.
+
+        Raises
+        ------
+        DataError
+            If the start lies outside the bounds, or nothing can be computed at any candidate.
+        """
+        options = self.options
+        low, high = options.delay_bounds
+        delay = 0.5 * (low + high) if start is None or start.delay is None else start.delay
+        if not low <= delay <= high:
+            raise DataError(f"the initial delay, {delay:g} s, lies outside the bounds {low:g} to {high:g} s")
+        paths: list[FilterPath] = []
+        search = minimise_redundantly(
+            delay,
+            self.reference_cost,
+            [self._path(k, paths) for k in range(len(self.costs))],
+            choice="best",
+            settled=lambda before, now: abs(now - before) <= options.tolerance * max(abs(now), self.period),
+            max_rounds=options.max_rounds,
+        )
+        fit = self._refine(search)
+        return RedundantFit(
+            **{item.name: getattr(fit, item.name) for item in fields(Fit)},
+            search=search,
+            filters=self.filters,
+            paths=tuple(paths),
+        )
+
+    def _refine(self, search: RedundantMinimum[float]) -> Fit:
+        """Go on from the minimum of J0, and from where the filter of widest band fits best in the last round."""
+        history = [
+            IterationRecord("filters", i, visit.point, visit.cost, (), ()) for i, visit in enumerate(search.trajectory)
+        ]
+        points = [search.point]
+        # J0 is flat around its minimum where noise or a model of too long a delay weigh on the narrow filters.
+        around = [visit.point for visit in search.visits if visit.round == search.rounds]
+        widest = [np.inf if minimum is None else minimum.squared_error for minimum in map(self._widest, around)]
+        if widest:
+            points.append(around[int(np.argmin(widest))])
+        best: Fit | None = None
+        for point in dict.fromkeys(points):
+            start = self._widest(point)
+            if start is None:
+                continue
+            found = Descent(Minimum(point, start.theta, start.squared_error), Status.CONVERGED, search.rounds)
+            fit = self.refinement.refine(found, list(history))
+            if best is None or fit.cost < best.cost:
+                best = fit
+        if best is None:
+            raise DataError(Status.SINGULAR.value)
+        return best
+
+    def _widest(self, delay: float) -> Minimum | None:
+        """Minimum of the filter of widest band at the lattice point next to a delay."""
+        return self._at(delay)[1][-1]
+
+    def _path(self, k: int, paths: list[FilterPath]) -> Path[float]:
+        """Solver path of one filter; what it does goes to ``paths``."""
+        cost = self.costs[k]
+        low, high = self.options.delay_bounds
+        rounds = 0
+
+        def follow(delay: float) -> list[float]:
+            nonlocal rounds
+            rounds += 1
+            here = self._at(delay)[1][k]
+            if here is None:
+                return []
+            ends: list[float] = []
+            # From the coefficients of J0 and from least squares: where one is trapped the other often is not.
+            for theta in (here.theta, None):
+                steps: list[Minimum] = []
+                found = descend(
+                    cost,
+                    delay,
+                    theta,
+                    (low, high),
+                    max_iterations=self.options.max_iterations,
+                    tolerance=self.options.tolerance,
+                    largest_step=LARGEST_STEP * (high - low),
+                    on_step=steps.append,
+                )
+                if found is not None:
+                    costs = np.array([self._percent(k, step) for step in steps])
+                    paths.append(FilterPath(rounds, k, np.array([step.delay for step in steps]), costs))
+                    ends.append(float(found.minimum.delay))
+            return ends
+
+        return follow
+
+    def _at(self, delay: float) -> tuple[float, list[Minimum | None]]:
+        """J0 and the minima of all filters at the lattice point next to a delay."""
+        place = round(delay / (LATTICE * self.period))
+        if place not in self._known:
+            low, high = self.options.delay_bounds
+            minima = self._minima(min(max(place * LATTICE * self.period, low), high))
+            mean = float(np.mean([self._percent(k, minimum) for k, minimum in enumerate(minima)]))
+            self._known[place] = mean, minima
+        return self._known[place]
+
+    def _percent(self, k: int, minimum: Minimum | None) -> float:
+        return NOTHING if minimum is None else 100.0 * float(np.sqrt(minimum.squared_error / self.costs[k].spread))
+
+    def _minima(self, delay: float) -> list[Minimum | None]:
+        """Coefficients of every filter at a delay: good ones are handed from filter to filter, down and up again."""
+        minima: list[Minimum | None] = [None] * len(self.costs)
+        neighbour: Array | None = None
+        for k in reversed(range(len(self.costs))):
+            # Least squares on a narrow band is hopeless in noise: the next wider band knows the system better.
+            found = minima[k] = self.costs[k].minimise(delay, neighbour)
+            neighbour = neighbour if found is None else found.theta
+        for k in range(1, len(self.costs)):
+            below, here = minima[k - 1], minima[k]
+            if below is not None:
+                found = self.costs[k].minimise_from(delay, [below.theta])
+                if found is not None and (here is None or found.squared_error < here.squared_error):
+                    minima[k] = found
+        return minima
+
+
+__all__ = ["FilterPath", "PreparedUsefulRedundancy", "RedundantFit", "UsefulRedundancy"]

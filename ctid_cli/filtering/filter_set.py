@@ -1,0 +1,323 @@
+r"""Sets of low-pass filters that lead a delay estimate out of local minima.
+
+A descent of one filtered cost may stop at a local minimum. If for every delay error some filter of a set has a descent
+that ends strictly closer to zero, switching between them ends at zero: minima are finite in number, and each lies below
+the one before. That is the necessary condition (40) for useful redundancy, which :func:`check_filters` verifies.
+
+Equation numbers are those of Ha, Welsh and Alamir, "Useful redundancy in parameter and time delay estimation for
+continuous-time models" (arXiv:1703.09344).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctid_cli.filtering.filter_theory import extrema
+from ctid_cli.filtering.lowpass import Lowpass
+from ctid_cli.signals.checks import require_integer, require_positive
+
+Array = NDArray[np.float64]
+
+#: Least ratio of the longest to the shortest period for which a sufficient number of filters exists, (41): the second
+#: extremum over the first, both by (36). Those of the true cost ask for 1.7192; between the two a narrow gap remains.
+LEAST_BETA = (5 / 4 - 1 / (5 * math.pi**2)) / (3 / 4 - 1 / (3 * math.pi**2))
+#: Beyond this ratio the longest period is too slow for the system that it must show.
+GREATEST_BETA = 10.0
+#: Filters times extrema that a check looks at, at most.
+_WORK_LIMIT = 20_000_000
+
+
+@dataclass(frozen=True)
+class FilterSet:
+    r"""Butterworth low-pass filters of linearly spaced periods, up to the bandwidth of a system.
+
+    Parameters
+    ----------
+    bandwidth : float
+        Bandwidth of the system [rad/s]: its last -3 dB crossing. The narrowest period is ``2 pi/bandwidth``.
+    count : int, default 10
+        Number of filters, at least 2.
+    beta : float, default 10.0
+        Ratio of the longest to the shortest period [-], from :data:`LEAST_BETA` to 10.
+    order : int, default 10
+        Order of the Butterworth filters, 1 to 20.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of its range.
+
+    Notes
+    -----
+    ``T_k = beta T_bw + (k - 1) (1 - beta) T_bw/(nf - 1)``, k = 1 ... nf: (38), of which (39) is another spelling.
+    The minima of a filter's cost are proportional to its period, hence the linear spacing.
+
+    Examples
+    --------
+    >>> FilterSet(bandwidth=2 * np.pi, count=6, beta=2.0).periods
+    array([2. , 1.8, 1.6, 1.4, 1.2, 1. ])
+    """
+
+    bandwidth: float = field(metadata={"doc": "Bandwidth of the system, its last -3 dB crossing", "unit": "rad/s"})
+    count: int = field(default=10, metadata={"doc": "Number of filters, at least 2", "unit": "-"})
+    beta: float = field(
+        default=10.0, metadata={"doc": "Ratio of the longest to the shortest period, 1.717 to 10", "unit": "-"}
+    )
+    order: int = field(default=10, metadata={"doc": "Order of the Butterworth filters, 1 to 20", "unit": "-"})
+
+    def __post_init__(self) -> None:
+        require_positive("bandwidth", self.bandwidth, "rad/s")
+        require_integer("count", self.count, 2)
+        _check_beta(self.beta)
+        Lowpass(self.bandwidth, self.order)
+
+    @property
+    def periods(self) -> Array:
+        """Periods of the cut-off frequencies [s], the longest first, shape (count,)."""
+        shortest = 2 * np.pi / self.bandwidth
+        return np.linspace(self.beta * shortest, shortest, self.count)
+
+    @property
+    def cutoffs(self) -> Array:
+        """Cut-off frequencies [rad/s], the lowest first, shape (count,)."""
+        return np.asarray(2 * np.pi / self.periods)
+
+    @property
+    def lowpasses(self) -> tuple[Lowpass, ...]:
+        """The filters, the lowest cut-off first."""
+        return tuple(Lowpass(float(cutoff), self.order) for cutoff in self.cutoffs)
+
+
+def _check_beta(beta: float) -> None:
+    if not LEAST_BETA <= beta <= GREATEST_BETA:
+        raise ValueError(
+            f"beta, the ratio of the longest to the shortest period, must be between {LEAST_BETA:.4f} (bound (41): the "
+            f"least for which some number of filters suffices) and {GREATEST_BETA:g}, not {beta}."
+        )
+
+
+def sufficient_number_of_filters(beta: float, bandwidth: float, largest_error: float) -> int:
+    r"""A number of filters that satisfies the necessary condition (40) for sure; often many fewer do.
+
+    Parameters
+    ----------
+    beta : float
+        Ratio of the longest to the shortest period [-], from :data:`LEAST_BETA` to 10.
+    bandwidth : float
+        Bandwidth of the system [rad/s].
+    largest_error : float
+        Largest delay error to start from [s].
+
+    Returns
+    -------
+    int
+        Number of filters; 1 where, by (37), the filter of longest period converges to zero by itself.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of its range.
+
+    Notes
+    -----
+    Equations (55)-(57): with i0 the first maximum of the longest period, by (36), that is not below the largest error,
+    ``nf >= (1/M + beta - 2)/(1/M - 1)``, ``M = (z - 4/(z pi^2))/(z + 2 - 4/((z + 2) pi^2))``, ``z = 4 i0 - 3``. All of
+    that rests on (36). With the true extrema the number suffices from beta = 1.7192 on; below, errors just beyond the
+    first maximum of the longest period lie under every positive minimum, and no number of filters helps.
+
+    Examples
+    --------
+    >>> sufficient_number_of_filters(10, 26.85, 15), sufficient_number_of_filters(10, 2.02, 15)
+    (114, 1)
+    """
+    _check_beta(beta)
+    require_positive("bandwidth", bandwidth, "rad/s")
+    require_positive("largest_error", largest_error, "s")
+    # Maximum i lies at (z/4 - 1/(z pi^2)) periods, z = 4 i - 1; solved for z it says in which valley an error lies.
+    ratio = largest_error * bandwidth / (2 * math.pi * beta)
+    i0 = max(1, math.ceil((2 * (ratio + math.hypot(ratio, 1 / math.pi)) + 1) / 4))
+    if i0 == 1:
+        return 1
+    z = 4 * i0 - 3
+    inverse = (z + 2 - 4 / ((z + 2) * math.pi**2)) / (z - 4 / (z * math.pi**2))
+    return math.ceil((inverse + beta - 2) / (inverse - 1))
+
+
+@dataclass(frozen=True)
+class ServedInterval:
+    """Delay errors from which the same filters lead closer to zero, to the same minima.
+
+    Parameters
+    ----------
+    low, high : float
+        Ends of the open interval of absolute delay errors [s].
+    filters : tuple of int
+        Indices of the filters that help, that of the minimum nearest to zero first.
+    minimum : float
+        The minimum nearest to zero [s], at most ``low``.
+    """
+
+    low: float
+    high: float
+    filters: tuple[int, ...]
+    minimum: float
+
+
+@dataclass(frozen=True)
+class FilterCheck:
+    """Whether a set of ideal low-pass filters leads from every delay error closer to zero.
+
+    Parameters
+    ----------
+    cutoffs : tuple of float
+        Cut-off frequencies [rad/s].
+    largest_error : float
+        Largest absolute delay error looked at [s].
+    intervals : tuple of ServedInterval
+        Where some filter helps, by rising error; together with the gaps they fill the range.
+    gaps : tuple of (float, float)
+        Open intervals of absolute delay errors [s] from which no filter leads closer to zero.
+    exact : bool
+        Whether the extrema are the roots of (51), else the approximation (36).
+    """
+
+    cutoffs: tuple[float, ...]
+    largest_error: float
+    intervals: tuple[ServedInterval, ...]
+    gaps: tuple[tuple[float, float], ...]
+    exact: bool
+
+    @property
+    def passes(self) -> bool:
+        """Whether there is no gap: the necessary condition (40) holds."""
+        return not self.gaps
+
+    def path(self, initial_error: float) -> list[tuple[int, float]]:
+        """Descents that lead from a delay error towards zero.
+
+        Parameters
+        ----------
+        initial_error : float
+            Delay error to start from [s], of either sign.
+
+        Returns
+        -------
+        list of (int, float)
+            Index of the filter and delay error [s] where its descent ends, step by step. Each step takes the filter
+            whose minimum is nearest to zero, the lowest index of several. The last error is zero unless the path runs
+            into a gap.
+
+        Raises
+        ------
+        ValueError
+            If the initial error lies outside the range of the check.
+        """
+        if not abs(initial_error) <= self.largest_error:
+            raise ValueError(
+                f"the check covers delay errors up to {self.largest_error:g} s, not {abs(initial_error):g} s; "
+                "repeat it with a larger range."
+            )
+        steps: list[tuple[int, float]] = []
+        error = abs(initial_error)
+        while error > 0:
+            ends = [
+                float(_ends(np.array([error]), *_landscape(cutoff, error, self.exact))[0]) for cutoff in self.cutoffs
+            ]
+            best = int(np.argmin(ends))
+            if not ends[best] < error:
+                break
+            error = ends[best]
+            steps.append((best, math.copysign(error, initial_error) if error else 0.0))
+        return steps
+
+
+def check_filters(cutoffs: ArrayLike, largest_error: float, exact: bool = True) -> FilterCheck:
+    r"""Verify the necessary condition (40) for a set of ideal low-pass filters.
+
+    Parameters
+    ----------
+    cutoffs : array_like, shape (nf,)
+        Cut-off frequencies [rad/s] of the filters in series with the system, in any order.
+    largest_error : float
+        Largest absolute delay error to start from [s].
+    exact : bool, default True
+        Whether to use the true extrema of the ideal cost, else the approximation (36).
+
+    Returns
+    -------
+    FilterCheck
+        Whether every error up to the largest one is served, by which filters, and where not.
+
+    Raises
+    ------
+    ValueError
+        If a cut-off frequency or the largest error is not positive, or the range holds too many extrema.
+
+    Notes
+    -----
+    No grid is involved. A descent leads from anywhere between two neighbouring maxima of a filter's cost to the minimum
+    between them, so the filter serves exactly the errors between that minimum and the maximum beyond it. The ends of
+    all these intervals split the range into pieces in which nothing changes. The ends themselves, where a descent may
+    go either way, are left out.
+
+    The condition is necessary, not sufficient: an estimator also has to prefer the nearer minimum to the one it is in,
+    and real filters are not ideal.
+
+    Examples
+    --------
+    >>> check = check_filters(FilterSet(26.85, count=15).cutoffs, largest_error=15.0)
+    >>> check.passes, len(check.path(15.0)), check.path(15.0)[-1]
+    (True, 19, (0, 0.0))
+    >>> check_filters(FilterSet(26.85, count=9).cutoffs, largest_error=15.0).passes
+    False
+    """
+    w = np.atleast_1d(np.asarray(cutoffs, dtype=float))
+    if w.ndim != 1 or not w.size:
+        raise ValueError("the cut-offs must be a list of at least one frequency in rad/s")
+    for cutoff in w:
+        require_positive("cutoff", float(cutoff), "rad/s")
+    require_positive("largest_error", largest_error, "s")
+    if w.size * (largest_error * w.sum() / np.pi + w.size) > _WORK_LIMIT:
+        raise ValueError(
+            f"{w.size} filters have too many extrema up to {largest_error:g} s to be looked at one by one; "
+            "give a smaller largest error, fewer filters or lower cut-offs."
+        )
+    landscapes = [_landscape(float(cutoff), largest_error, exact) for cutoff in w]
+    breaks = np.unique(np.concatenate([part for landscape in landscapes for part in landscape]))
+    breaks = np.array([0.0, *breaks[(breaks > 0) & (breaks < largest_error)], largest_error])
+    wide = np.diff(breaks) > 1e-12 * largest_error  # what is left of two ends that are equal but for rounding
+    low, high = breaks[:-1][wide], breaks[1:][wide]
+    middle = 0.5 * (low + high)
+    ends = np.array([_ends(middle, *landscape) for landscape in landscapes])
+    nearest_first = np.argsort(ends, axis=0, kind="stable")
+    helps = ends < middle
+    intervals: list[ServedInterval] = []
+    gaps: list[tuple[float, float]] = []
+    for k in range(middle.size):
+        filters = tuple(int(i) for i in nearest_first[:, k] if helps[i, k])
+        if not filters:
+            gaps.append((gaps.pop()[0] if gaps and gaps[-1][1] == low[k] else float(low[k]), float(high[k])))
+            continue
+        minimum = float(ends[filters[0], k])
+        last = intervals[-1] if intervals else None
+        if last and (last.high, last.filters, last.minimum) == (low[k], filters, minimum):
+            intervals[-1] = ServedInterval(last.low, float(high[k]), filters, minimum)
+        else:
+            intervals.append(ServedInterval(float(low[k]), float(high[k]), filters, minimum))
+    return FilterCheck(tuple(map(float, w)), float(largest_error), tuple(intervals), tuple(gaps), exact)
+
+
+def _landscape(cutoff: float, largest_error: float, exact: bool) -> tuple[Array, Array]:
+    """Maxima up to the first beyond an error, and the minima between them, the one at zero first [s]."""
+    pairs = int(largest_error * cutoff / (2 * np.pi)) + 2
+    all_ = extrema(cutoff, 2 * pairs - 1, exact)
+    return all_[::2], np.concatenate([[0.0], all_[1::2]])
+
+
+def _ends(errors: Array, maxima: Array, minima: Array) -> Array:
+    """Where descents from positive delay errors end [s]."""
+    return np.asarray(minima[np.searchsorted(maxima, errors)])

@@ -1,0 +1,158 @@
+"""What ``ctid check filters`` says of a filter set: whether it leads from every delay error to zero, and how."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import Any
+
+from ctid_cli.filtering import FilterSet, convergence_region, sufficient_number_of_filters
+from ctid_cli.filtering.filter_set import FilterCheck
+from ctid_cli.reporting.layout import count, number, text_table
+
+#: Lines of text are no longer than this.
+WIDTH = 100
+
+
+def filter_object(filters: FilterSet, check: FilterCheck) -> dict[str, Any]:
+    """A check of a filter set as JSON-able content.
+
+    Parameters
+    ----------
+    filters : FilterSet
+        The set.
+    check : FilterCheck
+        What was found for its cut-off frequencies.
+
+    Returns
+    -------
+    dict
+        The verdict, the filters (numbered from 1, the longest period first), the best filter for each interval of delay
+        errors, the gaps, the path from the largest error, and the sufficient number of filters. Times in seconds,
+        frequencies in rad/s.
+    """
+    return {
+        "passes": check.passes,
+        "bandwidth": filters.bandwidth,
+        "beta": filters.beta,
+        "largest_error": check.largest_error,
+        "filters": [
+            {
+                "filter": k + 1,
+                "period": float(period),
+                "cutoff": float(cutoff),
+                "convergence_region": convergence_region(float(cutoff), exact=check.exact),
+            }
+            for k, (period, cutoff) in enumerate(zip(filters.periods, filters.cutoffs, strict=True))
+        ],
+        "intervals": _best(check),
+        "gaps": [{"low": low, "high": high} for low, high in check.gaps],
+        "path": [{"filter": k + 1, "error": error} for k, error in check.path(check.largest_error)],
+        "sufficient_number": sufficient_number_of_filters(filters.beta, filters.bandwidth, check.largest_error),
+    }
+
+
+def _best(check: FilterCheck) -> list[dict[str, Any]]:
+    """Intervals of delay errors with their best filter, neighbours with the same one merged."""
+    rows: list[dict[str, Any]] = []
+    for interval in check.intervals:
+        best = interval.filters[0] + 1
+        last = rows[-1] if rows else {}
+        if (last.get("high"), last.get("filter"), last.get("minimum")) == (interval.low, best, interval.minimum):
+            last["high"] = interval.high
+        else:
+            rows.append({"low": interval.low, "high": interval.high, "filter": best, "minimum": interval.minimum})
+    return rows
+
+
+def filter_text(filters: FilterSet, check: FilterCheck) -> str:
+    """A check of a filter set for people.
+
+    Parameters
+    ----------
+    filters : FilterSet
+        The set.
+    check : FilterCheck
+        What was found for its cut-off frequencies.
+
+    Returns
+    -------
+    str
+        The verdict; the filters; which of them serves which delay error; the path from the largest error; the
+        sufficient number of filters.
+    """
+    content = filter_object(filters, check)
+    top = _time(check.largest_error)
+    parts = [
+        _verdict(content, top),
+        f"{count(filters.count, 'filter')}, periods from {number(filters.beta, 4)} to 1 times "
+        f"{_time(float(filters.periods[-1]))}, that of the bandwidth {number(filters.bandwidth, 4)} rad/s.",
+        text_table(
+            ["filter", "period [s]", "cut-off [rad/s]", "alone from [s]"],
+            [
+                [str(row["filter"]), *(number(row[key], 4) for key in ("period", "cutoff", "convergence_region"))]
+                for row in content["filters"]
+            ],
+            "rrrr",
+        )
+        + "\nalone from: delay errors up to this one lead to zero with this filter alone.",
+        text_table(
+            ["delay error [s]", "filter", "leads to [s]"],
+            [
+                [f"{number(row['low'], 5)} to {number(row['high'], 5)}", str(row["filter"] or "none"), row["text"]]
+                for row in sorted(
+                    [
+                        *({**row, "text": number(row["minimum"], 5)} for row in content["intervals"]),
+                        *({**gap, "filter": None, "text": "nothing closer"} for gap in content["gaps"]),
+                    ],
+                    key=lambda row: float(row["low"]),
+                )
+            ],
+            "lrr",
+        )
+        + "\nfilter: of those that lead closer to zero, the one that leads closest.",
+        _path(content),
+        _sufficient(content, filters.count, top),
+        "Checked is the necessary condition, with the exact extrema of the cost of an ideal low-pass filter: white "
+        "input, rational part known. Real filters, noise and an estimated rational part move the minima.",
+    ]
+    wrapped = [part if "\n" in part else textwrap.fill(part, WIDTH, break_on_hyphens=False) for part in parts]
+    return "\n\n".join(wrapped)
+
+
+def _time(value: float) -> str:
+    return f"{number(value, 5)} s"
+
+
+def _verdict(content: dict[str, Any], top: str) -> str:
+    gaps = content["gaps"]
+    if not gaps:
+        return f"PASS: from every delay error up to {top} some filter leads closer to zero, and so on down to zero."
+    where = ", ".join(f"{number(gap['low'], 5)} to {_time(gap['high'])}" for gap in gaps[:3])
+    more = f" and {count(len(gaps) - 3, 'more gap')}" if len(gaps) > 3 else ""
+    return (
+        f"NOT PASSED: from some delay errors up to {top} no filter leads closer to zero: {where}{more}. "
+        f"Up to {_time(gaps[0]['low'])} there is no gap."
+    )
+
+
+def _path(content: dict[str, Any]) -> str:
+    steps = [f"{number(step['error'], 5)} (filter {step['filter']})" for step in content["path"]]
+    if not steps:
+        return "No path: no filter leads closer to zero from the largest error."
+    stuck = "" if content["path"][-1]["error"] == 0 else "; from there no filter leads closer"
+    return f"Path [s] from {number(content['largest_error'], 5)}: {', '.join(steps)}{stuck}."
+
+
+def _sufficient(content: dict[str, Any], n: int, top: str) -> str:
+    enough = content["sufficient_number"]
+    if content["filters"][0]["convergence_region"] >= content["largest_error"]:
+        return f"One filter suffices: that of the longest period leads from {top} to zero by itself."
+    if enough == 1 or (n >= enough and not content["passes"]):
+        return (
+            f"Equation (56) asks for {count(enough, 'filter')}, but rests on extrema that are up to 0.15 % off, which "
+            "is too much here: a larger beta helps."
+        )
+    return (
+        f"Sufficient by (56) for delay errors up to {top}: {count(enough, 'filter')}. Fewer may do, and more of them "
+        "may fail: below that number check each set."
+    )

@@ -1,0 +1,357 @@
+"""Low-pass filter sets: costs of a delay error by independent routes, and the check against descents on a grid."""
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import integrate, linalg, signal
+
+from ctid_cli.filtering import (
+    FilterSet,
+    Lowpass,
+    check_filters,
+    convergence_region,
+    extrema,
+    filtered_cost,
+    ideal_cost,
+    sufficient_number_of_filters,
+)
+from ctid_cli.filtering.filter_set import LEAST_BETA
+from ctid_cli.models import TransferFunction
+
+CASE_1 = TransferFunction([2], [0.25, 0.7, 1], delay=8.0)
+CASE_2 = TransferFunction([-6400, 1600], [1, 5, 408, 416, 1600], delay=8.0)
+UNITY = TransferFunction([1], [1])
+ERRORS = [-2.0, 1e-7, 1e-3, 0.05, 0.7, 3.0, 15.0]
+
+
+# The ideal filter -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("error", [1e-4, 0.02, 0.158, 0.16, -0.7, 3.0, 15.0])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_ideal_cost_is_its_integral(error, noise):
+    # (35) with |L G0| = |L| = 1 up to the cut-off is (50): no factor lies between them.
+    cutoff = 2 * np.pi
+    integral, _ = integrate.quad(
+        lambda w: 2 * np.sin(w * error / 2) ** 2 + noise / 2, -cutoff, cutoff, limit=500, epsabs=0, epsrel=1e-11
+    )
+    assert ideal_cost(error, cutoff, noise) == pytest.approx(integral / np.pi, rel=1e-10)
+
+
+def test_ideal_cost_near_zero_and_far_away():
+    tiny = np.array([0.0, 1e-12, 1e-6])
+    np.testing.assert_allclose(ideal_cost(tiny, 3.0), 27 * tiny**2 / (3 * np.pi), rtol=1e-11)
+    assert ideal_cost(1e9, 3.0) == pytest.approx(6 / np.pi, rel=1e-9)
+    errors = np.array([[0.1, 0.3], [0.5, 2.0]])
+    np.testing.assert_array_equal(ideal_cost(-errors, 3.0), ideal_cost(errors, 3.0))
+    # both branches of the formula meet
+    assert ideal_cost((1 - 1e-9) / 3.0, 3.0) == pytest.approx(float(ideal_cost(1 / 3.0, 3.0)), rel=1e-8)
+
+
+def test_extrema_solve_their_equation_and_alternate():
+    cutoff = 26.85
+    exact = extrema(cutoff, 200, exact=True)
+    x = cutoff * exact
+    np.testing.assert_allclose(np.cos(x) * x, np.sin(x), atol=1e-12 * 200 * np.pi)
+    step = 0.01 / cutoff
+    curvature = ideal_cost(exact + step, cutoff) - 2 * ideal_cost(exact, cutoff) + ideal_cost(exact - step, cutoff)
+    assert (curvature[::2] < 0).all()
+    assert (curvature[1::2] > 0).all()
+    # none is left out: neighbours are half a period apart, and the first valley begins at zero
+    assert (np.diff(x) > np.pi).all()
+    assert (np.diff(x) < 1.03 * np.pi).all()
+    assert x[0] == pytest.approx(4.493409457909064, rel=1e-15)
+
+
+def test_printed_approximation_of_the_extrema():
+    period = 2 * np.pi / 26.85
+    i = np.arange(1, 201)
+    printed = (2 * i + 1) / 4 * period - period / ((2 * i + 1) * np.pi**2)
+    np.testing.assert_allclose(extrema(26.85, 200), printed, rtol=1e-14)
+    excess = printed / extrema(26.85, 200, exact=True) - 1
+    assert 0 < excess.max() == excess[0] < 0.0016
+    assert excess[1] < 0.0002
+
+
+def test_convergence_region():
+    assert convergence_region(2.0) == pytest.approx(3 * np.pi / 4 - 1 / (3 * np.pi), rel=1e-14)
+    inside = np.linspace(0, convergence_region(2.0, exact=True), 2001)
+    assert (np.diff(ideal_cost(inside, 2.0)) > 0).all()
+    assert ideal_cost(inside[-1] * 1.001, 2.0) < ideal_cost(inside[-1], 2.0)
+
+
+# Any filter -----------------------------------------------------------------------------------------------------------
+
+
+def by_autocorrelation(errors, system, lowpass):
+    """2 [gamma(0) - gamma(d)], gamma(d) = C expm(A d) P C' with P from the Lyapunov equation."""
+    one = signal.tf2ss(system.numerator, system.denominator)
+    two = signal.tf2ss(lowpass.numerator, lowpass.denominator)
+    n, m = one[0].shape[0], two[0].shape[0]
+    a = np.block([[one[0], np.zeros((n, m))], [two[1] @ one[2], two[0]]])
+    b = np.vstack([one[1], two[1] @ one[3]])
+    c = np.hstack([two[3] @ one[2], two[2]])
+    p = linalg.solve_continuous_lyapunov(a, -b @ b.T)
+    gamma = [(c @ linalg.expm(a * abs(d)) @ p @ c.T).item() for d in (0.0, *errors)]
+    return 2 * (gamma[0] - np.array(gamma[1:]))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("system", "lowpass"),
+    [
+        (CASE_1, Lowpass(0.202, 4)),
+        (CASE_1, Lowpass(2.02, 3)),
+        (CASE_2, Lowpass(2.685, 2)),
+        (CASE_2, Lowpass(26.85, 1)),
+        (TransferFunction([1, 0.3], [1, 0.02, 9]), TransferFunction([1, 4], [1, 2, 4])),
+    ],
+)
+def test_cost_by_the_autocorrelation(system, lowpass):
+    model = lowpass.model if isinstance(lowpass, Lowpass) else lowpass
+    errors = np.array([-2.0, 0.3, 0.7, 3.0, 15.0])
+    expected = by_autocorrelation(errors, system, model)
+    np.testing.assert_allclose(filtered_cost(errors, system, lowpass), expected, rtol=2e-10)
+    assert filtered_cost(0.0, system, lowpass) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("system", "lowpass"),
+    [(CASE_1, Lowpass(0.202, 10)), (CASE_2, Lowpass(2.685, 10)), (CASE_2, Lowpass(26.85, 2))],
+)
+def test_cost_by_residues_in_many_digits(system, lowpass):
+    # gamma(d) is the sum of the residues of F(s) F(-s) exp(s d) at the poles of F.
+    with mpmath.workdps(60):
+        n, wc = lowpass.order, mpmath.mpf(lowpass.cutoff)
+        butterworth = [wc * mpmath.expjpi(mpmath.mpf(2 * k + 1 + n) / (2 * n)) for k in range(n)]
+
+        def value(coefficients, s):
+            total = mpmath.mpf(0)
+            for c in coefficients:
+                total = total * s + mpmath.mpf(c)
+            return total
+
+        own = [mpmath.findroot(lambda s: value(system.denominator, s), complex(p)) for p in system.poles]
+        poles = butterworth + own
+
+        total = [mpmath.mpf(0)] * len(ERRORS)
+        for p in poles:
+            residue = value(system.numerator, p) * value(system.numerator, -p) * wc ** (2 * n)
+            for q in poles:
+                residue /= (p - q if q is not p else 1) * (-p - q)
+            total = [t - 2 * residue * mpmath.expm1(p * abs(d)) for t, d in zip(total, ERRORS, strict=True)]
+        expected = [float(t.real) for t in total]
+    np.testing.assert_allclose(filtered_cost(ERRORS, system, lowpass), expected, rtol=1e-10)
+
+
+def test_a_butterworth_filter_of_high_order_is_nearly_ideal():
+    errors = np.linspace(0.05, 6.0, 60)
+    ideal = ideal_cost(errors, 2.0)
+    off = [np.abs(filtered_cost(errors, UNITY, Lowpass(2.0, n)) / ideal - 1).max() for n in (5, 10, 20)]
+    # The spectra differ in a band of relative width 1/n.
+    assert off[2] < 0.5 * off[1] < 0.5 * 0.6 * off[0]
+    assert off[2] < 0.06
+
+
+def test_spectrum_of_the_input():
+    shaped = filtered_cost(ERRORS, CASE_1, Lowpass(2.0, 3), input_spectrum=lambda w: 1 / (1 + w**2))
+    cascade = TransferFunction(CASE_1.numerator, np.polymul(CASE_1.denominator, [1, 1]))
+    np.testing.assert_allclose(shaped, filtered_cost(ERRORS, cascade, Lowpass(2.0, 3)), rtol=1e-9)
+    np.testing.assert_allclose(
+        filtered_cost(ERRORS, CASE_1, Lowpass(2.0, 10), input_spectrum=lambda w: 3.0),
+        3 * filtered_cost(ERRORS, CASE_1, Lowpass(2.0, 10)),
+        rtol=1e-12,
+    )
+
+
+@pytest.mark.parametrize("order", [1, 2, 10])
+def test_noise_lifts_the_cost(order):
+    # Noise bandwidth of a Butterworth filter: wc (pi/2n)/sin(pi/2n) on each side.
+    lifted = filtered_cost([0.0, 2.0], CASE_1, Lowpass(0.4, order), noise_intensity=0.7)
+    bandwidth = 0.4 * (np.pi / (2 * order)) / np.sin(np.pi / (2 * order))
+    np.testing.assert_allclose(
+        lifted - filtered_cost([0.0, 2.0], CASE_1, Lowpass(0.4, order)), 0.7 * bandwidth / np.pi, rtol=1e-10
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((1.0, TransferFunction([1], [1, -1]), Lowpass(1.0)), "the system must be stable"),
+        ((1.0, CASE_1, TransferFunction([1], [1, 0])), "the low-pass filter must be stable"),
+        ((1.0, UNITY, UNITY), "together must have more poles than zeros"),
+        ((1.0, CASE_1, UNITY, None, 0.1), "with noise, the low-pass filter must have more poles"),
+        ((1.0, CASE_1, Lowpass(1.0), None, -0.1), "noise_intensity must be zero or a positive number"),
+        ((1.0, CASE_1, Lowpass(1.0), lambda w: np.cos(w)), "finite and not negative"),
+        ((np.nan, CASE_1, Lowpass(1.0)), "not a finite number"),
+        ((1e9, CASE_1, Lowpass(1.0)), "oscillates too often"),
+    ],
+)
+def test_costs_that_do_not_exist(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        filtered_cost(*arguments)
+
+
+# The set --------------------------------------------------------------------------------------------------------------
+
+
+def test_periods_by_both_printed_formulas():
+    filters = FilterSet(26.85, count=15)
+    shortest, k = 2 * np.pi / 26.85, np.arange(1, 16)
+    np.testing.assert_allclose(filters.periods, 10 * shortest + (k - 1) * (1 - 10) * shortest / 14, rtol=1e-13)
+    np.testing.assert_allclose(filters.periods, 10 * shortest - (k - 1) * (10 - 1) * shortest / 14, rtol=1e-13)
+    np.testing.assert_allclose(filters.cutoffs[[0, -1]], [2.685, 26.85], rtol=1e-14)
+    assert filters.lowpasses == tuple(Lowpass(w, 10) for w in filters.cutoffs)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"bandwidth": 0.0}, "bandwidth must be a positive number"),
+        ({"bandwidth": np.inf}, "bandwidth must be a positive number"),
+        ({"count": 1}, "count must be an integer of at least 2"),
+        ({"count": 2.5}, "count must be an integer of at least 2"),
+        ({"beta": 1.7}, r"be between 1\.7170 \(bound \(41\).* and 10, not 1\.7"),
+        ({"beta": 10.1}, "and 10, not 10.1"),
+        ({"beta": np.nan}, "and 10, not nan"),
+        ({"order": 0}, "order must be between 1 and 20"),
+    ],
+)
+def test_impossible_sets_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        FilterSet(**{"bandwidth": 2.0, **options})
+
+
+# The check ------------------------------------------------------------------------------------------------------------
+
+
+def descents(cutoff, errors):
+    """Where descents of the sampled ideal cost end, from every point of a grid that begins at zero."""
+    cost = ideal_cost(errors, cutoff)
+    follow = np.arange(errors.size)
+    lower, upper = cost[:-2] < cost[1:-1], cost[2:] < cost[1:-1]
+    follow[1:-1] = np.arange(1, errors.size - 1) - lower + (upper & ~lower)
+    for _ in range(int(np.log2(errors.size)) + 1):
+        follow = follow[follow]
+    return errors[follow]
+
+
+@pytest.mark.parametrize(
+    ("filters", "largest"), [(FilterSet(6.0, 4, 2.0), 9.0), (FilterSet(2.0, 3, 5.0), 30.0), (FilterSet(9.0, 7), 8.0)]
+)
+def test_check_against_descents_on_a_grid(filters, largest):
+    check = check_filters(filters.cutoffs, largest)
+    grid = np.linspace(0, 1.5 * largest, 60_001)
+    step = grid[1]
+    ends = np.array([descents(cutoff, grid) for cutoff in filters.cutoffs])
+    pieces = [(i.low, i.high, i) for i in check.intervals] + [(*gap, None) for gap in check.gaps]
+    pieces.sort(key=lambda piece: piece[0])
+    assert [piece[0] for piece in pieces] == [0.0, *(piece[1] for piece in pieces[:-1])]
+    assert pieces[-1][1] == largest
+    looked_at = 0
+    for low, high, interval in pieces:
+        inside = (grid > low + 2 * step) & (grid < high - 2 * step)
+        helps = ends[:, inside] < grid[inside] - step / 2
+        looked_at += inside.sum()
+        expected = set(interval.filters) if interval else set()
+        for k in range(filters.count):
+            assert (helps[k] == (k in expected)).all()
+        if interval and inside.any():
+            reached = np.where(helps, ends[:, inside], np.inf).min(axis=0)
+            np.testing.assert_allclose(reached, interval.minimum, atol=step)
+            np.testing.assert_allclose(ends[interval.filters[0], inside], interval.minimum, atol=step)
+    assert looked_at > 0.98 * 40_000
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_second_case(exact):
+    # Adequacy does not grow with the number of filters: nine fail where seven pass.
+    passing = [n for n in range(2, 16) if check_filters(FilterSet(26.85, n).cutoffs, 15.0, exact).passes]
+    assert passing == [7, 8, 10, 11, 12, 13, 14, 15]
+    assert [n for n in range(2, 16) if check_filters(FilterSet(26.85, n).cutoffs, 8.0, exact).passes] == [*range(7, 16)]
+    (gap,) = check_filters(FilterSet(26.85, 9).cutoffs, 15.0, exact).gaps
+    assert gap == pytest.approx((14.2961, 14.3331), abs=1e-4)
+
+
+def test_first_case_needs_only_its_widest_filter():
+    check = check_filters([0.202], 22.2)
+    assert check.passes
+    assert check.path(22.2) == [(0, 0.0)]
+    assert not check_filters([0.202], 22.3).passes
+
+
+def test_six_filters_of_ratio_two_leave_a_gap_below_fifteen_seconds():
+    check = check_filters(FilterSet(2 * np.pi, 6, 2.0).cutoffs, 15.0)
+    (gap,) = check.gaps
+    assert gap == pytest.approx((14.0974, 14.2482), abs=1e-4)
+    assert not check.passes
+    assert check.path(14.2) == []
+    assert check.path(14.0)[-1] == (0, 0.0)
+    assert check_filters(FilterSet(2 * np.pi, 6, 2.0).cutoffs, 14.09).passes
+
+
+def test_sufficient_numbers():
+    assert sufficient_number_of_filters(10, 26.85, 8) == 60
+    assert sufficient_number_of_filters(10, 26.85, 15) == 114
+    assert sufficient_number_of_filters(10, 2.02, 15) == 1
+    # the number changes exactly where the error passes a maximum (36) of the widest filter
+    for maximum in extrema(2.685, 9)[::2]:
+        below, above = (sufficient_number_of_filters(10, 26.85, maximum * factor) for factor in (1 - 1e-9, 1 + 1e-9))
+        assert below < above
+    with pytest.raises(ValueError, match="largest_error must be a positive number"):
+        sufficient_number_of_filters(10, 26.85, 0.0)
+    with pytest.raises(ValueError, match="beta"):
+        sufficient_number_of_filters(1.5, 26.85, 8.0)
+
+
+@given(beta=st.floats(1.7193, 10), ratio=st.floats(0.72, 8))
+def test_the_sufficient_number_suffices(beta, ratio):
+    largest = ratio * beta
+    n = sufficient_number_of_filters(beta, 2 * np.pi, largest)
+    assert check_filters(FilterSet(2 * np.pi, n, beta).cutoffs, largest).passes
+
+
+@given(ratio=st.floats(0.72, 8))
+def test_the_least_ratio_belongs_to_the_approximate_extrema(ratio):
+    first, second = extrema(1.0, 2)
+    assert pytest.approx(second / first, rel=1e-14) == LEAST_BETA
+    n = sufficient_number_of_filters(LEAST_BETA, 2 * np.pi, ratio * LEAST_BETA)
+    cutoffs = FilterSet(2 * np.pi, n, LEAST_BETA).cutoffs
+    assert check_filters(cutoffs, ratio * LEAST_BETA, exact=False).passes
+    # By the true ones the shortest period's first minimum lies beyond the longest one's first maximum.
+    gaps = check_filters(cutoffs, ratio * LEAST_BETA).gaps
+    assert gaps[0][0] == pytest.approx(convergence_region(cutoffs[0], exact=True))
+
+
+@given(
+    cutoffs=st.lists(st.floats(0.3, 20), min_size=1, max_size=8),
+    largest=st.floats(0.1, 25),
+    fraction=st.floats(-1, 1),
+)
+def test_paths_descend(cutoffs, largest, fraction):
+    check = check_filters(cutoffs, largest)
+    error = fraction * largest
+    for k, end in check.path(error):
+        assert abs(end) < abs(error)
+        assert end * error >= 0
+        # a descent: the filter's cost falls all the way
+        way = ideal_cost(np.linspace(error, end, 200), cutoffs[k])
+        assert (np.diff(way) <= 1e-12 * cutoffs[k]).all()
+        error = end
+    if error:
+        assert not check.passes
+        assert any(low <= abs(error) <= high for low, high in check.gaps)
+    assert [(k, -end) for k, end in check.path(-fraction * largest)] == check.path(fraction * largest)
+
+
+def test_what_cannot_be_checked():
+    with pytest.raises(ValueError, match="up to 5 s, not 6 s"):
+        check_filters([1.0], 5.0).path(-6.0)
+    with pytest.raises(ValueError, match="cutoff must be a positive number"):
+        check_filters([1.0, -1.0], 5.0)
+    with pytest.raises(ValueError, match="at least one frequency"):
+        check_filters([], 5.0)
+    with pytest.raises(ValueError, match="too many extrema"):
+        check_filters([1.0, 1e9], 5.0)
