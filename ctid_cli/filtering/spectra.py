@@ -1,0 +1,390 @@
+r"""Finite-record spectra of a record's output and of its delayed input, exactly, for any clock, hold and delay.
+
+Over a window ``[t_0, t_1]`` of length T and at its own frequencies ``w_k = 2 pi k / T`` the spectrum of a signal v is
+
+.. math:: V(w_k) = \frac{1}{T} \int_{t_0}^{t_1} v(t) e^{-j w_k (t - t_0)} dt.
+
+There ``exp(-j w_k T) = 1``: a derivative ``p^i v`` has the spectrum ``(jw)^i V`` plus a real polynomial in ``jw`` of
+degree ``i - 1`` made of the end values of v. A differential equation therefore holds exactly between finite spectra,
+up to one real polynomial for the states at both ends of the window.
+
+By Parseval the mean square of v over the window is ``|V(0)|^2 + 2 sum_k |V(w_k)|^2``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.filtering.bank import plain_array
+from ctid_cli.filtering.lowpass import Lowpass
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+IndexArray = NDArray[np.int64]
+
+#: Partial sums are kept for this many stretches of breaks; within a stretch they are formed when a delay asks.
+STRETCHES = 128
+#: No stretch is shorter than this number of breaks.
+SHORTEST_STRETCH = 8
+#: Sampling intervals are sorted into this many groups of like ones to find what interpolation does to the output.
+STEP_GROUPS = 64
+#: Delays whose spectra are remembered.
+REMEMBERED = 256
+
+
+class RecordSpectra:
+    """Spectra of a record's output and of its input at any delay.
+
+    Parameters
+    ----------
+    record : Record
+        The record.
+    window : tuple of float
+        First and last instant of the window [s].
+    count : int
+        Number of frequencies, from ``2 pi / T`` in steps of as much; the mean, at zero frequency, comes on top.
+    greatest_delay : float
+        The greatest delay that will be asked for [s].
+    keep_mean : bool, default True
+        Whether the zero frequency is kept. Without it a constant offset of the output has no effect at all.
+
+    Notes
+    -----
+    The input is exact. The output is joined by straight lines between its samples, missing ones left out. That keeps
+    the values and slopes at the ends of the window and damps the curvature between them: a wave ``exp(jwt)`` by
+    ``(sin(wh/2)/(wh/2))^2`` in an interval of length h. The mean of that factor over the window is taken out of the
+    spectrum. What remains are images of other frequencies: small, and noise-like on an irregular clock, but a reason
+    to finish an estimate in the time domain.
+    """
+
+    def __init__(
+        self, record: Record, window: tuple[float, float], count: int, greatest_delay: float, keep_mean: bool = True
+    ) -> None:
+        start, end = window
+        self.window = window
+        self.greatest_delay = greatest_delay
+        self._first = 0 if keep_mean else 1
+        #: Frequencies [rad/s], shape (K,).
+        self.frequencies: Array = 2 * np.pi / (end - start) * np.arange(self._first, count + 1, dtype=np.float64)
+        output = HeldSignal(record.t, record.bridged_y, "foh")
+        #: Mean factor by which straight lines between the samples damp each frequency [-], shape (K,).
+        self.damping: Array = _damping(record, window, self.frequencies)
+        joined = _HeldSpectrum(output, start, end - start, 0.0, count)
+        #: Spectrum of the output [output unit], shape (K,).
+        self.outputs: ComplexArray = joined.at(0.0, count, 1.0 / self.damping[-count:])[self._first :]
+        self._input = _HeldSpectrum(record.input, start, end - start, greatest_delay, count)
+        self._remembered: dict[float, ComplexArray] = {}
+
+    @property
+    def duration(self) -> float:
+        """Length of the window [s]."""
+        return self.window[1] - self.window[0]
+
+    def inputs(self, delay: float, count: int | None = None) -> ComplexArray:
+        """Spectrum of the delayed input over the window.
+
+        Parameters
+        ----------
+        delay : float
+            Delay [s], from 0 to the greatest one.
+        count : int, optional
+            Number of frequencies that are needed, from the lowest; all by default.
+
+        Returns
+        -------
+        ndarray, shape (count,)
+            Spectrum of ``u(t - delay)`` [input unit].
+
+        Raises
+        ------
+        ValueError
+            If the delay is out of range.
+        """
+        if not 0.0 <= delay <= self.greatest_delay:
+            raise ValueError(f"the delay must lie between 0 and {self.greatest_delay:g} s, not {delay:g} s")
+        needed = self.frequencies.size if count is None else count
+        known = self._remembered.get(delay)
+        if known is None or known.size < needed:
+            known = self._input.at(delay, needed - 1 + self._first)[self._first :]
+            if len(self._remembered) >= REMEMBERED:
+                del self._remembered[next(iter(self._remembered))]
+            self._remembered[delay] = known
+        return known[:needed]
+
+
+def record_spectra(
+    record: Record, start: float, highest: float, greatest_delay: float, *, keep_mean: bool = True
+) -> RecordSpectra:
+    """Lay out the spectra of a record.
+
+    Parameters
+    ----------
+    record : Record
+        The record.
+    start : float
+        The window starts this long after the first input break [s], or at the first sample if that is later: the
+        greatest trial delay, so that the delayed input is known in the whole window. It ends at the last sample.
+    highest : float
+        Highest frequency of interest [rad/s]; half the (median) sampling frequency where that is lower.
+    greatest_delay : float
+        The greatest delay that will be asked for [s].
+    keep_mean : bool, default True
+        Whether the zero frequency is kept. Without it a constant offset of the output has no effect at all.
+
+    Returns
+    -------
+    RecordSpectra
+        The spectra.
+
+    Raises
+    ------
+    DataError
+        If fewer than two samples lie in the window, or it is too short for one period of the highest frequency.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli.signals import Record
+    >>> t = np.arange(0.0, 10.5, 0.5)
+    >>> spectra = record_spectra(Record.from_arrays(t, np.ones(21), t), 2.0, 2.0, 2.0)
+    >>> spectra.window, spectra.frequencies.round(3).tolist()
+    ((2.0, 10.0), [0.0, 0.785, 1.571])
+    >>> spectra.outputs.round(3)
+    array([6.+0.j   , 0.+1.273j, 0.+0.637j])
+    """
+    present = record.t[record.valid]
+    first = max(float(record.input.t[0]) + start, float(present[0]))
+    inside = present[present >= first]
+    where = f"{record.name}: " if record.name else ""
+    if inside.size < 2:
+        raise DataError(
+            f"{where}fewer than two samples are left {start:g} s after the first input; "
+            "take a longer record or a smaller greatest delay"
+        )
+    last = float(inside[-1])
+    highest = min(highest, np.pi / float(np.median(np.diff(inside))))
+    count = int(np.floor(highest * (last - first) / (2 * np.pi)))
+    if count < 1:
+        raise DataError(
+            f"{where}the {last - first:g} s from {first:g} s on hold no full period of {highest:g} rad/s; "
+            "take a longer record, a smaller greatest delay or a higher frequency"
+        )
+    return RecordSpectra(record, (first, last), count, greatest_delay, keep_mean)
+
+
+def lowpass_weight(frequencies: Array, lowpass: Lowpass | None) -> Array:
+    """Squared gain of a Butterworth low-pass filter.
+
+    Parameters
+    ----------
+    frequencies : ndarray, shape (K,)
+        Frequencies [rad/s].
+    lowpass : Lowpass or None
+        The filter; None lets everything pass.
+
+    Returns
+    -------
+    ndarray, shape (K,)
+        ``1/(1 + (w/w_c)^(2 order))`` [-].
+    """
+    if lowpass is None:
+        return np.ones(frequencies.size)
+    # Far above a sharp filter the power overflows to infinity and the weight is 0, as it should be.
+    with np.errstate(over="ignore"):
+        weight: Array = 1.0 / (1.0 + (frequencies / lowpass.cutoff) ** (2 * lowpass.order))
+    return weight
+
+
+def _damping(record: Record, window: tuple[float, float], frequencies: Array) -> Array:
+    """Mean of ``(sin(wh/2)/(wh/2))^2`` over the sampling intervals in a window, each counted with its length."""
+    present = record.t[record.valid]
+    steps = np.sort(np.diff(present[(present >= window[0]) & (present <= window[1])]))
+    # Intervals of about the same length share one: that which has their mean to second order in the frequency.
+    groups = np.array_split(steps, min(steps.size, STEP_GROUPS))
+    lengths = np.array([group.sum() for group in groups])
+    typical = np.sqrt(np.array([(group**3).sum() for group in groups]) / lengths)
+    damping: Array = np.sinc(np.outer(frequencies, typical) / (2 * np.pi)) ** 2 @ lengths / lengths.sum()
+    return damping
+
+
+class _HeldSpectrum:
+    """Spectrum of a held signal over a window, for any delay of the signal.
+
+    Integration by parts leaves sums over the breaks: of the jumps of the value for a constant hold, of the jumps of
+    the slope for a linear one. Their partial sums are kept at every few breaks at both ends of the window.
+    """
+
+    def __init__(self, signal: HeldSignal, start: float, duration: float, greatest_delay: float, count: int) -> None:
+        times = signal.t - start
+        values = plain_array(signal.values)
+        self.foh = signal.hold == "foh"
+        slopes = np.zeros(times.size)
+        if self.foh:
+            slopes[:-1] = np.diff(values) / np.diff(times)
+        jumps = np.diff(slopes if self.foh else values, prepend=0.0)
+        integral = np.concatenate(
+            ([0.0], np.cumsum(np.diff(times) * (values[:-1] + 0.5 * slopes[:-1] * np.diff(times))))
+        )
+        # Nothing happens at a break without a jump, and nothing after the window matters.
+        kept = (jumps != 0.0) & (times < duration)
+        kept[0] = True
+        self.times, self.values, self.slopes, self.jumps, self.integral = (
+            np.ascontiguousarray(array[kept]) for array in (times, values, slopes, jumps, integral)
+        )
+        self.duration = duration
+        early = int(np.searchsorted(self.times, 0.0, side="right"))
+        late = int(np.searchsorted(self.times, duration - greatest_delay))
+        breaks = self.times.size
+        stretch = max(SHORTEST_STRETCH, (early + breaks - late) // STRETCHES)
+        #: Numbers of breaks up to which partial sums are kept.
+        self.marks = np.union1d(np.arange(0, early + 1, stretch), np.arange(late, breaks + 1, stretch)).astype(np.int64)
+        self.sums = _partial_sums(self.times, self.jumps, self.marks, 2 * np.pi / duration, count)
+
+    def at(self, delay: float, count: int, gain: Array | None = None) -> ComplexArray:
+        """Spectrum at zero frequency and the ``count`` frequencies above it, of the signal later by ``delay``.
+
+        At the latter, what happens inside the window, as opposed to its ends, is multiplied by ``gain``.
+        """
+        spectrum: ComplexArray = _window_spectrum(
+            self.times,
+            self.values,
+            self.slopes,
+            self.jumps,
+            self.integral,
+            self.foh,
+            self.marks,
+            self.sums,
+            self.duration,
+            delay,
+            np.ones(count) if gain is None else gain,
+        )
+        return spectrum
+
+
+@njit(cache=True, nogil=True)
+def _phases(angle: float, count: int, re: Array, im: Array) -> None:
+    """Real and imaginary parts of ``exp(-j k angle)``, k = 1 … count, by doubling: vector operations throughout."""
+    power_re, power_im = np.cos(angle), -np.sin(angle)
+    re[0], im[0] = power_re, power_im
+    done = 1
+    while done < count:
+        for i in range(min(done, count - done)):
+            re[done + i] = power_re * re[i] - power_im * im[i]
+            im[done + i] = power_re * im[i] + power_im * re[i]
+        power_re, power_im = power_re * power_re - power_im * power_im, 2.0 * power_re * power_im
+        done *= 2
+
+
+@njit(cache=True, nogil=True)
+def _add_jumps(times: Array, jumps: Array, first: int, last: int, base: float, phases: Array, total: Array) -> None:
+    """Add ``sum jump_i exp(-j k base t_i)`` over the breaks ``first … last - 1`` to ``total``."""
+    count = total.shape[1]
+    phase_re, phase_im = phases[0], phases[1]
+    total_re, total_im = total[0], total[1]
+    for i in range(first, last):
+        _phases(base * times[i], count, phase_re, phase_im)
+        for k in range(count):
+            total_re[k] += jumps[i] * phase_re[k]
+            total_im[k] += jumps[i] * phase_im[k]
+
+
+@njit(cache=True, nogil=True)
+def _partial_sums(times: Array, jumps: Array, marks: IndexArray, base: float, count: int) -> Array:
+    """Sums over the first ``marks[r]`` breaks, shape (marks, 2, count)."""
+    sums = np.zeros((marks.size, 2, count))
+    phases, total = np.zeros((2, count)), np.zeros((2, count))
+    done = 0
+    for r in range(marks.size):
+        _add_jumps(times, jumps, done, marks[r], base, phases, total)
+        done = marks[r]
+        for k in range(count):
+            sums[r, 0, k] = total[0, k]
+            sums[r, 1, k] = total[1, k]
+    return sums
+
+
+@njit(cache=True, nogil=True)
+def _last_at(grid: Array | IndexArray, value: float) -> int:
+    """Index of the last entry not above ``value``; 0 if there is none."""
+    low, high = 0, grid.size
+    while high - low > 1:
+        middle = (low + high) // 2
+        if grid[middle] <= value:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@njit(cache=True, nogil=True)
+def _window_spectrum(
+    times: Array,
+    values: Array,
+    slopes: Array,
+    jumps: Array,
+    integral: Array,
+    foh: bool,
+    marks: IndexArray,
+    sums: Array,
+    duration: float,
+    delay: float,
+    gain: Array,
+) -> ComplexArray:
+    """Compiled body of :meth:`_HeldSpectrum.at`.
+
+    With a and b the ends of the window on the undelayed signal's clock, value v and slope r there, and D the sum of
+    ``jump exp(-jw t)`` over the breaks between them,
+
+    ``T V = (v(a) e_a - v(b))/jw + (r(a) e_a - r(b))/(jw)^2 + gain exp(-jw delay) D/(jw)^i``,
+
+    i = 1 for a constant hold (whose slopes are zero) and 2 for a linear one. ``e_a`` is 1 unless a precedes the first
+    break, where the signal begins with a jump.
+    """
+    count = gain.size
+    spectrum = np.zeros(count + 1, np.complex128)
+    begin, end = max(-delay, times[0]), duration - delay
+    if end <= begin:
+        return spectrum
+    base = 2.0 * np.pi / duration
+    left, right = _last_at(times, begin), _last_at(times, end)
+    before, after = begin - times[left], end - times[right]
+    value_left, value_right = values[left] + slopes[left] * before, values[right] + slopes[right] * after
+    total_left = integral[left] + before * (values[left] + 0.5 * slopes[left] * before)
+    total_right = integral[right] + after * (values[right] + 0.5 * slopes[right] * after)
+    spectrum[0] = (total_right - total_left) / duration
+    if count == 0:
+        return spectrum
+    phases, total, early = np.zeros((2, count)), np.zeros((2, count)), np.zeros((2, count))
+    row, upper = _last_at(marks, left + 1), _last_at(marks, right + 1)
+    for k in range(count):
+        total[0, k] = sums[upper, 0, k]
+        total[1, k] = sums[upper, 1, k]
+        early[0, k] = sums[row, 0, k]
+        early[1, k] = sums[row, 1, k]
+    _add_jumps(times, jumps, marks[upper], right + 1, base, phases, total)
+    _add_jumps(times, jumps, marks[row], left + 1, base, phases, early)
+    _phases(base * delay, count, phases[0], phases[1])
+    starts = np.zeros((2, count))
+    if begin > -delay:
+        _phases(base * (delay + begin), count, starts[0], starts[1])
+    else:
+        for k in range(count):
+            starts[0, k] = 1.0
+    for k in range(count):
+        jw = 1j * (base * (k + 1))
+        start = complex(starts[0, k], starts[1, k])
+        inside = complex(total[0, k] - early[0, k], total[1, k] - early[1, k])
+        inside *= gain[k] * complex(phases[0, k], phases[1, k])
+        value = value_left * start - value_right
+        slope = slopes[left] * start - slopes[right]
+        if foh:
+            slope += inside
+        else:
+            value += inside
+        spectrum[k + 1] = (value + slope / jw) / jw / duration
+    return spectrum

@@ -1,0 +1,195 @@
+"""Finite-record spectra against quadrature of the held signals themselves, and what sampling does to the output's."""
+
+import numpy as np
+import pytest
+
+from ctid_cli.errors import DataError
+from ctid_cli.filtering.lowpass import Lowpass
+from ctid_cli.filtering.spectra import lowpass_weight, record_spectra
+from ctid_cli.signals import HeldSignal, Record
+
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(16)
+
+
+def quadrature(function, breaks, window, frequencies):
+    """``1/T int v exp(-jw(t - t0)) dt`` by Gauss's rule between the breaks: exact to rounding for short pieces."""
+    start, end = window
+    edges = np.unique(np.concatenate((breaks[(breaks > start) & (breaks < end)], window)))
+    middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
+    t = middle[:, None] + half[:, None] * NODES
+    integrand = (function(t) * WEIGHTS * half[:, None]).ravel()
+    return np.exp(-1j * np.outer(frequencies, (t - start).ravel())) @ integrand / (end - start)
+
+
+def clock(regular, n, seed=0):
+    return 0.05 * np.arange(n) if regular else np.cumsum(np.random.default_rng(seed).uniform(0.01, 0.09, n))
+
+
+def noisy_record(hold="zoh", regular=True, n=800, input_times=None):
+    rng = np.random.default_rng(1)
+    t = clock(regular, n)
+    tu = t if input_times is None else input_times
+    return Record(t, rng.standard_normal(n), HeldSignal(tu, rng.standard_normal(tu.size), hold), name="a record")
+
+
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize("start", [9.0, 2.0])
+def test_delayed_input_is_integrated_exactly(regular, hold, start):
+    # With a start of 2 s the longer delays reach back before the first break, where the input is zero. The first and
+    # last delay, multiples of the interval and arbitrary ones; asked for in an order that mixes both ends.
+    record = noisy_record(hold, regular)
+    spectra = record_spectra(record, start, 6.0, 9.0)
+    u = record.input
+    for delay in (9.0, 0.0, 4.4, 0.05, 8.123456, 2.0, np.pi):
+        breaks = np.append(u.t + delay, u.t[0] + delay)
+        values = quadrature(lambda t, d=delay: u.at(t - d), breaks, spectra.window, spectra.frequencies)
+        np.testing.assert_allclose(spectra.inputs(delay), values, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+def test_input_with_breaks_of_its_own(hold):
+    # Long stretches between breaks, the last of them well before the window's end: the last value stays.
+    times = np.sort(np.random.default_rng(5).uniform(0.2, 25.0, 40))
+    record = noisy_record(hold, regular=False, input_times=times)
+    spectra = record_spectra(record, 5.0, 6.0, 5.0)
+    fine = np.linspace(0, 50, 2000)
+    for delay in (0.0, 1.7, 5.0):
+        breaks = np.concatenate((times + delay, fine))
+        values = quadrature(lambda t, d=delay: record.input.at(t - d), breaks, spectra.window, spectra.frequencies)
+        np.testing.assert_allclose(spectra.inputs(delay), values, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("regular", [True, False])
+def test_output_is_integrated_as_straight_lines_and_undamped(regular):
+    # Ends of the window in value and slope are as they are; the rest is divided by the mean of sinc^2.
+    record = noisy_record(regular=regular)
+    spectra = record_spectra(record, 3.217, 6.0, 3.0)
+    (a, b), w = spectra.window, spectra.frequencies[1:]
+    lines = quadrature(lambda t: np.interp(t, record.t, record.y), record.t, (a, b), spectra.frequencies)
+    inside = record.t[record.t >= a]
+    h = np.diff(inside)
+    damping = (np.sinc(np.outer(w, h) / (2 * np.pi)) ** 2 @ h) / h.sum()
+    np.testing.assert_allclose(spectra.damping, np.append(1.0, damping), rtol=1e-14 if regular else 1e-5)
+    np.testing.assert_allclose(1 - spectra.damping[1:], 1 - damping, rtol=1e-3)
+    first, last = np.interp([a, a + 1e-3, b - 1e-3, b], record.t, record.y).reshape(2, 2)
+    ends = (first[0] - last[1]) / (1j * w) + (np.diff(first) - np.diff(last)) / 1e-3 / (1j * w) ** 2
+    ends /= b - a
+    expected = np.append(lines[0], ends + (lines[1:] - ends) / spectra.damping[1:])
+    np.testing.assert_allclose(spectra.outputs, expected, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize(("regular", "bound"), [(True, 2e-5), (False, 1e-3)])
+def test_smooth_outputs_keep_their_spectrum(regular, bound):
+    # Waves between the bins, a drift and a curvature: nothing of it is periodic in the window.
+    def smooth(t):
+        return np.sin(2.3 * t) + 0.3 * np.cos(5.1 * t + 1) + 0.2 * t - 0.004 * t**2
+
+    t = clock(regular, 800)
+    record = Record.from_arrays(t, np.ones(t.size), smooth(t))
+    spectra = record_spectra(record, 3.0, 6.0, 3.0)
+    exact = quadrature(smooth, t, spectra.window, spectra.frequencies)
+    lines = quadrature(lambda s: np.interp(s, t, record.y), t, spectra.window, spectra.frequencies)
+    error, as_lines = (np.linalg.norm(values - exact) / np.linalg.norm(exact) for values in (spectra.outputs, lines))
+    assert error < bound
+    assert error < 0.2 * as_lines
+
+
+def test_straight_line_is_its_own_interpolation():
+    t = clock(True, 400)
+    spectra = record_spectra(Record.from_arrays(t, np.ones(t.size), 3 - 2 * t), 1.0, 20.0, 1.0)
+    # int (c - 2 s) exp(-jws) ds/T = 2/(jw) at the window's own frequencies
+    np.testing.assert_allclose(spectra.outputs[1:], 2 / (1j * spectra.frequencies[1:]), rtol=1e-9)
+
+
+def test_power_of_the_bins_is_the_mean_square():
+    # Parseval, for waves at the window's own frequencies.
+    t = clock(True, 401)
+    base = 2 * np.pi / 20.0
+    y = 1.5 + np.sin(2 * base * t) - 0.5 * np.cos(7 * base * t)
+    spectra = record_spectra(Record.from_arrays(t, np.ones(t.size), y), 0.0, 10 * base, 0.0)
+    power = np.abs(spectra.outputs) ** 2
+    assert power[0] + 2 * power[1:].sum() == pytest.approx(1.5**2 + 0.5 + 0.125, rel=1e-4)
+    assert spectra.outputs[2] == pytest.approx(-0.5j, abs=1e-4)
+    assert spectra.outputs[7] == pytest.approx(-0.25, abs=1e-4)
+
+
+def test_missing_samples_are_left_out():
+    # As if the record had been sampled without them; masked ends shorten the window.
+    record = noisy_record("foh")
+    y = record.y.copy()
+    missing = np.r_[0:100, 300, 301, 440, 790:800]
+    y[missing] = np.nan
+    masked = record_spectra(Record(record.t, y, record.input), 3.0, 6.0, 3.0)
+    thinned = record_spectra(
+        Record(np.delete(record.t, missing), np.delete(record.y, missing), record.input), 3.0, 6.0, 3.0
+    )
+    assert masked.window == thinned.window == (record.t[100], record.t[789])
+    np.testing.assert_allclose(masked.outputs, thinned.outputs, rtol=0, atol=1e-10)
+    assert np.array_equal(masked.inputs(1.2), thinned.inputs(1.2))
+
+
+def test_origin_and_unit_of_time_do_not_matter():
+    record = noisy_record(regular=False)
+    spectra = record_spectra(record, 9.0, 6.0, 9.0)
+    u = record.input
+    moved = record_spectra(Record(record.t - 300, record.y, HeldSignal(u.t - 300, u.values)), 9.0, 6.0, 9.0)
+    np.testing.assert_allclose(moved.outputs, spectra.outputs, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(moved.inputs(4.7), spectra.inputs(4.7), rtol=0, atol=1e-11)
+    faster = record_spectra(
+        Record(record.t / 1024, record.y, HeldSignal(u.t / 1024, u.values)), 9 / 1024, 6.0 * 1024, 9 / 1024
+    )
+    np.testing.assert_allclose(faster.frequencies, 1024 * spectra.frequencies, rtol=1e-12)
+    np.testing.assert_allclose(faster.outputs, spectra.outputs, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(faster.inputs(4.7 / 1024), spectra.inputs(4.7), rtol=0, atol=1e-12)
+
+
+def test_without_the_mean_an_offset_has_no_effect():
+    record = noisy_record()
+    offset = Record(record.t, record.y + 5, record.input)
+    full, without, moved = (
+        record_spectra(r, 2.0, 6.0, 2.0, keep_mean=keep)
+        for r, keep in ((record, True), (record, False), (offset, False))
+    )
+    assert np.array_equal(without.frequencies, full.frequencies[1:])
+    assert np.array_equal(without.outputs, full.outputs[1:])
+    assert np.array_equal(without.inputs(1.1), full.inputs(1.1)[1:])
+    np.testing.assert_allclose(moved.outputs, without.outputs, rtol=0, atol=1e-11)
+
+
+def test_first_frequencies_alone_and_remembered_delays():
+    record = noisy_record()
+    spectra, fresh = (record_spectra(record, 9.0, 6.0, 9.0) for _ in range(2))
+    assert np.array_equal(spectra.outputs, fresh.outputs)
+    delays = np.linspace(0, 9, 300)  # more than are remembered
+    few = [spectra.inputs(delay, 4).copy() for delay in delays]
+    for delay, values in zip(delays, few, strict=True):
+        np.testing.assert_allclose(spectra.inputs(delay)[:4], values, rtol=0, atol=1e-15)
+        assert np.array_equal(spectra.inputs(delay), fresh.inputs(delay))
+
+
+def test_nothing_above_half_the_sampling_frequency():
+    spectra = record_spectra(noisy_record(), 1.0, 1e6, 1.0)
+    assert 62.0 < spectra.frequencies[-1] <= np.pi / 0.05
+    assert spectra.damping.min() > 0.4
+
+
+def test_weight_is_the_squared_gain():
+    frequencies = np.array([0.0, 0.1, 0.3, 0.6, 2.0])
+    for order in (1, 10):
+        gain = np.abs(Lowpass(0.3, order).model.frequency_response(frequencies))
+        np.testing.assert_allclose(lowpass_weight(frequencies, Lowpass(0.3, order)), gain**2, rtol=1e-9)
+    assert np.array_equal(lowpass_weight(frequencies, None), np.ones(5))
+    assert np.array_equal(lowpass_weight(np.array([0.0, 1e30]), Lowpass(0.3, 20)), [1.0, 0.0])
+
+
+def test_impossible_windows_and_delays_are_refused():
+    record = noisy_record(n=100)
+    with pytest.raises(DataError, match=r"a record: fewer than two samples are left 4\.95 s after the first input"):
+        record_spectra(record, 4.95, 6.0, 4.95)
+    with pytest.raises(DataError, match=r"a record: the 2\.95 s from 2 s on hold no full period of 2 rad/s"):
+        record_spectra(record, 2.0, 2.0, 2.0)
+    spectra = record_spectra(record, 2.0, 6.0, 2.0)
+    for delay in (-1e-3, 2.001, np.nan):
+        with pytest.raises(ValueError, match="the delay must lie between 0 and 2 s"):
+            spectra.inputs(delay)
