@@ -77,7 +77,10 @@ def fit(
 
     bounds = _delay_bounds(delay)
     try:
-        options = DelayProfile(poles, zeros, bounds, initial_state=initial_state.value, offset=offset.value)
+        # Every sample: the profile that is drawn is then the cost whose minimum the estimate is.
+        options = DelayProfile(
+            poles, zeros, bounds, initial_state=initial_state.value, offset=offset.value, search="samples"
+        )
     except ValueError as error:
         raise UsageError(str(error)) from None
     read = partial(read_measurement, time=time, input=input, output=output, hold=hold.value)

@@ -194,6 +194,7 @@ def _iterate(
     max_iterations: int,
     tolerance: float,
     halvings: int,
+    first: int,
     delay: float,
     interval: float,
     tu: Array,
@@ -235,7 +236,9 @@ def _iterate(
         accepted = False
         fraction, change = 1.0, 0.0
         # First the refined instrumental variable step; where that does not lower the cost, the Gauss-Newton step.
-        for attempt in range(2):
+        for attempt in range(first, 2):
+            # A direction in which the cost does not fall will not be better at the next step: it is not tried again.
+            first = attempt
             if attempt == 0:
                 solved = solve_scaled(mixed, right, rows, columns, step)
             else:
@@ -310,6 +313,7 @@ def _best_of(
     max_iterations: int,
     tolerance: float,
     halvings: int,
+    first: int,
     delay: float,
     interval: float,
     tu: Array,
@@ -339,6 +343,7 @@ def _best_of(
             max_iterations,
             tolerance,
             halvings,
+            first,
             delay,
             interval,
             tu,
@@ -367,6 +372,7 @@ def best_coefficients(
     max_iterations: int,
     tolerance: float,
     halvings: int,
+    gauss_newton: bool = False,
 ) -> tuple[Array, float, float | None] | None:
     """Least output-error cost over the coefficients at a fixed delay, from several starts.
 
@@ -386,6 +392,9 @@ def best_coefficients(
         Stop when a step changes the simulated output by less than this fraction of its rms value [-].
     halvings : int
         Trials of a step before a direction is given up.
+    gauss_newton : bool, default False
+        Whether to take Gauss-Newton steps only, without trying the instrumental-variable step first: cheaper where the
+        delay is wrong, since that step need not lower the cost there.
 
     Returns
     -------
@@ -407,6 +416,7 @@ def best_coefficients(
         max_iterations,
         tolerance,
         halvings,
+        1 if gauss_newton else 0,
         float(delay),
         data.interval or 0.0,
         data.tu,

@@ -3,21 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.estimators.compiled_iteration import best_coefficients
-from ctid_cli.estimators.delay_search import DelayCost, Minimum
+from ctid_cli.estimators.delay_search import DelayCost, Minimum, delay_step
 from ctid_cli.estimators.problems import least_squares_start
+from ctid_cli.estimators.refined_iv import Equations, Iterated, iterate
+from ctid_cli.estimators.spectral_problem import (
+    SpectralCoefficientProblem,
+    SpectralDelayProblem,
+    enough_bins,
+    spectral_least_squares_start,
+    spectral_refit_numerator,
+)
 from ctid_cli.filtering.bank import FilterData, filter_data
 from ctid_cli.filtering.lowpass import Lowpass
+from ctid_cli.filtering.spectra import RecordSpectra, lowpass_weight, record_spectra
 from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
 Array = NDArray[np.float64]
+Search = Literal["time", "spectral"]
+
+#: Highest frequency of a spectral search, as a multiple of the highest cut-off: a filter of order 10 passes 3e-4 of the
+#: power there.
+HIGHEST = 1.5
 
 
 @dataclass(frozen=True)
@@ -33,11 +48,14 @@ class Effort:
     halvings : int
         Trials of a step before a direction is given up: far from the true delay a pole may run to infinity, where no
         number of them helps.
+    gauss_newton : bool
+        Whether to take Gauss-Newton steps only, without trying the instrumental-variable step first.
     """
 
     max_iterations: int = 10
     tolerance: float = 1e-2
     halvings: int = 3
+    gauss_newton: bool = False
 
 
 class FilteredCost(DelayCost, Protocol):
@@ -46,6 +64,10 @@ class FilteredCost(DelayCost, Protocol):
     @property
     def spread(self) -> float:
         """Sum of squared deviations of the filtered output from its mean [output unit^2], or its equivalent."""
+
+    @property
+    def mean_factor(self) -> float:
+        """What turns a squared error of this cost into a mean square over the used part of the record."""
 
     def start(self, delay: float) -> Array | None:
         """Least-squares start at a delay.
@@ -100,6 +122,7 @@ class SampledCost:
         self.effort = effort or Effort()
         y = data.y_used
         self.spread = float(np.sum((y - y.mean()) ** 2))
+        self.mean_factor = 1.0 / max(data.count, 1)
 
     def start(self, delay: float) -> Array | None:
         """Least-squares start at a delay.
@@ -142,6 +165,7 @@ class SampledCost:
             max_iterations=effort.max_iterations,
             tolerance=effort.tolerance,
             halvings=effort.halvings,
+            gauss_newton=effort.gauss_newton,
         )
         return None if found is None else Minimum(delay, *found)
 
@@ -179,10 +203,149 @@ class SampledCost:
         return minimum.step
 
 
-def sampled_costs(
-    record: Record, lowpasses: Sequence[Lowpass], structure: Structure, greatest_delay: float, svf_cutoff: float
-) -> list[SampledCost]:
-    """Costs of one record behind several filters, in the time domain.
+class SpectralCost:
+    """Cost of a record's spectra behind a low-pass filter, the initial and the final state projected out.
+
+    Parameters
+    ----------
+    spectra : RecordSpectra
+        The record, of any clock.
+    lowpass : Lowpass
+        The filter.
+    structure : Structure
+        Degrees.
+    bounds : tuple of float
+        Least and greatest delay [s].
+    svf_cutoff : float
+        Cut-off of the state-variable filter of the starts [rad/s].
+    effort : Effort, optional
+        How hard to work at each delay.
+    """
+
+    mean_factor = 1.0
+
+    def __init__(
+        self,
+        spectra: RecordSpectra,
+        lowpass: Lowpass,
+        structure: Structure,
+        bounds: tuple[float, float],
+        svf_cutoff: float,
+        effort: Effort | None = None,
+    ) -> None:
+        self.spectra = spectra
+        self.weight = lowpass_weight(spectra.frequencies, lowpass)
+        self.structure = structure
+        self.svf_cutoff = svf_cutoff
+        self.effort = effort or Effort()
+        self.joint = SpectralDelayProblem(spectra, structure, bounds, self.weight)
+        sides = np.where(spectra.frequencies > 0, 2.0, 0.0)
+        self.spread = float(np.sum(sides * self.weight * np.abs(spectra.outputs) ** 2))
+
+    def start(self, delay: float) -> Array | None:
+        """Least-squares start at a delay.
+
+        Parameters
+        ----------
+        delay : float
+            Delay [s].
+
+        Returns
+        -------
+        ndarray, shape (n + m + 1,) or None
+            Coefficients of a stable model; None where the equations are singular.
+        """
+        return spectral_least_squares_start(self.spectra, self.structure, delay, self.svf_cutoff, self.weight)
+
+    def minimise_from(self, delay: float, starts: Sequence[Array]) -> Minimum | None:
+        """Least cost at a delay over several starts.
+
+        Parameters
+        ----------
+        delay : float
+            Delay [s].
+        starts : sequence of ndarray, each of shape (n + m + 1,)
+            Coefficients to start from.
+
+        Returns
+        -------
+        Minimum or None
+            The lowest minimum; None where no start leads anywhere.
+        """
+        effort = self.effort
+        problem = (_SpectralSearch if effort.gauss_newton else SpectralCoefficientProblem)(
+            self.spectra, self.structure, delay, self.weight
+        )
+        best: Iterated | None = None
+        for theta in starts:
+            found = iterate(
+                problem,
+                spectral_refit_numerator(self.spectra, self.structure, theta, delay, self.weight),
+                max_iterations=effort.max_iterations,
+                tolerance=effort.tolerance,
+                variant="guarded",
+                halvings=effort.halvings,
+            )
+            if found is not None and (best is None or found.equations.squared_error < best.equations.squared_error):
+                best = found
+        return None if best is None else Minimum(delay, best.theta, best.equations.squared_error)
+
+    def minimise(self, delay: float, theta: Array | None) -> Minimum | None:
+        """Minimise over the coefficients at one delay.
+
+        Parameters
+        ----------
+        delay : float
+            Delay [s].
+        theta : ndarray, shape (n + m + 1,) or None
+            Coefficients to start from; None for the least-squares start.
+
+        Returns
+        -------
+        Minimum or None
+            The minimum; None where the equations are singular.
+        """
+        start = self.start(delay) if theta is None else theta
+        return None if start is None else self.minimise_from(delay, [start])
+
+    def step(self, minimum: Minimum) -> float | None:
+        """Gauss-Newton step of the delay from a minimum of this cost.
+
+        Parameters
+        ----------
+        minimum : Minimum
+            As :meth:`minimise` returned it.
+
+        Returns
+        -------
+        float or None
+            Step [s]; None if the data do not determine the delay.
+        """
+        equations = self.joint.equations(np.concatenate((minimum.theta, [minimum.delay])))
+        return None if equations is None else delay_step(equations)
+
+
+class _SpectralSearch(SpectralCoefficientProblem):
+    """Gauss-Newton steps only."""
+
+    def equations(self, theta: Array) -> Equations | None:
+        equations = super().equations(theta)
+        return None if equations is None else replace(equations, instrument_regressor=equations.hessian)
+
+
+def filtered_costs(
+    record: Record,
+    lowpasses: Sequence[Lowpass],
+    structure: Structure,
+    bounds: tuple[float, float],
+    *,
+    search: Search,
+    start: float,
+    svf_cutoff: float | Sequence[float],
+    hold_output: Hold = "foh",
+    effort: Effort | None = None,
+) -> list[FilteredCost]:
+    """Costs of one record behind several filters.
 
     Parameters
     ----------
@@ -192,17 +355,36 @@ def sampled_costs(
         The filters.
     structure : Structure
         Degrees.
-    greatest_delay : float
+    bounds : tuple of float
+        Least and greatest delay [s].
+    search : {"time", "spectral"}
+        Samples of the filtered signals, or spectra. A filter that passes too few frequencies of a record to carry its
+        initial and final state besides the parameters works on samples in either case.
+    start : float
         Samples earlier than this after the first input [s] do not enter the costs.
-    svf_cutoff : float
-        Cut-off of the state-variable filter of the starts [rad/s].
+    svf_cutoff : float or sequence of float
+        Cut-off of the state-variable filter of the starts [rad/s], for all filters or for each.
+    hold_output : {"foh", "zoh"}, default "foh"
+        Interpolation of the filtered output between its samples, inside the estimator's own filters.
+    effort : Effort, optional
+        How hard to work at each delay.
 
     Returns
     -------
-    list of SampledCost
+    list of FilteredCost
         One for each filter.
     """
-    return [
-        SampledCost(filter_data(lowpass.resample(record), greatest_delay), structure, svf_cutoff)
-        for lowpass in lowpasses
-    ]
+    cutoffs = np.broadcast_to(np.asarray(svf_cutoff, dtype=float), (len(lowpasses),)).tolist()
+    spectra: RecordSpectra | None = None
+    if search == "spectral":
+        highest = HIGHEST * max(lowpass.cutoff for lowpass in lowpasses)
+        spectra = record_spectra(record, start, highest, bounds[1])
+    joint = replace(structure, delay=True)
+    costs: list[FilteredCost] = []
+    for lowpass, cutoff in zip(lowpasses, cutoffs, strict=True):
+        if spectra is not None and enough_bins(lowpass_weight(spectra.frequencies, lowpass), joint):
+            costs.append(SpectralCost(spectra, lowpass, structure, bounds, cutoff, effort))
+        else:
+            data = filter_data(lowpass.resample(record), start, hold_output)
+            costs.append(SampledCost(data, structure, cutoff, effort))
+    return costs

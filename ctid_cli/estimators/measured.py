@@ -12,11 +12,14 @@ from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.common import Start, check_iteration, check_record, history_entry
+from ctid_cli.estimators.delay_grid import Level, local_minima, search_grid
 from ctid_cli.estimators.delay_search import bound_in_the_way
+from ctid_cli.estimators.filtered_costs import Effort, filtered_costs
 from ctid_cli.estimators.output_error import Layout, OutputErrorProblem
 from ctid_cli.estimators.problems import CoefficientProblem, least_squares_start, refit_numerator
 from ctid_cli.estimators.refined_iv import Equations, Iterated, iterate
 from ctid_cli.filtering.bank import FilterData, filter_data
+from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
 from ctid_cli.inference.diagnostics import percent_from_r_squared
@@ -31,6 +34,7 @@ from ctid_cli.signals.record import Record
 Array = NDArray[np.float64]
 InitialState = Literal["rest", "estimate", "periodic"]
 Offset = Literal["none", "remove", "estimate"]
+ProfileSearch = Literal["time", "spectral", "samples"]
 
 #: Local minima of the profile that are refined.
 MINIMA = 3
@@ -44,6 +48,17 @@ FEWEST_DELAYS = 24
 MOST_DELAYS = 2000
 #: Most parts into which a step of the grid is divided around its minima.
 FINEST = 32
+#: A search behind filters: ratio of the cut-off frequencies of its levels, how many delays the first level may have
+#: before a coarser one is put before it, how many levels at most, and order and effort of each.
+LEVEL_RATIO = 3.0
+MOST_FIRST_DELAYS = 30
+MOST_LEVELS = 4
+LEVEL_ORDER = 10
+LEVEL_EFFORT = Effort(max_iterations=6, tolerance=2e-2, halvings=3, gauss_newton=True)
+#: Sampling intervals on either side of what such a search has found that every sample is asked about, and parts of
+#: them: the cost has a kink at every instant where the input moves.
+NEIGHBOURING = 1.0
+PARTS = 2
 #: Cut-offs of the state-variable filter that are tried, as multiples of the output's bandwidth.
 CUTOFFS = (0.2, 1.0, 5.0)
 #: Time constants after which a free response counts as gone (1e-12), and most periods that are prepended for it.
@@ -68,6 +83,10 @@ class DelayProfile:
         state of an input that repeats the record for ever.
     offset : {"none", "remove", "estimate"}, default "none"
         Constant offset of the output: none, means of input and output subtracted first, or estimated with the model.
+    search : {"time", "spectral", "samples"}, default "time"
+        What the search over the delay looks at: low-pass-filtered signals resampled at a lower rate, the spectra of
+        the record, or every sample. The first two need one record at rest without an estimated offset; every sample
+        is looked at otherwise. The estimate itself always comes from every sample.
     svf_cutoff : float, optional
         Cut-off of the state-variable filter of the starts [rad/s]; by default from the bandwidth of the output.
     max_iterations : int, default 100
@@ -85,8 +104,10 @@ class DelayProfile:
     Notes
     -----
     The cost, minimised over everything but the delay, is computed on a grid whose spacing is a quarter period of the
-    highest frequency that matters in the output (95 % of its power), so that no basin is missed. The best
-    local minima are refined jointly in all parameters, and the lowest is kept: no start has to be given.
+    highest frequency that matters in the output (95 % of its power), so that no basin is missed. Where the filters of
+    ``search`` can be used, long grids are searched from coarse to fine: behind a filter of a third of that bandwidth
+    three times fewer delays do, and the next level looks around the best of them only. The best local minima are
+    refined jointly in all parameters on every sample, and the lowest is kept: no start has to be given.
     """
 
     kind: ClassVar[str] = "delay_profile"
@@ -97,6 +118,10 @@ class DelayProfile:
     delay_bounds: tuple[float, float] = field(metadata={"doc": "Least and greatest delay", "unit": "s"})
     initial_state: InitialState = field(default="rest", metadata={"doc": "State of the system before the record"})
     offset: Offset = field(default="none", metadata={"doc": "Constant offset of the output"})
+    search: ProfileSearch = field(
+        default="time",
+        metadata={"doc": "What the search over the delay looks at: filtered signals, spectra, or every sample"},
+    )
     svf_cutoff: float | None = field(
         default=None, metadata={"doc": "Cut-off of the state-variable filter of the starts", "unit": "rad/s"}
     )
@@ -112,6 +137,7 @@ class DelayProfile:
         require_integer("zeros", self.zeros, 0)
         require_choice("initial_state", self.initial_state, get_args(InitialState))
         require_choice("offset", self.offset, get_args(Offset))
+        require_choice("search", self.search, get_args(ProfileSearch))
         require_choice("hold_output", self.hold_output, get_args(Hold))
         check_iteration(self.max_iterations, self.tolerance)
         if self.svf_cutoff is not None:
@@ -184,11 +210,15 @@ class Profile:
         Mean squared output error [output unit^2]; NaN where the equations were singular.
     bandwidth : float
         Frequency below which the output has 95 % of its power [rad/s]; the spacing is at most a quarter of its period.
+    cutoff : float or None
+        Cut-off frequency [rad/s] of the low-pass filter behind which the grid was searched, and to whose output the
+        costs belong; the spacing is then a quarter of its period. None where every sample was searched.
     """
 
     delays: Array
     costs: Array
     bandwidth: float
+    cutoff: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,26 +399,76 @@ class PreparedProfile:
         """
         options = self.options
         low, high = options.delay_bounds
+        searches = [self._search_levels, self._search_samples] if self._filtered else [self._search_samples]
+        for search in searches:
+            starts, profile = search()
+            problem = OutputErrorProblem(self.data, self.layout, low, (low, high))
+            history: list[IterationRecord] = []
+            best: Iterated | None = None
+            for delay, theta in starts:
+                refined, steps = self._refine(problem, theta[: options.poles], delay)
+                if refined is not None and (
+                    best is None or refined.equations.squared_error < best.equations.squared_error
+                ):
+                    best, history = refined, steps
+            if best is not None:
+                return self._finish(problem, best, history, profile)
+        raise DataError(Status.SINGULAR.value)
+
+    @property
+    def _filtered(self) -> bool:
+        """Whether the search may look at filtered signals: what filters see must be the answer to the input alone."""
+        options = self.options
+        low, high = options.delay_bounds
+        at_rest = options.initial_state == "rest" and options.offset != "estimate"
+        return options.search != "samples" and at_rest and len(self.records) == 1 and low < high
+
+    def _search_levels(self) -> tuple[list[tuple[float, Array]], Profile | None]:
+        """Starts for the refinement, none if nothing can be computed, and the profile: behind low-pass filters."""
+        cutoffs = self._cutoffs()
+        costs = filtered_costs(
+            self.records[0],
+            [Lowpass(cutoff, LEVEL_ORDER) for cutoff in cutoffs],
+            self.coefficients,
+            self.options.delay_bounds,
+            search="spectral" if self.options.search == "spectral" else "time",
+            start=0.0,
+            svf_cutoff=cutoffs,
+            hold_output=self.options.hold_output,
+            effort=LEVEL_EFFORT,
+        )
+        levels = [Level(cost, 0.5 * np.pi / cutoff) for cost, cutoff in zip(costs, cutoffs, strict=True)]
+        found = search_grid(levels, self.options.delay_bounds, FEWEST_DELAYS)
+        profile = Profile(found.delays, found.costs * costs[0].mean_factor, self.bandwidth, cutoffs[0])
+        interval = float(np.median(np.diff(self.records[0].t)))
+        starts: list[tuple[float, Array]] = []
+        for minimum in found.minima:
+            a = minimum.theta[: self.options.poles]
+            starts += self._local_grid([(minimum.delay, a)], NEIGHBOURING * interval, PARTS, 1)
+        return starts, profile
+
+    def _cutoffs(self) -> list[float]:
+        """Cut-off frequencies of the levels of a search [rad/s], lowest first."""
+        low, high = self.options.delay_bounds
+        cutoffs = [self.bandwidth]
+        while (high - low) * cutoffs[0] / (0.5 * np.pi) > MOST_FIRST_DELAYS and len(cutoffs) < MOST_LEVELS:
+            cutoffs.insert(0, cutoffs[0] / LEVEL_RATIO)
+        return cutoffs
+
+    def _search_samples(self) -> tuple[list[tuple[float, Array]], Profile | None]:
+        """Starts for the refinement, none if nothing can be computed, and the profile: from every sample."""
         delays = self._grid()
         candidates = self._scan(delays)
         costs = np.array([np.nan if c is None else c.equations.squared_error for c in candidates])
         if np.isnan(costs).all():
-            raise DataError(Status.SINGULAR.value)
-        if options.initial_state == "periodic":
+            return [], None
+        if self.options.initial_state == "periodic":
             candidate = candidates[int(np.nanargmin(costs))]
             assert candidate is not None
-            self._make_periodic(candidate.theta[: options.poles])
-        problem = OutputErrorProblem(self.data, self.layout, low, (low, high))
-        history: list[IterationRecord] = []
-        best: Iterated | None = None
-        for delay, theta in self._closer_look(delays, candidates, costs):
-            refined, steps = self._refine(problem, theta[: options.poles], delay)
-            if refined is not None and (best is None or refined.equations.squared_error < best.equations.squared_error):
-                best, history = refined, steps
-        if best is None:
-            raise DataError(Status.SINGULAR.value)
-        profile = Profile(delays, costs / problem.count, self.bandwidth) if delays.size > 1 else None
-        return self._finish(problem, best, history, profile)
+            self._make_periodic(candidate.theta[: self.options.poles])
+        count = sum(data.count for data in self.data)
+        profile = Profile(delays, costs / count, self.bandwidth) if delays.size > 1 else None
+        return self._closer_look(delays, candidates, costs), profile
 
     def squared_error_at(self, theta: Array, delay: float) -> float:
         """Least sum of squared output errors at a given delay, in the basin of an estimate.
@@ -510,29 +590,37 @@ class PreparedProfile:
         Held inputs that change on the sampling clock put a kink into the cost at every sampling interval, and local
         minima between the kinks: the fine grid resolves a quarter of an interval.
         """
-        chosen = [(float(delays[k]), candidates[k]) for k in _local_minima(costs, MINIMA)]
+        chosen = [(float(delays[k]), candidates[k]) for k in local_minima(costs, MINIMA)]
+        starts = [(delay, candidate.theta) for delay, candidate in chosen if candidate is not None]
+        if delays.size == 1:
+            return starts
+        spacing = float(delays[1] - delays[0])
+        interval = min(float(np.median(np.diff(record.t))) for record in self.records)
+        parts = int(np.clip(np.ceil(4.0 * spacing / interval), 4, FINEST))
+        centres = [(delay, theta[: self.options.poles]) for delay, theta in starts]
+        return self._local_grid(centres, spacing, parts, MINIMA) or starts
+
+    def _local_grid(
+        self, centres: Sequence[tuple[float, Array]], reach: float, parts: int, most: int
+    ) -> list[tuple[float, Array]]:
+        """The lowest minima on fine grids of all samples around given delays and denominators (a_1 … a_n)."""
         low, high = self.options.delay_bounds
-        if delays.size > 1:
-            spacing = float(delays[1] - delays[0])
-            interval = min(float(np.median(np.diff(record.t))) for record in self.records)
-            parts = int(np.clip(np.ceil(4.0 * spacing / interval), 4, FINEST))
-            fine: list[tuple[float, Iterated | None]] = []
-            for centre, candidate in chosen:
-                assert candidate is not None
-                for side in (-1, 1):
-                    a = candidate.theta[: self.options.poles]
-                    row: list[tuple[float, Iterated | None]] = []
-                    for part in range(0 if side > 0 else 1, parts + 1):
-                        delay = centre + side * part * spacing / parts
-                        if low <= delay <= high:
-                            result = self._coefficients(delay, a)
-                            a = a if result is None else result.theta[: self.options.poles]
-                            row.append((delay, result))
-                    fine += row if side > 0 else row[::-1]
-            fine.sort(key=lambda entry: entry[0])
-            errors = np.array([np.nan if r is None else r.equations.squared_error for _, r in fine])
-            chosen = [fine[k] for k in _local_minima(errors, MINIMA)] or chosen
-        return [(delay, candidate.theta) for delay, candidate in chosen if candidate is not None]
+        fine: list[tuple[float, Iterated | None]] = []
+        for centre, start in centres:
+            for side in (-1, 1):
+                a = start
+                row: list[tuple[float, Iterated | None]] = []
+                for part in range(0 if side > 0 else 1, parts + 1):
+                    delay = centre + side * part * reach / parts
+                    if low <= delay <= high:
+                        result = self._coefficients(delay, a)
+                        a = a if result is None else result.theta[: self.options.poles]
+                        row.append((delay, result))
+                fine += row if side > 0 else row[::-1]
+        fine.sort(key=lambda entry: entry[0])
+        errors = np.array([np.nan if r is None else r.equations.squared_error for _, r in fine])
+        found = [fine[k] for k in local_minima(errors, most)]
+        return [(delay, result.theta) for delay, result in found if result is not None]
 
     def _scan(self, delays: Array) -> list[Iterated | None]:
         """Coefficients at every delay of the grid, from least squares and from the neighbour's, the cheaper kept."""
@@ -686,14 +774,6 @@ class PreparedProfile:
             sensitivities=tuple(psi for psi, _ in parts),
             used=self._used(problem),
         )
-
-
-def _local_minima(costs: Array, most: int) -> list[int]:
-    """Indices of the lowest local minima of a profile, lowest first."""
-    padded = np.concatenate(([np.inf], np.where(np.isnan(costs), np.inf, costs), [np.inf]))
-    lowest = (padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]) & np.isfinite(padded[1:-1])
-    indices = np.flatnonzero(lowest)
-    return [int(k) for k in indices[np.argsort(costs[indices], kind="stable")][:most]]
 
 
 def _without_means(record: Record) -> tuple[Record, float, float]:

@@ -267,7 +267,7 @@ class OutputErrorProblem:
         Returns
         -------
         ndarray, shape (p,) or None
-            Parameters; None if the data do not determine them.
+            Parameters, those of least norm where the data do not determine them; None if they are not finite.
         """
         n = self.structure.poles
         theta = np.zeros(self.layout.size)
@@ -277,7 +277,7 @@ class OutputErrorProblem:
         if self.structure.delay:
             theta[self.structure.size - 1] = delay
             free[self.structure.size - 1] = False
-        return self._solved(theta, free)
+        return self._solved(theta, free, least_norm=True)
 
     def with_best_own(self, theta: Array) -> Array | None:
         """Best initial states and offsets for a given model, by linear least squares.
@@ -295,7 +295,7 @@ class OutputErrorProblem:
         free = np.arange(self.layout.size) >= self.structure.size
         return self._solved(np.where(free, 0.0, theta), free)
 
-    def _solved(self, theta: Array, free: NDArray[np.bool_]) -> Array | None:
+    def _solved(self, theta: Array, free: NDArray[np.bool_], least_norm: bool = False) -> Array | None:
         """Minimise over parameters that are zero and that the output depends on linearly."""
         if not free.any():
             return theta
@@ -304,7 +304,12 @@ class OutputErrorProblem:
             return None
         matrix = equations.hessian[np.ix_(free, free)]
         diagonal = np.diag(matrix)
-        solution = scaled_solve(matrix, equations.instrument_error[free], diagonal, diagonal)
+        right = equations.instrument_error[free]
+        solution = scaled_solve(matrix, right, diagonal, diagonal)
+        if solution is None and least_norm and np.isfinite(matrix).all():
+            # Whether a singular matrix is exactly so is a matter of rounding: a start must not hang on that.
+            scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+            solution = np.linalg.lstsq(matrix / scale / scale[:, None], right / scale, rcond=None)[0] / scale
         if solution is None:
             return None
         theta[free] = solution

@@ -183,23 +183,25 @@ def iterate(
     if on_step:
         on_step(theta, current)
     slow = 0
+    # Where instruments are regressors the step is Gauss-Newton's already: a second trial would repeat the first.
+    instruments = variant == "plain" or current.instrument_regressor is not current.hessian
     for iteration in range(max_iterations):
-        step = scaled_solve(
-            current.instrument_regressor,
-            current.instrument_error,
-            current.hessian.diagonal(),
-            np.abs(current.instrument_regressor.diagonal()),
-        )
-        # Where instruments are regressors the step is Gauss-Newton's already: a second trial would repeat the first.
-        same = step is not None and current.instrument_regressor is current.hessian
-        newton = same and variant == "guarded"
-        if step is None and variant == "plain":
-            return Iterated(theta, current, Status.SINGULAR, iteration)
-        accepted = None
-        if step is not None:
-            accepted = _take(problem, theta, current, step, variant, halvings)
-        if accepted is None and variant == "guarded" and not same:
-            newton = True
+        step, accepted = None, None
+        if instruments:
+            step = scaled_solve(
+                current.instrument_regressor,
+                current.instrument_error,
+                current.hessian.diagonal(),
+                np.abs(current.instrument_regressor.diagonal()),
+            )
+            if step is None and variant == "plain":
+                return Iterated(theta, current, Status.SINGULAR, iteration)
+            if step is not None:
+                accepted = _take(problem, theta, current, step, variant, halvings)
+        newton = accepted is None and variant == "guarded"
+        if newton:
+            # A direction in which the cost does not fall will not be better at the next step: it is not tried again.
+            instruments = False
             step = gauss_newton_step(current)
             if step is None:
                 return Iterated(theta, current, Status.SINGULAR, iteration)

@@ -3,7 +3,7 @@ r"""Delay and coefficients by useful redundancy: Gauss-Newton paths on a set of 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.common import Start, check_iteration, check_structure
 from ctid_cli.estimators.delay_search import Descent, Minimum, descend
-from ctid_cli.estimators.filtered_costs import FilteredCost, sampled_costs
+from ctid_cli.estimators.filtered_costs import FilteredCost, Search, filtered_costs
 from ctid_cli.estimators.redundancy import Path, RedundantMinimum, Visit, minimise_redundantly
 from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.filter_set import FilterSet
@@ -23,7 +23,6 @@ from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
 Array = NDArray[np.float64]
-Search = Literal["time", "spectral"]
 
 #: J0 is evaluated on a lattice of delays of this fraction of the shortest period, so that candidates that agree share
 #: it, and so do searches of the same data from different initial delays.
@@ -255,14 +254,15 @@ class PreparedUsefulRedundancy:
         bandwidth = options.bandwidth or output_bandwidth(record)
         self.filters = FilterSet(bandwidth, options.filters, options.beta, options.order)
         self.period = float(self.filters.periods[-1])
-        self.costs: list[FilteredCost] = list(
-            sampled_costs(
-                record,
-                self.filters.lowpasses,
-                self.refinement.structure,
-                options.delay_bounds[1],
-                options.svf_cutoff or bandwidth,
-            )
+        self.costs: list[FilteredCost] = filtered_costs(
+            record,
+            self.filters.lowpasses,
+            self.refinement.structure,
+            options.delay_bounds,
+            search=options.search,
+            start=options.delay_bounds[1],
+            svf_cutoff=options.svf_cutoff or bandwidth,
+            hold_output=options.hold_output,
         )
         self._known: dict[int, tuple[float, list[Minimum | None]]] = {}
 

@@ -79,7 +79,7 @@ def mixed(make_results, add_estimator, estimate):
     """Of one experiment: the existing method in part, the proposed one, and two that take no start."""
     good, bad = estimate(8.0), estimate(5.0, "STALLED")
     results = make_results({(5.0, "0.0"): [good, bad, bad, bad], (5.0, RANDOM): [good, bad], (15.0, "0.0"): [good]})
-    add_estimator(results, "delay_profile_time", {(5.0, None): [good, good, good, bad], (15.0, None): [good] * 4})
+    add_estimator(results, "profile_spectral", {(5.0, None): [good, good, good, bad], (15.0, None): [good] * 4})
     add_estimator(results, "proposed", {(5.0, "0.0"): [good] * 4, (5.0, RANDOM): [good] * 3 + [bad]})
     add_estimator(results, "delay_profile", {(5.0, None): [good] * 4, (15.0, None): [good] * 3 + [bad]})
     return results
@@ -95,7 +95,7 @@ def test_methods_stand_in_the_order_of_the_study_below_each_setting(mixed):
     for number in (1, 2):
         rows, text = tabulated(mixed, number)
         regular = [row for row in rows if (row.sampling, row.settings["snr_db"]) == ("regular", 5.0)]
-        methods = ["existing", "proposed", "delay_profile", "delay_profile_time"]
+        methods = ["existing", "proposed", "delay_profile", "profile_spectral"]
         assert list(dict.fromkeys(row.method for row in regular)) == methods
         first = text.split("15 dB")[0]
         assert sorted(methods, key=lambda method: first.index(f"{method} ")) == methods
@@ -104,16 +104,16 @@ def test_methods_stand_in_the_order_of_the_study_below_each_setting(mixed):
 @pytest.mark.parametrize("number", [1, 2])
 def test_an_estimator_without_a_start_is_in_every_table_with_one_estimate_per_data_set(mixed, number):
     rows, text = tabulated(mixed, number)
-    mine = [row for row in rows if row.method == "delay_profile_time"]
+    mine = [row for row in rows if row.method == "profile_spectral"]
     assert [(row.settings["snr_db"], row.initial_delay, row.n, row.percent) for row in mine] == [
         (5.0, None, 4, 75.0),
         (15.0, None, 4, 100.0),
     ]
-    assert "delay_profile and delay_profile_time were given no initial delay: one estimate per data set" in " ".join(
+    assert "delay_profile and profile_spectral were given no initial delay: one estimate per data set" in " ".join(
         text.split()
     )
     if number == 1:
-        line = next(line for line in text.splitlines() if "delay_profile_time" in line)
+        line = next(line for line in text.splitlines() if "profile_spectral" in line)
         assert line.split()[-9:] == ["n", "=", "4"] + ["75"] * 6
         assert "none" not in text.split("All cells")[0]
 
@@ -130,7 +130,7 @@ def test_all_methods_fit_100_columns_also_with_many_data_sets(make_results, add_
     results = make_results({(5.0, "0.0"): found, (5.0, RANDOM): found})
     for method in ("proposed", "proposed_spectral"):
         add_estimator(results, method, {(5.0, "0.0"): found, (5.0, RANDOM): found})
-    for method in ("delay_profile", "delay_profile_time"):
+    for method in ("delay_profile", "profile_spectral"):
         add_estimator(results, method, {(5.0, None): found})
     for cell in results.manifest["data_cells"]:
         cell["replicates"] = 300
@@ -180,9 +180,9 @@ def test_without_results_the_pooled_published_percentage_is_the_mean_of_the_tabl
 
 
 def test_failing_estimates_are_listed_with_what_makes_them_again(mixed):
-    rows = failing_estimates([mixed], ["proposed", "delay_profile", "delay_profile_time"])
+    rows = failing_estimates([mixed], ["proposed", "delay_profile", "profile_spectral"])
     assert [(r["method"], r["snr_db"], r["initial_delay"], r["replicate"], r["delay"]) for r in rows] == [
-        ("delay_profile_time", 5.0, None, 3, 5.0),
+        ("profile_spectral", 5.0, None, 3, 5.0),
         ("proposed", 5.0, "random", 3, 5.0),
         ("delay_profile", 15.0, None, 3, 5.0),
     ]

@@ -1,0 +1,200 @@
+"""A global search over the delay: a coarse grid behind a narrow low-pass filter, finer ones behind wider filters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.estimators.delay_search import Minimum, descend
+from ctid_cli.estimators.filtered_costs import FilteredCost
+
+Array = NDArray[np.float64]
+
+#: Local minima of a level around which the next level looks, and those of the last level that are returned.
+KEPT = 8
+MINIMA = 3
+#: Spacings of a level's grid on either side of its minima that the next level covers.
+REACH = 1.5
+#: A minimum whose cost exceeds the least of its level by more than this factor is given up.
+HOPELESS = 4.0
+#: Gauss-Newton steps on the delay that end the search.
+DESCENT_ITERATIONS = 10
+DESCENT_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """One level of the search.
+
+    Parameters
+    ----------
+    cost : FilteredCost
+        The filtered cost.
+    spacing : float
+        Spacing of the grid [s]: no more than a quarter period of the highest frequency that passes the filter.
+    """
+
+    cost: FilteredCost
+    spacing: float
+
+
+@dataclass(frozen=True, eq=False)
+class GridSearch:
+    """What a search over a grid has found.
+
+    Parameters
+    ----------
+    delays, costs : ndarray, shape (K,)
+        Grid of the first level [s] and its costs; NaN where the equations were singular.
+    minima : tuple of Minimum
+        The lowest minima of the last level, Gauss-Newton on the delay included, lowest first.
+    """
+
+    delays: Array
+    costs: Array
+    minima: tuple[Minimum, ...]
+
+
+def search_grid(levels: Sequence[Level], bounds: tuple[float, float], fewest: int) -> GridSearch:
+    """Search the whole range of the delay.
+
+    Parameters
+    ----------
+    levels : sequence of Level
+        From the coarsest to the finest.
+    bounds : tuple of float
+        Least and greatest delay [s].
+    fewest : int
+        Least number of delays on the first grid.
+
+    Returns
+    -------
+    GridSearch
+        Costs of the first level and minima of the last; no minima if nothing can be computed anywhere.
+
+    Notes
+    -----
+    At each delay the coefficients start from those of both neighbours and from least squares, and the cheapest are
+    kept.
+    """
+    low, high = bounds
+    wanted = max(int(np.ceil((high - low) / levels[0].spacing)) + 1, fewest)
+    delays = np.linspace(low, high, wanted)
+    first = found = scan(levels[0].cost, delays)
+    spacing = float(delays[1] - delays[0])
+    for level in levels[1:]:
+        centres = [delays[k] for k in _hopeful(_costs(found), KEPT)]
+        count = int(np.ceil(REACH * spacing / level.spacing))
+        offsets = level.spacing * np.arange(-count, count + 1)
+        # Grids that overlap share their points.
+        places = {round(float(centre + offset) / level.spacing) for centre in centres for offset in offsets}
+        delays = np.array([place * level.spacing for place in sorted(places)])
+        delays = np.unique(np.clip(delays, low, high))
+        found = scan(level.cost, delays)
+        spacing = level.spacing
+    minima = [_descended(levels[-1].cost, found[k], bounds) for k in _hopeful(_costs(found), MINIMA)]
+    minima.sort(key=lambda minimum: minimum.squared_error)
+    return GridSearch(np.linspace(low, high, wanted), _costs(first), tuple(minima))
+
+
+def scan(cost: FilteredCost, delays: Array) -> list[Minimum | None]:
+    """Least costs at given delays.
+
+    Parameters
+    ----------
+    cost : FilteredCost
+        The cost.
+    delays : ndarray, shape (K,)
+        Increasing delays [s].
+
+    Returns
+    -------
+    list of Minimum or None
+        One for each delay; None where the equations are singular.
+    """
+
+    def at(delay: float, here: Minimum | None, neighbour: Minimum | None) -> Minimum | None:
+        starts = [] if neighbour is None else [neighbour.theta]
+        if here is None:
+            own = cost.start(delay)
+            starts += [] if own is None else [own]
+        return cost.minimise_from(delay, starts)
+
+    return both_ways(delays, at)
+
+
+def both_ways(
+    delays: Array, at: Callable[[float, Minimum | None, Minimum | None], Minimum | None]
+) -> list[Minimum | None]:
+    """Go along a grid and back, so that good coefficients reach both neighbours.
+
+    Parameters
+    ----------
+    delays : ndarray, shape (K,)
+        Increasing delays [s].
+    at : callable
+        ``at(delay, here, neighbour)``: a minimum at a delay, given what is known there and next to it.
+
+    Returns
+    -------
+    list of Minimum or None
+        The lowest minimum found at each delay.
+    """
+    found: list[Minimum | None] = [None] * delays.size
+    for order in (range(delays.size), range(delays.size - 1, -1, -1)):
+        neighbour: Minimum | None = None
+        for k in order:
+            here = found[k]
+            if here is None or neighbour is not None:
+                trial = at(float(delays[k]), here, neighbour)
+                if trial is not None and (here is None or trial.squared_error < here.squared_error):
+                    found[k] = here = trial
+            neighbour = here
+    return found
+
+
+def local_minima(costs: Array, most: int) -> list[int]:
+    """Indices of the lowest local minima of a profile, lowest first.
+
+    Parameters
+    ----------
+    costs : ndarray, shape (K,)
+        Costs in the order of the delays; NaN counts as infinite.
+    most : int
+        Largest number of minima.
+
+    Returns
+    -------
+    list of int
+        Their indices.
+    """
+    padded = np.concatenate(([np.inf], np.where(np.isnan(costs), np.inf, costs), [np.inf]))
+    lowest = (padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]) & np.isfinite(padded[1:-1])
+    indices = np.flatnonzero(lowest)
+    return [int(k) for k in indices[np.argsort(costs[indices], kind="stable")][:most]]
+
+
+def _hopeful(costs: Array, most: int) -> list[int]:
+    """The lowest local minima, without those that are far above the least."""
+    lowest = local_minima(costs, most)
+    return [k for k in lowest if costs[k] <= HOPELESS * costs[lowest[0]]]
+
+
+def _costs(found: list[Minimum | None]) -> Array:
+    return np.array([np.nan if minimum is None else minimum.squared_error for minimum in found])
+
+
+def _descended(cost: FilteredCost, minimum: Minimum | None, bounds: tuple[float, float]) -> Minimum:
+    assert minimum is not None
+    found = descend(
+        cost,
+        minimum.delay,
+        minimum.theta,
+        bounds,
+        max_iterations=DESCENT_ITERATIONS,
+        tolerance=DESCENT_TOLERANCE,
+    )
+    return minimum if found is None or found.minimum.squared_error > minimum.squared_error else found.minimum

@@ -1,0 +1,1 @@
+"""Figures of published studies, computed from their specifications: one module per study, found by name."""

@@ -1,0 +1,211 @@
+"""What useful redundancy sees of a record: the costs of its filters over the delay, and its way through them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctid_cli.errors import UsageError
+from ctid_cli.estimators import Start
+from ctid_cli.estimators.delay_search import Minimum
+from ctid_cli.estimators.filtered_costs import FilteredCost
+from ctid_cli.estimators.useful_redundancy import PreparedUsefulRedundancy, RedundantFit, UsefulRedundancy
+from ctid_cli.experiment.plan import build_plan
+from ctid_cli.experiment.spec import load_spec
+from ctid_cli.reporting.study import data_folder, load_study
+from ctid_cli.signals.record import Record
+
+Array = NDArray[np.float64]
+
+#: How often the delays are gone through, up and down in turn: more does not lower the costs visibly.
+SWEEPS = 2
+#: Cost of a filter in which nothing can be computed [%].
+NOTHING = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class Leg:
+    """An accepted solver path: from one incumbent to the next.
+
+    Parameters
+    ----------
+    filter : int
+        Index of its filter, 0 for that of the longest period.
+    delays : ndarray, shape (K,)
+        Gauss-Newton steps [s], the incumbent it started from first.
+    costs : ndarray, shape (K,)
+        J0 there, as the search evaluates it [%].
+    switched : bool
+        Whether the leg before used another filter.
+    """
+
+    filter: int
+    delays: Array
+    costs: Array
+    switched: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Landscape:
+    """Costs over the delay and a search through them.
+
+    Parameters
+    ----------
+    delays : ndarray, shape (N,)
+        Delays [s], rising.
+    members : ndarray, shape (N, filters)
+        Least costs over the coefficients that were found [%], of the filter of longest period first.
+    evaluated : ndarray, shape (N,)
+        J0 as the search evaluates it [%].
+    fit : RedundantFit
+        The estimate.
+    legs : tuple of Leg
+        The way to it.
+    """
+
+    delays: Array
+    members: Array
+    evaluated: Array
+    fit: RedundantFit
+    legs: tuple[Leg, ...]
+
+    @property
+    def reference(self) -> Array:
+        """J0, the mean of the members [%], shape (N,)."""
+        return np.asarray(self.members.mean(axis=1))
+
+    @property
+    def cutoffs(self) -> Array:
+        """Cut-off frequencies of the filters [rad/s], shape (filters,)."""
+        assert self.fit.filters is not None
+        return self.fit.filters.cutoffs
+
+
+def published_search(
+    experiment: str, snr_db: float, noise: bool, otherwise: UsefulRedundancy
+) -> tuple[UsefulRedundancy, Record]:
+    """Estimator and first data set of an experiment of the useful-redundancy study.
+
+    Parameters
+    ----------
+    experiment : str
+        Name of the experiment.
+    snr_db : float
+        Its SNR [dB].
+    noise : bool
+        Whether to keep the noise.
+    otherwise : UsefulRedundancy
+        The estimator where the experiment names no ``proposed`` one.
+
+    Returns
+    -------
+    (UsefulRedundancy, Record)
+        The estimator, and the data set, made anew from its seed.
+
+    Raises
+    ------
+    UsageError
+        If there is no specification of the experiment to be found.
+    """
+    file = data_folder("configs") / load_study().experiments[experiment].config
+    if not file.is_file():
+        raise UsageError(
+            f"this figure is computed from the specification {file.parent.name}/{file.name}, which an installed "
+            "package does not carry; run ctid figure in a checkout of the repository"
+        )
+    plan = build_plan(load_spec(file))
+    record = next(cell for cell in plan.data_cells if cell.swept.get("snr_db") == snr_db).dataset(0).record
+    if not noise:
+        assert record.noise_free is not None
+        record = Record(record.t, record.noise_free, record.input)
+    named = [cell.estimator for cell in plan.estimators if cell.name == "proposed"]
+    return next((item for item in named if isinstance(item, UsefulRedundancy)), otherwise), record
+
+
+def landscape(
+    estimator: UsefulRedundancy, record: Record, delays: ArrayLike, initial_delay: float, sweeps: int = SWEEPS
+) -> Landscape:
+    """Costs over the delay, and the search from one initial delay.
+
+    Parameters
+    ----------
+    estimator : UsefulRedundancy
+        The estimator.
+    record : Record
+        The record.
+    delays : array_like, shape (N,)
+        Delays [s], rising.
+    initial_delay : float
+        Where the search starts [s].
+    sweeps : int, optional
+        How often to go through the delays for the least costs.
+
+    Returns
+    -------
+    Landscape
+        The costs and the search.
+
+    Notes
+    -----
+    Far from the true delay the costs have local minima over the coefficients, and which one the search ends in changes
+    from delay to delay. The least costs come from a continuation: coefficients that are good at one delay and for one
+    filter are tried at the next one and for its neighbours.
+    """
+    grid = np.asarray(delays, dtype=float)
+    prepared = estimator.prepare(record)
+    fit = prepared.fit(Start(delay=initial_delay))
+    return Landscape(
+        delays=grid,
+        members=_least_costs(prepared.costs, grid, sweeps),
+        evaluated=np.array([prepared.reference_cost(delay) for delay in grid]),
+        fit=fit,
+        legs=_legs(prepared, fit),
+    )
+
+
+def _least_costs(costs: list[FilteredCost], delays: Array, sweeps: int) -> Array:
+    count = len(costs)
+    best: list[list[Minimum | None]] = [[None] * count for _ in delays]
+    for sweep in range(sweeps):
+        places = range(delays.size) if sweep % 2 == 0 else range(delays.size - 1, -1, -1)
+        before: list[Minimum | None] = [None] * count
+        for i in places:
+            here = best[i]
+            for k in reversed(range(count)):
+                known = [before[k], *here[k + 1 : k + 2], *here[max(k - 1, 0) : k]]
+                starts = [minimum.theta for minimum in known if minimum is not None]
+                # Least squares on a narrow band is hopeless in noise.
+                if sweep == 0 and (k == count - 1 or not starts):
+                    start = costs[k].start(float(delays[i]))
+                    starts += [] if start is None else [start]
+                found = costs[k].minimise_from(float(delays[i]), starts)
+                old = here[k]
+                if found is not None and (old is None or found.squared_error < old.squared_error):
+                    here[k] = found
+            before = here
+    return np.array(
+        [
+            [
+                NOTHING if minimum is None else 100.0 * float(np.sqrt(minimum.squared_error / cost.spread))
+                for minimum, cost in zip(row, costs, strict=True)
+            ]
+            for row in best
+        ]
+    )
+
+
+def _legs(prepared: PreparedUsefulRedundancy, fit: RedundantFit) -> tuple[Leg, ...]:
+    assert fit.search is not None
+    legs = []
+    for _, visit in pairwise(fit.search.trajectory):
+        path = next(
+            path
+            for path in fit.paths
+            if (path.round, path.filter, float(path.delays[-1])) == (visit.round, visit.path, visit.point)
+        )
+        costs = np.array([prepared.reference_cost(float(delay)) for delay in path.delays])
+        legs.append(Leg(path.filter, path.delays, costs, visit in fit.switches))
+    return tuple(legs)

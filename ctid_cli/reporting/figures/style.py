@@ -1,0 +1,124 @@
+"""What all figures have in common: style, bytes that are the same every time, colours, and labels that do not touch."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+#: Colours that differ in lightness too, so that a grey print can be read.
+DARK, MIDDLE, LIGHT, BAND = "#08306b", "#6b6b6b", "#a8a8a8", "#e4e4e4"
+#: What stands out from lines of these colours, by shape as well.
+MARK = "#b03a00"
+#: Line styles of neighbouring curves.
+_STYLES = ("-", "--", "-.", (0, (1, 1)))
+_STYLE: dict[Any, Any] = {
+    "svg.hashsalt": "ctid",
+    "font.size": 9.0,
+    "axes.titlesize": 9.0,
+    "figure.titlesize": 10.0,
+    "legend.fontsize": 8.0,
+    "axes.grid": True,
+    "grid.color": "#eeeeee",
+    "axes.axisbelow": True,
+}
+
+
+def svg(width: float, height: float, draw: Callable[[Figure], None]) -> bytes:
+    """Draw a figure; the same drawing always gives the same bytes.
+
+    Parameters
+    ----------
+    width, height : float
+        Size [inch].
+    draw : callable
+        Draws into an empty figure, whose layout keeps labels apart.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    import matplotlib.style
+    from matplotlib.figure import Figure
+
+    # Not the user's own defaults: a published figure looks the same everywhere.
+    with matplotlib.style.context(["default", _STYLE]):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        draw(figure)
+        file = io.BytesIO()
+        figure.savefig(file, format="svg", metadata={"Date": None})
+    return file.getvalue()
+
+
+def ramp(count: int) -> list[dict[str, Any]]:
+    """Line properties of a family of curves, from light to dark, neighbours with different dashes.
+
+    Parameters
+    ----------
+    count : int
+        How many curves.
+
+    Returns
+    -------
+    list of dict
+        Keywords of ``Axes.plot``.
+
+    Examples
+    --------
+    >>> [line["linestyle"] for line in ramp(2)]
+    ['-', '--']
+    """
+    light, dark = np.array([0.52, 0.68, 0.84]), np.array([0.03, 0.12, 0.30])
+    shares = np.linspace(0.0, 1.0, count) if count > 1 else np.ones(1)
+    return [
+        {"color": tuple(light + share * (dark - light)), "linestyle": _STYLES[k % len(_STYLES)]}
+        for k, share in enumerate(shares)
+    ]
+
+
+def spread(values: ArrayLike, distance: float) -> Array:
+    """Places of labels: as close to their values as a least distance allows, in the same order.
+
+    Parameters
+    ----------
+    values : array_like, shape (n,)
+        Where the labels belong.
+    distance : float
+        Least distance of two labels, in the units of the values.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Where they go. Labels that would touch form a group around the mean of their values.
+
+    Examples
+    --------
+    >>> spread([0.0, 10.0, 10.5], 2.0)
+    array([ 0.  ,  9.25, 11.25])
+    """
+    values = np.asarray(values, dtype=float)
+    groups: list[list[int]] = []
+
+    def centre(group: Sequence[int]) -> float:
+        return float(values[list(group)].mean())
+
+    for k in np.argsort(values, kind="stable"):
+        groups.append([int(k)])
+        while len(groups) > 1:
+            below, above = groups[-2:]
+            if centre(above) - centre(below) >= 0.5 * distance * (len(below) + len(above)):
+                break
+            groups[-2:] = [below + above]
+    places = np.empty(values.size)
+    for group in groups:
+        places[group] = centre(group) + distance * (np.arange(len(group)) - 0.5 * (len(group) - 1))
+    return places

@@ -1,0 +1,460 @@
+"""Figures 1 to 7 of the useful-redundancy study.
+
+Figures 1 and 2 are theory; 3 to 7 are computed from the specifications of cases 1 and 2, whose first data set is made
+anew from its seed. Equation numbers are those of Ha, Welsh and Alamir, "Useful redundancy in parameter and time delay
+estimation for continuous-time models" (arXiv:1703.09344).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
+from ctid_cli.filtering import FilterSet, check_filters, convergence_region, extrema, ideal_cost
+from ctid_cli.reporting.figures.redundant_search import Landscape, landscape, published_search
+from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, ramp, spread, svg
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+TRUE_DELAY = 8.0
+SNR = 15.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """One of the two simulated systems of the study.
+
+    Parameters
+    ----------
+    number : int
+        Its number in the paper.
+    experiment : str
+        The experiment with regular sampling.
+    published : UsefulRedundancy
+        The published settings.
+    interval : float
+        Distance of the delays at which costs are drawn [s].
+    detail : (float, float)
+        Delays [s] that are drawn again in detail, at ten times as many points.
+    """
+
+    number: int
+    experiment: str
+    published: UsefulRedundancy
+    interval: float
+    detail: tuple[float, float]
+
+    @property
+    def delays(self) -> Array:
+        """Delays at which costs are drawn [s]."""
+        low, high = self.published.delay_bounds
+        whole = np.arange(round((high - low) / self.interval) + 1) * self.interval + low
+        return np.unique(np.round(np.concatenate([whole, np.linspace(*self.detail, 41)]), 9))
+
+
+CASE_1 = Case(
+    number=1,
+    experiment="useful-redundancy/case1-regular",
+    published=UsefulRedundancy(2, 0, delay_bounds=(0, 15), bandwidth=2.02, filters=10, svf_cutoff=1.0),
+    interval=0.05,
+    detail=(7.4, 9.0),
+)
+CASE_2 = Case(
+    number=2,
+    experiment="useful-redundancy/case2-regular",
+    published=UsefulRedundancy(4, 1, delay_bounds=(0, 15), bandwidth=26.85, filters=15, svf_cutoff=25.0),
+    interval=0.04,
+    detail=(7.9, 8.1),
+)
+
+
+def figure_1() -> bytes:
+    """Cost of a delay error behind an ideal low-pass filter, its extrema and its convergence region.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    cutoff, largest = 2 * np.pi, 4.0
+    errors = np.linspace(-largest, largest, 1601)
+    places = extrema(cutoff, 16, exact=True)
+    places = places[places < largest]
+    region, printed = (convergence_region(cutoff, exact) for exact in (True, False))
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        axes.axvspan(-region, region, color=BAND, linewidth=0)
+        axes.axhline(2 * cutoff / np.pi, color=MIDDLE, linewidth=0.8, linestyle="--")
+        axes.plot(errors, ideal_cost(errors, cutoff), color=DARK, linewidth=1.2)
+        for first, marker, label in ((0, "^", "local maximum"), (1, "v", "local minimum")):
+            at = np.concatenate([-places[first::2][::-1], places[first::2]])
+            axes.plot(at, ideal_cost(at, cutoff), marker, color=MARK, markersize=4.5, label=label)
+        axes.plot([0.0], [0.0], "o", color=DARK, markersize=6, clip_on=False, label="global minimum")
+        axes.annotate(
+            f"convergence region\n$|\\delta\\tau| < {region:.4f}$ s\n(by the approximation (37): {printed:.4f} s)",
+            (region, 1.0),
+            (region + 0.3, 1.0),
+            va="center",
+            arrowprops={"arrowstyle": "-", "linewidth": 0.6, "shrinkA": 2, "shrinkB": 0},
+        )
+        axes.text(-largest + 0.05, 2 * cutoff / np.pi - 0.12, r"$2\omega_c/\pi$", va="top", color=MIDDLE)
+        axes.set_xlabel(r"delay error $\delta\tau$ [s]")
+        axes.set_ylabel(r"cost $\bar{J}$ [(output unit)²]")
+        axes.set_xlim(-largest, largest)
+        axes.set_ylim(bottom=0.0)
+        axes.legend(loc="lower left", frameon=True)
+        axes.set_title(
+            r"Ideal low-pass filter, $\omega_c = 2\pi$ rad/s: cost of a delay error, equation (50) "
+            "(white input of unit intensity, no noise)"
+        )
+
+    return svg(7.5, 3.4, draw)
+
+
+def figure_2() -> bytes:
+    """Six ideal costs, which of them serves which delay error, and the minimum path from one of these.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    filters = FilterSet(bandwidth=2 * np.pi, count=6, beta=2.0)
+    largest, start, shown = 15.0, 14.0, 5.25
+    check = check_filters(filters.cutoffs, largest)
+    path = [(-1, start), *check.path(start)]
+    lines = ramp(filters.count)
+
+    def draw(figure: Figure) -> None:
+        above, below = figure.subplots(2, 1, height_ratios=[1.25, 1])
+        errors = np.linspace(0.0, shown, 1001)
+        for k, cutoff in enumerate(filters.cutoffs):
+            above.plot(errors, ideal_cost(errors, cutoff), linewidth=1.0, **lines[k])
+        ends = [2 * cutoff / np.pi for cutoff in filters.cutoffs]
+        for k, place in enumerate(spread(ends, 0.3)):
+            above.text(
+                shown + 0.05,
+                place,
+                f"filter {k + 1}: {filters.cutoffs[k] / np.pi:.2f}$\\pi$ rad/s",
+                va="center",
+                color=lines[k]["color"],
+                fontsize=8,
+            )
+        for (_, high), (k, low) in pairwise(path):
+            along = np.linspace(low, high, 60)
+            cost = ideal_cost(along, filters.cutoffs[k])
+            above.plot(along, cost, color=MARK, linewidth=2.2, alpha=0.8, solid_capstyle="round")
+        for (k, low), (following, _) in pairwise(path[1:]):
+            heights = [float(ideal_cost(low, filters.cutoffs[i])) for i in (k, following)]
+            above.plot([low, low], heights, color=MARK, linewidth=0.9, linestyle=":")
+            above.plot([low], heights[:1], "*", color=MARK, markersize=8, markeredgecolor="white", markeredgewidth=0.4)
+        above.set_xlim(0.0, shown)
+        above.set_ylim(bottom=0.0)
+        above.set_xlabel(r"delay error $|\delta\tau|$ [s]")
+        above.set_ylabel(r"cost $\bar{J}$ [(output unit)²]")
+
+        for color, label, helpful in (
+            (BAND, "leads closer to zero", lambda k, filters: k in filters),
+            (LIGHT, "leads closest", lambda k, filters: k == filters[0]),
+        ):
+            for k in range(filters.count):
+                spans = [(item.low, item.high) for item in check.intervals if helpful(k, item.filters)]
+                bars = [(low, high - low) for low, high in _joined(spans)]
+                below.broken_barh(bars, (k + 0.64, 0.72), color=color, linewidth=0, label=None if k else label)
+        for low, high in check.gaps:
+            below.axvspan(low, high, facecolor="none", edgecolor="black", hatch="//////", linewidth=0.6)
+            below.annotate(
+                f"gap, {low:.2f} to {high:.2f} s: no filter",
+                (0.5 * (low + high), 6.55),
+                (-24, 10),
+                textcoords="offset points",
+                ha="right",
+                va="center",
+                fontsize=8,
+                annotation_clip=False,
+                arrowprops={"arrowstyle": "-", "linewidth": 0.6, "shrinkA": 1, "shrinkB": 0},
+            )
+        corners = [(error, k + 1) for (_, high), (k, low) in pairwise(path) for error in (high, low)]
+        below.plot(*np.transpose(corners), color=MARK, linewidth=1.1, label=f"minimum path from {start:g} s")
+        below.plot([start], [path[1][0] + 1], "s", color=MARK, markersize=4)
+        at = np.transpose([(low, k + 1) for k, low in path[1:-1]])
+        below.plot(*at, "*", color=MARK, markersize=7, markeredgecolor="white", markeredgewidth=0.4, label="switch")
+        below.legend(loc="lower left", bbox_to_anchor=(-0.01, 0.99), ncols=4, frameon=False, columnspacing=1.2)
+        below.set_xlim(0.0, largest)
+        below.set_ylim(0.45, 6.55)
+        below.set_yticks(range(1, 7))
+        below.grid(False, axis="y")
+        below.set_xlabel(r"delay error $|\delta\tau|$ [s]")
+        below.set_ylabel("filter")
+        above.set_title("costs (50), and the end of the minimum path", loc="left")
+        figure.suptitle(
+            "Six ideal low-pass filters, $\\beta$ = 2, bandwidth $2\\pi$ rad/s: which filter serves which delay error\n"
+            "The paper states that every error below 15 s is served; there is one gap"
+        )
+
+    return svg(7.5, 5.8, draw)
+
+
+def _joined(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Intervals, those that adjoin made one."""
+    joined: list[tuple[float, float]] = []
+    for low, high in spans:
+        if joined and joined[-1][1] == low:
+            low = joined.pop()[0]
+        joined.append((low, high))
+    return joined
+
+
+def figure_3() -> bytes:
+    """Ten filtered costs of case 1 with the model error, without noise.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    return costs_svg(
+        _computed(CASE_1, noise=False),
+        "Case 1 without noise: costs of the ten filters, normalised as in (45), "
+        "coefficients re-estimated at every delay",
+    )
+
+
+def figure_4() -> bytes:
+    """J0 of case 1 without noise, and the minimum path.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    return trajectory_svg(_computed(CASE_1, noise=False), CASE_1, "Case 1 without noise: $J_0$ and the minimum path")
+
+
+def figure_5() -> bytes:
+    """Costs of the ten filters on one data set of case 1.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    return costs_svg(
+        _computed(CASE_1, noise=True),
+        f"Case 1, one data set, regular sampling, SNR {SNR:g} dB: costs of the ten filters, normalised as in (45)",
+    )
+
+
+def figure_6() -> bytes:
+    """J0 and the trajectory of the delay estimate on one data set of case 1.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    return _data_set(CASE_1)
+
+
+def figure_7() -> bytes:
+    """J0 and the trajectory of the delay estimate on one data set of case 2.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    return _data_set(CASE_2)
+
+
+def _data_set(case: Case) -> bytes:
+    title = f"Case {case.number}, one data set, regular sampling, SNR {SNR:g} dB: $J_0$ and the delay estimate"
+    return trajectory_svg(_computed(case, noise=True), case, title)
+
+
+@cache
+def _computed(case: Case, noise: bool) -> Landscape:
+    estimator, record = published_search(case.experiment, SNR, noise, case.published)
+    return landscape(estimator, record, case.delays, initial_delay=0.0)
+
+
+def costs_svg(result: Landscape, title: str) -> bytes:
+    """Costs of all filters over the delay.
+
+    Parameters
+    ----------
+    result : Landscape
+        The costs.
+    title : str
+        What they belong to.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    delays, members = result.delays, result.members
+    lines = ramp(members.shape[1])
+    top = 1.03 * float(members.max())
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        _draw_true_delay(axes)
+        for k, line in enumerate(lines):
+            axes.plot(delays, members[:, k], linewidth=1.1, **line)
+        for k, place in enumerate(spread(members[-1], 0.052 * top)):
+            color = lines[k]["color"]
+            axes.annotate(
+                f"{k + 1}: {result.cutoffs[k]:.3g} rad/s",
+                (delays[-1], members[-1, k]),
+                (delays[-1] + 0.35, place),
+                va="center",
+                fontsize=8,
+                color=color,
+                annotation_clip=False,
+                arrowprops={"arrowstyle": "-", "linewidth": 0.5, "color": color, "shrinkA": 0, "shrinkB": 0},
+            )
+        axes.text(TRUE_DELAY - 0.1, 0.97 * top, "true delay", ha="right", va="top", fontsize=8, color=MIDDLE)
+        axes.set_xlim(delays[0], delays[-1])
+        axes.set_ylim(0.0, top)
+        axes.set_xlabel(r"delay $\hat\tau$ [s]")
+        axes.set_ylabel(r"cost $100\,\|y_k - \hat x_k\| \,/\, \|y_k - \mathrm{mean}\,y_k\|$ [%]")
+        axes.set_title(title)
+
+    return svg(7.5, 4.0, draw)
+
+
+def trajectory_svg(result: Landscape, case: Case, title: str) -> bytes:
+    """J0 over the delay, and the way of the delay estimate with the filters that it used.
+
+    Parameters
+    ----------
+    result : Landscape
+        Costs and search.
+    case : Case
+        Says what to draw in detail.
+    title : str
+        What it shows.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    whole = (float(result.delays[0]) - 0.2, float(result.delays[-1]))
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(2, 2, width_ratios=[1.9, 1], height_ratios=[1.6, 1])
+        for (cost, used), (low, high) in zip(panels.T, (whole, case.detail), strict=True):
+            _draw_reference(cost, result, low, high)
+            _draw_filters(used, result)
+            for axes in (cost, used):
+                _draw_true_delay(axes)
+                axes.set_xlim(low, high)
+            cost.tick_params(labelbottom=False)
+            used.set_xlabel(r"delay $\hat\tau$ [s]")
+        panels[0, 0].set_ylabel("cost $J_0$ [%]")
+        panels[1, 0].set_ylabel("filter of the path")
+        panels[0, 1].set_title("around the true delay, 8 s", loc="left")
+        _name_filters(panels[1, 0], result)
+        count = sum(leg.switched for leg in result.legs)
+        switches = {0: "no switch of the filter", 1: "one switch of the filter"}.get(count, f"{count} switches")
+        figure.suptitle(
+            f"{title}\nfrom {result.legs[0].delays[0]:g} s, {switches}; search ends at "
+            f"{result.legs[-1].delays[-1]:.4f} s, refinement on unfiltered data at {result.fit.model.delay:.4f} s"
+        )
+        figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+
+    return svg(7.5, 5.6, draw)
+
+
+def _draw_true_delay(axes: Any) -> None:
+    axes.axvline(TRUE_DELAY, color=MIDDLE, linewidth=0.8, zorder=0.9)
+
+
+def _draw_reference(axes: Any, result: Landscape, low: float, high: float) -> None:
+    delays, least = result.delays, result.reference
+    axes.plot(delays, least, color=DARK, linewidth=1.4, label="$J_0$, least over the coefficients")
+    axes.plot(
+        delays,
+        result.evaluated,
+        color=LIGHT,
+        linewidth=0.8,
+        drawstyle="steps-mid",
+        zorder=1.5,
+        label="$J_0$ as the search evaluates it",
+    )
+    for k, leg in enumerate(result.legs):
+        label = None if k else "Gauss-Newton steps"
+        axes.plot(leg.delays, leg.costs, "o:", color=MARK, markersize=3.5, linewidth=0.8, label=label)
+    _draw_marks(axes, result, [leg.costs for leg in result.legs])
+    inside = (low <= delays) & (delays <= high)
+    shown = max(
+        least[inside].max(),
+        *(leg.costs[(low <= leg.delays) & (leg.delays <= high)].max(initial=0.0) for leg in result.legs),
+    )
+    axes.set_ylim(0.0, 1.25 * shown)
+
+
+def _draw_filters(axes: Any, result: Landscape) -> None:
+    count = result.members.shape[1]
+    rows = [np.full(leg.delays.size, leg.filter + 1.0) for leg in result.legs]
+    for leg, row in zip(result.legs, rows, strict=True):
+        axes.plot(leg.delays, row, "o-", color=MARK, markersize=3, linewidth=1.0)
+    for leg, before, row in zip(result.legs[1:], rows, rows[1:], strict=False):
+        axes.plot(leg.delays[[0, 0]], [before[-1], row[0]], color=MARK, linewidth=0.8, linestyle=":")
+    _draw_marks(axes, result, rows)
+    axes.set_ylim(0.4, count + 0.6)
+    axes.set_yticks(range(1, count + 1, 1 if count <= 10 else 2))
+    axes.tick_params(axis="y", labelsize=7)
+
+
+def _draw_marks(axes: Any, result: Landscape, heights: Sequence[Array]) -> None:
+    """Start and end of the way, and a star where it leaves one filter for another."""
+    axes.plot(result.legs[0].delays[:1], heights[0][:1], "s", color=MARK, markersize=5, label="start")
+    leaving = zip(result.legs[1:], heights, strict=False)
+    stars = [(leg.delays[0], before[-1]) for leg, before in leaving if leg.switched]
+    if stars:
+        axes.plot(*np.transpose(stars), "*", color=MARK, markersize=10, zorder=4, label="switch of the filter")
+    axes.plot(
+        result.legs[-1].delays[-1:],
+        heights[-1][-1:],
+        "D",
+        color="white",
+        markeredgecolor=MARK,
+        markersize=5,
+        zorder=5,
+        label="end of the search",
+    )
+
+
+def _name_filters(axes: Any, result: Landscape) -> None:
+    ends: dict[int, float] = {}
+    for leg in result.legs:
+        ends[leg.filter] = max(ends.get(leg.filter, 0.0), float(leg.delays.max()))
+    count = result.members.shape[1]
+    for k, place in zip(ends, spread([k + 1.0 for k in ends], 0.11 * count), strict=True):
+        text = f"filter {k + 1}, {result.cutoffs[k]:.3g} rad/s"
+        axes.annotate(text, (ends[k] + 0.35, place), va="center", fontsize=8)
+
+
+FIGURES: Mapping[str, Callable[[], bytes]] = {
+    "1": figure_1,
+    "2": figure_2,
+    "3": figure_3,
+    "4": figure_4,
+    "5": figure_5,
+    "6": figure_6,
+    "7": figure_7,
+}
