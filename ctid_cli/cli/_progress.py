@@ -68,7 +68,7 @@ class Reporter:
             case events.PlanReady():
                 self._plan(event)
             case events.KernelsCompiling():
-                self._say("preparing numerical kernels (compiled the first time, which takes below 30 s; then cached)")
+                self._say("preparing numerical kernels (compiled the first time, in up to a minute; then cached)")
             case events.KernelsCompiled():
                 if event.seconds > QUICK:
                     self._say(f"kernels ready after {seconds(event.seconds)}")

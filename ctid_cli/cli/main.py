@@ -10,6 +10,7 @@ import ctid_cli
 from ctid_cli.cli._checks import CheckCommand
 from ctid_cli.cli.check import check
 from ctid_cli.cli.export import export
+from ctid_cli.cli.figure import figure
 from ctid_cli.cli.fit import fit
 from ctid_cli.cli.run import run
 from ctid_cli.cli.schema import schema
@@ -51,7 +52,7 @@ def _root(
 
 
 app.command(cls=CheckCommand)(check)
-for _command in (fit, run, status, table, show, export, validate, schema):
+for _command in (fit, run, status, table, figure, show, export, validate, schema):
     app.command()(_command)
 
 

@@ -47,12 +47,15 @@ class FilterPath:
         Accepted trial delays [s], the incumbent it started from first.
     costs : ndarray, shape (K,)
         ``100 ||y - x|| / ||y - mean y||`` of the filtered data there [%].
+    coefficients : ndarray, shape (K, n + m + 1)
+        ``(a_1 … a_n, b_0 … b_m)`` there.
     """
 
     round: int
     filter: int
     delays: Array
     costs: Array
+    coefficients: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,7 +331,7 @@ class PreparedUsefulRedundancy:
             settled=lambda before, now: abs(now - before) <= options.tolerance * max(abs(now), self.period),
             max_rounds=options.max_rounds,
         )
-        fit = self._refine(search)
+        fit = self._refine(search, self._history(search, paths))
         return RedundantFit(
             **{item.name: getattr(fit, item.name) for item in fields(Fit)},
             search=search,
@@ -336,11 +339,27 @@ class PreparedUsefulRedundancy:
             paths=tuple(paths),
         )
 
-    def _refine(self, search: RedundantMinimum[float]) -> Fit:
+    def _history(self, search: RedundantMinimum[float], paths: list[FilterPath]) -> list[IterationRecord]:
+        """The steps of the paths that led from incumbent to incumbent."""
+        n = self.options.poles
+        history: list[IterationRecord] = []
+        for visit in search.trajectory[1:]:
+            path = next(
+                p for p in paths if (p.round, p.filter) == (visit.round, visit.path) and p.delays[-1] == visit.point
+            )
+            cost = self.costs[path.filter]
+            squares = (path.costs / 100.0) ** 2 * cost.spread * cost.mean_factor
+            stage = f"filter {path.filter + 1}"
+            for i, (delay, square, theta) in enumerate(zip(path.delays, squares, path.coefficients, strict=True)):
+                history.append(
+                    IterationRecord(
+                        stage, i, float(delay), float(square), (1.0, *theta[:n].tolist()), tuple(theta[n:].tolist())
+                    )
+                )
+        return history
+
+    def _refine(self, search: RedundantMinimum[float], history: list[IterationRecord]) -> Fit:
         """Go on from the minimum of J0, and from where the filter of widest band fits best in the last round."""
-        history = [
-            IterationRecord("filters", i, visit.point, visit.cost, (), ()) for i, visit in enumerate(search.trajectory)
-        ]
         points = [search.point]
         # J0 is flat around its minimum where noise or a model of too long a delay weigh on the narrow filters.
         around = [visit.point for visit in search.visits if visit.round == search.rounds]
@@ -392,7 +411,8 @@ class PreparedUsefulRedundancy:
                 )
                 if found is not None:
                     costs = np.array([self._percent(k, step) for step in steps])
-                    paths.append(FilterPath(rounds, k, np.array([step.delay for step in steps]), costs))
+                    delays = np.array([step.delay for step in steps])
+                    paths.append(FilterPath(rounds, k, delays, costs, np.array([step.theta for step in steps])))
                     ends.append(float(found.minimum.delay))
             return ends
 

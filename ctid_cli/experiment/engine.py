@@ -139,7 +139,7 @@ def run_experiment(
         todo = _jobs(plan, peek)
         if todo:
             on_event(events.KernelsCompiling())
-            on_event(events.KernelsCompiled((warm or _compile_kernels)()))
+            on_event(events.KernelsCompiled(warm() if warm else _compile_kernels(plan)))
             _check_first_records(todo)
         moved = place.move_aside(folder) if fresh else None
         _make(folder)
@@ -368,10 +368,10 @@ def _check_first_records(jobs: list[Job]) -> None:
             continue
 
 
-def _compile_kernels() -> float:
+def _compile_kernels(plan: Plan) -> float:
     from ctid_cli.estimators import compile_kernels
 
-    return compile_kernels()
+    return compile_kernels(cell.estimator for cell in plan.estimators)
 
 
 def _make(folder: Path) -> None:

@@ -181,12 +181,42 @@ def test_finds_the_delay_of_case_2_in_heavy_noise(replicate):
 
 
 def test_the_profile_is_lowest_next_to_the_estimate():
-    fit = DelayProfile(2, 0, (0, 15)).fit(make_record(snr_db=15))
+    fit = DelayProfile(2, 0, (0, 15), search="samples").fit(make_record(snr_db=15))
     profile = fit.profile
+    assert profile.cutoff is None
     spacing = np.diff(profile.delays).max()
     assert spacing <= 0.5 * np.pi / profile.bandwidth * (1 + 1e-12)
     assert abs(profile.delays[np.nanargmin(profile.costs)] - fit.model.delay) <= spacing
     assert fit.cost <= np.nanmin(profile.costs)
+
+
+@pytest.mark.parametrize("search", ["time", "spectral"])
+@pytest.mark.parametrize(("model", "poles", "zeros"), [(CASE_1, 2, 0), (CASE_2, 4, 1)])
+@pytest.mark.parametrize("regular", [True, False])
+def test_searches_behind_filters_find_what_every_sample_finds(search, model, poles, zeros, regular):
+    record = make_record(model, seed=7, snr_db=5, regular=regular)
+    fit = DelayProfile(poles, zeros, (0, 15), search=search).fit(record)
+    assert fit.status is Status.CONVERGED
+    # From the neighbourhood of the truth, on every sample.
+    local = DelayProfile(poles, zeros, (7.8, 8.2), search="samples").fit(record)
+    assert fit.cost <= local.cost * (1 + 1e-9)
+    assert fit.model.delay == pytest.approx(local.model.delay, abs=1e-5)
+    profile = fit.profile
+    assert profile.cutoff is not None
+    assert profile.cutoff <= profile.bandwidth
+    spacing = np.diff(profile.delays).max()
+    assert spacing <= 0.5 * np.pi / profile.cutoff * (1 + 1e-12)
+    assert abs(profile.delays[np.nanargmin(profile.costs)] - fit.model.delay) <= 1.5 * spacing
+
+
+@pytest.mark.parametrize("search", ["time", "spectral"])
+def test_where_filters_would_see_more_than_the_answer_every_sample_is_searched(search):
+    record = record_of(noise=0.02)
+    for options in ({"offset": "estimate"}, {"initial_state": "estimate"}):
+        fast = DelayProfile(2, 0, (0, 3), search=search, **options).fit(record)
+        slow = DelayProfile(2, 0, (0, 3), search="samples", **options).fit(record)
+        assert fast.profile.cutoff is None
+        assert np.array_equal(fast.theta, slow.theta)
 
 
 def test_a_delay_outside_the_range_stops_at_the_bound():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators import ESTIMATORS, DelayProfile, Srivc, Start, Svf, TdSrivc
+from ctid_cli.estimators import ESTIMATORS, DelayProfile, Srivc, Start, Svf, TdSrivc, UsefulRedundancy
 from ctid_cli.filtering import simulate
 from ctid_cli.inference import Status, fit_percent, r_squared
 from ctid_cli.models import TransferFunction
@@ -128,7 +128,13 @@ def test_nothing_of_the_record_changes():
 
 
 def test_registry_holds_every_estimator_by_its_kind():
-    assert ESTIMATORS == {"svf": Svf, "srivc": Srivc, "td_srivc": TdSrivc, "delay_profile": DelayProfile}
+    assert list(ESTIMATORS.items()) == [
+        ("svf", Svf),
+        ("srivc", Srivc),
+        ("td_srivc", TdSrivc),
+        ("useful_redundancy", UsefulRedundancy),
+        ("delay_profile", DelayProfile),
+    ]
 
 
 def test_too_few_iterations_say_so():
