@@ -130,8 +130,11 @@ class UsefulRedundancy:
     a minimum of the filtered cost; the candidate of least J0 becomes the incumbent, itself a candidate. J0 is the mean
     over the filters of ``100 ||y_k - x_k|| / ||y_k - mean y_k||``, each with its own coefficients at that delay (45).
     Those come from the filter next to it, first from the widest band to the narrowest and then back, the cheaper kept;
-    the filter of widest band starts from least squares. Gauss-Newton steps are no longer than half the shortest
-    period. Estimates end on the unfiltered data: Gauss-Newton on the delay, then on all parameters together.
+    the filter of widest band starts from least squares. A path starts from these coefficients, and a second time from
+    least squares. Gauss-Newton steps are no longer than half the range of the delay; the publication limits them, but
+    not by how much, and short steps end in the small bumps of the costs far from the minimum. Estimates end on the
+    unfiltered data: Gauss-Newton on the delay, then on all parameters together, from the minimum of J0 and from the
+    candidate of the last round that the filter of widest band likes best, the lower cost kept.
 
     The search fails where no filter's path leads to a lower J0; :func:`~ctid_cli.filtering.check_filters` says for
     which initial errors a set of filters can be trusted.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +12,8 @@ from ctid_cli.errors import UsageError
 from ctid_cli.estimators import Start
 from ctid_cli.estimators.delay_search import Minimum
 from ctid_cli.estimators.filtered_costs import FilteredCost
-from ctid_cli.estimators.useful_redundancy import PreparedUsefulRedundancy, RedundantFit, UsefulRedundancy
+from ctid_cli.estimators.useful_redundancy import NOTHING, PreparedUsefulRedundancy, RedundantFit, UsefulRedundancy
+from ctid_cli.experiment.dataset import DataSet
 from ctid_cli.experiment.plan import build_plan
 from ctid_cli.experiment.spec import load_spec
 from ctid_cli.reporting.study import data_folder, load_study
@@ -22,8 +23,6 @@ Array = NDArray[np.float64]
 
 #: How often the delays are gone through, up and down in turn: more does not lower the costs visibly.
 SWEEPS = 2
-#: Cost of a filter in which nothing can be computed [%].
-NOTHING = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +59,8 @@ class Landscape:
         Least costs over the coefficients that were found [%], of the filter of longest period first.
     evaluated : ndarray, shape (N,)
         J0 as the search evaluates it [%].
+    true_delay : float
+        True delay [s].
     fit : RedundantFit
         The estimate.
     legs : tuple of Leg
@@ -69,6 +70,7 @@ class Landscape:
     delays: Array
     members: Array
     evaluated: Array
+    true_delay: float
     fit: RedundantFit
     legs: tuple[Leg, ...]
 
@@ -86,7 +88,7 @@ class Landscape:
 
 def published_search(
     experiment: str, snr_db: float, noise: bool, otherwise: UsefulRedundancy
-) -> tuple[UsefulRedundancy, Record]:
+) -> tuple[UsefulRedundancy, DataSet]:
     """Estimator and first data set of an experiment of the useful-redundancy study.
 
     Parameters
@@ -102,13 +104,13 @@ def published_search(
 
     Returns
     -------
-    (UsefulRedundancy, Record)
+    (UsefulRedundancy, DataSet)
         The estimator, and the data set, made anew from its seed.
 
     Raises
     ------
     UsageError
-        If there is no specification of the experiment to be found.
+        If there is no specification of the experiment to be found, or none with this SNR.
     """
     file = data_folder("configs") / load_study().experiments[experiment].config
     if not file.is_file():
@@ -117,16 +119,20 @@ def published_search(
             "package does not carry; run ctid figure in a checkout of the repository"
         )
     plan = build_plan(load_spec(file))
-    record = next(cell for cell in plan.data_cells if cell.swept.get("snr_db") == snr_db).dataset(0).record
+    cells = [cell for cell in plan.data_cells if cell.swept.get("snr_db") == snr_db]
+    if not cells:
+        raise UsageError(f"{file}: this figure shows a data set of SNR {snr_db:g} dB; add that to noise.snr_db")
+    data_set = cells[0].dataset(0)
     if not noise:
+        record = data_set.record
         assert record.noise_free is not None
-        record = Record(record.t, record.noise_free, record.input)
+        data_set = replace(data_set, record=Record(record.t, record.noise_free, record.input))
     named = [cell.estimator for cell in plan.estimators if cell.name == "proposed"]
-    return next((item for item in named if isinstance(item, UsefulRedundancy)), otherwise), record
+    return next((item for item in named if isinstance(item, UsefulRedundancy)), otherwise), data_set
 
 
 def landscape(
-    estimator: UsefulRedundancy, record: Record, delays: ArrayLike, initial_delay: float, sweeps: int = SWEEPS
+    estimator: UsefulRedundancy, data_set: DataSet, delays: ArrayLike, initial_delay: float, sweeps: int = SWEEPS
 ) -> Landscape:
     """Costs over the delay, and the search from one initial delay.
 
@@ -134,8 +140,8 @@ def landscape(
     ----------
     estimator : UsefulRedundancy
         The estimator.
-    record : Record
-        The record.
+    data_set : DataSet
+        The record and its true delay.
     delays : array_like, shape (N,)
         Delays [s], rising.
     initial_delay : float
@@ -155,18 +161,20 @@ def landscape(
     filter are tried at the next one and for its neighbours.
     """
     grid = np.asarray(delays, dtype=float)
-    prepared = estimator.prepare(record)
+    prepared = estimator.prepare(data_set.record)
+    assert data_set.true_model is not None
     fit = prepared.fit(Start(delay=initial_delay))
     return Landscape(
         delays=grid,
         members=_least_costs(prepared.costs, grid, sweeps),
         evaluated=np.array([prepared.reference_cost(delay) for delay in grid]),
+        true_delay=data_set.true_model.delay,
         fit=fit,
         legs=_legs(prepared, fit),
     )
 
 
-def _least_costs(costs: list[FilteredCost], delays: Array, sweeps: int) -> Array:
+def _least_costs(costs: Sequence[FilteredCost], delays: Array, sweeps: int) -> Array:
     count = len(costs)
     best: list[list[Minimum | None]] = [[None] * count for _ in delays]
     for sweep in range(sweeps):
@@ -200,7 +208,7 @@ def _least_costs(costs: list[FilteredCost], delays: Array, sweeps: int) -> Array
 def _legs(prepared: PreparedUsefulRedundancy, fit: RedundantFit) -> tuple[Leg, ...]:
     assert fit.search is not None
     legs = []
-    for _, visit in pairwise(fit.search.trajectory):
+    for visit in fit.search.trajectory[1:]:
         path = next(
             path
             for path in fit.paths

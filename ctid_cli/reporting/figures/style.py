@@ -24,7 +24,7 @@ _STYLE: dict[Any, Any] = {
     "svg.hashsalt": "ctid",
     "font.size": 9.0,
     "axes.titlesize": 9.0,
-    "figure.titlesize": 10.0,
+    "figure.titlesize": 9.5,
     "legend.fontsize": 8.0,
     "axes.grid": True,
     "grid.color": "#eeeeee",

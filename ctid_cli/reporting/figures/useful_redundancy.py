@@ -7,11 +7,11 @@ estimation for continuous-time models" (arXiv:1703.09344).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
 from ctid_cli.filtering import FilterSet, check_filters, convergence_region, extrema, ideal_cost
 from ctid_cli.reporting.figures.redundant_search import Landscape, landscape, published_search
+from ctid_cli.reporting.figures.search_plot import costs_svg, trajectory_svg
 from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, ramp, spread, svg
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-TRUE_DELAY = 8.0
+#: SNR of the data sets that are drawn [dB].
 SNR = 15.0
 
 
@@ -45,7 +46,9 @@ class Case:
     interval : float
         Distance of the delays at which costs are drawn [s].
     detail : (float, float)
-        Delays [s] that are drawn again in detail, at ten times as many points.
+        Delays [s] that are drawn again in detail.
+    sweeps : int
+        How often to go through the delays for the least costs.
     """
 
     number: int
@@ -53,6 +56,7 @@ class Case:
     published: UsefulRedundancy
     interval: float
     detail: tuple[float, float]
+    sweeps: int
 
     @property
     def delays(self) -> Array:
@@ -68,6 +72,7 @@ CASE_1 = Case(
     published=UsefulRedundancy(2, 0, delay_bounds=(0, 15), bandwidth=2.02, filters=10, svf_cutoff=1.0),
     interval=0.05,
     detail=(7.4, 9.0),
+    sweeps=4,
 )
 CASE_2 = Case(
     number=2,
@@ -75,6 +80,7 @@ CASE_2 = Case(
     published=UsefulRedundancy(4, 1, delay_bounds=(0, 15), bandwidth=26.85, filters=15, svf_cutoff=25.0),
     interval=0.04,
     detail=(7.9, 8.1),
+    sweeps=2,
 )
 
 
@@ -114,7 +120,7 @@ def figure_1() -> bytes:
         axes.set_xlim(-largest, largest)
         axes.set_ylim(bottom=0.0)
         axes.legend(loc="lower left", frameon=True)
-        axes.set_title(
+        figure.suptitle(
             r"Ideal low-pass filter, $\omega_c = 2\pi$ rad/s: cost of a delay error, equation (50) "
             "(white input of unit intensity, no noise)"
         )
@@ -175,11 +181,9 @@ def figure_2() -> bytes:
         for low, high in check.gaps:
             below.axvspan(low, high, facecolor="none", edgecolor="black", hatch="//////", linewidth=0.6)
             below.annotate(
-                f"gap, {low:.2f} to {high:.2f} s: no filter",
-                (0.5 * (low + high), 6.55),
-                (-24, 10),
-                textcoords="offset points",
-                ha="right",
+                f"gap, {low:.2f} to\n{high:.2f} s: no filter\nleads closer",
+                (high, 3.5),
+                (largest + 0.15, 3.5),
                 va="center",
                 fontsize=8,
                 annotation_clip=False,
@@ -239,7 +243,8 @@ def figure_4() -> bytes:
     bytes
         An SVG file.
     """
-    return trajectory_svg(_computed(CASE_1, noise=False), CASE_1, "Case 1 without noise: $J_0$ and the minimum path")
+    title = "Case 1 without noise: $J_0$ and the minimum path"
+    return trajectory_svg(_computed(CASE_1, noise=False), title, CASE_1.detail)
 
 
 def figure_5() -> bytes:
@@ -280,173 +285,13 @@ def figure_7() -> bytes:
 
 def _data_set(case: Case) -> bytes:
     title = f"Case {case.number}, one data set, regular sampling, SNR {SNR:g} dB: $J_0$ and the delay estimate"
-    return trajectory_svg(_computed(case, noise=True), case, title)
+    return trajectory_svg(_computed(case, noise=True), title, case.detail)
 
 
 @cache
 def _computed(case: Case, noise: bool) -> Landscape:
-    estimator, record = published_search(case.experiment, SNR, noise, case.published)
-    return landscape(estimator, record, case.delays, initial_delay=0.0)
-
-
-def costs_svg(result: Landscape, title: str) -> bytes:
-    """Costs of all filters over the delay.
-
-    Parameters
-    ----------
-    result : Landscape
-        The costs.
-    title : str
-        What they belong to.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
-    delays, members = result.delays, result.members
-    lines = ramp(members.shape[1])
-    top = 1.03 * float(members.max())
-
-    def draw(figure: Figure) -> None:
-        axes = figure.add_subplot()
-        _draw_true_delay(axes)
-        for k, line in enumerate(lines):
-            axes.plot(delays, members[:, k], linewidth=1.1, **line)
-        for k, place in enumerate(spread(members[-1], 0.052 * top)):
-            color = lines[k]["color"]
-            axes.annotate(
-                f"{k + 1}: {result.cutoffs[k]:.3g} rad/s",
-                (delays[-1], members[-1, k]),
-                (delays[-1] + 0.35, place),
-                va="center",
-                fontsize=8,
-                color=color,
-                annotation_clip=False,
-                arrowprops={"arrowstyle": "-", "linewidth": 0.5, "color": color, "shrinkA": 0, "shrinkB": 0},
-            )
-        axes.text(TRUE_DELAY - 0.1, 0.97 * top, "true delay", ha="right", va="top", fontsize=8, color=MIDDLE)
-        axes.set_xlim(delays[0], delays[-1])
-        axes.set_ylim(0.0, top)
-        axes.set_xlabel(r"delay $\hat\tau$ [s]")
-        axes.set_ylabel(r"cost $100\,\|y_k - \hat x_k\| \,/\, \|y_k - \mathrm{mean}\,y_k\|$ [%]")
-        axes.set_title(title)
-
-    return svg(7.5, 4.0, draw)
-
-
-def trajectory_svg(result: Landscape, case: Case, title: str) -> bytes:
-    """J0 over the delay, and the way of the delay estimate with the filters that it used.
-
-    Parameters
-    ----------
-    result : Landscape
-        Costs and search.
-    case : Case
-        Says what to draw in detail.
-    title : str
-        What it shows.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
-    whole = (float(result.delays[0]) - 0.2, float(result.delays[-1]))
-
-    def draw(figure: Figure) -> None:
-        panels = figure.subplots(2, 2, width_ratios=[1.9, 1], height_ratios=[1.6, 1])
-        for (cost, used), (low, high) in zip(panels.T, (whole, case.detail), strict=True):
-            _draw_reference(cost, result, low, high)
-            _draw_filters(used, result)
-            for axes in (cost, used):
-                _draw_true_delay(axes)
-                axes.set_xlim(low, high)
-            cost.tick_params(labelbottom=False)
-            used.set_xlabel(r"delay $\hat\tau$ [s]")
-        panels[0, 0].set_ylabel("cost $J_0$ [%]")
-        panels[1, 0].set_ylabel("filter of the path")
-        panels[0, 1].set_title("around the true delay, 8 s", loc="left")
-        _name_filters(panels[1, 0], result)
-        count = sum(leg.switched for leg in result.legs)
-        switches = {0: "no switch of the filter", 1: "one switch of the filter"}.get(count, f"{count} switches")
-        figure.suptitle(
-            f"{title}\nfrom {result.legs[0].delays[0]:g} s, {switches}; search ends at "
-            f"{result.legs[-1].delays[-1]:.4f} s, refinement on unfiltered data at {result.fit.model.delay:.4f} s"
-        )
-        figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
-
-    return svg(7.5, 5.6, draw)
-
-
-def _draw_true_delay(axes: Any) -> None:
-    axes.axvline(TRUE_DELAY, color=MIDDLE, linewidth=0.8, zorder=0.9)
-
-
-def _draw_reference(axes: Any, result: Landscape, low: float, high: float) -> None:
-    delays, least = result.delays, result.reference
-    axes.plot(delays, least, color=DARK, linewidth=1.4, label="$J_0$, least over the coefficients")
-    axes.plot(
-        delays,
-        result.evaluated,
-        color=LIGHT,
-        linewidth=0.8,
-        drawstyle="steps-mid",
-        zorder=1.5,
-        label="$J_0$ as the search evaluates it",
-    )
-    for k, leg in enumerate(result.legs):
-        label = None if k else "Gauss-Newton steps"
-        axes.plot(leg.delays, leg.costs, "o:", color=MARK, markersize=3.5, linewidth=0.8, label=label)
-    _draw_marks(axes, result, [leg.costs for leg in result.legs])
-    inside = (low <= delays) & (delays <= high)
-    shown = max(
-        least[inside].max(),
-        *(leg.costs[(low <= leg.delays) & (leg.delays <= high)].max(initial=0.0) for leg in result.legs),
-    )
-    axes.set_ylim(0.0, 1.25 * shown)
-
-
-def _draw_filters(axes: Any, result: Landscape) -> None:
-    count = result.members.shape[1]
-    rows = [np.full(leg.delays.size, leg.filter + 1.0) for leg in result.legs]
-    for leg, row in zip(result.legs, rows, strict=True):
-        axes.plot(leg.delays, row, "o-", color=MARK, markersize=3, linewidth=1.0)
-    for leg, before, row in zip(result.legs[1:], rows, rows[1:], strict=False):
-        axes.plot(leg.delays[[0, 0]], [before[-1], row[0]], color=MARK, linewidth=0.8, linestyle=":")
-    _draw_marks(axes, result, rows)
-    axes.set_ylim(0.4, count + 0.6)
-    axes.set_yticks(range(1, count + 1, 1 if count <= 10 else 2))
-    axes.tick_params(axis="y", labelsize=7)
-
-
-def _draw_marks(axes: Any, result: Landscape, heights: Sequence[Array]) -> None:
-    """Start and end of the way, and a star where it leaves one filter for another."""
-    axes.plot(result.legs[0].delays[:1], heights[0][:1], "s", color=MARK, markersize=5, label="start")
-    leaving = zip(result.legs[1:], heights, strict=False)
-    stars = [(leg.delays[0], before[-1]) for leg, before in leaving if leg.switched]
-    if stars:
-        axes.plot(*np.transpose(stars), "*", color=MARK, markersize=10, zorder=4, label="switch of the filter")
-    axes.plot(
-        result.legs[-1].delays[-1:],
-        heights[-1][-1:],
-        "D",
-        color="white",
-        markeredgecolor=MARK,
-        markersize=5,
-        zorder=5,
-        label="end of the search",
-    )
-
-
-def _name_filters(axes: Any, result: Landscape) -> None:
-    ends: dict[int, float] = {}
-    for leg in result.legs:
-        ends[leg.filter] = max(ends.get(leg.filter, 0.0), float(leg.delays.max()))
-    count = result.members.shape[1]
-    for k, place in zip(ends, spread([k + 1.0 for k in ends], 0.11 * count), strict=True):
-        text = f"filter {k + 1}, {result.cutoffs[k]:.3g} rad/s"
-        axes.annotate(text, (ends[k] + 0.35, place), va="center", fontsize=8)
+    estimator, data_set = published_search(case.experiment, SNR, noise, case.published)
+    return landscape(estimator, data_set, case.delays, initial_delay=0.0, sweeps=case.sweeps)
 
 
 FIGURES: Mapping[str, Callable[[], bytes]] = {

@@ -1,0 +1,45 @@
+"""``ctid figure``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ctid_cli.cli._common import Out, guarded
+
+
+@guarded
+def figure(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME]...", help="Figure (2, useful-redundancy/2) or study (useful-redundancy)."),
+    ] = None,
+    out: Out = Path("results"),
+    file: Annotated[
+        Path | None, typer.Option("--file", metavar="FILE", help="Where a single figure goes instead.")
+    ] = None,
+) -> None:
+    """Draw figures of a study as SVG files.
+
+    They are computed from the study's specifications and need no results. Each goes to
+    OUT/<study>_figures/figure_<number>.svg, and its path is printed.
+
+    Without a name: all figures of the useful-redundancy study.
+    """
+    from ctid_cli.errors import StorageError, UsageError
+    from ctid_cli.reporting.figures.registry import find_figures
+
+    figures = find_figures(names or [])
+    if file is not None and len(figures) != 1:
+        raise UsageError(f"--file takes one figure, not {len(figures)}; --out names the folder of several")
+    for item in figures:
+        path = out / item.place if file is None else file
+        content = item.svg()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        except OSError as error:
+            raise StorageError(f"{path} cannot be written: {error.strerror or error}") from error
+        typer.echo(path)

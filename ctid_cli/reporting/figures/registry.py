@@ -1,0 +1,95 @@
+"""Which figures there are, by name: ``useful-redundancy/2``, or ``2`` for short."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ctid_cli.errors import UsageError
+from ctid_cli.reporting.figures import useful_redundancy
+from ctid_cli.reporting.study import DEFAULT_STUDY
+
+#: Figures of every study: number, and what draws it as an SVG file.
+STUDIES: Mapping[str, Mapping[str, Callable[[], bytes]]] = {"useful-redundancy": useful_redundancy.FIGURES}
+
+
+@dataclass(frozen=True)
+class StudyFigure:
+    """A figure that can be drawn.
+
+    Parameters
+    ----------
+    study : str
+        Its study.
+    number : str
+        Its number there.
+    """
+
+    study: str
+    number: str
+
+    @property
+    def place(self) -> Path:
+        """Its file, relative to the results folder."""
+        return Path(f"{self.study.replace('-', '_')}_figures") / f"figure_{self.number}.svg"
+
+    def svg(self) -> bytes:
+        """Draw it.
+
+        Returns
+        -------
+        bytes
+            An SVG file.
+        """
+        return STUDIES[self.study][self.number]()
+
+
+def find_figures(names: Sequence[str]) -> list[StudyFigure]:
+    """The figures that were asked for.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Figures (``2``, ``useful-redundancy/2``) or studies; none means the whole default study.
+
+    Returns
+    -------
+    list of StudyFigure
+        In the order asked for, none twice.
+
+    Raises
+    ------
+    UsageError
+        If a name is neither a figure nor a study with figures.
+
+    Examples
+    --------
+    >>> [str(figure.place) for figure in find_figures(["2"])]
+    ['useful_redundancy_figures/figure_2.svg']
+    """
+    found: list[StudyFigure] = []
+    for name in names or [DEFAULT_STUDY]:
+        study, _, number = name.rpartition("/")
+        study = study or DEFAULT_STUDY
+        if name in STUDIES:
+            found += [StudyFigure(name, number) for number in STUDIES[name]]
+        elif number in STUDIES.get(study, {}):
+            found.append(StudyFigure(study, number))
+        elif study in STUDIES and number.isdigit():
+            raise UsageError(f"{study} has no figure {number}; it has {', '.join(STUDIES[study])}")
+        else:
+            raise UsageError(_unknown(name))
+    return list(dict.fromkeys(found))
+
+
+def _unknown(name: str) -> str:
+    known = [*STUDIES[DEFAULT_STUDY], *(entry for study in STUDIES for entry in _names(study))]
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else "."
+    return f"{name!r} is neither a figure nor a study with figures{hint} Known: {', '.join(known)}"
+
+
+def _names(study: str) -> list[str]:
+    return [study, *(f"{study}/{number}" for number in STUDIES[study])]

@@ -1,0 +1,185 @@
+"""Drawings of a search by useful redundancy: the costs of its filters, and J0 with the way of the delay estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.reporting.figures.redundant_search import Landscape
+from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, ramp, spread, svg
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+
+def costs_svg(result: Landscape, title: str) -> bytes:
+    """Costs of all filters over the delay.
+
+    Parameters
+    ----------
+    result : Landscape
+        The costs.
+    title : str
+        What they belong to.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    delays, members = result.delays, result.members
+    lines = ramp(members.shape[1])
+    top = 1.03 * float(members.max())
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        _draw_true_delay(axes, result)
+        for k, line in enumerate(lines):
+            axes.plot(delays, members[:, k], linewidth=1.1, **line)
+        for k, place in enumerate(spread(members[-1], 0.052 * top)):
+            color = lines[k]["color"]
+            axes.annotate(
+                f"{k + 1}: {result.cutoffs[k]:.3g} rad/s",
+                (delays[-1], members[-1, k]),
+                (delays[-1] + 0.35, place),
+                va="center",
+                fontsize=8,
+                color=color,
+                annotation_clip=False,
+                arrowprops={"arrowstyle": "-", "linewidth": 0.5, "color": color, "shrinkA": 0, "shrinkB": 0},
+            )
+        axes.text(result.true_delay - 0.1, 0.97 * top, "true delay", ha="right", va="top", fontsize=8, color=MIDDLE)
+        axes.set_xlim(delays[0], delays[-1])
+        axes.set_ylim(0.0, top)
+        axes.set_xlabel(r"delay $\hat\tau$ [s]")
+        axes.set_ylabel(r"cost $100\,\|y_k - \hat x_k\| \,/\, \|y_k - \mathrm{mean}\,y_k\|$ [%]")
+        figure.suptitle(title)
+
+    return svg(7.5, 4.0, draw)
+
+
+def trajectory_svg(result: Landscape, title: str, detail: tuple[float, float]) -> bytes:
+    """J0 over the delay, and the way of the delay estimate with the filters that it used.
+
+    Parameters
+    ----------
+    result : Landscape
+        Costs and search.
+    title : str
+        What it shows.
+    detail : (float, float)
+        Delays [s] that are drawn again in detail.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    whole = (float(result.delays[0]) - 0.2, float(result.delays[-1]))
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(2, 2, width_ratios=[1.9, 1], height_ratios=[1.6, 1])
+        for (cost, used), (low, high) in zip(panels.T, (whole, detail), strict=True):
+            _draw_reference(cost, result, low, high)
+            _draw_filters(used, result)
+            for axes in (cost, used):
+                _draw_true_delay(axes, result)
+                axes.set_xlim(low, high)
+            cost.tick_params(labelbottom=False)
+            used.set_xlabel(r"delay $\hat\tau$ [s]")
+        panels[0, 0].set_ylabel("cost $J_0$ [%]")
+        panels[1, 0].set_ylabel("filter of the path")
+        panels[0, 1].set_title(f"around the true delay, {result.true_delay:g} s", loc="left")
+        _name_filters(panels[1, 0], result)
+        count = sum(leg.switched for leg in result.legs)
+        switches = {0: "no switch", 1: "one switch"}.get(count, f"{count} switches")
+        figure.suptitle(
+            f"{title}\nsearch from {result.legs[0].delays[0]:g} s: {switches}, ends at "
+            f"{result.legs[-1].delays[-1]:.4f} s; refined on unfiltered data: {result.fit.model.delay:.4f} s"
+        )
+        handles, labels = (
+            a + b for a, b in zip(*(axes.get_legend_handles_labels() for axes in panels[:, 0]), strict=True)
+        )
+        figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+
+    return svg(7.5, 5.6, draw)
+
+
+def _draw_true_delay(axes: Any, result: Landscape) -> None:
+    axes.axvline(result.true_delay, color=MIDDLE, linewidth=0.8, zorder=0.9)
+
+
+def _draw_reference(axes: Any, result: Landscape, low: float, high: float) -> None:
+    delays, least = result.delays, result.reference
+    axes.plot(delays, least, color=DARK, linewidth=1.4, label="$J_0$, least over the coefficients")
+    axes.plot(
+        delays,
+        result.evaluated,
+        color=LIGHT,
+        linewidth=0.8,
+        drawstyle="steps-mid",
+        zorder=1.5,
+        label="$J_0$ as the search evaluates it",
+    )
+    for k, leg in enumerate(result.legs):
+        label = None if k else "Gauss-Newton steps"
+        axes.plot(leg.delays, leg.costs, "o:", color=MARK, markersize=3.5, linewidth=0.8, label=label)
+    _draw_marks(axes, result, [leg.costs for leg in result.legs])
+    if low <= delays[0] and delays[-1] <= high:
+        axes.set_ylim(0.0, 1.05 * max(least.max(), result.evaluated.max()))
+        return
+    inside = (low <= delays) & (delays <= high)
+    axes.set_ylim(0.0, 1.25 * least[inside].max())
+
+
+def _draw_filters(axes: Any, result: Landscape) -> None:
+    count = result.members.shape[1]
+    label: str | None = "end of a path not taken"
+    for path in result.fit.paths:
+        # Nothing came of the last round, or nothing that is not on the way.
+        if path.round <= len(result.legs) and not any(path.delays is leg.delays for leg in result.legs):
+            axes.plot(path.delays, np.full(path.delays.size, path.filter + 1.0), "-", color=LIGHT, linewidth=0.7)
+            axes.plot(path.delays[-1:], [path.filter + 1.0], "|", color=MIDDLE, markersize=5, label=label)
+            label = None
+    rows = [np.full(leg.delays.size, leg.filter + 1.0) for leg in result.legs]
+    for leg, row in zip(result.legs, rows, strict=True):
+        axes.plot(leg.delays, row, "o-", color=MARK, markersize=3, linewidth=1.0)
+    for leg, before, row in zip(result.legs[1:], rows, rows[1:], strict=False):
+        axes.plot(leg.delays[[0, 0]], [before[-1], row[0]], color=MARK, linewidth=0.8, linestyle=":")
+    _draw_marks(axes, result, rows, named=False)
+    axes.grid(False, axis="y")
+    axes.set_ylim(0.4, count + 0.6)
+    axes.set_yticks(range(1, count + 1, 1 if count <= 10 else 2))
+    axes.tick_params(axis="y", labelsize=7)
+
+
+def _draw_marks(axes: Any, result: Landscape, heights: Sequence[Array], named: bool = True) -> None:
+    """Start and end of the way, and a star where it leaves one filter for another."""
+    first, last = result.legs[0], result.legs[-1]
+    leaving = zip(result.legs[1:], heights, strict=False)
+    stars = [(leg.delays[0], before[-1]) for leg, before in leaving if leg.switched]
+    for name, places, style in (
+        ("start", [(first.delays[0], heights[0][0])], {"marker": "s", "markersize": 5}),
+        ("switch", stars, {"marker": "*", "markersize": 10, "zorder": 4}),
+        (
+            "end of the search",
+            [(last.delays[-1], heights[-1][-1])],
+            {"marker": "D", "markersize": 5, "markerfacecolor": "white", "zorder": 5},
+        ),
+    ):
+        if places:
+            axes.plot(*np.transpose(places), linestyle="", color=MARK, label=name if named else None, **style)
+
+
+def _name_filters(axes: Any, result: Landscape) -> None:
+    rightmost = max(float(leg.delays.max()) for leg in result.legs)
+    used = sorted({leg.filter for leg in result.legs})
+    box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
+    for k, row in zip(used, spread([k + 1.0 for k in used], 0.11 * result.members.shape[1]), strict=True):
+        text = f"filter {k + 1}, {result.cutoffs[k]:.3g} rad/s"
+        axes.text(rightmost + 0.35, row, text, va="center", fontsize=8, bbox=box, zorder=2.2)
