@@ -110,6 +110,7 @@ def descend(
     max_iterations: int,
     tolerance: float,
     largest_step: float = np.inf,
+    reflect: bool = False,
     on_step: Callable[[Minimum], None] | None = None,
 ) -> Descent | None:
     """Gauss-Newton on the delay from one start.
@@ -130,6 +131,9 @@ def descend(
         Stop when a step lowers the cost by less than this fraction.
     largest_step : float, optional
         Longest step [s]; longer ones are shortened to it.
+    reflect : bool, default False
+        Whether a step that leaves the bounds is mirrored at the bound in the place of being halved: from a start on a
+        bound no step of the wrong sign can be halved into the range.
     on_step : callable, optional
         Called with the minimum at the start and after every accepted step.
 
@@ -140,8 +144,8 @@ def descend(
 
     Notes
     -----
-    A step is halved while it leaves the bounds or does not lower the cost, and the search ends where that makes it
-    shorter than 1e-5 of the range of the delay.
+    A step is halved while it leaves the bounds (unless it is mirrored) or does not lower the cost, and the search ends
+    where that makes it shorter than 1e-5 of the range of the delay.
     """
     low, high = bounds
     smallest = SMALLEST_STEP * (high - low)
@@ -158,11 +162,15 @@ def descend(
             step = largest_step if step > 0 else -largest_step
         accepted = None
         while accepted is None:
-            while not low <= current.delay + step <= high:
+            target = current.delay + step
+            if reflect and not low <= target <= high:
+                target = 2.0 * (low if target < low else high) - target
+            while not low <= target <= high:
                 step *= 0.5
+                target = current.delay + step
             if abs(step) <= smallest:
                 return Descent(current, Status.CONVERGED, iteration)
-            trial = cost.minimise(current.delay + step, current.theta)
+            trial = cost.minimise(target, current.theta)
             if trial is not None and trial.squared_error < current.squared_error:
                 accepted = trial
             else:

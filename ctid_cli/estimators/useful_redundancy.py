@@ -27,8 +27,9 @@ Array = NDArray[np.float64]
 #: J0 is evaluated on a lattice of delays of this fraction of the shortest period, so that candidates that agree share
 #: it, and so do searches of the same data from different initial delays.
 LATTICE = 0.05
-#: The longest Gauss-Newton step, as a fraction of the range of the delay.
-LARGEST_STEP = 0.5
+#: The longest Gauss-Newton step, as a fraction of the range of the delay: from a fifth to four fifths all serve, with a
+#: tenth the paths end in small bumps far from the minimum.
+LARGEST_STEP = 1 / 3
 #: J0 of a filter in which nothing can be computed [%].
 NOTHING = 100.0
 
@@ -131,10 +132,10 @@ class UsefulRedundancy:
     over the filters of ``100 ||y_k - x_k|| / ||y_k - mean y_k||``, each with its own coefficients at that delay (45).
     Those come from the filter next to it, first from the widest band to the narrowest and then back, the cheaper kept;
     the filter of widest band starts from least squares. A path starts from these coefficients, and a second time from
-    least squares. Gauss-Newton steps are no longer than half the range of the delay; the publication limits them, but
-    not by how much, and short steps end in the small bumps of the costs far from the minimum. Estimates end on the
-    unfiltered data: Gauss-Newton on the delay, then on all parameters together, from the minimum of J0 and from the
-    candidate of the last round that the filter of widest band likes best, the lower cost kept.
+    least squares. Gauss-Newton steps are no longer than a third of the range of the delay; the publication limits
+    them, but not by how much. One that leaves the range is mirrored at its end. Estimates end on the unfiltered data:
+    Gauss-Newton on the delay, then on all parameters together, from the minimum of J0 and from the candidate of the
+    last round that the filter of widest band likes best, the lower cost kept.
 
     The search fails where no filter's path leads to a lower J0; :func:`~ctid_cli.filtering.check_filters` says for
     which initial errors a set of filters can be trusted.
@@ -410,6 +411,7 @@ class PreparedUsefulRedundancy:
                     max_iterations=self.options.max_iterations,
                     tolerance=self.options.tolerance,
                     largest_step=LARGEST_STEP * (high - low),
+                    reflect=True,
                     on_step=steps.append,
                 )
                 if found is not None:

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators import Lowpass, Srivc, Svf, TdSrivc
+from ctid_cli.estimators import Lowpass, Srivc, Svf, TdSrivc, UsefulRedundancy
 from ctid_cli.signals import HeldSignal, Record
 from tests.estimators.records import make_record
 
 TD = {"delay_bounds": (0, 2)}
-ESTIMATORS = [(Svf, {}), (Srivc, {}), (TdSrivc, TD)]
-NAMES = ["svf", "srivc", "td_srivc"]
+ESTIMATORS = [(Svf, {}), (Srivc, {}), (TdSrivc, TD), (UsefulRedundancy, TD)]
+NAMES = ["svf", "srivc", "td_srivc", "useful_redundancy"]
 
 
 @pytest.mark.parametrize(("estimator", "more"), ESTIMATORS, ids=NAMES)
@@ -43,12 +43,17 @@ def test_impossible_options_are_refused(estimator, more, options, message):
         ({"tolerance": 0.0}, "tolerance must lie between 0 and 1, not 0.0"),
         ({"tolerance": 1.0}, "tolerance must lie between 0 and 1, not 1.0"),
         ({"tolerance": np.nan}, "tolerance must lie between 0 and 1, not nan"),
-        ({"variant": "guardd"}, "variant must be .*'guarded'.*'guardd'"),
     ],
 )
 def test_impossible_iterations_are_refused(estimator, more, options, message):
     with pytest.raises(ValueError, match=message):
         estimator(**{"poles": 2, "zeros": 0, **more, **options})
+
+
+@pytest.mark.parametrize(("estimator", "more"), [(Srivc, {}), (TdSrivc, TD)])
+def test_unknown_variants_are_refused(estimator, more):
+    with pytest.raises(ValueError, match=r"variant must be .*'guarded'.*'guardd'"):
+        estimator(2, 0, **more, variant="guardd")
 
 
 @pytest.mark.parametrize("estimator", [Svf, Srivc])
@@ -61,9 +66,10 @@ def test_impossible_delays_are_refused(estimator, delay):
 @pytest.mark.parametrize(
     "bounds", [(3, 2), (2, 2), (-1, 2), (0, np.inf), (0, np.nan), (np.nan, 2), (0, 1, 2), (1,), 3.0]
 )
-def test_impossible_delay_bounds_are_refused(bounds):
+@pytest.mark.parametrize("estimator", [TdSrivc, UsefulRedundancy])
+def test_impossible_delay_bounds_are_refused(estimator, bounds):
     with pytest.raises(ValueError, match="delay_bounds must be two delays in seconds"):
-        TdSrivc(2, 0, bounds)
+        estimator(2, 0, bounds)
 
 
 def record_of(t, u, y):
@@ -95,11 +101,12 @@ def test_delay_beyond_the_record_leaves_no_samples(estimator):
         estimator(2, 0, delay=50.0).fit(record_of(T, U, Y))
 
 
-def test_delay_bounds_beyond_the_record_are_refused():
+@pytest.mark.parametrize("estimator", [TdSrivc, UsefulRedundancy])
+def test_delay_bounds_beyond_the_record_are_refused(estimator):
     with pytest.raises(DataError, match=r"motor.csv: the greatest delay, 15 s, is not shorter than the record, 9.9 s"):
-        TdSrivc(2, 0, (0, 15)).fit(record_of(T, U, Y))
+        estimator(2, 0, (0, 15)).fit(record_of(T, U, Y))
     with pytest.raises(DataError, match=r"usable samples for 4 parameters"):
-        TdSrivc(2, 0, (0, 9.7)).fit(record_of(T, U, Y))
+        estimator(2, 0, (0, 9.7)).fit(record_of(T, U, Y))
 
 
 def test_lowpass_beyond_the_clock_is_refused():

@@ -90,3 +90,101 @@ def test_cutoff_beyond_the_clock_is_refused():
 def test_impossible_filters_are_refused(cutoff, order, message):
     with pytest.raises(ValueError, match=message):
         Lowpass(cutoff, order)
+
+
+# Filtered and resampled -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+@pytest.mark.parametrize("order", [1, 4, 10])
+def test_resampled_signals_are_those_of_the_analogue_filter(order, hold):
+    # scipy's exact discretisations of the filter, on the clock of the record, at every fourth sample.
+    r, per_period = record(hold), 6.0
+    cutoff = 2 * np.pi / (per_period * 4 * 0.05)
+    model = Lowpass(cutoff, order).model
+    resampled = Lowpass(cutoff, order).resample(r, per_period)
+    np.testing.assert_allclose(resampled.t, r.t[::4], atol=1e-9)
+    np.testing.assert_allclose(resampled.input.t, resampled.t, rtol=0)
+    assert (resampled.input.hold, resampled.interval) == ("foh", pytest.approx(0.2, rel=1e-9))
+    state_space = signal.tf2ss(model.numerator, model.denominator)
+    for values, kind, found in ((r.input.values, hold, resampled.input.values), (r.y, "foh", resampled.y)):
+        a, b, c, d, _ = signal.cont2discrete(state_space, 0.05, kind)
+        _, expected, _ = signal.dlsim((a, b, c, d, 0.05), values)
+        np.testing.assert_allclose(found, expected[::4, 0], atol=1e-8 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("cutoff", [0.3, 2.0, 20.0])
+def test_resampling_takes_irregular_records_and_their_own_breaks(cutoff):
+    # The input keeps its own clock until it is filtered: the exact response at the new instants.
+    rng = np.random.default_rng(1)
+    t = np.cumsum(rng.uniform(0.01, 0.09, 800)) + 3.0
+    breaks = np.arange(1.3, t[-1], 0.37)
+    held = HeldSignal(breaks, rng.standard_normal(breaks.size))
+    r = Record(t, simulate(CASE_1, held, t), held)
+    lowpass = Lowpass(cutoff, 4)
+    resampled = lowpass.resample(r)
+    assert resampled.t[0] == 1.3  # what happens first, input or output
+    assert t[-1] - resampled.interval < resampled.t[-1] <= t[-1] + 1e-9
+    assert resampled.input_on_grid
+    np.testing.assert_array_equal(resampled.input.values, simulate(lowpass.model, held, resampled.t))
+    # Before the output begins there is nothing to compare with.
+    assert np.array_equal(resampled.valid, resampled.t >= t[0])
+
+
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize("cutoff", [1.0, 20.0, 40.0, 62.0, 70.0, 1e4])
+def test_resampling_never_adds_samples(cutoff, regular):
+    r = record(regular=regular)
+    resampled = Lowpass(cutoff, 2).resample(r)
+    assert resampled.n_samples <= r.n_samples * (1 if regular else 1.05)
+    wanted = 2 * np.pi / (6 * cutoff)
+    assert resampled.interval == pytest.approx(max(wanted, np.median(np.diff(r.t))), rel=1e-9)
+
+
+def test_more_samples_per_period_are_more_samples():
+    r = record()
+    for per_period in (4.0, 6.0, 12.0, 40.0):
+        assert Lowpass(0.9, 2).resample(r, per_period).interval == pytest.approx(2 * np.pi / (0.9 * per_period))
+
+
+@pytest.mark.parametrize("regular", [True, False])
+def test_resampled_holes_stay_masked_and_the_record_unchanged(regular):
+    r = record(regular=regular)
+    y = r.y.copy()
+    first, last = 400, 460
+    y[first : last + 1] = np.nan
+    y[-3:] = np.nan
+    masked = Record(r.t, y, r.input, name="a record")
+    resampled = Lowpass(5.0, 3).resample(masked)
+    # Present are exactly those that lie between (or on) two samples that are.
+    gaps = [(r.t[first - 1], r.t[last + 1]), (r.t[-4], np.inf)]
+    inside = np.any([(resampled.t > a + 1e-6) & (resampled.t < b - 1e-6) for a, b in gaps], axis=0)
+    assert inside.sum() > 10
+    assert np.array_equal(resampled.valid, ~inside)
+    # The hole is bridged by a straight line before the filter.
+    bridged = Record(r.t, np.interp(r.t, r.t[np.isfinite(y)], y[np.isfinite(y)]), r.input)
+    whole = Lowpass(5.0, 3).resample(bridged)
+    np.testing.assert_allclose(resampled.y[~inside], whole.y[~inside], rtol=1e-12)
+    assert resampled.name == "a record"
+    assert np.array_equal(masked.y, y, equal_nan=True)
+
+
+def test_origin_of_time_does_not_matter_when_resampling():
+    r = record()
+    moved = Record(r.t + 1.7e5, r.y, HeldSignal(r.t + 1.7e5, r.input.values, "zoh"))
+    one, two = Lowpass(2.0, 4).resample(r), Lowpass(2.0, 4).resample(moved)
+    np.testing.assert_allclose(two.t - 1.7e5, one.t, atol=1e-9)
+    np.testing.assert_allclose(two.y, one.y, atol=1e-7 * np.abs(one.y).max())
+    np.testing.assert_allclose(two.input.values, one.input.values, atol=1e-7 * np.abs(one.input.values).max())
+
+
+def test_straight_lines_lose_what_the_theory_says():
+    # A tone at the cut-off, 6 samples a period: the lines between them keep sinc(1/6)^2 of its amplitude, 91 %.
+    t = 0.01 * np.arange(60_000)
+    w = 2 * np.pi / (6 * 0.2)
+    tone = Record(t, np.zeros(t.size), HeldSignal(t, np.sin(w * t), "foh"))
+    resampled = Lowpass(w, 10).resample(tone)
+    fine = t[(t > 400) & (t < 400 + 300 * 1.2)]
+    basis = np.column_stack((np.sin(w * fine), np.cos(w * fine)))
+    amplitude = np.hypot(*np.linalg.lstsq(basis, resampled.input.at(fine), rcond=None)[0])
+    assert amplitude == pytest.approx(np.sinc(1 / 6) ** 2 / np.sqrt(2), rel=1e-3)

@@ -1,0 +1,423 @@
+"""Useful redundancy on whole records: from anywhere to the truth, and what the search says of itself."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators import Lowpass, Start, TdSrivc, UsefulRedundancy
+from ctid_cli.estimators.problems import CoefficientProblem
+from ctid_cli.estimators.redundancy import SearchStatus
+from ctid_cli.estimators.useful_redundancy import LATTICE
+from ctid_cli.filtering import FilterSet
+from ctid_cli.inference import Status, Structure
+from ctid_cli.models import TransferFunction
+from ctid_cli.signals import HeldSignal, Record
+from tests.estimators.records import CASE_1, CASE_2, SVF_CUTOFF, assert_same_model, make_record
+
+BOUNDS = (0.0, 15.0)
+BANDWIDTH = {CASE_1: 2.02, CASE_2: 26.85}
+FILTERS = {CASE_1: 10, CASE_2: 15}
+SEARCHES = ["time", "spectral"]
+
+
+def options(model=CASE_1, **more):
+    """The settings of the benchmark."""
+    return {
+        "poles": model.order,
+        "zeros": model.numerator.size - 1,
+        "delay_bounds": BOUNDS,
+        "bandwidth": BANDWIDTH[model],
+        "filters": FILTERS[model],
+        "svf_cutoff": SVF_CUTOFF[model],
+        **more,
+    }
+
+
+@pytest.fixture(scope="module")
+def prepared():
+    """One noisy record of the first benchmark, for tests that only read it."""
+    return UsefulRedundancy(**options()).prepare(make_record(snr_db=5, seed=5, replicate=2))
+
+
+def same(one, two):
+    """Whether two fits agree bit for bit, with their searches."""
+    return (
+        one.parameters == two.parameters
+        and one.history == two.history
+        and one.search == two.search
+        and one.covariance.tolist() == two.covariance.tolist()
+        and [(p.round, p.filter, p.delays.tolist(), p.costs.tolist(), p.coefficients.tolist()) for p in one.paths]
+        == [(p.round, p.filter, p.delays.tolist(), p.costs.tolist(), p.coefficients.tolist()) for p in two.paths]
+    )
+
+
+# To the truth -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("start", [0.0, 3.0, 9.0])
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize(("model", "search"), [(CASE_1, "time"), (CASE_1, "spectral"), (CASE_2, "time")])
+def test_noise_free_data_return_the_true_model_and_delay(model, search, regular, start):
+    record = make_record(model, regular=regular, n=2500)
+    fit = UsefulRedundancy(**options(model, search=search)).fit(record, Start(start))
+    assert fit.status is Status.CONVERGED
+    assert abs(fit.model.delay - 8.0) < 1e-6
+    assert_same_model(fit.model, model, 1e-6)
+
+
+@pytest.mark.parametrize("start", [0.0, 3.0, 9.0, 15.0, None])
+@pytest.mark.parametrize("snr_db", [5, 15])
+def test_every_start_leads_to_the_same_estimate(start, snr_db):
+    # That of the plain search from right beside the true delay.
+    record = make_record(snr_db=snr_db, regular=False)
+    fit = UsefulRedundancy(**options()).fit(record, None if start is None else Start(start))
+    near = TdSrivc(2, 0, BOUNDS).fit(record, Start(8.1))
+    assert_same_model(fit.model, near.model, 1e-6)
+    assert fit.cost == pytest.approx(near.cost, rel=1e-9)
+    np.testing.assert_allclose(list(fit.standard_errors.values()), list(near.standard_errors.values()), rtol=1e-4)
+    assert fit.count == near.count
+
+
+def test_delay_off_the_sampling_grid():
+    truth = TransferFunction(CASE_1.numerator, CASE_1.denominator, 7.98765)
+    record = make_record(truth, n=3000, clock_period=0.5)
+    assert_same_model(UsefulRedundancy(**options()).fit(record, Start(2.0)).model, truth, 1e-6)
+
+
+# Data sets on which the plain search from the same start ends in a local minimum, with every one of these filters.
+TRAPS = [
+    (CASE_1, {"seed": 5, "replicate": 2, "snr_db": 15}, 3.0, [None, Lowpass(2.02, 10)]),
+    (CASE_2, {"seed": 5, "replicate": 0, "snr_db": 15, "n": 4000}, 0.0, [None, Lowpass(2.685, 10), Lowpass(2.685, 2)]),
+]
+
+
+@pytest.mark.parametrize(("model", "data", "start", "lowpasses"), TRAPS, ids=["case 1", "case 2"])
+def test_escapes_where_one_filter_is_trapped(model, data, start, lowpasses):
+    record = make_record(model, **data)
+    degrees = (model.order, model.numerator.size - 1)
+    fit = UsefulRedundancy(**options(model)).fit(record, Start(start))
+    assert abs(fit.model.delay - 8.0) < 0.01
+    for lowpass in lowpasses:
+        single = TdSrivc(*degrees, BOUNDS, lowpass=lowpass, svf_cutoff=SVF_CUTOFF[model]).fit(record, Start(start))
+        assert abs(single.model.delay - 8.0) > 1.0
+        assert single.cost > 2 * fit.cost
+
+
+@pytest.mark.parametrize("regular", [True, False])
+def test_bandwidth_is_estimated_where_it_is_not_given(regular):
+    record = make_record(snr_db=15, regular=regular)
+    fit = UsefulRedundancy(2, 0, BOUNDS).fit(record, Start(0.0))
+    assert 1.0 < fit.filters.bandwidth < 10.0
+    assert_same_model(fit.model, UsefulRedundancy(**options()).fit(record, Start(9.0)).model, 1e-6)
+
+
+# Of the costs -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("search", SEARCHES)
+@pytest.mark.parametrize("model", [CASE_1, CASE_2])
+def test_all_costs_have_their_minimum_at_the_true_delay(model, search):
+    # Without noise, on a lattice over the bounds, fine around 8 s: within a tenth of each filter's own period. They
+    # are nearly zero there, and J0 is large everywhere else.
+    record = make_record(model, n=3000)
+    prepared = UsefulRedundancy(**options(model, search=search)).prepare(record)
+    periods, shortest = prepared.filters.periods, prepared.period
+    coarse = np.arange(0.0, 15.1, 1.0)
+    fine = 8.0 + 0.1 * shortest * np.arange(-8, 9)
+    costs = np.array([prepared.member_costs(delay) for delay in np.concatenate((coarse, fine))])
+    delays = np.concatenate((coarse, fine))
+    assert (np.abs(delays[np.argmin(costs, axis=0)] - 8.0) <= 0.1 * periods).all()
+    mean = costs.mean(axis=1)
+    assert abs(delays[np.argmin(mean)] - 8.0) <= 0.05 * shortest
+    assert (costs[delays == 8.0] < 2.0).all()
+    assert mean[delays == 8.0].max() < 1.0
+    assert mean[np.abs(delays - 8.0) > 2.5].min() > 10 * mean.min()
+
+
+def test_reference_cost_is_the_mean_of_the_members_on_a_lattice(prepared):
+    step = LATTICE * 2 * np.pi / BANDWIDTH[CASE_1]
+    for place in (3, 20, 52):
+        mean = prepared.member_costs(place * step).mean()
+        for part in (-0.49, 0.0, 0.3, 0.49):
+            assert prepared.reference_cost((place + part) * step) == pytest.approx(mean, rel=1e-9)
+        assert abs(prepared.reference_cost((place + 0.51) * step) - mean) > 1e-3 * mean
+    assert prepared.member_costs(8.0).shape == (10,)
+
+
+def test_lattice_points_beyond_a_bound_are_moved_onto_it():
+    prepared = UsefulRedundancy(**options(delay_bounds=(1.0, 9.0))).prepare(make_record(snr_db=15))
+    for bound in (1.0, 9.0):
+        assert prepared.reference_cost(bound) > 0
+    step = LATTICE * prepared.period
+    # The lattice points next to both bounds lie outside of them.
+    assert round(1.0 / step) * step < 1.0
+    assert prepared.reference_cost(1.0) == prepared.member_costs(1.0).mean()
+    assert round(9.0 / step) * step > 9.0
+    assert prepared.reference_cost(9.0) == prepared.member_costs(9.0).mean()
+
+
+def test_members_are_those_of_the_filter_set(prepared):
+    expected = FilterSet(BANDWIDTH[CASE_1], 10, 10.0, 10)
+    assert prepared.filters == expected
+    assert len(prepared.costs) == 10
+    assert prepared.period == pytest.approx(2 * np.pi / BANDWIDTH[CASE_1])
+    other = UsefulRedundancy(**options(filters=4, beta=3.0, order=5)).prepare(make_record(snr_db=15, n=2000))
+    np.testing.assert_allclose(other.filters.cutoffs, BANDWIDTH[CASE_1] / np.array([3, 7 / 3, 5 / 3, 1]))
+    assert {lowpass.order for lowpass in other.filters.lowpasses} == {5}
+
+
+# Of the search ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("search", SEARCHES)
+def test_starts_do_not_influence_one_another(search):
+    # Bit for bit, in any order, with one prepared record or one for each.
+    record = make_record(snr_db=5, seed=5, replicate=2, n=1500)
+    estimator = UsefulRedundancy(**options(search=search))
+    starts = [0.0, 9.0, 3.0]
+    alone = {start: estimator.fit(record, Start(start)) for start in starts}
+    for order in (starts, starts[::-1]):
+        prepared = estimator.prepare(record)
+        prepared.reference_cost(7.9)
+        for start in order + order[:1]:
+            assert same(prepared.fit(Start(start)), alone[start])
+
+
+@pytest.mark.parametrize("search", SEARCHES)
+@pytest.mark.parametrize(("model", "replicate", "start"), [(CASE_1, 2, 3.0), (CASE_2, 1, 0.0)])
+def test_search_tells_how_it_went(model, replicate, start, search):
+    record = make_record(model, snr_db=5, seed=5, replicate=replicate, n=4000)
+    estimator = UsefulRedundancy(**options(model, search=search))
+    prepared = estimator.prepare(record)
+    fit = prepared.fit(Start(start))
+    search, trajectory = fit.search, fit.search.trajectory
+    assert search.status.succeeded
+    # The first incumbent is the start, and every next one is better.
+    assert (trajectory[0].point, trajectory[0].round, trajectory[0].path) == (start, 0, -1)
+    costs = [visit.cost for visit in trajectory]
+    assert all(after < before for before, after in pairwise(costs))
+    assert [visit.cost for visit in search.visits] == [prepared.reference_cost(v.point) for v in search.visits]
+    assert (search.point, search.cost) == (trajectory[-1].point, trajectory[-1].cost)
+    assert min(visit.cost for visit in search.visits) == search.cost
+    # Each round follows every filter from the incumbent, and candidates are the ends of those paths.
+    incumbents = {visit.round + 1: visit.point for visit in trajectory}
+    for number in range(1, search.rounds + 1):
+        followed = [path for path in fit.paths if path.round == number]
+        candidates = [visit for visit in search.visits if visit.round == number]
+        assert [path.filter for path in followed] == [visit.path for visit in candidates]
+        assert [path.delays[-1] for path in followed] == [visit.point for visit in candidates]
+        assert set(range(FILTERS[model])) == {path.filter for path in followed}
+        assert {path.delays[0] for path in followed} == {incumbents[number]}
+    # On a path the cost of its own filter falls, and the delay stays within the bounds.
+    for path in fit.paths:
+        assert path.delays.shape == path.costs.shape
+        assert (np.diff(path.costs) < 0).all()
+        assert (path.delays >= 0).all()
+        assert (path.delays <= 15).all()
+        assert path.delays.size <= estimator.max_iterations + 1
+    # Switches are the incumbents that another filter led to than the one before.
+    on_paths = trajectory[1:]
+    assert fit.switches == search.switches
+    assert list(fit.switches) == [now for before, now in pairwise(on_paths) if now.path != before.path]
+
+
+def test_some_search_does_switch():
+    # A long way, on which one filter leads into the valley and another one on from there.
+    record = make_record(CASE_2, snr_db=5, seed=5, replicate=1, n=3000)
+    fits = [UsefulRedundancy(**options(CASE_2)).fit(record, Start(start)) for start in (0.0, 3.0)]
+    assert any(fit.switches for fit in fits)
+    assert all(abs(fit.model.delay - 8.0) < 0.01 for fit in fits)
+
+
+def test_history_leads_from_incumbent_to_incumbent(prepared):
+    # Along the paths that led there, each step with its coefficients and their mean squared error behind that filter.
+    fit = prepared.fit(Start(3.0))
+    trajectory = fit.search.trajectory
+    assert len(trajectory) > 1
+    steps = [entry for entry in fit.history if entry.stage.startswith("filter")]
+    begins = [i for i, entry in enumerate(steps) if entry.iteration == 0]
+    blocks = [steps[a:b] for a, b in pairwise([*begins, len(steps)])]
+    assert len(blocks) == len(trajectory) - 1
+    for block, (before, after) in zip(blocks, pairwise(trajectory), strict=True):
+        assert {entry.stage for entry in block} == {f"filter {after.path + 1}"}
+        assert [entry.iteration for entry in block] == list(range(len(block)))
+        assert (block[0].delay, block[-1].delay) == (before.point, after.point)
+        data = prepared.costs[after.path].data
+        for entry in block:
+            theta = np.array([*entry.denominator[1:], *entry.numerator])
+            error = CoefficientProblem(data, Structure(2, 0), entry.delay).equations(theta).squared_error
+            assert entry.cost == pytest.approx(error / data.count, rel=1e-6)
+        assert (np.diff([entry.cost for entry in block]) < 0).all()
+    stages = list(dict.fromkeys(entry.stage for entry in fit.history if entry not in steps))
+    assert stages == ["refine", "joint"]
+    assert fit.history[-1].cost == pytest.approx(fit.cost, rel=1e-12)
+    assert fit.history[-1].delay == fit.model.delay
+
+
+def test_too_few_rounds_end_the_search(prepared):
+    record = make_record(snr_db=5, seed=5, replicate=2)
+    fit = UsefulRedundancy(**options(max_rounds=1)).fit(record, Start(3.0))
+    assert (fit.search.status, fit.search.rounds) == (SearchStatus.MAX_ROUNDS, 1)
+    assert {path.round for path in fit.paths} == {1}
+    longer = prepared.fit(Start(3.0))
+    assert longer.search.rounds > 1
+    assert longer.search.visits[: len(fit.search.visits)] == fit.search.visits
+
+
+def test_coarse_tolerance_settles_early():
+    # A round that moves the incumbent by less than a share of its delay is the last.
+    record = make_record(snr_db=5, seed=5, replicate=2)
+    fit = UsefulRedundancy(**options(tolerance=0.5)).fit(record, Start(7.0))
+    assert (fit.search.status, fit.search.rounds) == (SearchStatus.SETTLED, 1)
+    assert abs(fit.search.point - 7.0) <= 0.5 * fit.search.point
+
+
+def test_without_a_start_the_middle_of_the_bounds_is_taken(prepared):
+    assert same(prepared.fit(), prepared.fit(Start(7.5)))
+    assert same(prepared.fit(Start()), prepared.fit(Start(7.5)))
+
+
+# Bounds -----------------------------------------------------------------------------------------------
+
+
+def test_start_outside_the_bounds_is_refused():
+    prepared = UsefulRedundancy(2, 0, (2, 12), bandwidth=2.02).prepare(make_record(n=1000))
+    for delay in (1.0, 13.0, -2.0, np.nan):
+        with pytest.raises(DataError, match=f"initial delay, {delay:g} s, lies outside the bounds 2 to 12 s"):
+            prepared.fit(Start(delay))
+
+
+@pytest.mark.parametrize("bound", [0, 1])
+def test_start_on_a_bound_is_a_start(bound):
+    record = make_record(snr_db=15)
+    for bounds in ((0.0, 15.0), (3.0, 11.0)):
+        fit = UsefulRedundancy(**options(delay_bounds=bounds)).fit(record, Start(bounds[bound]))
+        assert fit.search.trajectory[0].point == bounds[bound]
+        assert abs(fit.model.delay - 8.0) < 0.01
+        assert all((path.delays >= bounds[0]).all() and (path.delays <= bounds[1]).all() for path in fit.paths)
+
+
+@pytest.mark.parametrize("bounds", [(0.0, 7.8), (8.2, 15.0)])
+def test_true_delay_beyond_a_bound_ends_at_the_bound(bounds):
+    nearest = min(max(8.0, bounds[0]), bounds[1])
+    fit = UsefulRedundancy(**options(delay_bounds=bounds)).fit(make_record(snr_db=15))
+    assert (fit.model.delay, fit.status) == (nearest, Status.DELAY_AT_BOUND)
+
+
+# Units ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("search", SEARCHES)
+@pytest.mark.parametrize("seconds", [1e-3, 3600.0])
+def test_unit_of_time_does_not_matter(seconds, search):
+    # Milliseconds for seconds, or hours: the same search and the same estimate.
+    record = make_record(snr_db=5, seed=5, replicate=2, n=1500)
+    held = HeldSignal(record.input.t * seconds, record.input.values)
+    scaled = Record(record.t * seconds, record.y, held)
+    more = {"bandwidth": 2.02 / seconds, "svf_cutoff": 1.0 / seconds, "delay_bounds": (0.0, 15.0 * seconds)}
+    one = UsefulRedundancy(**options(search=search)).fit(record, Start(3.0))
+    two = UsefulRedundancy(**options(search=search, **more)).fit(scaled, Start(3.0 * seconds))
+    factors = {"a1": 1 / seconds, "a2": seconds**-2, "b0": seconds**-2, "delay": seconds}
+    for name, value in one.parameters.items():
+        assert two.parameters[name] == pytest.approx(factors[name] * value, rel=1e-6)
+    assert [v.path for v in two.search.trajectory] == [v.path for v in one.search.trajectory]
+    for before, after in zip(one.search.trajectory, two.search.trajectory, strict=True):
+        assert after.point == pytest.approx(before.point * seconds, rel=1e-4)
+        assert after.cost == pytest.approx(before.cost, rel=1e-4)
+
+
+@pytest.mark.parametrize("search", SEARCHES)
+@pytest.mark.parametrize(("gain_u", "gain_y"), [(1e6, -1e-3), (-1e-9, 1e9)])
+def test_units_of_the_signals_do_not_matter(gain_u, gain_y, search):
+    record = make_record(snr_db=5, seed=5, replicate=2, n=1500)
+    scaled = Record(record.t, gain_y * record.y, HeldSignal(record.input.t, gain_u * record.input.values))
+    one, two = (UsefulRedundancy(**options(search=search)).fit(r, Start(3.0)) for r in (record, scaled))
+    for name, value in one.parameters.items():
+        factor = gain_y / gain_u if name == "b0" else 1.0
+        assert two.parameters[name] == pytest.approx(factor * value, rel=1e-6)
+    assert two.cost == pytest.approx(gain_y**2 * one.cost, rel=1e-6)
+    assert [v.path for v in two.search.trajectory] == [v.path for v in one.search.trajectory]
+    for before, after in zip(one.search.trajectory, two.search.trajectory, strict=True):
+        assert (after.point, after.cost) == pytest.approx((before.point, before.cost), rel=1e-4)
+
+
+def test_origin_of_time_does_not_matter():
+    record = make_record(snr_db=15, n=2500)
+    moved = Record(record.t + 1000.0, record.y, HeldSignal(record.input.t + 1000.0, record.input.values))
+    one, two = (UsefulRedundancy(**options()).fit(r, Start(1.0)) for r in (record, moved))
+    assert_same_model(two.model, one.model, 1e-6)
+
+
+# Records and models of other kinds --------------------------------------------------------------------
+
+
+def test_missing_outputs_are_estimated_around():
+    # Two holes, and a tenth of the other samples: the estimate of the plain search beside the true delay.
+    record = make_record(snr_db=15)
+    y = record.y.copy()
+    y[(record.t > 50) & (record.t < 55)] = np.nan
+    y[np.random.default_rng(0).random(y.size) < 0.1] = np.nan
+    masked = Record(record.t, y, record.input)
+    fit = UsefulRedundancy(**options()).fit(masked, Start(1.0))
+    assert_same_model(fit.model, TdSrivc(2, 0, BOUNDS).fit(masked, Start(8.1)).model, 1e-6)
+    assert fit.count == int((np.isfinite(y) & (record.t >= 15 - 1e-9)).sum())
+
+
+def test_repeated_poles():
+    # A model on the border between real and complex poles.
+    truth = TransferFunction([4.0], [1.0, 4.0, 4.0], 8.0)
+    record = make_record(truth, n=3000)
+    fit = UsefulRedundancy(2, 0, BOUNDS, bandwidth=1.3).fit(record, Start(1.0))
+    assert_same_model(fit.model, truth, 1e-6)
+
+
+@pytest.mark.parametrize(("poles", "zeros"), [(2, 1), (3, 0), (3, 1)])
+def test_more_coefficients_than_the_system_has(poles, zeros):
+    # Too many: the delay makes up for what the others do, and the fit is no worse than from beside the true delay.
+    record = make_record(snr_db=15)
+    fit = UsefulRedundancy(poles, zeros, BOUNDS, bandwidth=2.02).fit(record, Start(1.0))
+    assert abs(fit.model.delay - 8.0) < 0.6
+    near = TdSrivc(poles, zeros, BOUNDS).fit(record, Start(8.0))
+    assert fit.cost <= near.cost * (1 + 1e-3)
+
+
+def test_nothing_of_the_record_changes():
+    record = make_record(snr_db=15, n=1500)
+    before = [a.copy() for a in (record.t, record.y, record.input.t, record.input.values)]
+    UsefulRedundancy(**options()).fit(record, Start(7.0))
+    after = (record.t, record.y, record.input.t, record.input.values)
+    assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+# Options ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"bandwidth": 0.0}, r"bandwidth must be a positive number \[rad/s\], not 0.0"),
+        ({"bandwidth": -2.0}, r"bandwidth must be a positive number \[rad/s\], not -2.0"),
+        ({"bandwidth": np.nan}, "bandwidth must be a positive number"),
+        ({"bandwidth": "2"}, "bandwidth must be a positive number"),
+        ({"filters": 1}, "must be an integer of at least 2, not 1"),
+        ({"filters": 2.5}, "must be an integer of at least 2, not 2.5"),
+        ({"beta": 1.5}, r"beta, .*, must be between 1.7170 .* and 10, not 1.5"),
+        ({"beta": 10.5}, r"beta, .*, must be between 1.7170 .* and 10, not 10.5"),
+        ({"beta": np.nan}, "beta, .*, not nan"),
+        ({"order": 0}, "order must be between 1 and 20, not 0"),
+        ({"order": 21}, "order must be between 1 and 20, not 21"),
+        ({"search": "frequency"}, "search must be 'time' or 'spectral', not 'frequency'"),
+        ({"max_rounds": 0}, "max_rounds must be an integer of at least 1, not 0"),
+        ({"max_rounds": 1.5}, "max_rounds must be an integer of at least 1, not 1.5"),
+    ],
+)
+def test_impossible_options_are_refused(more, message):
+    with pytest.raises(ValueError, match=message):
+        UsefulRedundancy(**options(**more))
+
+
+def test_bounds_become_numbers():
+    assert UsefulRedundancy(2, 0, [0, "15"]).delay_bounds == (0.0, 15.0)
+    assert UsefulRedundancy(2, 0, np.array([0, 15])).delay_bounds == (0.0, 15.0)
