@@ -37,6 +37,7 @@ reproduce: $(VENV)/.installed
 	$(BIN)/ctid figure useful-redundancy --out "$(OUT)"
 	$(BIN)/ctid table --out "$(OUT)"
 	$(BIN)/ctid table --check --out "$(OUT)"
+	@if [ "$(RUNS)" -ge 100 ]; then $(BIN)/python experiments/useful_redundancy/publish.py --results "$(OUT)"; fi
 
 bench: $(VENV)/.test-installed
 	set -e; for benchmark in benchmarks/bench_*.py; do $(BIN)/python "$$benchmark"; done

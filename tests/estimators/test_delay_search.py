@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.estimators.delay_search import SMALLEST_STEP, Minimum, bound_in_the_way, delay_step, descend
+from ctid_cli.estimators.delay_search import Minimum, bound_in_the_way, delay_step, descend
 from ctid_cli.estimators.problems import CoefficientProblem, DelayProblem
 from ctid_cli.estimators.refined_iv import Equations, iterate
 from ctid_cli.filtering import filter_data, standard_rows
@@ -18,7 +18,8 @@ from tests.estimators.records import CASE_1, CASE_2, make_record, theta_of
 
 THETA = np.array([3.0, 4.0])
 BOUNDS = (0.0, 10.0)
-SMALLEST = SMALLEST_STEP * 10.0
+#: A hundred-thousandth of the range.
+SMALLEST = 1e-4
 
 
 class Artificial:
