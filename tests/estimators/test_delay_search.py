@@ -144,11 +144,35 @@ def test_step_beyond_a_bound_is_halved_until_it_stays_inside(start, at, bound):
     assert (found.minimum.delay, found.status, found.iterations) == (bound, Status.CONVERGED, 1)
 
 
-@given(st.floats(0, 10), st.floats(-30, 40), st.floats(0.1, 3), st.floats(0.05, 10))
-def test_never_leaves_the_bounds_nor_rises(start, at, gain, largest_step):
+@pytest.mark.parametrize(("start", "bound"), [(0.0, 0.0), (10.0, 10.0), (1.0, 0.0), (9.0, 10.0)])
+def test_step_beyond_a_bound_is_mirrored_where_that_is_wanted(start, bound):
+    # The slope points outwards there, away from the valley: no fraction of the step helps, its mirror image does.
+    outwards = 4.0 if bound else -4.0
+    cost = Artificial(lambda d: (d - 5.0) ** 2, lambda d: outwards if d == start else 5.0 - d)
+    found, _ = search(cost, start, reflect=True)
+    assert cost.asked == [start, 2 * bound - (start + outwards), 5.0]
+    assert (found.minimum.delay, found.iterations) == (5.0, 2)
+    found, _ = search(cost, start)
+    assert abs(found.minimum.delay - bound) <= 1.0
+
+
+def test_mirrored_steps_are_halved_too():
+    # Beyond the bound lies the minimum: mirror images of 17 and 13 s are no better, the one of 11 s is the start.
+    cost = quadratic(17.0)
+    found, _ = search(cost, 9.0, reflect=True)
+    assert cost.asked[:5] == [9.0, 3.0, 7.0, 9.0, 10.0]
+    assert (found.minimum.delay, found.status, found.iterations) == (10.0, Status.CONVERGED, 1)
+    # A mirror image beyond the other bound is halved into the range.
+    cost = Artificial(lambda d: (d - 4.0) ** 2, lambda d: -15.0 if d == 1.0 else 4.0 - d)
+    found, _ = search(cost, 1.0, reflect=True)
+    assert all(0.0 <= delay <= 10.0 for delay in cost.asked)
+
+
+@given(st.floats(0, 10), st.floats(-30, 40), st.floats(0.1, 3), st.floats(0.05, 10), st.booleans())
+def test_never_leaves_the_bounds_nor_rises(start, at, gain, largest_step, reflect):
     # Wherever the minimum lies, and whatever the steps are worth.
     cost = Artificial(lambda d: (d - at) ** 2 + 1.0, lambda d: gain * (at - d))
-    found, seen = search(cost, start, max_iterations=500, tolerance=1e-12, largest_step=largest_step)
+    found, seen = search(cost, start, max_iterations=500, tolerance=1e-12, largest_step=largest_step, reflect=reflect)
     assert all(0.0 <= delay <= 10.0 for delay in cost.asked)
     costs = [minimum.squared_error for minimum in seen]
     assert all(after < before for before, after in pairwise(costs))
