@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 from ctid_cli.estimators.delay_search import LEAST_CURVATURE
 from ctid_cli.estimators.problems import is_hurwitz
 from ctid_cli.estimators.refined_iv import NEGLIGIBLE_FALL, ROUNDING, SLOW_STEPS, SUFFICIENT_FALL
-from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, FilterData, scaled_denominator, standard_moments
+from ctid_cli.filtering.bank import (
+    MODAL_CONDITION_LIMIT,
+    FilterData,
+    plain_array,
+    scaled_denominator,
+    standard_moments,
+)
 from ctid_cli.filtering.sections import polynomial_roots, time_scale
 from ctid_cli.inference.sensitivity import Structure
 
@@ -46,7 +52,7 @@ def solve_scaled(matrix: Array, right: Array, rows: Array, columns: Array, out: 
     p = right.size
     work = np.empty((p, p + 1))
     for i in range(p):
-        if not (rows[i] > 0.0 and columns[i] > 0.0):
+        if not (0.0 < rows[i] < np.inf and 0.0 < columns[i] < np.inf):
             return False
     for i in range(p):
         scale = 1.0 / np.sqrt(rows[i])
@@ -407,8 +413,10 @@ def best_coefficients(
 
     None in the place of the three where no start leads anywhere.
     """
+    usable = np.array(starts, dtype=np.float64, order="C", ndmin=2)
+    usable = plain_array(usable[np.isfinite(usable).all(axis=1)])
     error, step, theta, best = _best_of(
-        np.array(starts, dtype=np.float64, order="C", ndmin=2),
+        usable,
         structure.poles,
         structure.sensitivity_rows,
         structure.regressor_rows,

@@ -109,6 +109,7 @@ def descend(
     *,
     max_iterations: int,
     tolerance: float,
+    smallest_step: float | None = None,
     largest_step: float = np.inf,
     reflect: bool = False,
     on_step: Callable[[Minimum], None] | None = None,
@@ -129,6 +130,8 @@ def descend(
         Largest number of delay steps.
     tolerance : float
         Stop when a step lowers the cost by less than this fraction.
+    smallest_step : float, optional
+        Shortest step [s]; 1e-5 of the range of the delay by default.
     largest_step : float, optional
         Longest step [s]; longer ones are shortened to it.
     reflect : bool, default False
@@ -145,10 +148,10 @@ def descend(
     Notes
     -----
     A step is halved while it leaves the bounds (unless it is mirrored) or does not lower the cost, and the search ends
-    where that makes it shorter than 1e-5 of the range of the delay.
+    where that makes it shorter than the shortest step.
     """
     low, high = bounds
-    smallest = SMALLEST_STEP * (high - low)
+    smallest = SMALLEST_STEP * (high - low) if smallest_step is None else smallest_step
     current = cost.minimise(delay, theta)
     if current is None:
         return None
@@ -156,7 +159,7 @@ def descend(
         on_step(current)
     for iteration in range(max_iterations):
         step = cost.step(current)
-        if step is None:
+        if step is None or not np.isfinite(step):
             return Descent(current, Status.SINGULAR, iteration)
         if abs(step) > largest_step:
             step = largest_step if step > 0 else -largest_step

@@ -33,6 +33,8 @@ Search = Literal["time", "spectral"]
 #: Highest frequency of a spectral search, as a multiple of the highest cut-off: a filter of order 10 passes 3e-4 of the
 #: power there.
 HIGHEST = 1.5
+#: A cost of fewer samples for each parameter says nothing about the delay.
+SAMPLES_PER_PARAMETER = 3
 
 
 @dataclass(frozen=True)
@@ -344,7 +346,7 @@ def filtered_costs(
     svf_cutoff: float | Sequence[float],
     hold_output: Hold = "foh",
     effort: Effort | None = None,
-) -> list[FilteredCost]:
+) -> list[FilteredCost | None]:
     """Costs of one record behind several filters.
 
     Parameters
@@ -371,8 +373,8 @@ def filtered_costs(
 
     Returns
     -------
-    list of FilteredCost
-        One for each filter.
+    list of FilteredCost or None
+        One for each filter; None where a filter leaves too few samples to estimate from.
     """
     cutoffs = np.broadcast_to(np.asarray(svf_cutoff, dtype=float), (len(lowpasses),)).tolist()
     spectra: RecordSpectra | None = None
@@ -380,11 +382,12 @@ def filtered_costs(
         highest = HIGHEST * max(lowpass.cutoff for lowpass in lowpasses)
         spectra = record_spectra(record, start, highest, bounds[1])
     joint = replace(structure, delay=True)
-    costs: list[FilteredCost] = []
+    costs: list[FilteredCost | None] = []
     for lowpass, cutoff in zip(lowpasses, cutoffs, strict=True):
         if spectra is not None and enough_bins(lowpass_weight(spectra.frequencies, lowpass), joint):
             costs.append(SpectralCost(spectra, lowpass, structure, bounds, cutoff, effort))
         else:
             data = filter_data(lowpass.resample(record), start, hold_output)
-            costs.append(SampledCost(data, structure, cutoff, effort))
+            enough = data.count >= SAMPLES_PER_PARAMETER * joint.size and np.ptp(data.y_used) > 0.0
+            costs.append(SampledCost(data, structure, cutoff, effort) if enough else None)
     return costs

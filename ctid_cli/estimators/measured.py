@@ -55,10 +55,6 @@ MOST_FIRST_DELAYS = 30
 MOST_LEVELS = 4
 LEVEL_ORDER = 10
 LEVEL_EFFORT = Effort(max_iterations=6, tolerance=2e-2, halvings=3, gauss_newton=True)
-#: Sampling intervals on either side of what such a search has found that every sample is asked about, and parts of
-#: them: the cost has a kink at every instant where the input moves.
-NEIGHBOURING = 1.0
-PARTS = 2
 #: Cut-offs of the state-variable filter that are tried, as multiples of the output's bandwidth.
 CUTOFFS = (0.2, 1.0, 5.0)
 #: Time constants after which a free response counts as gone (1e-12), and most periods that are prepended for it.
@@ -437,14 +433,23 @@ class PreparedProfile:
             hold_output=self.options.hold_output,
             effort=LEVEL_EFFORT,
         )
-        levels = [Level(cost, 0.5 * np.pi / cutoff) for cost, cutoff in zip(costs, cutoffs, strict=True)]
+        usable = [(cost, cutoff) for cost, cutoff in zip(costs, cutoffs, strict=True) if cost is not None]
+        if costs[-1] is None:
+            return [], None
+        levels = [Level(cost, 0.5 * np.pi / cutoff) for cost, cutoff in usable]
         found = search_grid(levels, self.options.delay_bounds, FEWEST_DELAYS)
-        profile = Profile(found.delays, found.costs * costs[0].mean_factor, self.bandwidth, cutoffs[0])
-        interval = float(np.median(np.diff(self.records[0].t)))
-        starts: list[tuple[float, Array]] = []
-        for minimum in found.minima:
-            a = minimum.theta[: self.options.poles]
-            starts += self._local_grid([(minimum.delay, a)], NEIGHBOURING * interval, PARTS, 1)
+        first, cutoff = usable[0]
+        profile = Profile(found.delays, found.costs * first.mean_factor, self.bandwidth, cutoff)
+        starts = [(minimum.delay, minimum.theta) for minimum in found.minima]
+        interval = self.data[0].interval
+        if interval is None:
+            return starts, profile
+        # On a regular clock the cost has a kink at every interval, and local minima between them that a model too small
+        # for its system makes deep: every sample is asked about a quarter period around what the filters have found.
+        reach = max(interval, 0.25 * np.pi / self.bandwidth)
+        parts = int(np.ceil(2.0 * reach / interval))
+        centres = [(delay, theta[: self.options.poles]) for delay, theta in starts]
+        starts = [start for centre in centres for start in self._local_grid([centre], reach, min(parts, FINEST), 1)]
         return starts, profile
 
     def _cutoffs(self) -> list[float]:

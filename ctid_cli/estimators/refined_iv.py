@@ -130,7 +130,7 @@ def scaled_solve(matrix: Array, right: Array, rows: Array, columns: Array) -> Ar
     ndarray, shape (p,) or None
         The solution; None if the matrix is singular or holds non-finite numbers.
     """
-    if not (rows > 0).all() or not (columns > 0).all():
+    if not ((rows > 0) & (rows < np.inf)).all() or not ((columns > 0) & (columns < np.inf)).all():
         return None
     left_scale = 1.0 / np.sqrt(rows)
     right_scale = left_scale if rows is columns else 1.0 / np.sqrt(columns)

@@ -2,7 +2,7 @@ r"""Delay and coefficients by useful redundancy: Gauss-Newton paths on a set of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar, get_args
 
 import numpy as np
@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.common import Start, check_iteration, check_structure
+from ctid_cli.estimators.delay_grid import scan
 from ctid_cli.estimators.delay_search import Descent, Minimum, descend
-from ctid_cli.estimators.filtered_costs import FilteredCost, Search, filtered_costs
-from ctid_cli.estimators.redundancy import Path, RedundantMinimum, Visit, minimise_redundantly
+from ctid_cli.estimators.filtered_costs import Effort, FilteredCost, Search, filtered_costs
+from ctid_cli.estimators.redundancy import Path, RedundantMinimum, SearchStatus, Visit, minimise_redundantly
 from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.inference.answer import output_bandwidth
@@ -26,10 +27,16 @@ Array = NDArray[np.float64]
 
 #: J0 is evaluated on a lattice of delays of this fraction of the shortest period, so that candidates that agree share
 #: it, and so do searches of the same data from different initial delays.
-LATTICE = 0.05
+LATTICE = 0.1
+#: The shortest Gauss-Newton step of the search, as a fraction of the shortest period.
+SMALLEST_STEP = 0.01
 #: The longest Gauss-Newton step, as a fraction of the range of the delay: from a fifth to four fifths all serve, with a
 #: tenth the paths end in small bumps far from the minimum.
 LARGEST_STEP = 1 / 3
+#: Where no path leads lower and J0 exceeds this [%], the paths start once more a period of their filter away.
+POOR = 25.0
+#: Points of the lattice by which one start of the refinement is shorter than the best delay behind the widest band.
+SHORTER = 2
 #: J0 of a filter in which nothing can be computed [%].
 NOTHING = 100.0
 
@@ -45,7 +52,7 @@ class FilterPath:
     filter : int
         Index of the filter, 0 for that of the longest period.
     delays : ndarray, shape (K,)
-        Accepted trial delays [s], the incumbent it started from first.
+        Accepted trial delays [s], where it started first: the incumbent, or a period of the filter away from it.
     costs : ndarray, shape (K,)
         ``100 ||y - x|| / ||y - mean y||`` of the filtered data there [%].
     coefficients : ndarray, shape (K, n + m + 1)
@@ -133,9 +140,10 @@ class UsefulRedundancy:
     Those come from the filter next to it, first from the widest band to the narrowest and then back, the cheaper kept;
     the filter of widest band starts from least squares. A path starts from these coefficients, and a second time from
     least squares. Gauss-Newton steps are no longer than a third of the range of the delay; the publication limits
-    them, but not by how much. One that leaves the range is mirrored at its end. Estimates end on the unfiltered data:
-    Gauss-Newton on the delay, then on all parameters together, from the minimum of J0 and from the candidate of the
-    last round that the filter of widest band likes best, the lower cost kept.
+    them, but not by how much. One that leaves the range is mirrored at its end. Where every path fails and J0 is still
+    above 25 %, each filter's path starts once more one of its periods to either side. Estimates end on the unfiltered
+    data: Gauss-Newton on the delay, then on all parameters together, from the minimum of J0, from that of the filter
+    of widest band within half the shortest period of it, and from a fifth of a period less, the lowest cost kept.
 
     The search fails where no filter's path leads to a lower J0; :func:`~ctid_cli.filtering.check_filters` says for
     which initial errors a set of filters can be trusted.
@@ -191,6 +199,8 @@ class UsefulRedundancy:
         require_integer("max_rounds", self.max_rounds, 1)
         if self.svf_cutoff is not None:
             require_positive("svf_cutoff", self.svf_cutoff, "rad/s")
+        require_integer("filters", self.filters, 2)
+        require_integer("order", self.order, 1, 20)
         FilterSet(self.bandwidth or 1.0, self.filters, self.beta, self.order)
         if self.bandwidth is not None:
             require_positive("bandwidth", self.bandwidth, "rad/s")
@@ -261,7 +271,7 @@ class PreparedUsefulRedundancy:
         bandwidth = options.bandwidth or output_bandwidth(record)
         self.filters = FilterSet(bandwidth, options.filters, options.beta, options.order)
         self.period = float(self.filters.periods[-1])
-        self.costs: list[FilteredCost] = filtered_costs(
+        costs = filtered_costs(
             record,
             self.filters.lowpasses,
             self.refinement.structure,
@@ -270,7 +280,16 @@ class PreparedUsefulRedundancy:
             start=options.delay_bounds[1],
             svf_cutoff=options.svf_cutoff or bandwidth,
             hold_output=options.hold_output,
+            effort=Effort(max_iterations=6, halvings=2, gauss_newton=options.search == "spectral"),
         )
+        self.costs: list[FilteredCost] = [cost for cost in costs if cost is not None]
+        if len(self.costs) < len(costs):
+            raise DataError(
+                f"{record.name + ': ' if record.name else ''}after the greatest delay, {options.delay_bounds[1]:g} s, "
+                f"the record is too short for {len(costs) - len(self.costs)} of {len(costs)} filters, whose periods "
+                f"reach {self.filters.periods[0]:.3g} s; take a smaller beta, a larger bandwidth, a smaller greatest "
+                "delay or a longer record"
+            )
         self._known: dict[int, tuple[float, list[Minimum | None]]] = {}
 
     def member_costs(self, delay: float) -> Array:
@@ -289,7 +308,7 @@ class PreparedUsefulRedundancy:
         return np.array([self._percent(k, minimum) for k, minimum in enumerate(self._minima(delay))])
 
     def reference_cost(self, delay: float) -> float:
-        """J0 at the nearest point of a lattice of a twentieth of the shortest period: the mean of all members' costs.
+        """J0 at the nearest point of a lattice of a tenth of the shortest period: the mean of all members' costs.
 
         Parameters
         ----------
@@ -327,14 +346,7 @@ class PreparedUsefulRedundancy:
         if not low <= delay <= high:
             raise DataError(f"the initial delay, {delay:g} s, lies outside the bounds {low:g} to {high:g} s")
         paths: list[FilterPath] = []
-        search = minimise_redundantly(
-            delay,
-            self.reference_cost,
-            [self._path(k, paths) for k in range(len(self.costs))],
-            choice="best",
-            settled=lambda before, now: abs(now - before) <= options.tolerance * max(abs(now), self.period),
-            max_rounds=options.max_rounds,
-        )
+        search = self._search(delay, paths)
         fit = self._refine(search, self._history(search, paths))
         return RedundantFit(
             **{item.name: getattr(fit, item.name) for item in fields(Fit)},
@@ -342,6 +354,30 @@ class PreparedUsefulRedundancy:
             filters=self.filters,
             paths=tuple(paths),
         )
+
+    def _search(self, delay: float, paths: list[FilterPath]) -> RedundantMinimum[float]:
+        """Rounds over all filters, and a look at the next valleys before a poor incumbent is settled for."""
+        options = self.options
+
+        def rounds_from(delay: float, done: int, hop: bool) -> RedundantMinimum[float]:
+            return minimise_redundantly(
+                delay,
+                self.reference_cost,
+                [self._path(k, paths, done, hop) for k in range(len(self.costs))],
+                choice="best",
+                settled=lambda before, now: abs(now - before) <= options.tolerance * max(abs(now), self.period),
+                max_rounds=1 if hop else options.max_rounds - done,
+            )
+
+        found = rounds_from(delay, 0, False)
+        while found.status is SearchStatus.EXHAUSTED and found.cost > POOR and found.rounds < options.max_rounds - 1:
+            beyond = rounds_from(found.point, found.rounds, True)
+            improved = len(beyond.trajectory) > 1
+            found = _joined(found, beyond)
+            if not improved:
+                break
+            found = _joined(found, rounds_from(found.point, found.rounds, False))
+        return found
 
     def _history(self, search: RedundantMinimum[float], paths: list[FilterPath]) -> list[IterationRecord]:
         """The steps of the paths that led from incumbent to incumbent."""
@@ -363,53 +399,54 @@ class PreparedUsefulRedundancy:
         return history
 
     def _refine(self, search: RedundantMinimum[float], history: list[IterationRecord]) -> Fit:
-        """Go on from the minimum of J0, and from where the filter of widest band fits best in the last round."""
-        points = [search.point]
-        # J0 is flat around its minimum where noise or a model of too long a delay weigh on the narrow filters.
-        around = [visit.point for visit in search.visits if visit.round == search.rounds]
-        widest = [np.inf if minimum is None else minimum.squared_error for minimum in map(self._widest, around)]
-        if widest:
-            points.append(around[int(np.argmin(widest))])
+        """Go on from the minimum of J0, and from where the filter of widest band fits best within half a period."""
+        low, high = self.options.delay_bounds
+        # J0 is flat around its minimum where noise, or a model with too long a delay, weighs on the narrow filters.
+        nearby = np.clip(search.point + self.period * np.linspace(-0.5, 0.5, 1 + round(1 / LATTICE)), low, high)
+        found = [minimum for minimum in scan(self.costs[-1], np.unique(nearby)) if minimum is not None]
+        widest = self._at(search.point)[1][-1]
+        starts = [] if widest is None else [replace(widest, delay=search.point)]
+        if found:
+            least = int(np.argmin([minimum.squared_error for minimum in found]))
+            # Where the delay is too long a pole makes up for it by running to infinity, and does not come back.
+            starts += [found[least], found[max(least - SHORTER, 0)]]
         best: Fit | None = None
-        for point in dict.fromkeys(points):
-            start = self._widest(point)
-            if start is None:
-                continue
-            found = Descent(Minimum(point, start.theta, start.squared_error), Status.CONVERGED, search.rounds)
-            fit = self.refinement.refine(found, list(history))
+        for start in starts:
+            fit = self.refinement.refine(Descent(start, Status.CONVERGED, search.rounds), list(history))
             if best is None or fit.cost < best.cost:
                 best = fit
         if best is None:
             raise DataError(Status.SINGULAR.value)
         return best
 
-    def _widest(self, delay: float) -> Minimum | None:
-        """Minimum of the filter of widest band at the lattice point next to a delay."""
-        return self._at(delay)[1][-1]
-
-    def _path(self, k: int, paths: list[FilterPath]) -> Path[float]:
-        """Solver path of one filter; what it does goes to ``paths``."""
+    def _path(self, k: int, paths: list[FilterPath], done: int, hop: bool) -> Path[float]:
+        """Solver path of one filter after a number of rounds; what it does goes to ``paths``."""
         cost = self.costs[k]
         low, high = self.options.delay_bounds
-        rounds = 0
+        period = float(self.filters.periods[k])
+        rounds = done
 
         def follow(delay: float) -> list[float]:
             nonlocal rounds
             rounds += 1
-            here = self._at(delay)[1][k]
-            if here is None:
-                return []
+            starts: list[tuple[float, Array | None]]
+            if hop:
+                starts = [(start, None) for start in (delay - period, delay + period) if low <= start <= high]
+            else:
+                # From the coefficients of J0 and from least squares: where one is trapped the other often is not.
+                here = self._at(delay)[1][k]
+                starts = [(delay, theta) for theta in ((None,) if here is None else (here.theta, None))]
             ends: list[float] = []
-            # From the coefficients of J0 and from least squares: where one is trapped the other often is not.
-            for theta in (here.theta, None):
+            for start, theta in starts:
                 steps: list[Minimum] = []
                 found = descend(
                     cost,
-                    delay,
+                    start,
                     theta,
                     (low, high),
                     max_iterations=self.options.max_iterations,
                     tolerance=self.options.tolerance,
+                    smallest_step=SMALLEST_STEP * self.period,
                     largest_step=LARGEST_STEP * (high - low),
                     reflect=True,
                     on_step=steps.append,
@@ -451,6 +488,12 @@ class PreparedUsefulRedundancy:
                 if found is not None and (here is None or found.squared_error < here.squared_error):
                     minima[k] = found
         return minima
+
+
+def _joined(first: RedundantMinimum[float], then: RedundantMinimum[float]) -> RedundantMinimum[float]:
+    """A search and the one that went on from its end as one."""
+    later = tuple(replace(visit, round=visit.round + first.rounds) for visit in then.visits[1:])
+    return replace(then, rounds=first.rounds + then.rounds, visits=first.visits + later)
 
 
 __all__ = ["FilterPath", "PreparedUsefulRedundancy", "RedundantFit", "UsefulRedundancy"]

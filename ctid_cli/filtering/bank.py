@@ -406,7 +406,7 @@ def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Ar
                 slope *= pole - roots[j]
                 if roots[j] != pole:
                     curvature += 2.0 / (pole - roots[j])
-        if slope == 0.0 or pole == 0.0:
+        if slope * slope == 0.0 or pole == 0.0:
             return np.inf, poles, residues, mapping
         slopes[i], curvatures[i] = slope, curvature
         if paired:

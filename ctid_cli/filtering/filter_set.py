@@ -93,7 +93,7 @@ class FilterSet:
 
 
 def _check_beta(beta: float) -> None:
-    if not LEAST_BETA <= beta <= GREATEST_BETA:
+    if not isinstance(beta, int | float | np.number) or not LEAST_BETA <= beta <= GREATEST_BETA:
         raise ValueError(
             f"beta, the ratio of the longest to the shortest period, must be between {LEAST_BETA:.4f} (bound (41): the "
             f"least for which some number of filters suffices) and {GREATEST_BETA:g}, not {beta}."
