@@ -52,19 +52,19 @@ def with_lsim(a, b, delay, interval, u):
 SIMULATIONS = {"exact": exact_zoh, "scipy.signal.lsim": with_lsim}
 
 
-def multi_start(record, poles, bounds, starts, simulation):
+def multi_start(record, poles, bounds, starts, simulation, zeros=0):
     """Coefficients and delay of the lowest cost over starts at equally spaced delays."""
     u, interval = record.input.values, record.interval
 
     def residuals(theta):
         return record.y - simulation(np.append(1.0, theta[:poles]), theta[poles:-1], theta[-1], interval, u)
 
-    low = [0.0] * poles + [-np.inf, bounds[0]]
-    high = [np.inf] * (poles + 1) + [bounds[1]]
+    low = [0.0] * poles + [-np.inf] * (zeros + 1) + [bounds[0]]
+    high = [np.inf] * (poles + zeros + 1) + [bounds[1]]
     best = None
     inner = np.linspace(*bounds, starts + 2)[1:-1]  # a start on a bound would be moved off it anyway
     for delay in inner:
-        start = np.append(list(Svf(poles, 0, delay=float(delay)).fit(record).parameters.values()), delay)
+        start = np.append(list(Svf(poles, zeros, delay=float(delay)).fit(record).parameters.values()), delay)
         start[:poles] = np.maximum(start[:poles], 1e-6)
         found = optimize.least_squares(
             residuals, start, bounds=(low, high), x_scale="jac", ftol=1e-10, xtol=1e-10, gtol=1e-10, max_nfev=50

@@ -216,7 +216,7 @@ def test_periods_by_both_printed_formulas():
         ({"beta": 1.7}, r"be between 1\.7170 \(bound \(41\).* and 10, not 1\.7"),
         ({"beta": 10.1}, "and 10, not 10.1"),
         ({"beta": np.nan}, "and 10, not nan"),
-        ({"order": 0}, "order must be between 1 and 20"),
+        ({"order": 0}, "order must be an integer from 1 to 20"),
     ],
 )
 def test_impossible_sets_are_refused(options, message):
