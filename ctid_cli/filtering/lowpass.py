@@ -136,18 +136,17 @@ class Lowpass:
             interval = max(most, float(np.median(np.diff(record.t))), (last - first) / record.n_samples)
             t = first + interval * np.arange(int((last - first) / interval + 1e-9) + 1)
             u, y = (simulate(self.model, signal, t) for signal in (record.input, output))
-        return Record(
-            t,
-            np.where(_covered(t, record.t[record.valid], interval), y, np.nan),
-            HeldSignal(t, u, "foh"),
-            name=record.name,
-        )
+        covered = _covered(t, record, interval)
+        return Record(t, np.where(covered, y, np.nan), HeldSignal(t, u, "foh"), name=record.name)
 
 
-def _covered(t: Array, present: Array, longest: float) -> NDArray[np.bool_]:
-    """Whether instants lie on a sample that is present, or between two that are no farther apart than given."""
+def _covered(t: Array, record: Record, longest: float) -> NDArray[np.bool_]:
+    """Whether instants lie between two neighbouring samples, or in a hole no longer than given."""
+    places = np.flatnonzero(record.valid)
+    present = record.t[places]
     before = np.searchsorted(present, t, side="right") - 1
     after = np.searchsorted(present, t, side="left")
     inside = (before >= 0) & (after < present.size)
-    gap = present[np.minimum(after, present.size - 1)] - present[np.maximum(before, 0)]
-    return np.asarray(inside & (gap <= longest * (1.0 + 1e-9)))
+    left, right = np.maximum(before, 0), np.minimum(after, present.size - 1)
+    short = present[right] - present[left] <= longest * (1.0 + 1e-9)
+    return np.asarray(inside & (short | (places[right] - places[left] <= 1)))
