@@ -138,7 +138,7 @@ def test_all_costs_have_their_minimum_at_the_true_delay(model, search):
 
 def test_reference_cost_is_the_mean_of_the_members_on_a_lattice(prepared):
     step = LATTICE * 2 * np.pi / BANDWIDTH[CASE_1]
-    for place in (3, 20, 52):
+    for place in (3, 20, 40):
         mean = prepared.member_costs(place * step).mean()
         for part in (-0.49, 0.0, 0.3, 0.49):
             assert prepared.reference_cost((place + part) * step) == pytest.approx(mean, rel=1e-9)
@@ -226,7 +226,7 @@ def test_search_tells_how_it_went(model, replicate, start, search):
 def test_some_search_does_switch():
     # A long way, on which one filter leads into the valley and another one on from there.
     record = make_record(CASE_2, snr_db=5, seed=5, replicate=1, n=3000)
-    fits = [UsefulRedundancy(**options(CASE_2)).fit(record, Start(start)) for start in (0.0, 3.0)]
+    fits = [UsefulRedundancy(**options(CASE_2, max_iterations=2)).fit(record, Start(start)) for start in (0.0, 3.0)]
     assert any(fit.switches for fit in fits)
     assert all(abs(fit.model.delay - 8.0) < 0.01 for fit in fits)
 
@@ -406,8 +406,8 @@ def test_nothing_of_the_record_changes():
         ({"beta": 1.5}, r"beta, .*, must be between 1.7170 .* and 10, not 1.5"),
         ({"beta": 10.5}, r"beta, .*, must be between 1.7170 .* and 10, not 10.5"),
         ({"beta": np.nan}, "beta, .*, not nan"),
-        ({"order": 0}, "order must be between 1 and 20, not 0"),
-        ({"order": 21}, "order must be between 1 and 20, not 21"),
+        ({"order": 0}, "order must be an integer from 1 to 20, not 0"),
+        ({"order": 21}, "order must be an integer from 1 to 20, not 21"),
         ({"search": "frequency"}, "search must be 'time' or 'spectral', not 'frequency'"),
         ({"max_rounds": 0}, "max_rounds must be an integer of at least 1, not 0"),
         ({"max_rounds": 1.5}, "max_rounds must be an integer of at least 1, not 1.5"),
