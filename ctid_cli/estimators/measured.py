@@ -445,7 +445,7 @@ class PreparedProfile:
         if interval is None:
             return starts, profile
         # On a regular clock the cost has a kink at every interval, and local minima between them that a model too small
-        # for its system makes deep: every sample is asked about a quarter period around what the filters have found.
+        # for its system makes deep: every sample is asked about an eighth of a period around what the filters found.
         reach = max(interval, 0.25 * np.pi / self.bandwidth)
         parts = int(np.ceil(2.0 * reach / interval))
         centres = [(delay, theta[: self.options.poles]) for delay, theta in starts]
