@@ -105,7 +105,7 @@ BROKEN = {
     "bad value in a sweep": ("[5, 15]", "[5, loud]", 8, 34, "noise.snr_db[1]", "a number [dB]"),
     "option refused": ("stages: 10", "stages: 30", 5, 11, "excitation.stages", "from 2 to 20, not 30"),
     "option refused in a sweep": ("stages: 10", "stages: [4, 30]", 5, 15, "excitation.stages[1]", "not 30"),
-    "nested option refused": ("order: 2", "order: 40", 15, 35, "estimators.one.lowpass.order", "between 1 and 20"),
+    "nested option refused": ("order: 2", "order: 40", 15, 35, "estimators.one.lowpass.order", "from 1 to 20, not 40"),
     "options that exclude each other": (
         "[5, 15]", "[5, 15], standard_deviation: 1", 8, 1, "noise", "both were given"
     ),
