@@ -36,6 +36,33 @@ class Start:
     delay: float | None = field(default=None, metadata={"doc": "Initial delay", "unit": "s"})
 
 
+def initial_delay(start: Start | None, bounds: tuple[float, float]) -> float:
+    """Delay from which a search starts.
+
+    Parameters
+    ----------
+    start : Start or None
+        What the user gave.
+    bounds : tuple of float
+        Least and greatest delay [s].
+
+    Returns
+    -------
+    float
+        The given delay, else the middle of the bounds [s].
+
+    Raises
+    ------
+    DataError
+        If the given delay lies outside the bounds.
+    """
+    low, high = bounds
+    delay = 0.5 * (low + high) if start is None or start.delay is None else start.delay
+    if not low <= delay <= high:
+        raise DataError(f"the initial delay, {delay:g} s, lies outside the bounds {low:g} to {high:g} s")
+    return delay
+
+
 def check_structure(poles: int, zeros: int) -> None:
     """Check the degrees of a strictly proper model.
 

@@ -82,7 +82,7 @@ def search_grid(levels: Sequence[Level], bounds: tuple[float, float], fewest: in
     """
     low, high = bounds
     wanted = max(int(np.ceil((high - low) / levels[0].spacing)) + 1, fewest)
-    delays = np.linspace(low, high, wanted)
+    grid = delays = np.linspace(low, high, wanted)
     first = found = scan(levels[0].cost, delays)
     spacing = float(delays[1] - delays[0])
     for level in levels[1:]:
@@ -97,7 +97,7 @@ def search_grid(levels: Sequence[Level], bounds: tuple[float, float], fewest: in
         spacing = level.spacing
     minima = [_descended(levels[-1].cost, found[k], bounds) for k in _hopeful(_costs(found), MINIMA)]
     minima.sort(key=lambda minimum: minimum.squared_error)
-    return GridSearch(np.linspace(low, high, wanted), _costs(first), tuple(minima))
+    return GridSearch(grid, _costs(first), tuple(minima))
 
 
 def scan(cost: FilteredCost, delays: Array) -> list[Minimum | None]:

@@ -61,15 +61,14 @@ class Effort:
 
 
 class FilteredCost(DelayCost, Protocol):
-    """A cost of filtered data that offers starts of its own."""
+    """A cost of filtered data that offers starts of its own.
 
-    @property
-    def spread(self) -> float:
-        """Sum of squared deviations of the filtered output from its mean [output unit^2], or its equivalent."""
+    ``spread`` is the sum of squared deviations of the filtered output from its mean [output unit^2], or its equivalent;
+    ``mean_factor`` turns a squared error of this cost into a mean square over the used part of the record.
+    """
 
-    @property
-    def mean_factor(self) -> float:
-        """What turns a squared error of this cost into a mean square over the used part of the record."""
+    spread: float
+    mean_factor: float
 
     def start(self, delay: float) -> Array | None:
         """Least-squares start at a delay.
@@ -101,8 +100,26 @@ class FilteredCost(DelayCost, Protocol):
             The lowest minimum; None where no start leads anywhere.
         """
 
+    def minimise(self, delay: float, theta: Array | None) -> Minimum | None:
+        """Minimise over the coefficients at one delay.
 
-class SampledCost:
+        Parameters
+        ----------
+        delay : float
+            Delay [s].
+        theta : ndarray, shape (n + m + 1,) or None
+            Coefficients to start from; None for the least-squares start.
+
+        Returns
+        -------
+        Minimum or None
+            The minimum; None where the equations are singular.
+        """
+        start = self.start(delay) if theta is None else theta
+        return None if start is None else self.minimise_from(delay, [start])
+
+
+class SampledCost(FilteredCost):
     """Cost of the samples of a filtered record, minimised by the compiled guarded iteration.
 
     Parameters
@@ -171,24 +188,6 @@ class SampledCost:
         )
         return None if found is None else Minimum(delay, *found)
 
-    def minimise(self, delay: float, theta: Array | None) -> Minimum | None:
-        """Minimise over the coefficients at one delay.
-
-        Parameters
-        ----------
-        delay : float
-            Delay [s].
-        theta : ndarray, shape (n + m + 1,) or None
-            Coefficients to start from; None for the least-squares start.
-
-        Returns
-        -------
-        Minimum or None
-            The minimum; None where the equations are singular.
-        """
-        start = self.start(delay) if theta is None else theta
-        return None if start is None else self.minimise_from(delay, [start])
-
     def step(self, minimum: Minimum) -> float | None:
         """Gauss-Newton step of the delay from a minimum of this cost.
 
@@ -205,7 +204,7 @@ class SampledCost:
         return minimum.step
 
 
-class SpectralCost:
+class SpectralCost(FilteredCost):
     """Cost of a record's spectra behind a low-pass filter, the initial and the final state projected out.
 
     Parameters
@@ -291,24 +290,6 @@ class SpectralCost:
             if found is not None and (best is None or found.equations.squared_error < best.equations.squared_error):
                 best = found
         return None if best is None else Minimum(delay, best.theta, best.equations.squared_error)
-
-    def minimise(self, delay: float, theta: Array | None) -> Minimum | None:
-        """Minimise over the coefficients at one delay.
-
-        Parameters
-        ----------
-        delay : float
-            Delay [s].
-        theta : ndarray, shape (n + m + 1,) or None
-            Coefficients to start from; None for the least-squares start.
-
-        Returns
-        -------
-        Minimum or None
-            The minimum; None where the equations are singular.
-        """
-        start = self.start(delay) if theta is None else theta
-        return None if start is None else self.minimise_from(delay, [start])
 
     def step(self, minimum: Minimum) -> float | None:
         """Gauss-Newton step of the delay from a minimum of this cost.

@@ -16,6 +16,7 @@ from ctid_cli.estimators.common import (
     check_structure,
     finish,
     history_entry,
+    initial_delay,
 )
 from ctid_cli.estimators.delay_search import Descent, Minimum, bound_in_the_way, delay_step, descend
 from ctid_cli.estimators.problems import CoefficientProblem, DelayProblem
@@ -213,10 +214,7 @@ class PreparedTdSrivc:
             If the start lies outside the bounds, or the equations of the start are singular.
         """
         options = self.options
-        low, high = options.delay_bounds
-        delay = 0.5 * (low + high) if start is None or start.delay is None else start.delay
-        if not low <= delay <= high:
-            raise DataError(f"the initial delay, {delay:g} s, lies outside the bounds {low:g} to {high:g} s")
+        delay = initial_delay(start, options.delay_bounds)
         history: list[IterationRecord] = []
         found = _SampleCost(self.search_data, self.structure, options).descend(delay, None, "search", history)
         if found is None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.common import Start, check_iteration, check_structure
+from ctid_cli.estimators.common import Start, check_iteration, check_structure, initial_delay
 from ctid_cli.estimators.delay_grid import scan
 from ctid_cli.estimators.delay_search import Descent, Minimum, descend
 from ctid_cli.estimators.filtered_costs import Effort, FilteredCost, Search, filtered_costs
@@ -341,10 +341,7 @@ class PreparedUsefulRedundancy:
             If the start lies outside the bounds, or nothing can be computed at any candidate.
         """
         options = self.options
-        low, high = options.delay_bounds
-        delay = 0.5 * (low + high) if start is None or start.delay is None else start.delay
-        if not low <= delay <= high:
-            raise DataError(f"the initial delay, {delay:g} s, lies outside the bounds {low:g} to {high:g} s")
+        delay = initial_delay(start, options.delay_bounds)
         paths: list[FilterPath] = []
         search = self._search(delay, paths)
         fit = self._refine(search, self._history(search, paths))
