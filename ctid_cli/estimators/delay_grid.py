@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -115,43 +115,19 @@ def scan(cost: FilteredCost, delays: Array) -> list[Minimum | None]:
     list of Minimum or None
         One for each delay; None where the equations are singular.
     """
-
-    def at(delay: float, here: Minimum | None, neighbour: Minimum | None) -> Minimum | None:
-        starts = [] if neighbour is None else [neighbour.theta]
-        if here is None:
-            own = cost.start(delay)
-            starts += [] if own is None else [own]
-        return cost.minimise_from(delay, starts)
-
-    return both_ways(delays, at)
-
-
-def both_ways(
-    delays: Array, at: Callable[[float, Minimum | None, Minimum | None], Minimum | None]
-) -> list[Minimum | None]:
-    """Go along a grid and back, so that good coefficients reach both neighbours.
-
-    Parameters
-    ----------
-    delays : ndarray, shape (K,)
-        Increasing delays [s].
-    at : callable
-        ``at(delay, here, neighbour)``: a minimum at a delay, given what is known there and next to it.
-
-    Returns
-    -------
-    list of Minimum or None
-        The lowest minimum found at each delay.
-    """
     found: list[Minimum | None] = [None] * delays.size
+    # Along the grid and back, so that good coefficients reach both neighbours.
     for order in (range(delays.size), range(delays.size - 1, -1, -1)):
         neighbour: Minimum | None = None
         for k in order:
             here = found[k]
-            if here is None or neighbour is not None:
-                trial = at(float(delays[k]), here, neighbour)
-                if trial is not None and (here is None or trial.squared_error < here.squared_error):
-                    found[k] = here = trial
+            starts = [] if neighbour is None else [neighbour.theta]
+            if here is None:
+                own = cost.start(float(delays[k]))
+                starts += [] if own is None else [own]
+            trial = cost.minimise_from(float(delays[k]), starts) if starts else None
+            if trial is not None and (here is None or trial.squared_error < here.squared_error):
+                found[k] = here = trial
             neighbour = here
     return found
 
