@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from ctid_cli.estimators.additive_srivc import AdditiveFit, AdditiveSrivc
 from ctid_cli.estimators.common import Start
 from ctid_cli.estimators.compilation import compile_kernels
 from ctid_cli.estimators.identification import Identification, identify
@@ -15,11 +16,13 @@ from ctid_cli.filtering.lowpass import Lowpass
 
 #: Every estimator by the name that a specification gives it.
 ESTIMATORS: dict[str, type[Any]] = {
-    estimator.kind: estimator for estimator in (Svf, Srivc, TdSrivc, UsefulRedundancy, DelayProfile)
+    estimator.kind: estimator for estimator in (Svf, Srivc, TdSrivc, UsefulRedundancy, DelayProfile, AdditiveSrivc)
 }
 
 __all__ = [
     "ESTIMATORS",
+    "AdditiveFit",
+    "AdditiveSrivc",
     "DelayProfile",
     "Identification",
     "Lowpass",

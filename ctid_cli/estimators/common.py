@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.output_error import OutputErrorProblem
 from ctid_cli.estimators.problems import CoefficientProblem
 from ctid_cli.filtering.bank import FilterData
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
@@ -16,11 +16,15 @@ from ctid_cli.inference.diagnostics import percent_from_r_squared
 from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
+from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.record import Record
 
 Array = NDArray[np.float64]
+
+#: What an estimator takes from a start: an initial delay, or initial parameters.
+StartFrom = Literal["delay", "parameters"]
 
 
 @dataclass(frozen=True)
@@ -31,9 +35,12 @@ class Start:
     ----------
     delay : float, optional
         Initial delay [s]; None leaves the choice to the estimator.
+    model : AdditiveModel, optional
+        Initial parameters, as a sum of submodels; None leaves them to the estimator.
     """
 
     delay: float | None = field(default=None, metadata={"doc": "Initial delay", "unit": "s"})
+    model: AdditiveModel | None = field(default=None, metadata={"doc": "Initial parameters"})
 
 
 def initial_delay(start: Start | None, bounds: tuple[float, float]) -> float:
@@ -133,9 +140,25 @@ def check_record(record: Record, data: FilterData, parameters: int) -> None:
         raise DataError(f"{where}the output is constant ({data.y_used[0]:g}) over the samples that can be used")
 
 
-def history_entry(
-    stage: str, iteration: int, problem: CoefficientProblem | OutputErrorProblem, theta: Array, cost: float
-) -> IterationRecord:
+class Splits(Protocol):
+    """An estimation problem, as far as its history needs to know it."""
+
+    def split(self, theta: Array) -> tuple[Array, Array, float]:
+        """Denominator, numerator and delay of a parameter vector.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (p,)
+            Parameters.
+
+        Returns
+        -------
+        a, b, delay : ndarray, ndarray, float
+            Monic denominator, numerator, delay [s].
+        """
+
+
+def history_entry(stage: str, iteration: int, problem: Splits, theta: Array, cost: float) -> IterationRecord:
     """Describe one accepted iteration.
 
     Parameters
@@ -144,7 +167,7 @@ def history_entry(
         Part of the algorithm.
     iteration : int
         Counted from 0 within the stage.
-    problem : CoefficientProblem or OutputErrorProblem
+    problem : Splits
         Knows how theta splits.
     theta : ndarray, shape (p,)
         Parameters.

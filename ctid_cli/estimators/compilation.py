@@ -12,9 +12,13 @@ from ctid_cli.estimators.compiled_iteration import best_coefficients
 from ctid_cli.estimators.problems import is_hurwitz
 from ctid_cli.estimators.spectral_problem import SpectralCoefficientProblem
 from ctid_cli.filtering.bank import filter_data, second_moments
+from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.filtering.spectra import record_spectra
+from ctid_cli.filtering.submodels import SubmodelFilter
 from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.models.additive import Term
+from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
@@ -26,7 +30,7 @@ def compile_kernels(estimators: Iterable[Any] = ()) -> float:
     Parameters
     ----------
     estimators : iterable of estimators, optional
-        Estimators whose searches over filtered signals or spectra are compiled too.
+        Estimators whose searches over filtered signals or spectra, sums of submodels and loops are compiled too.
 
     Returns
     -------
@@ -45,6 +49,12 @@ def compile_kernels(estimators: Iterable[Any] = ()) -> float:
     record = Record(t, t, signal)
     second_moments(filter_data(record), a, b)
     is_hurwitz(a)
+    estimators = list(estimators)
+    if any(estimator.kind == "additive_srivc" or _in_loop(estimator) for estimator in estimators):
+        SubmodelFilter(filter_data(record), (Term(1, 0),)).moments(np.array([1.0, 1.0]))
+    if any(_in_loop(estimator) for estimator in estimators):
+        controller = DiscreteController([1.0], [1.0])
+        simulate_loop(TransferFunction(b, a), controller, np.ones(8), np.zeros(8), 1.0)
     searches = {getattr(estimator, "search", None) for estimator in estimators}
     if searches & {"time", "spectral"}:
         best_coefficients(
@@ -61,3 +71,7 @@ def compile_kernels(estimators: Iterable[Any] = ()) -> float:
         weight = np.ones(spectra.frequencies.size)
         SpectralCoefficientProblem(spectra, Structure(2, 0), 0.0, weight).equations(np.array([2.0, 4.0, 1.0]))
     return time.perf_counter() - began
+
+
+def _in_loop(estimator: Any) -> bool:
+    return getattr(estimator, "instruments", "open_loop") == "closed_loop"

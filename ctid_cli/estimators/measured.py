@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.common import Start, check_iteration, check_record, history_entry
+from ctid_cli.estimators.common import Start, StartFrom, check_iteration, check_record, history_entry
 from ctid_cli.estimators.delay_grid import Level, local_minima, search_grid
 from ctid_cli.estimators.delay_search import bound_in_the_way
 from ctid_cli.estimators.filtered_costs import Effort, filtered_costs
@@ -108,6 +108,7 @@ class DelayProfile:
 
     kind: ClassVar[str] = "delay_profile"
     uses_start: ClassVar[bool] = False
+    start_from: ClassVar[StartFrom | None] = None
 
     poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})
     zeros: int = field(metadata={"doc": "Number of zeros, fewer than poles"})

@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from ctid_cli.inference.status import Status
 
 Array = NDArray[np.float64]
+#: How steps are accepted where the solution is a minimum of the output-error cost, and in general.
 Variant = Literal["plain", "guarded"]
+StepRule = Literal["plain", "guarded", "relaxed"]
 
 #: Halvings of a step before a direction is given up.
 HALVINGS = 12
@@ -30,6 +32,10 @@ NEGLIGIBLE_FALL = 1e-2
 #: The guarded variant takes a step only if the cost falls by this fraction of what its slope promises: a step that
 #: overshoots and lands as high on the other side is halved instead (Armijo's rule).
 SUFFICIENT_FALL = 0.1
+#: The relaxed variant takes the next of these fractions of every step once steps have not become shorter for so many
+#: iterations.
+RELAXATIONS = (1.0, 0.7, 0.5)
+PATIENCE = 10
 #: A rise of the cost below this fraction is rounding, not a rise.
 ROUNDING = 1e-13
 
@@ -147,7 +153,7 @@ def iterate(
     *,
     max_iterations: int,
     tolerance: float,
-    variant: Variant,
+    variant: StepRule,
     halvings: int = HALVINGS,
     on_step: Callable[[Array, Equations], None] | None = None,
 ) -> Iterated | None:
@@ -163,11 +169,13 @@ def iterate(
         Largest number of steps.
     tolerance : float
         Stop when a step changes the simulated output by less than this fraction of its rms value [-].
-    variant : {"plain", "guarded"}
+    variant : {"plain", "guarded", "relaxed"}
         ``plain`` takes every full step. ``guarded`` accepts a step only if the output-error cost falls enough, halves
-        it otherwise, and falls back on the Gauss-Newton direction, along which the cost must fall.
+        it otherwise, and falls back on the Gauss-Newton direction, along which the cost must fall. ``relaxed`` takes
+        full steps whatever the cost, as in closed loop, where the solution is not the minimum of the cost; where they
+        do not become shorter, 0.7 and then 0.5 of them, which ends cycles; and halves one that leaves the admissible.
     halvings : int, default 12
-        Trials of the guarded variant before a direction is given up.
+        Trials of the guarded and the relaxed variant before a direction is given up.
     on_step : callable, optional
         Called with the parameters and their second moments at the start and after every accepted step.
 
@@ -184,7 +192,8 @@ def iterate(
         on_step(theta, current)
     slow = 0
     # Where instruments are regressors the step is Gauss-Newton's already: a second trial would repeat the first.
-    instruments = variant == "plain" or current.instrument_regressor is not current.hessian
+    instruments = variant != "guarded" or current.instrument_regressor is not current.hessian
+    pace = _Pace()
     for iteration in range(max_iterations):
         step, accepted = None, None
         if instruments:
@@ -194,10 +203,11 @@ def iterate(
                 current.hessian.diagonal(),
                 np.abs(current.instrument_regressor.diagonal()),
             )
-            if step is None and variant == "plain":
+            if step is None and variant != "guarded":
                 return Iterated(theta, current, Status.SINGULAR, iteration)
             if step is not None:
-                accepted = _take(problem, theta, current, step, variant, halvings)
+                first = pace.fraction(relative_change(current, step)) if variant == "relaxed" else 1.0
+                accepted = _take(problem, theta, current, step, variant, halvings, first)
         newton = accepted is None and variant == "guarded"
         if newton:
             # A direction in which the cost does not fall will not be better at the next step: it is not tried again.
@@ -209,7 +219,7 @@ def iterate(
         assert step is not None
         change = relative_change(current, step)
         if accepted is None:
-            if variant == "plain":
+            if variant != "guarded":
                 return Iterated(theta, current, Status.DIVERGED, iteration)
             # At the minimum up to rounding no step can lower the cost: that is convergence, not failure.
             done = newton and change <= max(tolerance, 1e-7)
@@ -219,13 +229,33 @@ def iterate(
         theta, current, fraction = accepted
         if on_step:
             on_step(theta, current)
-        if fraction == 1.0 and change <= tolerance:
+        if (fraction == 1.0 or variant == "relaxed") and change <= tolerance:
             return Iterated(theta, current, Status.CONVERGED, iteration + 1)
         # Steps that keep promising more than they give: along a curved valley of equal cost, or across a kink of it.
         slow = slow + 1 if fall < NEGLIGIBLE_FALL * expected else 0
         if variant == "guarded" and slow == SLOW_STEPS:
             return Iterated(theta, current, Status.STALLED, iteration + 1)
     return Iterated(theta, current, Status.MAX_ITERATIONS, max_iterations)
+
+
+class _Pace:
+    """Fraction of the steps that the relaxed variant takes."""
+
+    def __init__(self) -> None:
+        self.stage = 0
+        self.shortest = math.inf
+        self.waited = 0
+
+    def fraction(self, change: float) -> float:
+        """The fraction, from the length of the full step."""
+        if change < self.shortest:
+            self.shortest, self.waited = change, 0
+        else:
+            self.waited += 1
+        if self.waited == PATIENCE and self.stage + 1 < len(RELAXATIONS):
+            # What was reached before does not bind: shorter steps lead elsewhere at first.
+            self.stage, self.shortest, self.waited = self.stage + 1, change, 0
+        return RELAXATIONS[self.stage]
 
 
 def gauss_newton_step(equations: Equations) -> Array | None:
@@ -266,19 +296,24 @@ def relative_change(equations: Equations, step: Array) -> float:
 
 
 def _take(
-    problem: Problem, theta: Array, current: Equations, step: Array, variant: Variant, halvings: int
+    problem: Problem,
+    theta: Array,
+    current: Equations,
+    step: Array,
+    variant: StepRule,
+    halvings: int,
+    fraction: float = 1.0,
 ) -> tuple[Array, Equations, float] | None:
     """The first acceptable fraction of a step, or None."""
-    fraction = 1.0
     slope = max(float(step @ current.instrument_error), 0.0)
-    for _ in range(halvings if variant == "guarded" else 1):
+    for _ in range(1 if variant == "plain" else halvings):
         candidate = problem.admissible(theta + fraction * step)
         trial = problem.equations(candidate)
         if trial is not None and np.isfinite(trial.squared_error):
             rounding = ROUNDING * (trial.output_power + current.output_power)
             promised = 2.0 * fraction * slope
             limit = current.squared_error * (1.0 + ROUNDING) + rounding * ROUNDING - SUFFICIENT_FALL * promised
-            if variant == "plain" or trial.squared_error <= limit:
+            if variant != "guarded" or trial.squared_error <= limit:
                 return candidate, trial, fraction
         fraction *= 0.5
     return None

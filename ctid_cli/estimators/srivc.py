@@ -2,32 +2,47 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import ClassVar, get_args
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
+from ctid_cli.estimators.additive_estimate import Covariance, estimate_submodels
+from ctid_cli.estimators.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
 from ctid_cli.estimators.common import (
     Start,
+    StartFrom,
     check_iteration,
     check_record,
     check_structure,
     finish,
     history_entry,
 )
-from ctid_cli.estimators.problems import CoefficientProblem, least_squares_start, refit_numerator
-from ctid_cli.estimators.refined_iv import Equations, Iterated, Variant, iterate
-from ctid_cli.filtering.bank import FilterData, filter_data
+from ctid_cli.estimators.problems import (
+    CoefficientProblem,
+    least_squares_start,
+    refit_numerator,
+    with_stable_denominator,
+)
+from ctid_cli.estimators.refined_iv import Equations, Iterated, StepRule, iterate
+from ctid_cli.filtering.bank import FilterData, filter_data, standard_rows
+from ctid_cli.inference.diagnostics import percent_from_r_squared
 from ctid_cli.inference.fit import Fit, IterationRecord
+from ctid_cli.inference.robust import sandwich_covariance
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
+from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.models.factoring import unfactored, unfactored_jacobian
 from ctid_cli.signals.checks import require_choice, require_not_negative, require_positive
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
 Array = NDArray[np.float64]
+
+#: How steps are accepted; ``auto`` depends on the instruments.
+SrivcVariant = Literal["auto", "guarded", "plain", "relaxed"]
 
 
 @dataclass(frozen=True)
@@ -48,10 +63,18 @@ class Srivc:
         Largest number of iterations.
     tolerance : float, default 1e-6
         Stop when a step changes the simulated output by less than this fraction of its rms value [-].
-    variant : {"guarded", "plain"}, default "guarded"
-        ``plain`` is the published iteration; ``guarded`` never lets the output-error cost rise.
+    variant : {"auto", "guarded", "plain", "relaxed"}, default "auto"
+        ``plain`` is the published iteration; ``guarded`` never lets the output-error cost rise; ``relaxed`` shortens
+        steps that do not settle. ``auto`` is ``guarded`` in open loop and ``relaxed`` in closed loop, where the
+        solution is not the minimum of that cost.
     hold_output : {"foh", "zoh"}, default "foh"
         Interpolation of the measured output between samples; changes the path, not the converged estimate.
+    instruments : {"open_loop", "closed_loop"}, default "open_loop"
+        ``closed_loop`` (CLSRIVC) simulates the instruments in the noise-free loop of the model with the record's
+        controller and reference: needed where feedback brings coloured noise into the input.
+    covariance : {"white", "sandwich"}, default "white"
+        Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
+        residuals.
 
     Raises
     ------
@@ -84,6 +107,7 @@ class Srivc:
 
     kind: ClassVar[str] = "srivc"
     uses_start: ClassVar[bool] = False
+    start_from: ClassVar[StartFrom | None] = "parameters"
 
     poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})
     zeros: int = field(metadata={"doc": "Number of zeros, fewer than poles"})
@@ -96,18 +120,38 @@ class Srivc:
         default=1e-6,
         metadata={"doc": "Stop when a step changes the simulated output by less than this fraction of its rms value"},
     )
-    variant: Variant = field(default="guarded", metadata={"doc": "plain: as published; guarded: the cost never rises"})
+    variant: SrivcVariant = field(
+        default="auto",
+        metadata={
+            "doc": "plain: as published; guarded: the cost never rises; relaxed: shorter steps where they do not "
+            "settle; auto: guarded, and relaxed in closed loop"
+        },
+    )
     hold_output: Hold = field(default="foh", metadata={"doc": "Interpolation of the measured output between samples"})
+    instruments: Instruments = field(
+        default="open_loop", metadata={"doc": "From the measured input, or from the noise-free loop of the model"}
+    )
+    covariance: Covariance = field(default="white", metadata={"doc": "Noise that the standard errors hold for"})
 
     def __post_init__(self) -> None:
         check_structure(self.poles, self.zeros)
         require_choice("hold_output", self.hold_output, get_args(Hold))
-        require_choice("variant", self.variant, get_args(Variant))
+        require_choice("variant", self.variant, get_args(SrivcVariant))
+        require_choice("instruments", self.instruments, get_args(Instruments))
+        require_choice("covariance", self.covariance, get_args(Covariance))
+        check_closed_loop(self.instruments, self.variant)
         require_positive("svf_cutoff", self.svf_cutoff, "rad/s")
         check_iteration(self.max_iterations, self.tolerance)
         require_not_negative("delay", self.delay, "s")
 
-    def prepare(self, record: Record) -> PreparedSrivc:
+    @property
+    def step_rule(self) -> StepRule:
+        """How steps are accepted, ``auto`` resolved."""
+        if self.variant == "auto":
+            return "guarded" if self.instruments == "open_loop" else "relaxed"
+        return self.variant
+
+    def prepare(self, record: Record) -> PreparedSrivc | PreparedClosedLoopSrivc:
         """Check a record and lay it out.
 
         Parameters
@@ -117,15 +161,15 @@ class Srivc:
 
         Returns
         -------
-        PreparedSrivc
+        PreparedSrivc or PreparedClosedLoopSrivc
             Ready to fit.
 
         Raises
         ------
         DataError
-            If nothing can be estimated from the record.
+            If nothing can be estimated from the record, or it lacks the loop that the instruments need.
         """
-        return PreparedSrivc(self, record)
+        return PreparedSrivc(self, record) if self.instruments == "open_loop" else PreparedClosedLoopSrivc(self, record)
 
     def fit(self, record: Record, start: Start | None = None) -> Fit:
         """Estimate the coefficients.
@@ -135,7 +179,7 @@ class Srivc:
         record : Record
             The record.
         start : Start, optional
-            Ignored: the least-squares start needs no value.
+            Initial parameters, as the sum of submodels that they make; by least squares without them.
 
         Returns
         -------
@@ -145,7 +189,7 @@ class Srivc:
         Raises
         ------
         DataError
-            If nothing can be estimated from the record.
+            If nothing can be estimated from the record or from that start.
         """
         return self.prepare(record).fit(start)
 
@@ -173,7 +217,7 @@ class PreparedSrivc:
         Parameters
         ----------
         start : Start, optional
-            Ignored: the least-squares start needs no value.
+            Initial parameters, as the sum of submodels that they make; by least squares without them.
 
         Returns
         -------
@@ -183,11 +227,14 @@ class PreparedSrivc:
         Raises
         ------
         DataError
-            If the equations of the start are singular.
+            If the start does not fit the degrees, or the equations of the least-squares start are singular.
         """
         options = self.options
         problem = CoefficientProblem(self.data, self.structure, options.delay)
-        theta = initial_coefficients(problem, options.svf_cutoff, options.variant)
+        if start is not None and start.model is not None:
+            theta: Array | None = given_coefficients(start.model, self.structure)
+        else:
+            theta = initial_coefficients(problem, options.svf_cutoff, options.step_rule)
         if theta is None:
             raise DataError(Status.SINGULAR.value)
         history: list[IterationRecord] = []
@@ -201,15 +248,132 @@ class PreparedSrivc:
             theta,
             max_iterations=options.max_iterations,
             tolerance=options.tolerance,
-            variant=options.variant,
+            variant=options.step_rule,
             on_step=record_step,
         )
         if result is None:
             return finish(problem, theta, Status.DIVERGED, 0, history)
-        return finish(problem, result.theta, result.status, result.iterations, history)
+        fit = finish(problem, result.theta, result.status, result.iterations, history)
+        return fit if options.covariance == "white" else self._with_sandwich(problem, result.theta, fit)
+
+    def _with_sandwich(self, problem: CoefficientProblem, theta: Array, fit: Fit) -> Fit:
+        a, b, delay = problem.split(theta)
+        rows = standard_rows(problem.data, a, b, delay)
+        structure = problem.structure
+        psi = rows[:, structure.sensitivity_rows] * structure.signs
+        covariance = sandwich_covariance(psi, rows[:, structure.error_row], regular=problem.data.interval is not None)
+        return replace(fit, covariance=covariance)
 
 
-def initial_coefficients(problem: CoefficientProblem, svf_cutoff: float, variant: Variant) -> Array | None:
+class PreparedClosedLoopSrivc:
+    """A record checked and laid out for :class:`Srivc` with closed-loop instruments (CLSRIVC).
+
+    Parameters
+    ----------
+    options : Srivc
+        The estimator.
+    record : Record
+        The record, with its loop.
+    """
+
+    def __init__(self, options: Srivc, record: Record) -> None:
+        self.options = options
+        loop = loop_data(record, options.instruments)
+        data = filter_data(record, options.delay, options.hold_output)
+        self.structure = Structure(options.poles, options.zeros)
+        check_record(record, data, self.structure.size)
+        self.problem = AdditiveProblem(data, (Term(options.poles, options.zeros),), options.delay, loop)
+
+    def fit(self, start: Start | None = None) -> Fit:
+        """Estimate the coefficients.
+
+        Parameters
+        ----------
+        start : Start, optional
+            Initial parameters, as the sum of submodels that they make; by least squares without them.
+
+        Returns
+        -------
+        Fit
+            The estimate.
+
+        Raises
+        ------
+        DataError
+            If the start does not fit the degrees, the equations of the least-squares start are singular, or the loop of
+            the start is unstable.
+
+        Notes
+        -----
+        It is additive SRIVC with a single submodel; coefficients and covariance are converted to the monic form.
+        """
+        options, problem, structure = self.options, self.problem, self.structure
+        if start is not None and start.model is not None:
+            theta: Array | None = given_coefficients(start.model, structure)
+        else:
+            direct = CoefficientProblem(problem.data, structure, options.delay)
+            theta = initial_coefficients(direct, options.svf_cutoff, "guarded")
+        if theta is None:
+            raise DataError(Status.SINGULAR.value)
+        single = Submodel(theta[structure.poles :], np.concatenate(([1.0], theta[: structure.poles])))
+        estimate = estimate_submodels(
+            problem,
+            AdditiveModel([single]).theta,
+            max_iterations=options.max_iterations,
+            tolerance=options.tolerance,
+            variant=options.step_rule,
+            covariance=options.covariance,
+        )
+        additive = problem.model(estimate.theta)
+        jacobian = unfactored_jacobian(additive)
+        # The numerator has all its powers there, and the highest of them are zero.
+        kept = [*range(structure.poles), *range(jacobian.shape[0] - structure.zeros - 1, jacobian.shape[0])]
+        return Fit(
+            model=unfactored(additive),
+            parameter_names=structure.names,
+            covariance=jacobian[kept] @ estimate.covariance @ jacobian[kept].T,
+            status=estimate.status,
+            cost=estimate.squared_error / problem.data.count,
+            fit_percent=percent_from_r_squared(estimate.r2),
+            r2=estimate.r2,
+            count=problem.data.count,
+            iterations=estimate.iterations,
+            condition_number=estimate.condition_number,
+            history=estimate.history,
+        )
+
+
+def given_coefficients(model: AdditiveModel, structure: Structure) -> Array:
+    """Initial coefficients from a sum of submodels.
+
+    Parameters
+    ----------
+    model : AdditiveModel
+        The start.
+    structure : Structure
+        Degrees.
+
+    Returns
+    -------
+    ndarray, shape (n + m + 1,)
+        ``(a_1 … a_n, b_0 … b_m)``, unstable poles reflected.
+
+    Raises
+    ------
+    DataError
+        If the sum has another number of poles, or more zeros.
+    """
+    whole = unfactored(model)
+    if whole.order != structure.poles or whole.numerator.size > structure.zeros + 1:
+        raise DataError(
+            f"the start has {whole.order} poles and {whole.numerator.size - 1} zeros, and the estimator "
+            f"{structure.poles} and {structure.zeros}"
+        )
+    padded = np.concatenate((np.zeros(structure.zeros + 1 - whole.numerator.size), whole.numerator))
+    return with_stable_denominator(np.concatenate((whole.denominator[1:], padded)), structure.poles)
+
+
+def initial_coefficients(problem: CoefficientProblem, svf_cutoff: float, variant: StepRule) -> Array | None:
     """Least-squares start; the guarded variant re-fits the numerator to the output error.
 
     Parameters
@@ -218,7 +382,7 @@ def initial_coefficients(problem: CoefficientProblem, svf_cutoff: float, variant
         Record, degrees and delay.
     svf_cutoff : float
         Cut-off of the state-variable filter [rad/s].
-    variant : {"plain", "guarded"}
+    variant : {"plain", "guarded", "relaxed"}
         Variant of the iteration.
 
     Returns

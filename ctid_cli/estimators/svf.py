@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar, get_args
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.common import Start, check_record, check_structure, finish, history_entry
+from ctid_cli.estimators.common import Start, StartFrom, check_record, check_structure, finish, history_entry
 from ctid_cli.estimators.problems import CoefficientProblem, least_squares_start
 from ctid_cli.filtering.bank import filter_data
 from ctid_cli.inference.fit import Fit
@@ -52,6 +52,7 @@ class Svf:
 
     kind: ClassVar[str] = "svf"
     uses_start: ClassVar[bool] = False
+    start_from: ClassVar[StartFrom | None] = None
 
     poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})
     zeros: int = field(metadata={"doc": "Number of zeros, fewer than poles"})

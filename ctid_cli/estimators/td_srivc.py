@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.common import (
     Start,
+    StartFrom,
     check_iteration,
     check_record,
     check_structure,
@@ -89,6 +90,7 @@ class TdSrivc:
 
     kind: ClassVar[str] = "td_srivc"
     uses_start: ClassVar[bool] = True
+    start_from: ClassVar[StartFrom | None] = "delay"
 
     poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})
     zeros: int = field(metadata={"doc": "Number of zeros, fewer than poles"})

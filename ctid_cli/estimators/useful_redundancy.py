@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.common import Start, check_iteration, check_structure, initial_delay
+from ctid_cli.estimators.common import Start, StartFrom, check_iteration, check_structure, initial_delay
 from ctid_cli.estimators.delay_grid import scan
 from ctid_cli.estimators.delay_search import Descent, Minimum, descend
 from ctid_cli.estimators.filtered_costs import Effort, FilteredCost, Search, filtered_costs
@@ -169,6 +169,7 @@ class UsefulRedundancy:
 
     kind: ClassVar[str] = "useful_redundancy"
     uses_start: ClassVar[bool] = True
+    start_from: ClassVar[StartFrom | None] = "delay"
 
     poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})
     zeros: int = field(metadata={"doc": "Number of zeros, fewer than poles"})

@@ -331,10 +331,21 @@ def _evaluate(coefficients: Array, point: complex) -> tuple[complex, complex, co
 
 
 @njit(cache=True, nogil=True)
-def _modal_condition(roots: ComplexArray, slopes: ComplexArray, curvatures: ComplexArray) -> float:
+def modal_condition(roots: ComplexArray, slopes: ComplexArray, curvatures: ComplexArray) -> float:
     """How much the partial fractions of ``p^k/A^2`` amplify rounding, against the peak gain of each.
 
-    Gains are compared at zero frequency and at the magnitude of every pole; the worst power k counts.
+    Parameters
+    ----------
+    roots : ndarray, shape (n,)
+        Poles [rad/s].
+    slopes, curvatures : ndarray, shape (n,)
+        ``A'`` and ``A''/A'`` there.
+
+    Returns
+    -------
+    float
+        Gains are compared at zero frequency and at the magnitude of every pole; the worst power k counts. Infinite
+        with a repeated pole.
     """
     n = roots.size
     worst = 0.0
@@ -437,7 +448,7 @@ def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Ar
     mapping[n, 2 * n] = 1.0
     mapping[3 * n + 1, 3 * n + 1] = 1.0
     _fill_derivative(a, b, mapping)
-    return _modal_condition(roots, slopes, curvatures), poles, residues, mapping
+    return modal_condition(roots, slopes, curvatures), poles, residues, mapping
 
 
 @njit(cache=True, nogil=True)

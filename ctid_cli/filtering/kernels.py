@@ -38,24 +38,52 @@ INVERSE_FACTORIALS = tuple(1.0 / math.factorial(k + 2) for k in range(11))
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
-def _accumulate(block: Array, count: int, gram: Array) -> None:
-    """Add the products of ``count`` buffered rows to the upper triangle of the Gram matrix."""
+def accumulate(block: Array, count: int, gram: Array) -> None:
+    """Add the products of buffered rows to the upper triangle of a Gram matrix.
+
+    Parameters
+    ----------
+    block : ndarray, shape (q, BLOCK)
+        Rows, one column per sample.
+    count : int
+        Columns that are filled.
+    gram : ndarray, shape (q, q)
+        Sums; what is below the diagonal is not meaningful.
+
+    Notes
+    -----
+    Two rows with two others at a time: each number that is loaded enters two products, which halves the time.
+    """
     q = block.shape[0]
-    for i in range(q):
-        left = block[i]
-        for j in range(i, q):
-            right = block[j]
+    for i in range(0, q - 1, 2):
+        left, left_next = block[i], block[i + 1]
+        for j in range(i, q - 1, 2):
+            right, right_next = block[j], block[j + 1]
+            total, total_right, total_left, total_both = 0.0, 0.0, 0.0, 0.0
+            for k in range(count):
+                total += left[k] * right[k]
+                total_right += left[k] * right_next[k]
+                total_left += left_next[k] * right[k]
+                total_both += left_next[k] * right_next[k]
+            gram[i, j] += total
+            gram[i, j + 1] += total_right
+            gram[i + 1, j] += total_left
+            gram[i + 1, j + 1] += total_both
+    if q % 2 == 1:
+        right = block[q - 1]
+        for i in range(q):
+            left = block[i]
             total = 0.0
             for k in range(count):
                 total += left[k] * right[k]
-            gram[i, j] += total
+            gram[i, q - 1] += total
 
 
 @njit(cache=True, nogil=True)
 def _emit(block: Array, filled: int, written: int, rows: Array, gram: Array) -> int:
     """Pass a block on to whatever the caller asked for; returns the number of rows written so far."""
     if gram.size:
-        _accumulate(block, filled, gram)
+        accumulate(block, filled, gram)
     if rows.size:
         for k in range(filled):
             for i in range(block.shape[0]):
@@ -224,8 +252,22 @@ def _step_functions(x: complex) -> tuple[complex, complex, complex]:
 
 
 @njit(cache=True, nogil=True)
-def _step_weights(pole: complex, step: float) -> tuple[complex, complex, complex, complex, complex, complex]:
-    """Weights with which :func:`_modal_step` moves a mode over a step."""
+def step_weights(pole: complex, step: float) -> tuple[complex, complex, complex, complex, complex, complex]:
+    """Weights with which a mode and its square move over a step.
+
+    Parameters
+    ----------
+    pole : complex
+        p [rad/s].
+    step : float
+        Length h of the step [s].
+
+    Returns
+    -------
+    tuple of complex
+        ``exp(p h)``, the weight of z in w, those of the value at the start and of the change over the step in z, and
+        the same two in w, for ``z = 1/(s - p) v`` and ``w = 1/(s - p)^2 v`` with v linear over the step.
+    """
     x = pole * step
     decay, value, slope = _step_functions(x)
     square = step * step
@@ -328,9 +370,9 @@ def modal_pass(
     at_break, at_sample = np.zeros((modes, 6), np.complex128), np.zeros((modes, 6), np.complex128)
     if regular:
         for i in range(modes):
-            for k, weight in enumerate(_step_weights(poles[i], interval)):
+            for k, weight in enumerate(step_weights(poles[i], interval)):
                 at_break[i, k] = weight
-            for k, weight in enumerate(_step_weights(poles[i], interval * fraction)):
+            for k, weight in enumerate(step_weights(poles[i], interval * fraction)):
                 at_sample[i, k] = weight
     share = common_clock and not regular
     # Instants that differ by rounding only are one instant.
@@ -352,7 +394,7 @@ def modal_pass(
                     elif share:
                         weights = _weights(memory[j % ring, i])
                     else:
-                        weights = _step_weights(poles[i], tu[j + 1] - tu[j])
+                        weights = step_weights(poles[i], tu[j + 1] - tu[j])
                     z[i], w[i] = _modal_step(weights, z[i], w[i], u[j], change)
             j += 1
         used = keep_rows and use[k]
@@ -367,7 +409,7 @@ def modal_pass(
             for i in range(modes):
                 z_now, w_now = z[i], w[i]
                 if step > 0.0:
-                    weights = _weights(at_sample[i]) if regular else _step_weights(poles[i], step)
+                    weights = _weights(at_sample[i]) if regular else step_weights(poles[i], step)
                     z_now, w_now = _modal_step(weights, z_now, w_now, u[j], change)
                 x += output_map[i].real * z_now.real - output_map[i].imag * z_now.imag
                 if used:
@@ -400,7 +442,7 @@ def modal_pass(
         if k + 1 < n_samples and (keep_rows or share):
             change = y[k + 1] - y[k] if y_foh else 0.0
             for i in range(modes):
-                weights = _weights(at_break[i]) if regular else _step_weights(poles[i], t[k + 1] - t[k])
+                weights = _weights(at_break[i]) if regular else step_weights(poles[i], t[k + 1] - t[k])
                 if share:
                     for m, weight in enumerate(weights):
                         memory[k % ring, i, m] = weight

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import norm
 
+from ctid_cli.models.factoring import pole_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
@@ -44,31 +45,47 @@ class DerivedParameter:
     unit: str
     reason: str = ""
 
+    @classmethod
+    def by_delta_method(
+        cls,
+        name: str,
+        estimate: float,
+        gradient: Array,
+        covariance: Array,
+        unit: str,
+        quantile: float,
+        reason: str = "",
+    ) -> DerivedParameter:
+        """A quantity and its accuracy from its gradient: ``var g = (dg/dtheta) C (dg/dtheta)'``.
 
-def pole_jacobian(denominator: ArrayLike, poles: ArrayLike) -> NDArray[np.complex128]:
-    """Derivatives of the poles with respect to the denominator coefficients: ``dp/da_i = -p^(n-i) / A'(p)``.
+        Parameters
+        ----------
+        name : str
+            Name of the quantity.
+        estimate : float
+            Value [unit].
+        gradient : ndarray, shape (p,)
+            Its derivatives with respect to the parameters.
+        covariance : ndarray, shape (p, p)
+            Covariance C of the parameters.
+        unit : str
+            Unit of the quantity.
+        quantile : float
+            Standard errors from the estimate to either end of the interval [-].
+        reason : str, default ""
+            Why the accuracy is not defined, where that is known already.
 
-    Parameters
-    ----------
-    denominator : array_like, shape (n + 1,)
-        Monic A in descending powers.
-    poles : array_like, shape (n,)
-        Its roots [rad/s].
-
-    Returns
-    -------
-    ndarray, shape (n, n)
-        Row: pole; column: ``a_1 … a_n``; not finite for repeated poles.
-    """
-    a = np.asarray(denominator, dtype=float)
-    p = np.asarray(poles, dtype=complex)
-    n = a.size - 1
-    # A'(p) as a product over the other poles: exact where the polynomial form would cancel.
-    distances = p[:, None] - p[None, :]
-    np.fill_diagonal(distances, 1.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        jacobian: ComplexArray = -(p[:, None] ** np.arange(n - 1, -1, -1)) / np.prod(distances, axis=1)[:, None]
-    return jacobian
+        Returns
+        -------
+        DerivedParameter
+            With NaN for the accuracy, and a reason, where it is not defined.
+        """
+        variance = float(gradient @ covariance @ gradient) if np.isfinite(gradient).all() else NAN
+        error = float(np.sqrt(variance)) if variance >= 0 and not reason else NAN
+        if not reason and not np.isfinite(error):
+            reason = "The covariance of the coefficients is not defined."
+        reach = quantile * error
+        return cls(name, estimate, error, estimate - reach, estimate + reach, unit, reason)
 
 
 def derived_parameters(
@@ -130,58 +147,76 @@ def derived_parameters(
         )
     quantile = float(norm.ppf(0.5 + level / 2))
     poles = model.poles
-    jacobian = pole_jacobian(model.denominator, poles)
-    A = C[:n, :n]
-    rows: list[DerivedParameter] = []
-
-    def row(name: str, estimate: float, gradient: Array, block: Array, unit: str, reason: str = "") -> None:
-        variance = float(gradient @ block @ gradient) if np.isfinite(gradient).all() else NAN
-        error = float(np.sqrt(variance)) if variance >= 0 and not reason else NAN
-        if not reason and not np.isfinite(error):
-            reason = "The covariance of the coefficients is not defined."
-        reach = quantile * error
-        rows.append(DerivedParameter(name, estimate, error, estimate - reach, estimate + reach, unit, reason))
-
-    number = 0
-    for k, pole in enumerate(poles):
-        if pole.imag < 0:
-            continue
-        number += 1
-        slope = jacobian[k]
-        reason = _undetermined(poles, k, slope, A, quantile, np.arange(n) != k)
-        if pole.imag == 0:
-            p = float(pole.real)
-            row(f"pole_{number}", p, slope.real, A, "rad/s", reason)
-            if p == 0:
-                reason = "The pole lies at the origin: it integrates and has no time constant."
-                row(f"time_constant_{number}", float("inf"), slope.real, A, "s", reason)
-            else:
-                row(f"time_constant_{number}", -1.0 / p, slope.real / p**2, A, "s", reason)
-            continue
-        x, y = float(pole.real), float(pole.imag)
-        frequency = abs(complex(pole))
-        row(f"pole_{number}_real", x, slope.real, A, "rad/s", reason)
-        row(f"pole_{number}_imag", y, slope.imag, A, "rad/s", reason)
-        # d(x^2 + y^2) = 2 Re(conj(p) dp)
-        radial = (x * slope.real + y * slope.imag) / frequency
-        turning = y * (x * slope.imag - y * slope.real) / frequency**3
-        others = (np.arange(n) != k) & (poles != np.conj(pole))
-        reason = _undetermined(poles, k, slope, A, quantile, others)
-        row(f"natural_frequency_{number}", frequency, radial, A, "rad/s", reason)
-        row(f"natural_frequency_{number}_hz", frequency / (2 * np.pi), radial / (2 * np.pi), A, "Hz", reason)
-        row(f"damping_{number}", -x / frequency, turning, A, "-", reason)
-
+    rows = pole_rows(poles, pole_jacobian(model.denominator, poles), C[:n, :n], quantile)
     gradient = np.zeros(C.shape[0])
     last = float(model.denominator[-1])
+    reason = ""
     if last == 0:
         reason = "The model integrates (a pole at the origin) and has no static gain."
-        row("static_gain", float("inf"), gradient, C, gain_unit, reason)
     else:
         gradient[-1] = 1.0 / last
         if n:
             gradient[n - 1] = -model.dc_gain / last
-        row("static_gain", model.dc_gain, gradient, C, gain_unit)
-    return tuple(rows)
+    gain = DerivedParameter.by_delta_method("static_gain", model.dc_gain, gradient, C, gain_unit, quantile, reason)
+    return (*rows, gain)
+
+
+def pole_rows(
+    poles: ComplexArray, jacobian: ComplexArray, covariance: Array, quantile: float, *, number_lone: bool = True
+) -> list[DerivedParameter]:
+    """Poles, time constants, natural frequencies and damping, for whatever parameters the poles depend on.
+
+    Parameters
+    ----------
+    poles : ndarray, shape (n,)
+        Poles [rad/s], conjugates included.
+    jacobian : ndarray, shape (n, p)
+        Their derivatives with respect to the parameters.
+    covariance : ndarray, shape (p, p)
+        Covariance of the parameters.
+    quantile : float
+        Standard errors from the estimate to either end of the interval [-].
+    number_lone : bool, default True
+        Whether the only real pole or pair carries the number 1 in its name.
+
+    Returns
+    -------
+    list of DerivedParameter
+        As :func:`derived_parameters`, without the gain.
+    """
+    rows: list[DerivedParameter] = []
+
+    def row(name: str, estimate: float, gradient: Array, unit: str, reason: str) -> None:
+        rows.append(DerivedParameter.by_delta_method(name, estimate, gradient, covariance, unit, quantile, reason))
+
+    upper = [k for k, pole in enumerate(poles) if pole.imag >= 0]
+    for number, k in enumerate(upper, 1):
+        label = f"_{number}" if number_lone or len(upper) > 1 else ""
+        pole, slope = poles[k], jacobian[k]
+        everyone_else = np.arange(poles.size) != k
+        reason = _undetermined(poles, k, slope, covariance, quantile, everyone_else)
+        if pole.imag == 0:
+            p = float(pole.real)
+            row(f"pole{label}", p, slope.real, "rad/s", reason)
+            if p == 0:
+                reason = "The pole lies at the origin: it integrates and has no time constant."
+                row(f"time_constant{label}", float("inf"), slope.real, "s", reason)
+            else:
+                row(f"time_constant{label}", -1.0 / p, slope.real / p**2, "s", reason)
+            continue
+        x, y = float(pole.real), float(pole.imag)
+        frequency = abs(complex(pole))
+        row(f"pole{label}_real", x, slope.real, "rad/s", reason)
+        row(f"pole{label}_imag", y, slope.imag, "rad/s", reason)
+        # d(x^2 + y^2) = 2 Re(conj(p) dp)
+        radial = (x * slope.real + y * slope.imag) / frequency
+        turning = y * (x * slope.imag - y * slope.real) / frequency**3
+        others = everyone_else & (poles != np.conj(pole))
+        reason = _undetermined(poles, k, slope, covariance, quantile, others)
+        row(f"natural_frequency{label}", frequency, radial, "rad/s", reason)
+        row(f"natural_frequency{label}_hz", frequency / (2 * np.pi), radial / (2 * np.pi), "Hz", reason)
+        row(f"damping{label}", -x / frequency, turning, "-", reason)
+    return rows
 
 
 def _undetermined(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -63,7 +64,7 @@ class Fit:
         Iterations in all stages.
     condition_number : float
         Of the scaled ``sum psi psi'`` [-].
-    history : tuple of IterationRecord
+    history : sequence of IterationRecord
         The accepted iterations.
     """
 
@@ -77,7 +78,7 @@ class Fit:
     count: int
     iterations: int
     condition_number: float
-    history: tuple[IterationRecord, ...] = field(default=(), repr=False)
+    history: Sequence[IterationRecord] = field(default=(), repr=False)
 
     @property
     def parameters(self) -> dict[str, float]:

@@ -1,5 +1,6 @@
 """Records, held signals, excitations, sampling schemes and noise."""
 
+from ctid_cli.signals.arma_noise import ArmaNoise
 from ctid_cli.signals.csv_file import read_held_signal, read_record
 from ctid_cli.signals.excitation import (
     EXCITATIONS,
@@ -15,8 +16,15 @@ from ctid_cli.signals.excitation import (
 from ctid_cli.signals.held import COINCIDENCE, HeldSignal, Hold
 from ctid_cli.signals.measurement import Measurement, read_measurement
 from ctid_cli.signals.noise import NOISES, Noise, WhiteNoise
-from ctid_cli.signals.record import Record, regular_interval
-from ctid_cli.signals.sampling import SAMPLINGS, InputRecord, RegularSampling, Sampling, UniformIntervals
+from ctid_cli.signals.record import Controller, Enters, Loop, Record, regular_interval
+from ctid_cli.signals.sampling import (
+    SAMPLINGS,
+    InputRecord,
+    RegularSampling,
+    Sampling,
+    UniformIntervals,
+    geometric_sizes,
+)
 from ctid_cli.signals.streams import ROLES, Role, stream
 
 __all__ = [
@@ -26,12 +34,16 @@ __all__ = [
     "ROLES",
     "SAMPLINGS",
     "TAPS",
+    "ArmaNoise",
+    "Controller",
+    "Enters",
     "Excitation",
     "Gaussian",
     "HeldSignal",
     "Hold",
     "InputFile",
     "InputRecord",
+    "Loop",
     "Measurement",
     "Multisine",
     "Noise",
@@ -43,6 +55,7 @@ __all__ = [
     "Step",
     "UniformIntervals",
     "WhiteNoise",
+    "geometric_sizes",
     "maximal_length_sequence",
     "read_held_signal",
     "read_measurement",

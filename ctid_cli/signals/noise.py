@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ctid_cli.errors import DataError
-from ctid_cli.signals.checks import require_finite, require_not_negative
+from ctid_cli.signals.arma_noise import ArmaNoise
+from ctid_cli.signals.noise_level import require_one_level, variance_at
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,9 @@ class WhiteNoise:
         Signal-to-noise ratio [dB]: ten times the decimal logarithm of the mean square of the noise-free
         output over the variance of the noise.
     standard_deviation : float, optional
-        Standard deviation [output unit]; 0 for no noise. Exactly one of the two is given.
+        Standard deviation [output unit]; 0 for no noise.
+    variance : float, optional
+        Variance [output unit^2]. Exactly one of the three is given.
 
     Notes
     -----
@@ -40,6 +42,8 @@ class WhiteNoise:
     """
 
     kind: ClassVar[str] = "white"
+    #: Whether samples at different instants are correlated.
+    coloured: ClassVar[bool] = False
 
     snr_db: float | None = field(
         default=None,
@@ -48,15 +52,81 @@ class WhiteNoise:
     standard_deviation: float | None = field(
         default=None, metadata={"doc": "standard deviation of the noise", "unit": "output unit"}
     )
+    variance: float | None = field(
+        default=None, metadata={"doc": "variance of the noise", "unit": "output unit^2", "added_later": True}
+    )
 
     def __post_init__(self) -> None:
-        if (self.snr_db is None) == (self.standard_deviation is None):
-            given = "neither was" if self.snr_db is None else "both were"
-            raise ValueError(f"noise needs either snr_db [dB] or standard_deviation [output unit]; {given} given.")
-        if self.snr_db is not None:
-            require_finite("snr_db", self.snr_db, "dB")
+        require_one_level(
+            {"snr_db": self.snr_db, "standard_deviation": self.standard_deviation, "variance": self.variance}
+        )
+
+    @property
+    def filter(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Numerator and denominator in rising powers of q^-1 of what white innovations pass through."""
+        return (1.0,), (1.0,)
+
+    def innovation_variance_of(self, noise_free: NDArray[np.float64] | None = None) -> float:
+        """Variance of the innovations, which are the noise itself.
+
+        Parameters
+        ----------
+        noise_free : ndarray, shape (N,), optional
+            The output without noise [output unit]; needed with a signal-to-noise ratio.
+
+        Returns
+        -------
+        float
+            Variance [output unit^2].
+
+        Raises
+        ------
+        DataError
+            If a signal-to-noise ratio is asked for and the noise-free output is missing or zero throughout.
+        """
         if self.standard_deviation is not None:
-            require_not_negative("standard_deviation", self.standard_deviation, "output unit")
+            return self.standard_deviation**2
+        if self.variance is not None:
+            return self.variance
+        assert self.snr_db is not None
+        return variance_at(self.snr_db, noise_free)
+
+    def variance_of(self, noise_free: NDArray[np.float64] | None = None) -> float:
+        """Variance of the noise.
+
+        Parameters
+        ----------
+        noise_free : ndarray, shape (N,), optional
+            The output without noise [output unit]; needed with a signal-to-noise ratio.
+
+        Returns
+        -------
+        float
+            Variance [output unit^2].
+
+        Raises
+        ------
+        DataError
+            If a signal-to-noise ratio is asked for and the noise-free output is missing or zero throughout.
+        """
+        return self.innovation_variance_of(noise_free)
+
+    def autocovariance(self, lags: ArrayLike, noise_free: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        """Covariance of samples at a distance.
+
+        Parameters
+        ----------
+        lags : array_like of int, shape (M,)
+            Distances [samples].
+        noise_free : ndarray, shape (N,), optional
+            The output without noise [output unit]; needed with a signal-to-noise ratio.
+
+        Returns
+        -------
+        ndarray, shape (M,)
+            The variance at lag 0, zero elsewhere [output unit^2].
+        """
+        return np.where(np.asarray(lags) == 0, self.variance_of(noise_free), 0.0)
 
     def generate(self, noise_free: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
         """Noise for one record.
@@ -64,7 +134,7 @@ class WhiteNoise:
         Parameters
         ----------
         noise_free : ndarray, shape (N,)
-            The output without noise [output unit].
+            The output without noise [output unit]; only its length matters without a signal-to-noise ratio.
         rng : numpy.random.Generator
             Source of the N standard normal samples.
 
@@ -81,17 +151,10 @@ class WhiteNoise:
         shape = rng.standard_normal(noise_free.size)
         if self.standard_deviation is not None:
             return self.standard_deviation * shape
-        assert self.snr_db is not None
-        power = float(np.mean(noise_free**2))
-        if power == 0.0:
-            raise DataError(
-                "the noise-free output is zero, so no noise has a signal-to-noise ratio to it; "
-                "is the delay longer than the record? Give noise.standard_deviation, or a longer record"
-            )
-        return float(np.sqrt(power / 10 ** (self.snr_db / 10))) * shape
+        return float(np.sqrt(self.variance_of(noise_free))) * shape
 
 
-Noise = WhiteNoise
+Noise = WhiteNoise | ArmaNoise
 
 #: Kinds of noise by the word that selects them in a specification.
-NOISES: dict[str, type[Noise]] = {WhiteNoise.kind: WhiteNoise}
+NOISES: dict[str, type[Noise]] = {noise.kind: noise for noise in (WhiteNoise, ArmaNoise)}

@@ -4,15 +4,67 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.errors import DataError
+from ctid_cli.signals.checks import require_choice
 from ctid_cli.signals.held import HeldSignal, Hold
 
 #: A clock counts as regular when no instant is further than this fraction of the interval from its place.
 REGULARITY = 1e-7
+
+
+#: Where the reference enters a loop.
+Enters = Literal["controller", "input"]
+
+
+class Controller(Protocol):
+    """A discrete-time controller ``C(q)``, as far as a record needs to know it."""
+
+    @property
+    def numerator(self) -> ArrayLike:
+        """Coefficients in descending powers of q."""
+
+    @property
+    def denominator(self) -> ArrayLike:
+        """Coefficients in descending powers of q."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """What closed the loop while a record was taken.
+
+    Parameters
+    ----------
+    reference : ndarray, shape (N,)
+        The reference r at the sampling instants.
+    controller : Controller
+        What made the input from reference and output.
+    enters : {"controller", "input"}, default "controller"
+        Whether r enters before the controller, ``u = C(q) (r - y)``, or behind it, ``u = r - C(q) y``.
+
+    Raises
+    ------
+    DataError
+        If the reference is not a list of finite numbers.
+    ValueError
+        If it is not said where it enters.
+    """
+
+    reference: NDArray[np.float64]
+    controller: Controller
+    enters: Enters = "controller"
+
+    def __post_init__(self) -> None:
+        require_choice("enters", self.enters, get_args(Enters))
+        reference = np.array(self.reference, dtype=float)
+        if reference.ndim != 1 or not np.isfinite(reference).all():
+            raise DataError("the reference of a loop must be one finite number for each sample")
+        reference.setflags(write=False)
+        object.__setattr__(self, "reference", reference)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,14 +80,17 @@ class Record:
     input : HeldSignal
         The input on its own break times [s].
     noise_free : ndarray, shape (N,), optional
-        The output without noise [output unit], known only for simulated records.
+        The output before noise is added [output unit], known only for simulated records.
     name : str, default ""
         Where the record comes from; appears in messages.
+    loop : Loop, optional
+        What closed the loop; None for a record taken in open loop, or in a loop that is not known.
 
     Raises
     ------
     DataError
-        If the record is empty, its times do not increase strictly, or no output is finite.
+        If the record is empty, its times do not increase strictly, or no output is finite; or if there is a loop, and
+        the clock is not regular or the input not held from one sample to the next.
 
     Notes
     -----
@@ -47,6 +102,7 @@ class Record:
     input: HeldSignal
     noise_free: NDArray[np.float64] | None = None
     name: str = ""
+    loop: Loop | None = None
 
     def __post_init__(self) -> None:
         t = np.array(self.t, dtype=float)
@@ -74,6 +130,22 @@ class Record:
         y.setflags(write=False)
         object.__setattr__(self, "t", t)
         object.__setattr__(self, "y", y)
+        if self.loop is not None:
+            self._require_loop(self.loop, where)
+
+    def _require_loop(self, loop: Loop, where: str) -> None:
+        if loop.reference.size != self.t.size:
+            raise DataError(f"{where}the reference has {loop.reference.size} values for {self.t.size} samples")
+        if self.interval is None:
+            raise DataError(
+                f"{where}a closed loop needs a regular clock: its controller is discrete and acts at every sample, "
+                "and these are not equidistant"
+            )
+        if self.input.hold != "zoh" or not self.input_on_grid:
+            raise DataError(
+                f"{where}in a closed loop the input is held (zoh) from one sample to the next, because a discrete "
+                "controller makes it; give its values at the samples"
+            )
 
     @classmethod
     def from_arrays(cls, t: ArrayLike, u: ArrayLike, y: ArrayLike, hold: Hold = "zoh", name: str = "") -> Record:

@@ -12,6 +12,44 @@ from ctid_cli.signals.checks import require_choice, require_integer, require_pos
 
 InputRecord = Literal["sampled", "exact"]
 
+
+def geometric_sizes(first: int, last: int, count: int) -> list[int]:
+    """Whole numbers spaced geometrically, such as the record lengths of a study of how accuracy grows with them.
+
+    Parameters
+    ----------
+    first, last : int
+        Least and greatest of them, positive.
+    count : int
+        How many, at least 2.
+
+    Returns
+    -------
+    list of int
+        ``first (last / first)^(k / (count - 1))`` for k = 0, 1, …, rounded to the nearest whole number.
+
+    Raises
+    ------
+    ValueError
+        If they do not increase strictly.
+
+    Examples
+    --------
+    >>> from ctid_cli.signals import geometric_sizes
+    >>> geometric_sizes(100, 10_000, 5)
+    [100, 316, 1000, 3162, 10000]
+    """
+    require_integer("the first size", first, 1)
+    require_integer("the last size", last, 1)
+    require_integer("the count", count, 2)
+    if first >= last:
+        raise ValueError(f"the first size must be below the last; they are {first} and {last}.")
+    sizes = [int(size) for size in np.rint(np.geomspace(first, last, count))]
+    if len(set(sizes)) < count:
+        raise ValueError(f"there are no {count} different sizes from {first} to {last}, spaced geometrically.")
+    return sizes
+
+
 _INPUT_RECORD_DOC = (
     "what the estimator is told of the input: its samples at the output's instants (sampled), or its true edges (exact)"
 )
@@ -41,7 +79,7 @@ class RegularSampling:
     kind: ClassVar[str] = "regular"
 
     interval: float = field(metadata={"doc": "sampling interval", "unit": "s"})
-    samples: int = field(metadata={"doc": "number of samples, at least 2", "unit": "-"})
+    samples: int = field(metadata={"doc": "number of samples, at least 2", "unit": "-", "geometric": True})
     input_record: InputRecord = field(default="sampled", metadata={"doc": _INPUT_RECORD_DOC, "unit": "-"})
 
     def __post_init__(self) -> None:
@@ -90,7 +128,7 @@ class UniformIntervals:
 
     low: float = field(metadata={"doc": "shortest sampling interval", "unit": "s"})
     high: float = field(metadata={"doc": "longest sampling interval", "unit": "s"})
-    samples: int = field(metadata={"doc": "number of samples, at least 2", "unit": "-"})
+    samples: int = field(metadata={"doc": "number of samples, at least 2", "unit": "-", "geometric": True})
     input_record: InputRecord = field(default="sampled", metadata={"doc": _INPUT_RECORD_DOC, "unit": "-"})
 
     def __post_init__(self) -> None:

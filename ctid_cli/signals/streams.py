@@ -6,10 +6,10 @@ from typing import Literal
 
 import numpy as np
 
-Role = Literal["input", "sampling", "noise", "start"]
+Role = Literal["input", "sampling", "noise", "start", "parameters"]
 
 #: First component of every spawn key. Results are repeatable only while these numbers stay what they are.
-ROLES: dict[Role, int] = {"input": 0, "sampling": 1, "noise": 2, "start": 3}
+ROLES: dict[Role, int] = {"input": 0, "sampling": 1, "noise": 2, "start": 3, "parameters": 4}
 
 
 def stream(seed: int, role: Role, replicate: int) -> np.random.Generator:
@@ -19,8 +19,8 @@ def stream(seed: int, role: Role, replicate: int) -> np.random.Generator:
     ----------
     seed : int
         Seed of the experiment, zero or positive.
-    role : {"input", "sampling", "noise", "start"}
-        What the numbers are for.
+    role : {"input", "sampling", "noise", "start", "parameters"}
+        What the numbers are for; the last two are for initial delays and for initial parameters.
     replicate : int
         Number of the data set, from 0.
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals import NOISES, WhiteNoise, stream
+from ctid_cli.signals import NOISES, ArmaNoise, WhiteNoise, stream
 
 
 def rng(replicate=0):
@@ -23,6 +23,9 @@ def test_levels_scale_one_shape(snr_db, replicate):
     scale = np.sqrt(np.mean(OUTPUT**2) / 10 ** (snr_db / 10))
     np.testing.assert_allclose(noise, scale * reference, rtol=1e-12)
     np.testing.assert_allclose(WhiteNoise(standard_deviation=scale).generate(OUTPUT, rng(replicate)), noise, rtol=1e-12)
+    np.testing.assert_allclose(WhiteNoise(variance=scale**2).generate(OUTPUT, rng(replicate)), noise, rtol=1e-12)
+    for level in (WhiteNoise(snr_db=snr_db), WhiteNoise(standard_deviation=scale), WhiteNoise(variance=scale**2)):
+        assert level.variance_of(OUTPUT) == pytest.approx(scale**2, rel=1e-12)
 
 
 def test_snr_is_reached():
@@ -57,17 +60,21 @@ def test_zero_deviation_is_no_noise_and_draws_as_much():
 def test_snr_of_nothing_is_refused():
     with pytest.raises(DataError, match="noise-free output is zero"):
         WhiteNoise(snr_db=10.0).generate(np.zeros(10), rng())
+    with pytest.raises(DataError, match="beside a noise-free output"):
+        WhiteNoise(snr_db=10.0).variance_of()
 
 
 def test_kinds_name_their_classes():
-    assert NOISES == {"white": WhiteNoise}
+    assert NOISES == {"white": WhiteNoise, "arma": ArmaNoise}
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "needs either snr_db .* or standard_deviation .*; neither was given"),
-        ({"snr_db": 5.0, "standard_deviation": 1.0}, "both were given"),
+        ({}, "needs exactly one of snr_db .*, standard_deviation .*, variance .*; none was given"),
+        ({"snr_db": 5.0, "standard_deviation": 1.0}, "snr_db and standard_deviation were given"),
+        ({"variance": 5.0, "standard_deviation": 1.0}, "standard_deviation and variance were given"),
+        ({"variance": -0.1}, r"variance must be zero or a positive number \[output unit\^2\], not -0.1"),
         ({"snr_db": float("inf")}, r"snr_db must be a finite number \[dB\], not inf"),
         ({"snr_db": "loud"}, "snr_db must be a finite number"),
         (

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals import HeldSignal, Record, regular_interval
+from ctid_cli.signals import HeldSignal, Loop, Record, regular_interval
 
 ONE = HeldSignal([0.0], [1.0])
 
@@ -87,3 +87,57 @@ def test_record_never_changes():
 def test_unusable_records_are_refused(t, y, message):
     with pytest.raises(DataError, match=message):
         Record(t, y, ONE, name="pump")
+
+
+# --- closed loops ---------------------------------------------------------------------------------
+
+
+class Proportional:
+    """The least that a record needs to know of a controller."""
+
+    numerator = (2.0,)
+    denominator = (1.0,)
+
+
+T = 0.1 * np.arange(5)
+
+
+def in_loop(t=T, u=T, hold="zoh", reference=(1.0, 2.0, 3.0, 4.0, 5.0), **more):
+    return Record(
+        t, np.ones(5), HeldSignal(u, np.ones(len(u)), hold), name="pump", loop=Loop(reference, Proportional(), **more)
+    )
+
+
+def test_a_record_keeps_its_loop_unchanged():
+    reference = np.arange(5.0)
+    record = Record(T, np.ones(5), HeldSignal(T, np.ones(5)), loop=Loop(reference, Proportional(), enters="input"))
+    reference[0] = 7.0
+    assert record.loop.reference.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert record.loop.enters == "input"
+    assert record.loop.controller.numerator == (2.0,)
+    with pytest.raises(ValueError, match="read-only"):
+        record.loop.reference[0] = 0.0
+    assert in_loop().loop.enters == "controller"
+    assert Record(T, np.ones(5), ONE).loop is None
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"reference": [1.0, 2.0]}, "pump: the reference has 2 values for 5 samples"),
+        ({"reference": [1.0, np.nan, 1.0, 1.0, 1.0]}, "one finite number for each sample"),
+        ({"reference": [[1.0] * 5]}, "one finite number for each sample"),
+        ({"t": T**2, "u": T**2}, "pump: a closed loop needs a regular clock: its controller is discrete"),
+        ({"hold": "foh"}, "pump: in a closed loop the input is held .zoh. from one sample to the next"),
+        ({"u": T[:1]}, "pump: in a closed loop the input is held"),
+        ({"u": T + 0.05}, "pump: in a closed loop the input is held"),
+    ],
+)
+def test_impossible_loops_are_refused(options, message):
+    with pytest.raises(DataError, match=message):
+        in_loop(**options)
+
+
+def test_a_reference_enters_in_one_of_two_places():
+    with pytest.raises(ValueError, match="enters must be 'controller' or 'input', not 'output'"):
+        in_loop(enters="output")

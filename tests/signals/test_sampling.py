@@ -5,7 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.signals import ROLES, SAMPLINGS, RegularSampling, UniformIntervals, regular_interval, stream
+from ctid_cli.signals import (
+    ROLES,
+    SAMPLINGS,
+    RegularSampling,
+    UniformIntervals,
+    geometric_sizes,
+    regular_interval,
+    stream,
+)
 
 
 def rng(replicate=0):
@@ -76,12 +84,50 @@ def test_impossible_options_are_refused(make, message):
         make()
 
 
+# --- sizes ----------------------------------------------------------------------------------------
+
+
+@given(st.integers(50, 1000), st.floats(1.5, 300), st.integers(2, 30))
+def test_geometric_sizes(first, ratio, count):
+    last = round(first * ratio)
+    sizes = geometric_sizes(first, last, count)
+    assert (sizes[0], sizes[-1], len(sizes)) == (first, last, count)
+    for k, size in enumerate(sizes):
+        assert abs(size - first * (last / first) ** (k / (count - 1))) <= 0.5 + 1e-9 * size
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "count", "unrounded", "rounded"),
+    [(2000, 100_000, 30, 778_580, 778_581), (500, 123_036, 50, 1_153_484, 1_153_482)],
+)
+def test_sizes_of_the_published_studies_of_additive_models(first, last, count, unrounded, rounded):
+    # The totals that González, Classens, Rojas, Welsh and Oomen print are those of the sizes before rounding.
+    exact = [first * (last / first) ** (k / (count - 1)) for k in range(count)]
+    assert round(sum(exact)) == unrounded
+    assert sum(geometric_sizes(first, last, count)) == rounded
+
+
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [
+        ((500, 500, 3), "the first size must be below the last; they are 500 and 500"),
+        ((2, 5, 9), "no 9 different sizes from 2 to 5"),
+        ((0, 5, 2), "the first size must be an integer of at least 1, not 0"),
+        ((1, 5.5, 2), "the last size must be an integer of at least 1, not 5.5"),
+        ((1, 5, 1), "the count must be an integer of at least 2, not 1"),
+    ],
+)
+def test_impossible_sizes_are_refused(sizes, message):
+    with pytest.raises(ValueError, match=message):
+        geometric_sizes(*sizes)
+
+
 # --- streams --------------------------------------------------------------------------------------
 
 
 def test_streams_are_those_of_the_spawn_keys():
     # Stored results are repeatable only as long as these numbers stay what they are.
-    assert ROLES == {"input": 0, "sampling": 1, "noise": 2, "start": 3}
+    assert ROLES == {"input": 0, "sampling": 1, "noise": 2, "start": 3, "parameters": 4}
     sequence = np.random.SeedSequence(20170331, spawn_key=(2, 5))
     expected = np.random.default_rng(sequence).standard_normal(3)
     assert np.array_equal(stream(20170331, "noise", 5).standard_normal(3), expected)
@@ -89,4 +135,4 @@ def test_streams_are_those_of_the_spawn_keys():
 
 def test_streams_differ_by_seed_role_and_replicate():
     draws = {float(stream(s, role, k).random()) for s in (0, 1) for role in ROLES for k in range(5)}
-    assert len(draws) == 2 * 4 * 5
+    assert len(draws) == 2 * 5 * 5

@@ -1,0 +1,236 @@
+"""The estimation problem of a sum of submodels, in open or closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators.problems import is_hurwitz, reflect_unstable
+from ctid_cli.estimators.refined_iv import Equations
+from ctid_cli.filtering.bank import FilterData, plain_array
+from ctid_cli.filtering.submodels import OPEN_LOOP, InitialState, LoopData, SubmodelFilter
+from ctid_cli.models.additive import AdditiveModel, Term
+from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.factoring import unfactored
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.record import Record
+
+Array = NDArray[np.float64]
+
+#: Where instruments come from: the measured input, or the noise-free loop of the model.
+Instruments = Literal["open_loop", "closed_loop"]
+
+
+def check_closed_loop(instruments: Instruments, variant: str) -> None:
+    """Refuse to guard a cost that the solution does not minimise.
+
+    Parameters
+    ----------
+    instruments : {"open_loop", "closed_loop"}
+        Where instruments come from.
+    variant : str
+        How steps are accepted.
+
+    Raises
+    ------
+    ValueError
+        For ``guarded`` in closed loop.
+    """
+    if instruments == "closed_loop" and variant == "guarded":
+        raise ValueError(
+            "variant guarded is for open-loop instruments: in closed loop the solution is not the minimum of the "
+            "output-error cost; use relaxed or plain"
+        )
+
+
+def loop_data(record: Record, instruments: Instruments) -> LoopData:
+    """The feedback that instruments are simulated with.
+
+    Parameters
+    ----------
+    record : Record
+        The record.
+    instruments : {"open_loop", "closed_loop"}
+        Where instruments come from.
+
+    Returns
+    -------
+    LoopData
+        Without feedback for ``open_loop``, whatever the record.
+
+    Raises
+    ------
+    DataError
+        If closed-loop instruments are asked for and the record has no loop, or lacks values of the input's grid.
+    """
+    if instruments == "open_loop":
+        return OPEN_LOOP
+    where = f"{record.name}: " if record.name else ""
+    if record.loop is None:
+        raise DataError(
+            f"{where}closed-loop instruments need the reference and the controller, and this record has neither; give "
+            "them with the record, or use instruments 'open_loop'"
+        )
+    if not record.input_on_grid or record.input.hold != "zoh":
+        raise DataError(
+            f"{where}closed-loop instruments need an input that is held from sample to sample of a regular clock: the "
+            "controller is discrete"
+        )
+    controller = DiscreteController(record.loop.controller.numerator, record.loop.controller.denominator)
+    order = controller.denominator.size
+    numerator = np.zeros(order)
+    numerator[order - controller.numerator.size :] = controller.numerator
+    return LoopData(
+        plain_array(record.loop.reference),
+        numerator,
+        plain_array(controller.denominator),
+        record.loop.enters == "controller",
+    )
+
+
+class AdditiveProblem:
+    """Parameters of a sum of submodels: ``theta = (a_1 … a_n, b_0 … b_m)`` of each submodel in turn.
+
+    Parameters
+    ----------
+    data : FilterData
+        The record.
+    terms : sequence of Term
+        Degrees of the submodels.
+    delay : float
+        Known delay [s].
+    loop : LoopData
+        The feedback that instruments are simulated with; :data:`~ctid_cli.filtering.submodels.OPEN_LOOP` for none.
+    initial_state : {"rest", "periodic", "estimated"}
+        State of the filters at the first sample. ``estimated`` adds the parameters of a free response to theta, see
+        :class:`~ctid_cli.filtering.submodels.SubmodelFilter`.
+    """
+
+    def __init__(
+        self,
+        data: FilterData,
+        terms: Sequence[Term],
+        delay: float,
+        loop: LoopData = OPEN_LOOP,
+        initial_state: InitialState = "rest",
+    ) -> None:
+        self.data = data
+        self.terms = tuple(terms)
+        self.delay = delay
+        self.initial_state: InitialState = initial_state
+        self.filter = SubmodelFilter(data, terms, delay, loop, initial_state)
+
+    def with_other_hold(self) -> AdditiveProblem:
+        """The same problem with the other interpolation of the output in the regressors.
+
+        Returns
+        -------
+        AdditiveProblem
+            It has the same solutions, which the iteration approaches on another path.
+        """
+        data = replace(self.data, y_foh=not self.data.y_foh)
+        return AdditiveProblem(data, self.terms, self.delay, self.filter.loop, self.initial_state)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters of the model, those of a free response not counted."""
+        return sum(term.size for term in self.terms)
+
+    def model(self, theta: Array) -> AdditiveModel:
+        """The model that parameters describe.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (p,)
+            Parameters, those of a free response last if there are any.
+
+        Returns
+        -------
+        AdditiveModel
+            Its submodels in the order of the terms.
+
+        Raises
+        ------
+        DataError
+            If they describe none.
+        """
+        return AdditiveModel.from_theta(theta[: self.size], self.terms, self.delay)
+
+    def split(self, theta: Array) -> tuple[Array, Array, float]:
+        """Unfactored denominator, numerator and delay [s] of a parameter vector.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (p,)
+            Parameters.
+
+        Returns
+        -------
+        a, b, delay : ndarray, ndarray, float
+            Monic denominator, numerator, delay.
+        """
+        try:
+            whole = unfactored(self.model(theta))
+        except DataError:
+            whole = TransferFunction([np.nan_to_num(theta[self.size - 1])], [1.0], self.delay)
+        return whole.denominator, whole.numerator, whole.delay
+
+    def admissible(self, theta: Array) -> Array:
+        """Reflect unstable submodels; the static gains stay.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (p,)
+            Parameters.
+
+        Returns
+        -------
+        ndarray, shape (p,)
+            Parameters of stable submodels; unchanged where they are stable or not finite.
+        """
+        if not np.isfinite(theta).all():
+            return theta
+        result = theta
+        offset = 0
+        for term in self.terms:
+            n = term.poles
+            rising = theta[offset : offset + n]
+            if n and rising[-1] != 0.0:
+                monic = np.append(rising[::-1], 1.0) / rising[-1]
+                if not is_hurwitz(monic):
+                    stable = reflect_unstable(monic)
+                    result = result.copy() if result is theta else result
+                    result[offset : offset + n] = stable[-2::-1] / stable[-1]
+            offset += term.size
+        return result
+
+    def equations(self, theta: Array) -> Equations | None:
+        """Second moments of the iteration.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (p,)
+            Parameters.
+
+        Returns
+        -------
+        Equations or None
+            The moments; None where they are not finite.
+        """
+        if not np.isfinite(theta).all():
+            return None
+        moments = self.filter.moments(theta)
+        if moments is None:
+            return None
+        return Equations(
+            moments.instrument_regressor,
+            moments.instrument_error,
+            moments.hessian,
+            moments.squared_error,
+            moments.output_power,
+        )

@@ -1,0 +1,327 @@
+"""Refined instrumental variables for a sum of submodels, in open and closed loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators.additive_estimate import Covariance, SubmodelEstimate, estimate_submodels
+from ctid_cli.estimators.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
+from ctid_cli.estimators.common import Start, StartFrom, check_iteration, check_record
+from ctid_cli.estimators.refined_iv import StepRule
+from ctid_cli.filtering.bank import filter_data
+from ctid_cli.filtering.submodels import InitialState
+from ctid_cli.inference.diagnostics import percent_from_r_squared
+from ctid_cli.inference.fit import Fit
+from ctid_cli.models.additive import AdditiveModel, Term
+from ctid_cli.models.factoring import unfactored
+from ctid_cli.signals.checks import require_choice, require_not_negative
+from ctid_cli.signals.held import Hold
+from ctid_cli.signals.record import Record
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class AdditiveFit(Fit):
+    """An estimated sum of submodels.
+
+    Parameters
+    ----------
+    additive : AdditiveModel
+        The estimate, its submodels by rising natural frequency. ``model`` is the same as one transfer function, and
+        ``covariance`` that of the parameters of this sum.
+    start : AdditiveModel
+        Where the iterations started.
+    start_method : str
+        How that start was found, in a sentence.
+    loop_radius : float
+        Largest magnitude of the poles of the sampled loop of the estimate with the controller [-]; NaN in open loop.
+    """
+
+    additive: AdditiveModel = field(kw_only=True)
+    start: AdditiveModel = field(kw_only=True, repr=False)
+    start_method: str = field(kw_only=True)
+    loop_radius: float = field(kw_only=True)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Parameters by name: ``g1_a1 … g1_b0 …, g2_a1 …``, where the number is the power of p."""
+        return self.additive.parameters
+
+
+@dataclass(frozen=True)
+class AdditiveSrivc:
+    r"""Refined instrumental variables for a sum of submodels ``B_i / (p^l A_i)``.
+
+    Parameters
+    ----------
+    terms : tuple of Term
+        Degrees of the submodels; integrators in one of them at most.
+    delay : float, default 0.0
+        Known delay [s].
+    instruments : {"open_loop", "closed_loop"}, default "open_loop"
+        ``closed_loop`` simulates the instruments in the noise-free loop of the model with the record's controller and
+        reference: needed for unbiased estimates where feedback brings coloured noise into the input.
+    initial_state : {"rest", "periodic", "estimated"}, default "rest"
+        State at the first sample: at rest, that of one period of a steady state, or free responses to be estimated.
+    covariance : {"white", "sandwich"}, default "white"
+        Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
+        residuals.
+    max_iterations : int, default 100
+        Largest number of iterations.
+    tolerance : float, default 1e-8
+        Stop when a step changes the simulated output by less than this fraction of its rms value [-].
+    variant : {"relaxed", "plain", "guarded"}, default "relaxed"
+        ``plain`` takes full steps; ``relaxed`` shortens them where they do not settle; ``guarded`` never lets the
+        output-error cost rise, in open loop only.
+    hold_output : {"foh", "zoh"}, default "foh"
+        Interpolation of what the other submodels leave of the output; changes the path, not the converged estimate.
+        Where the iteration does not converge it is run once more with the other one.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+
+    Notes
+    -----
+    ``beta+ = beta + [sum psi phi']^-1 sum psi eps`` with psi and phi as in :mod:`ctid_cli.filtering.submodels`. It is
+    the published iteration: there every submodel has a right-hand side ``sum psi y_f,i`` of its own and only the
+    diagonal blocks of the solution are kept; but ``y_f,i - phi_i' theta_i`` is the output error for every i, so all of
+    them change by the same vector. With one submodel it is SRIVC, in closed loop CLSRIVC.
+
+    In closed loop its solution is a root of ``sum psi eps``, not a minimum of the output-error cost.
+
+    It fails from a start far from the solution: natural frequencies wrong by more than about half.
+
+    References
+    ----------
+    R. A. González, K. Classens, C. R. Rojas, J. S. Welsh and T. Oomen, "Identification of additive continuous-time
+    systems in open and closed loop", *Automatica* (2025), arXiv:2401.01263.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli import HeldSignal, Record
+    >>> from ctid_cli.filtering import simulate_additive
+    >>> from ctid_cli.models import AdditiveModel, Submodel, Term
+    >>> system = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
+    >>> rng = np.random.default_rng(1)
+    >>> t = 0.05 * np.arange(4000)
+    >>> u = HeldSignal(t, rng.standard_normal(4000))
+    >>> y = simulate_additive(system, u, t) + 0.1 * rng.standard_normal(4000)
+    >>> fit = AdditiveSrivc(terms=(Term(2, 0), Term(2, 0))).fit(Record(t, y, u))
+    >>> {name: f"{value:.3f} +- {fit.standard_errors[name]:.3f}" for name, value in fit.parameters.items()}
+    ... # doctest: +NORMALIZE_WHITESPACE
+    {}
+    """
+
+    kind: ClassVar[str] = "additive_srivc"
+    start_from: ClassVar[StartFrom | None] = "parameters"
+
+    terms: tuple[Term, ...] = field(metadata={"doc": "Degrees of the submodels"})
+    delay: float = field(default=0.0, metadata={"doc": "Known delay", "unit": "s"})
+    instruments: Instruments = field(
+        default="open_loop", metadata={"doc": "From the measured input, or from the noise-free loop of the model"}
+    )
+    initial_state: InitialState = field(default="rest", metadata={"doc": "State at the first sample"})
+    covariance: Covariance = field(default="white", metadata={"doc": "Noise that the standard errors hold for"})
+    max_iterations: int = field(default=100, metadata={"doc": "Largest number of iterations"})
+    tolerance: float = field(default=1e-8, metadata={"doc": "Relative change of the output at which to stop"})
+    variant: StepRule = field(default="relaxed", metadata={"doc": "How steps are accepted"})
+    hold_output: Hold = field(default="foh", metadata={"doc": "Interpolation of the measured output between samples"})
+
+    def __post_init__(self) -> None:
+        if not self.terms:
+            raise ValueError("terms must list at least one submodel, for example {poles: 2, zeros: 0}")
+        check_terms(self.terms)
+        require_not_negative("delay", self.delay, "s")
+        require_choice("instruments", self.instruments, get_args(Instruments))
+        require_choice("initial_state", self.initial_state, get_args(InitialState))
+        require_choice("covariance", self.covariance, get_args(Covariance))
+        require_choice("variant", self.variant, get_args(StepRule))
+        require_choice("hold_output", self.hold_output, get_args(Hold))
+        check_iteration(self.max_iterations, self.tolerance)
+        check_closed_loop(self.instruments, self.variant)
+        if self.initial_state == "periodic":
+            if self.instruments == "closed_loop":
+                raise ValueError("initial_state periodic is for open-loop instruments; use rest or estimated")
+            if any(term.integrators for term in self.terms):
+                raise ValueError(
+                    "initial_state periodic needs terms without integrators: their output has no steady state"
+                )
+
+    def prepare(self, record: Record) -> PreparedAdditiveSrivc:
+        """Check a record and lay it out.
+
+        Parameters
+        ----------
+        record : Record
+            The record.
+
+        Returns
+        -------
+        PreparedAdditiveSrivc
+            Ready to fit.
+
+        Raises
+        ------
+        DataError
+            If nothing can be estimated from the record, or it lacks the loop that the instruments need.
+        """
+        return PreparedAdditiveSrivc(self, record)
+
+    def fit(self, record: Record, start: Start | None = None) -> AdditiveFit:
+        """Estimate the submodels.
+
+        Parameters
+        ----------
+        record : Record
+            The record.
+        start : Start, optional
+            ``start.model`` has the degrees of the terms; without it a start is found from the record.
+
+        Returns
+        -------
+        AdditiveFit
+            The estimate.
+
+        Raises
+        ------
+        DataError
+            If nothing can be estimated from the record or from that start.
+        """
+        return self.prepare(record).fit(start)
+
+
+def check_terms(terms: tuple[Term, ...]) -> None:
+    """Check that a sum of terms determines its parameters.
+
+    Parameters
+    ----------
+    terms : tuple of Term
+        Degrees of the submodels.
+
+    Raises
+    ------
+    ValueError
+        If two terms integrate or two have direct feed-through, or there are too many poles.
+    """
+    if sum(term.integrators > 0 for term in terms) > 1:
+        raise ValueError("terms may have integrators in one submodel only: several could not be told apart")
+    if sum(term.zeros == term.order for term in terms) > 1:
+        raise ValueError(
+            "terms may have as many zeros as poles in one submodel only: several constants could not be told apart"
+        )
+    if sum(term.order for term in terms) > 40:
+        raise ValueError(f"terms have {sum(term.order for term in terms)} poles together; at most 40 are supported")
+
+
+class PreparedAdditiveSrivc:
+    """A record checked and laid out for :class:`AdditiveSrivc`.
+
+    Parameters
+    ----------
+    options : AdditiveSrivc
+        The estimator.
+    record : Record
+        The record.
+    """
+
+    def __init__(self, options: AdditiveSrivc, record: Record) -> None:
+        self.options = options
+        self.record = record
+        loop = loop_data(record, options.instruments)
+        # A record of one period has an input before its first sample: the same one.
+        data = filter_data(record, 0.0 if options.initial_state == "periodic" else options.delay, options.hold_output)
+        self.problem = AdditiveProblem(data, options.terms, options.delay, loop, options.initial_state)
+        check_record(record, data, self.problem.size + self.problem.filter.free)
+        if options.initial_state == "periodic" and (data.interval is None or not record.valid.all()):
+            where = f"{record.name}: " if record.name else ""
+            raise DataError(
+                f"{where}one period of a steady state must be sampled on one regular clock without missing samples; "
+                "use initial_state 'estimated'"
+            )
+        self._automatic: tuple[AdditiveModel, str] | None = None
+
+    def fit(self, start: Start | None = None) -> AdditiveFit:
+        """Estimate the submodels.
+
+        Parameters
+        ----------
+        start : Start, optional
+            ``start.model`` has the degrees of the terms; without it a start is found from the record.
+
+        Returns
+        -------
+        AdditiveFit
+            The estimate.
+
+        Raises
+        ------
+        DataError
+            If the start does not fit the terms, or nothing can be estimated from it.
+        """
+        options = self.options
+        if start is not None and start.model is not None:
+            model, method = start.model, "The start was given."
+            if model.terms != options.terms:
+                given, wanted = _terms_text(model.terms), _terms_text(options.terms)
+                raise DataError(f"the start has the submodels {given} and the estimator {wanted}")
+        else:
+            if self._automatic is None:
+                from ctid_cli.estimators.modal_start import automatic_start
+
+                found = automatic_start(self.record, options.terms, options.delay)
+                self._automatic = found.model, found.method
+            model, method = self._automatic
+        estimate = estimate_submodels(
+            self.problem,
+            model.theta,
+            max_iterations=options.max_iterations,
+            tolerance=options.tolerance,
+            variant=options.variant,
+            covariance=options.covariance,
+        )
+        return _fit(self.problem, estimate, model, method)
+
+
+def _fit(problem: AdditiveProblem, estimate: SubmodelEstimate, start: AdditiveModel, method: str) -> AdditiveFit:
+    """The result, with submodels by rising natural frequency."""
+    try:
+        model = problem.model(estimate.theta)
+    except DataError as error:
+        raise DataError(f"the iterations ended where the terms cannot be told apart: {error} Start closer.") from None
+    places = np.split(np.arange(problem.size), np.cumsum([term.size for term in problem.terms])[:-1])
+    order = np.concatenate([places[k] for k in model.order_of_sorting])
+    ordered = model.sorted()
+    return AdditiveFit(
+        model=unfactored(ordered),
+        parameter_names=ordered.names,
+        covariance=estimate.covariance[np.ix_(order, order)],
+        status=estimate.status,
+        cost=estimate.squared_error / problem.data.count,
+        fit_percent=percent_from_r_squared(estimate.r2),
+        r2=estimate.r2,
+        count=problem.data.count,
+        iterations=estimate.iterations,
+        condition_number=estimate.condition_number,
+        history=estimate.history,
+        additive=ordered,
+        start=start,
+        start_method=method,
+        loop_radius=estimate.loop_radius,
+    )
+
+
+def _terms_text(terms: tuple[Term, ...]) -> str:
+    return ", ".join(
+        f"{{poles: {term.poles}, zeros: {term.zeros}"
+        + (f", integrators: {term.integrators}}}" if term.integrators else "}")
+        for term in terms
+    )

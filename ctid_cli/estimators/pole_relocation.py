@@ -1,0 +1,431 @@
+r"""Poles of a sum of modes from the spectra of a record: found one at a time, then moved together.
+
+At the lines of a finite record the output of ``G = sum R_i/(s - p_i)`` obeys, with the transient of the states at both
+ends of the window as a second numerator over the same poles and V the noise,
+
+.. math:: Y = \sum_i \frac{r_i U + t_i}{s - p_i} + V, \qquad s = j\omega .
+
+For given poles this is linear. Poles are moved as in vector fitting: with ``\sigma = 1 + sum c_i/(s - p_i)``,
+
+.. math:: \sigma Y = \sum_i \frac{r_i U + t_i}{s - p_i}
+
+is linear in r, t and c, and the zeros of sigma are better poles. Least squares would be biased by the noise in
+``sigma Y``; with the fitted output in the place of Y as instrument, a fixed point (c = 0) is a stationary point of the
+squared output error, as in refined instrumental variables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.filtering.spectra import record_spectra
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+IndexArray = NDArray[np.intp]
+
+#: Longer records are searched in their first samples only: poles need not be exact, and the work stays bounded.
+LONGEST_STRETCH = 8192
+#: Neighbouring lines over which noise is told from a smooth response and transient.
+LOCAL_LINES = 12
+LOCAL_DEGREE = 2
+#: A band of that many lines counts as excited by the input from this ratio of explained to noise power on.
+CLEARLY_EXPLAINED = 6.0
+#: Lines are kept up to the highest clearly explained frequency times this: weaker modes may lie beyond it.
+HEADROOM = 2.0
+FEWEST_LINES = 128
+#: Moves of all poles after each new mode, and after the last.
+MOVES_BETWEEN = 4
+MOVES_AT_THE_END = 15
+#: Poles are settled when none moves by more than this fraction of its magnitude.
+SETTLED = 1e-4
+#: Peaks that are tried at each resolution, and dampings as fractions of its width.
+PEAKS = 3
+DAMPINGS = (0.15, 0.5)
+#: Real poles that are tried, spread over the band.
+REAL_POLES = 25
+#: Least damping ratio of a moved pole [-].
+LEAST_DAMPING = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Weighted spectra of a stretch of a record.
+
+    Parameters
+    ----------
+    frequencies : ndarray, shape (K,)
+        Equidistant frequencies [rad/s], without zero.
+    inputs, outputs : ndarray, shape (K,)
+        Spectra of delayed input and output, divided by the noise level.
+    weights : ndarray, shape (K,)
+        What they were multiplied with: the spectrum of a transient.
+    integrators : int
+        Poles at the origin.
+    direct : bool
+        Whether the input feeds through.
+    """
+
+    frequencies: Array
+    inputs: ComplexArray
+    outputs: ComplexArray
+    weights: Array
+    integrators: int
+    direct: bool
+
+    @property
+    def s(self) -> ComplexArray:
+        """``j w`` [rad/s]."""
+        return 1j * self.frequencies
+
+    def weighted(self, weights: Array) -> Lines:
+        """The same lines with other weights.
+
+        Parameters
+        ----------
+        weights : ndarray, shape (K,)
+            Reciprocal noise levels; only their ratios matter.
+
+        Returns
+        -------
+        Lines
+            The lines.
+        """
+        weights = weights / float(np.median(weights))
+        change = weights / self.weights
+        return replace(self, inputs=self.inputs * change, outputs=self.outputs * change, weights=weights)
+
+
+def spectral_lines(record: Record, delay: float, integrators: int = 0, direct: bool = False) -> Lines | None:
+    """Spectra from which poles can be found.
+
+    Parameters
+    ----------
+    record : Record
+        The record, on any clock.
+    delay : float
+        Known delay [s].
+    integrators : int, default 0
+        Poles at the origin.
+    direct : bool, default False
+        Whether the input feeds through.
+
+    Returns
+    -------
+    Lines or None
+        Lines of weight one up to somewhat beyond the highest frequency at which the output clearly follows the input;
+        None for a record too short to have any.
+    """
+    stretch = record
+    if record.n_samples > LONGEST_STRETCH:
+        early = record.input.t <= record.t[LONGEST_STRETCH - 1]
+        held = HeldSignal(record.input.t[early], record.input.values[early], record.input.hold)
+        stretch = Record(record.t[:LONGEST_STRETCH], record.y[:LONGEST_STRETCH], held, name=record.name)
+    try:
+        spectra = record_spectra(stretch, delay, np.inf, delay, keep_mean=False)
+    except DataError:
+        return None
+    count = spectra.frequencies.size
+    lines = Lines(spectra.frequencies, spectra.inputs(delay), spectra.outputs, np.ones(count), integrators, direct)
+    if count < 2 * LOCAL_LINES:
+        return lines
+    edges, noise, explained = _local_fits(lines)
+    clear = np.flatnonzero(explained > CLEARLY_EXPLAINED * _median_of_neighbours(noise))
+    if not clear.size:
+        return lines
+    kept = int(min(max(HEADROOM * edges[clear[-1] + 1], FEWEST_LINES), count))
+    return replace(
+        lines,
+        frequencies=lines.frequencies[:kept],
+        inputs=lines.inputs[:kept],
+        outputs=lines.outputs[:kept],
+        weights=lines.weights[:kept],
+    )
+
+
+def local_weights(lines: Lines) -> Array:
+    """Reciprocal noise levels, from what no locally smooth response and transient explain.
+
+    Parameters
+    ----------
+    lines : Lines
+        Lines of weight one.
+
+    Returns
+    -------
+    ndarray, shape (K,)
+        Weights.
+    """
+    edges, noise, _ = _local_fits(lines)
+    return _weights(lines.frequencies, edges, _median_of_neighbours(noise))
+
+
+def residual_weights(lines: Lines, poles: Sequence[complex]) -> Array:
+    """Reciprocal noise levels, from what a fit with given poles leaves.
+
+    Parameters
+    ----------
+    lines : Lines
+        Lines.
+    poles : sequence of complex
+        One of each conjugate pair, and real ones [rad/s].
+
+    Returns
+    -------
+    ndarray, shape (K,)
+        Weights.
+    """
+    residual = _complex(_residual(lines, poles)[0]) / lines.weights
+    edges = _edges(residual.size)
+    noise = np.add.reduceat(np.abs(residual) ** 2, edges[:-1]) / np.diff(edges)
+    return _weights(lines.frequencies, edges, noise)
+
+
+def find_poles(lines: Lines, pairs: int, reals: int) -> list[complex]:
+    """Poles of the modes that explain most of the output.
+
+    Parameters
+    ----------
+    lines : Lines
+        Lines.
+    pairs, reals : int
+        Numbers of complex pairs and of real poles to start from; pairs may end as two real poles and vice versa.
+
+    Returns
+    -------
+    list of complex
+        One of each conjugate pair, and real ones, by rising magnitude [rad/s].
+
+    Notes
+    -----
+    Greedy: candidates for the next mode come from the peaks of the power that a locally constant gain explains of the
+    residual, at several resolutions; that which would lower the squared error most is taken, and all poles found so far
+    are moved before the next is looked for.
+    """
+    poles: list[complex] = []
+    while pairs or reals:
+        residual, basis = _residual(lines, poles)
+        candidates = _candidates(lines, _complex(residual), pairs > 0, reals > 0)
+        gains = [_gain(lines, residual, basis, pole) for pole in candidates]
+        best = candidates[int(np.argmax(gains))]
+        pairs, reals = (pairs - 1, reals) if best.imag else (pairs, reals - 1)
+        poles = relocate(lines, [*poles, best], MOVES_BETWEEN)
+    return relocate(lines, poles, MOVES_AT_THE_END)
+
+
+def relocate(lines: Lines, poles: Sequence[complex], moves: int) -> list[complex]:
+    """Move all poles together towards a smaller squared error.
+
+    Parameters
+    ----------
+    lines : Lines
+        Lines.
+    poles : sequence of complex
+        One of each conjugate pair, and real ones [rad/s].
+    moves : int
+        Largest number of moves.
+
+    Returns
+    -------
+    list of complex
+        The best poles on the way, stable, by rising magnitude.
+    """
+    current = list(poles)
+    best, least = current, np.inf
+    for move in range(moves + 1):
+        residual, known = _residual(lines, current)
+        error = float(residual @ residual)
+        if error < least:
+            best, least = current, error
+        if move == moves:
+            break
+        moved = _moved(lines, current, residual, known)
+        if moved is None:
+            break
+        settled = len(moved) == len(current) and all(
+            abs(new - old) <= SETTLED * abs(old) for new, old in zip(moved, current, strict=True)
+        )
+        current = moved
+        if settled:
+            break
+    return sorted(best, key=abs)
+
+
+def _moved(lines: Lines, poles: list[complex], residual: Array, known: Array) -> list[complex] | None:
+    """Zeros of sigma, reflected into the left half-plane; None where the equations are singular."""
+    basis = _basis(lines.s, poles)
+    fitted = lines.outputs - _complex(residual)
+    instruments = _stacked(basis * fitted[:, None])
+    regressors = _stacked(basis * lines.outputs[:, None])
+    regressors -= known @ (known.T @ regressors)
+    left, right = _norms(instruments), _norms(regressors)
+    try:
+        c = -np.linalg.solve((instruments / left).T @ (regressors / right), (instruments / left).T @ residual) / right
+    except np.linalg.LinAlgError:
+        return None
+    if not np.isfinite(c).all():
+        return None
+    dynamics, entry = np.zeros((c.size, c.size)), np.zeros(c.size)
+    place = 0
+    for pole in poles:
+        if pole.imag:
+            dynamics[place : place + 2, place : place + 2] = [[pole.real, pole.imag], [-pole.imag, pole.real]]
+            entry[place] = 2.0
+            place += 2
+        else:
+            dynamics[place, place], entry[place] = pole.real, 1.0
+            place += 1
+    roots = np.linalg.eigvals(dynamics - np.outer(entry, c))
+    damping = np.maximum(np.abs(roots.real), LEAST_DAMPING * np.abs(roots))
+    # Poles that run out of the band would leave the equations singular.
+    low, high = 0.1 * lines.frequencies[0], 10.0 * lines.frequencies[-1]
+    size = np.maximum(np.abs(roots), 1e-300)
+    stable = (-damping + 1j * roots.imag) * (np.clip(size, low, high) / size)
+    return sorted((complex(root) for root in stable if root.imag >= 0), key=abs)
+
+
+def _residual(lines: Lines, poles: Sequence[complex]) -> tuple[Array, Array]:
+    """What the best numerators leave of the output, and an orthonormal basis of what they can explain."""
+    columns = _fixed_columns(lines)
+    if poles:
+        basis = _basis(lines.s, poles)
+        columns += [basis * lines.inputs[:, None], basis * lines.weights[:, None]]
+    output = _stacked(lines.outputs)
+    if not columns:
+        return output, np.zeros((output.size, 0))
+    known = _orthonormal(_stacked(np.hstack(columns)))
+    return output - known @ (known.T @ output), known
+
+
+def _fixed_columns(lines: Lines) -> list[ComplexArray]:
+    """Columns without unknown poles: integrators with their transient, and a direct feed-through."""
+    powers = lines.s[:, None] ** -np.arange(1.0, lines.integrators + 1)
+    columns = [powers * lines.inputs[:, None], powers * lines.weights[:, None]] if lines.integrators else []
+    return [*columns, lines.inputs[:, None]] if lines.direct else columns
+
+
+def _candidates(lines: Lines, residual: ComplexArray, pairs: bool, reals: bool) -> list[complex]:
+    """Poles that may be next."""
+    spacing = float(lines.frequencies[0])
+    found: list[complex] = []
+    if reals:
+        found += [complex(-w) for w in np.geomspace(0.5 * spacing, lines.frequencies[-1], REAL_POLES)]
+    if not pairs:
+        return found
+    cross, power = residual * lines.inputs.conj(), np.abs(lines.inputs) ** 2
+    width = 3
+    while width == 3 or width <= residual.size // 2:
+        explained = np.abs(_moving_sum(cross, width)) ** 2
+        explained /= np.maximum(_moving_sum(power, width).real, 1e-12 * width * float(power.max()) + 1e-300)
+        for peak in _peaks(explained):
+            found += [complex(-part * width * spacing, lines.frequencies[peak]) for part in DAMPINGS]
+        width = int(1.6 * width) + 1 | 1
+    return found
+
+
+def _moving_sum(values: NDArray[np.generic], width: int) -> ComplexArray:
+    """Sums over an odd number of neighbours, fewer at the ends."""
+    total = np.concatenate(([0.0], np.cumsum(values)))
+    place = np.arange(values.size)
+    half = width // 2
+    return np.asarray(total[np.minimum(place + half + 1, values.size)] - total[np.maximum(place - half, 0)])
+
+
+def _peaks(values: Array) -> IndexArray:
+    """The highest local maxima."""
+    padded = np.concatenate(([-np.inf], values, [-np.inf]))
+    places = np.flatnonzero((values >= padded[:-2]) & (values > padded[2:]))
+    return places[np.argsort(-values[places])[:PEAKS]]
+
+
+def _gain(lines: Lines, residual: Array, known: Array, pole: complex) -> float:
+    """By how much one more pole (pair) would lower the squared error."""
+    basis = _basis(lines.s, [pole])
+    columns = _stacked(np.hstack((basis * lines.inputs[:, None], basis * lines.weights[:, None])))
+    columns /= _norms(columns)
+    new = _orthonormal(columns - known @ (known.T @ columns))
+    return float(np.sum((new.T @ residual) ** 2))
+
+
+def _basis(s: ComplexArray, poles: Sequence[complex]) -> ComplexArray:
+    """``1/(s - p)`` of each real pole and two real combinations of each pair, shape (K, n)."""
+    columns = []
+    for pole in poles:
+        one = 1.0 / (s - pole)
+        if pole.imag:
+            other = 1.0 / (s - pole.conjugate())
+            columns += [one + other, 1j * (one - other)]
+        else:
+            columns.append(one)
+    return np.stack(columns, axis=1)
+
+
+def _stacked(values: ComplexArray) -> Array:
+    return np.concatenate((values.real, values.imag))
+
+
+def _complex(stacked: Array) -> ComplexArray:
+    half = stacked.size // 2
+    return np.asarray(stacked[:half] + 1j * stacked[half:])
+
+
+def _norms(columns: Array) -> Array:
+    norms: Array = np.linalg.norm(columns, axis=0)
+    return np.where(norms > 0, norms, 1.0)
+
+
+def _orthonormal(columns: Array) -> Array:
+    """Orthonormal basis; columns are scaled first, since those of high powers of a frequency would drown others."""
+    basis: Array = np.linalg.qr(columns / _norms(columns))[0]
+    return basis
+
+
+# --- noise level -----------------------------------------------------------------------------------
+
+
+def _edges(count: int) -> IndexArray:
+    """Where blocks of neighbouring lines begin and end."""
+    return np.linspace(0, count, max(count // LOCAL_LINES, 1) + 1).round().astype(np.intp)
+
+
+def _local_fits(lines: Lines) -> tuple[IndexArray, Array, Array]:
+    """Blocks of lines, the variance that polynomials in w leave in each, and the power per line of the response."""
+    edges = _edges(lines.frequencies.size)
+    noise, explained = np.zeros(edges.size - 1), np.zeros(edges.size - 1)
+    for k, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        powers = np.linspace(-1.0, 1.0, last - first)[:, None] ** np.arange(LOCAL_DEGREE + 1)
+        transient = np.linalg.qr(powers)[0]
+        output = lines.outputs[first:last] - transient @ (transient.T @ lines.outputs[first:last])
+        columns = powers * lines.inputs[first:last, None]
+        columns = columns - transient @ (transient.T @ columns)
+        response, strength, _ = np.linalg.svd(columns, full_matrices=False)
+        response = response[:, strength > 1e-9 * max(float(strength[0]), 1e-300)]
+        follows = response.conj().T @ output
+        free = last - first - transient.shape[1] - response.shape[1]
+        left = float(np.sum(np.abs(output) ** 2) - np.sum(np.abs(follows) ** 2))
+        noise[k] = max(left, 0.0) / max(free, 1)
+        explained[k] = float(np.sum(np.abs(follows) ** 2)) / max(response.shape[1], 1)
+    return edges, noise, explained
+
+
+def _median_of_neighbours(levels: Array) -> Array:
+    """Running median over five blocks: a resonance narrower than a block is no noise."""
+    if levels.size < 3:
+        return levels
+    padded = np.pad(levels, 2, mode="reflect")
+    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
+
+
+def _weights(frequencies: Array, edges: IndexArray, noise: Array) -> Array:
+    """Reciprocal standard deviations, with straight lines between the blocks in logarithmic scales."""
+    centres = 0.5 * (frequencies[edges[:-1]] + frequencies[edges[1:] - 1])
+    floor = 1e-24 * float(noise.max()) + 1e-300
+    level = np.interp(np.log(frequencies), np.log(centres), np.log(np.maximum(noise, floor)))
+    return np.asarray(np.exp(-0.5 * level))

@@ -1,0 +1,323 @@
+r"""A continuous-time model in a loop with a discrete-time controller.
+
+The reference r enters before the controller, ``u = C(q) (r - y)``, or behind it, ``u = r - C(q) y``. The measured
+output is ``y = x + v``, and x is the response of the model to the held input u. Everything is exact at the sampling
+instants.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, get_args
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.filtering.bank import plain_array
+from ctid_cli.filtering.sampled import SampledModel, sampled_model, state_space_response
+from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.checks import require_choice
+from ctid_cli.signals.record import Controller, Enters
+
+Array = NDArray[np.float64]
+
+#: Below this fraction of its terms, 1 + (direct gain round the loop) is rounding.
+NO_GAIN = 1e-12
+
+
+class LoopSignals(NamedTuple):
+    """Signals of a closed loop at the sampling instants.
+
+    Parameters
+    ----------
+    u : ndarray, shape (N,)
+        Input of the model [input unit].
+    x : ndarray, shape (N,)
+        Its output without the noise [output unit].
+    """
+
+    u: Array
+    x: Array
+
+
+def simulate_loop(
+    model: AdditiveModel | TransferFunction,
+    controller: Controller,
+    reference: ArrayLike,
+    noise: ArrayLike,
+    interval: float,
+    enters: Enters = "controller",
+) -> LoopSignals:
+    """Input and noise-free output of a loop that is at rest before the first sample.
+
+    Parameters
+    ----------
+    model : AdditiveModel or TransferFunction
+        The plant; any proper model, any delay.
+    controller : Controller
+        What makes the input from reference and output.
+    reference : array_like, shape (N,)
+        r at the sampling instants [output unit; input unit if it enters behind the controller].
+    noise : array_like, shape (N,) or ()
+        v, what is added to the output before the controller sees it [output unit]; 0 for none.
+    interval : float
+        Sampling interval [s].
+    enters : {"controller", "input"}, default "controller"
+        Whether r enters before or behind the controller.
+
+    Returns
+    -------
+    LoopSignals
+        u and x; the measured output is ``x + noise``.
+
+    Raises
+    ------
+    DataError
+        If the loop has no solution (direct gains of -1 round the loop), the signals outgrow the range of numbers, or
+        reference and noise do not match.
+    ValueError
+        If the interval is not positive or it is not said where the reference enters.
+
+    Examples
+    --------
+    >>> plant, half = TransferFunction([1.0], [1.0, 1.0]), DiscreteController([0.5], [1.0])
+    >>> simulate_loop(plant, half, [1.0, 1.0, 1.0], 0.0, 0.5).u.round(4)
+    array([0.5   , 0.4016, 0.3613])
+    """
+    require_choice("enters", enters, get_args(Enters))
+    r = plain_array(reference)
+    v = plain_array(noise)
+    if v.ndim == 0:
+        v = np.full(r.shape, v)
+    if r.ndim != 1 or v.shape != r.shape:
+        raise DataError(
+            f"reference and noise of a loop must be lists of equal length; got shapes {r.shape} and {v.shape}"
+        )
+    plant = sampled_model(model, interval)
+    discrete = _realised(controller)
+    _require_solvable(plant, discrete)
+    A, B, C, D = discrete.state_space()
+    u, x = np.empty(r.size), np.empty(r.size)
+    _closed_loop(
+        plant.transition,
+        plant.from_input,
+        plant.output,
+        plant.direct,
+        plant.shift,
+        A,
+        B[:, 0].copy(),
+        C[0],
+        float(D[0, 0]),
+        r,
+        v,
+        float(enters == "controller"),
+        u,
+        x,
+    )
+    if not (np.isfinite(u).all() and np.isfinite(x).all()):
+        raise DataError(
+            "the signals of the closed loop are not finite: check reference and noise, and whether the loop is stable; "
+            f"its largest pole has the magnitude {loop_radius(model, controller, interval):.6g}"
+        )
+    return LoopSignals(u, x)
+
+
+@njit(cache=True, nogil=True)
+def _closed_loop(
+    transition: Array,
+    from_input: Array,
+    output: Array,
+    direct: float,
+    shift: int,
+    A: Array,
+    B: Array,
+    C: Array,
+    D: float,
+    r: Array,
+    v: Array,
+    before: float,
+    u: Array,
+    x: Array,
+) -> None:
+    """Compiled body of :func:`simulate_loop`; ``before`` is the share of r that the controller sees, 1 or 0."""
+    n, m = from_input.size, B.size
+    z, z_next = np.zeros(n), np.zeros(n)
+    s, s_next = np.zeros(m), np.zeros(m)
+    for k in range(u.size):
+        free = 0.0
+        for i in range(n):
+            free += output[i] * z[i]
+        error = before * r[k] - v[k]
+        law = (1.0 - before) * r[k]
+        for i in range(m):
+            law += C[i] * s[i]
+        if shift == 0:
+            # The input acts on the output that it is made from: solve for it.
+            arriving = (law + D * (error - free)) / (1.0 + D * direct)
+            x[k] = free + direct * arriving
+            u[k] = arriving
+        else:
+            arriving = u[k - shift] if k >= shift else 0.0
+            x[k] = free + direct * arriving
+            u[k] = law + D * (error - x[k])
+        error -= x[k]
+        for i in range(n):
+            total = from_input[i] * arriving
+            for j in range(n):
+                total += transition[i, j] * z[j]
+            z_next[i] = total
+        for i in range(m):
+            total = B[i] * error
+            for j in range(m):
+                total += A[i, j] * s[j]
+            s_next[i] = total
+        z, z_next = z_next, z
+        s, s_next = s_next, s
+
+
+def loop_state_space(
+    model: AdditiveModel | TransferFunction, controller: Controller, interval: float, enters: Enters = "controller"
+) -> tuple[Array, Array, Array, Array]:
+    r"""State-space form of the closed loop from ``(r, v)`` to ``(u, x)``.
+
+    Parameters
+    ----------
+    model : AdditiveModel or TransferFunction
+        The plant; any proper model, any delay.
+    controller : Controller
+        What makes the input from reference and output.
+    interval : float
+        Sampling interval [s].
+    enters : {"controller", "input"}, default "controller"
+        Whether r enters before or behind the controller.
+
+    Returns
+    -------
+    A : ndarray, shape (n, n)
+        Dynamics; states of the model, its delay line, and the controller.
+    B : ndarray, shape (n, 2)
+        From reference and noise.
+    C : ndarray, shape (2, n)
+        To input and noise-free output.
+    D : ndarray, shape (2, 2)
+        Direct feedthrough.
+
+    Raises
+    ------
+    DataError
+        If the loop has no solution (direct gains of -1 round the loop), or the model has more zeros than poles.
+    ValueError
+        If the interval is not positive or it is not said where the reference enters.
+    """
+    require_choice("enters", enters, get_args(Enters))
+    sampled = sampled_model(model, interval)
+    discrete = _realised(controller)
+    _require_solvable(sampled, discrete)
+    A, B, C, D = sampled.state_space()
+    Ac, Bc, Cc, Dc = discrete.state_space()
+    n, m = len(A), len(Ac)
+    # The controller sees inner - x and puts out Cc s + Dc (inner - x), to which outer is added.
+    before = float(enters == "controller")
+    inner, outer = np.array([[before, -1.0]]), np.array([[1.0 - before, 0.0]])
+    divisor = 1.0 + Dc * D
+    u_state = np.hstack((-Dc @ C, Cc)) / divisor
+    u_input = (Dc @ inner + outer) / divisor
+    x_state = np.hstack((C, np.zeros((1, m)))) + D @ u_state
+    x_input = D @ u_input
+    dynamics = np.vstack((np.hstack((A, np.zeros((n, m)))), np.hstack((np.zeros((m, n)), Ac))))
+    dynamics += np.vstack((B @ u_state, -Bc @ x_state))
+    inputs = np.vstack((B @ u_input, Bc @ (inner - x_input)))
+    return dynamics, inputs, np.vstack((u_state, x_state)), np.vstack((u_input, x_input))
+
+
+def loop_radius(model: AdditiveModel | TransferFunction, controller: Controller, interval: float) -> float:
+    """Largest magnitude of the poles of the sampled loop: it is stable below 1.
+
+    Parameters
+    ----------
+    model : AdditiveModel or TransferFunction
+        The plant; any proper model, any delay.
+    controller : Controller
+        What makes the input from reference and output.
+    interval : float
+        Sampling interval [s].
+
+    Returns
+    -------
+    float
+        Spectral radius [-], poles that cancel included.
+
+    Raises
+    ------
+    DataError
+        As :func:`loop_state_space`.
+    ValueError
+        If the interval is not positive.
+
+    Examples
+    --------
+    >>> round(loop_radius(TransferFunction([1.0], [1.0, 0.0]), DiscreteController([0.5], [1.0]), 1.0), 12)
+    0.5
+    """
+    dynamics = loop_state_space(model, controller, interval)[0]
+    return float(np.abs(np.linalg.eigvals(dynamics)).max(initial=0.0))
+
+
+def input_sensitivity(
+    model: AdditiveModel | TransferFunction,
+    controller: Controller,
+    interval: float,
+    frequencies: ArrayLike,
+    enters: Enters = "controller",
+) -> NDArray[np.complex128]:
+    r"""Frequency response from the reference to the input of the noise-free loop.
+
+    Parameters
+    ----------
+    model : AdditiveModel or TransferFunction
+        The plant G; any proper model, any delay.
+    controller : Controller
+        What makes the input from reference and output, C.
+    interval : float
+        Sampling interval [s].
+    frequencies : array_like, shape (W,)
+        Angular frequencies w [rad/s].
+    enters : {"controller", "input"}, default "controller"
+        Whether r enters before or behind the controller.
+
+    Returns
+    -------
+    ndarray, shape (W,)
+        ``C/(1 + G C)``, or ``1/(1 + G C)`` for a reference behind the controller, at ``exp(j w interval)``.
+
+    Raises
+    ------
+    DataError
+        As :func:`loop_state_space`.
+    ValueError
+        If the interval is not positive or it is not said where the reference enters.
+
+    Notes
+    -----
+    Evaluated on the state space of the loop, so it stays finite where model or controller integrate.
+    """
+    loop = loop_state_space(model, controller, interval, enters)
+    return state_space_response(*loop, frequencies, interval)[:, 0, 0]
+
+
+def _realised(controller: Controller) -> DiscreteController:
+    """The controller with a state space."""
+    return DiscreteController(controller.numerator, controller.denominator)
+
+
+def _require_solvable(plant: SampledModel, controller: DiscreteController) -> None:
+    """Refuse a loop without delay in which the present input is not determined by the present signals."""
+    gain = 0.0 if plant.shift else controller.direct * plant.direct
+    if abs(1.0 + gain) <= NO_GAIN * max(1.0, abs(gain)):
+        raise DataError(
+            "the loop has no solution: model and controller both act at once, with gains whose product is -1; change "
+            "the gain of the controller, or give the model a delay or fewer zeros"
+        )

@@ -1,0 +1,241 @@
+"""The sampled equivalent of a model behind a zero-order hold, and the response of a sum of submodels to any input."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.filtering.bank import plain_array, scaled_denominator, split_delay
+from ctid_cli.filtering.exponential import held_step
+from ctid_cli.filtering.sections import chain, polynomial_roots, time_scale
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.checks import require_positive
+from ctid_cli.signals.held import HeldSignal
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SampledModel:
+    r"""``z_(k+1) = F z_k + g u_(k-shift)``, ``x_k = c z_k + d u_(k-shift)`` for an input held between the samples.
+
+    Parameters
+    ----------
+    transition : ndarray, shape (n, n)
+        F, block diagonal for a sum of submodels.
+    from_input : ndarray, shape (n,)
+        g.
+    output : ndarray, shape (n,)
+        c.
+    direct : float
+        d.
+    shift : int
+        Whole samples by which the input arrives late.
+    """
+
+    transition: Array
+    from_input: Array
+    output: Array
+    direct: float
+    shift: int
+
+    def state_space(self) -> tuple[Array, Array, Array, Array]:
+        """Realisation with the late inputs as further states.
+
+        Returns
+        -------
+        A : ndarray, shape (n + shift, n + shift)
+            Dynamics.
+        B : ndarray, shape (n + shift, 1)
+            From the input.
+        C : ndarray, shape (1, n + shift)
+            To the output.
+        D : ndarray, shape (1, 1)
+            Direct feedthrough.
+        """
+        n, size = self.from_input.size, self.from_input.size + self.shift
+        A, B, C, D = np.zeros((size, size)), np.zeros((size, 1)), np.zeros((1, size)), np.zeros((1, 1))
+        A[:n, :n], C[0, :n] = self.transition, self.output
+        if self.shift:
+            # The states behind the plant's are u_(k-1) … u_(k-shift).
+            A[:n, -1], C[0, -1], B[n, 0] = self.from_input, self.direct, 1.0
+            A[n:, n:] = np.eye(self.shift, k=-1)
+        else:
+            B[:, 0], D[0, 0] = self.from_input, self.direct
+        return A, B, C, D
+
+
+def sampled_model(model: AdditiveModel | TransferFunction, interval: float) -> SampledModel:
+    r"""Exact zero-order-hold equivalent of a model at rest.
+
+    Parameters
+    ----------
+    model : AdditiveModel or TransferFunction
+        Any proper model, integrators, repeated poles and any delay included.
+    interval : float
+        Sampling interval h [s].
+
+    Returns
+    -------
+    SampledModel
+        Its states are those of each submodel in turn.
+
+    Raises
+    ------
+    DataError
+        If the model has more zeros than poles.
+    ValueError
+        If the interval is not positive.
+
+    Notes
+    -----
+    With the delay ``(shift - fraction) h``, ``0 <= fraction < 1``, the output at ``t_k`` is that of the undelayed model
+    ``fraction h`` after ``t_(k-shift)``, while it still holds ``u_(k-shift)``.
+    """
+    require_positive("the sampling interval", interval, "s")
+    parts = [s.transfer_function() for s in model.submodels] if isinstance(model, AdditiveModel) else [model]
+    shift, fraction = split_delay(model.delay, interval)
+    n = sum(part.order for part in parts)
+    transition, from_input, output, direct = np.zeros((n, n)), np.zeros(n), np.zeros(n), 0.0
+    first = 0
+    for part in parts:
+        place = slice(first, first + part.order)
+        transition[place, place], from_input[place], output[place], feedthrough = _part(part, interval, fraction)
+        direct += feedthrough
+        first += part.order
+    return SampledModel(transition, from_input, output, direct, shift)
+
+
+def _part(part: TransferFunction, interval: float, fraction: float) -> tuple[Array, Array, Array, float]:
+    """One-interval map of an undelayed transfer function, read out a fraction of the interval after each sample."""
+    if part.relative_degree < 0:
+        raise DataError("a model with more zeros than poles has no response to a jump")
+    n = part.order
+    numerator = np.concatenate((np.zeros(part.relative_degree), part.numerator))
+    direct = float(numerator[0])
+    if not n:
+        return np.zeros((0, 0)), np.zeros(0), np.zeros(0), direct
+    a = plain_array(part.denominator)
+    w0 = time_scale(a)
+    dynamics, gain, powers = chain(polynomial_roots(scaled_denominator(a, w0)))
+    strictly_proper = (numerator - direct * a)[1:] / w0 ** np.arange(1, n + 1)
+    output = strictly_proper[::-1] @ powers
+    transition, from_input, _ = held_step(dynamics, gain, interval * w0)
+    if fraction:
+        part_way, from_held, _ = held_step(dynamics, gain, fraction * interval * w0)
+        output, direct = output @ part_way, float(output @ from_held) + direct
+    return transition, from_input, output, direct
+
+
+def sampled_state_space(model: AdditiveModel | TransferFunction, interval: float) -> tuple[Array, Array, Array, Array]:
+    r"""State-space form ``A, B, C, D`` of :func:`sampled_model`.
+
+    Parameters
+    ----------
+    model : AdditiveModel or TransferFunction
+        Any proper model, integrators, repeated poles and any delay included.
+    interval : float
+        Sampling interval [s].
+
+    Returns
+    -------
+    A : ndarray, shape (n + shift, n + shift)
+        Dynamics: block diagonal for the submodels, then one state for each whole sample of delay, rounded up.
+    B : ndarray, shape (n + shift, 1)
+        From the input.
+    C : ndarray, shape (1, n + shift)
+        To the output.
+    D : ndarray, shape (1, 1)
+        Direct feedthrough.
+
+    Raises
+    ------
+    DataError
+        If the model has more zeros than poles.
+    ValueError
+        If the interval is not positive.
+
+    Examples
+    --------
+    >>> A, B, C, D = sampled_state_space(TransferFunction([1.0], [1.0, 1.0], delay=0.2), 0.1)
+    >>> A.round(4)
+    array([[0.9048, 0.    , 0.0952],
+           [0.    , 0.    , 0.    ],
+           [0.    , 1.    , 0.    ]])
+    """
+    return sampled_model(model, interval).state_space()
+
+
+def state_space_response(
+    A: ArrayLike, B: ArrayLike, C: ArrayLike, D: ArrayLike, frequencies: ArrayLike, interval: float
+) -> NDArray[np.complex128]:
+    r"""``C (q I - A)^(-1) B + D`` at ``q = exp(j w h)``.
+
+    Parameters
+    ----------
+    A : array_like, shape (n, n)
+        Dynamics.
+    B : array_like, shape (n, inputs)
+        From the inputs.
+    C : array_like, shape (outputs, n)
+        To the outputs.
+    D : array_like, shape (outputs, inputs)
+        Direct feedthrough.
+    frequencies : array_like, shape (W,)
+        Angular frequencies w [rad/s].
+    interval : float
+        Sampling interval h [s].
+
+    Returns
+    -------
+    ndarray, shape (W, outputs, inputs)
+        Complex gains.
+    """
+    dynamics, inputs, outputs, feedthrough = (np.asarray(matrix, dtype=float) for matrix in (A, B, C, D))
+    q = np.exp(1j * np.asarray(frequencies, dtype=float) * interval)
+    resolvent = q[:, None, None] * np.eye(len(dynamics)) - dynamics
+    return np.asarray(outputs @ np.linalg.solve(resolvent, inputs.astype(complex)) + feedthrough)
+
+
+def simulate_additive(model: AdditiveModel, signal: HeldSignal, times: ArrayLike) -> Array:
+    """Output of a sum of submodels at rest before the first break of its input.
+
+    Parameters
+    ----------
+    model : AdditiveModel
+        The sum.
+    signal : HeldSignal
+        The input; zero before its first break.
+    times : array_like, shape (N,)
+        Instants [s], strictly increasing.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        Noise-free output [output unit].
+
+    Raises
+    ------
+    DataError
+        If the instants do not increase strictly.
+
+    Notes
+    -----
+    Exact for every clock and delay, as :func:`ctid_cli.filtering.simulate`, and formed submodel by submodel: no
+    polynomial of the order of the whole sum, with the rounding of its roots, is needed.
+
+    Examples
+    --------
+    >>> from ctid_cli.models import Submodel
+    >>> model = AdditiveModel([Submodel([1.0], [1.0, 1.0]), Submodel([2.0], [0.5, 1.0])])
+    >>> simulate_additive(model, HeldSignal([0.0], [1.0]), [1.0]).round(6)
+    array([2.36145])
+    """
+    parts = [submodel.transfer_function() for submodel in model.submodels]
+    delayed = [TransferFunction(part.numerator, part.denominator, model.delay) for part in parts]
+    return np.asarray(np.sum([simulate(part, signal, times) for part in delayed], axis=0))

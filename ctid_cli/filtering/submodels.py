@@ -1,0 +1,434 @@
+r"""Filtered signals of a sum of submodels and their second moments: rows of additive refined instrumental variables.
+
+Submodel i is ``G_i = B_i / (p^l A_i)``, ``A_i = 1 + a_1 p + … + a_n p^n``, ``B_i = b_0 + … + b_m p^m``, with
+integrators (l > 0) in at most one of them, and ``theta = (a_1 … a_n, b_0 … b_m)`` of each in turn. At each used sample,
+with z the instrument source, u the input and ``y_i = y - sum of the other x_l`` what the others leave of the output,
+
+.. math:: \psi_{a_k} = -\frac{p^k B_i}{p^l A_i^2} z, \quad \psi_{b_k} = \frac{p^k}{p^l A_i} z, \qquad
+          \varphi_{a_k} = -\frac{p^k}{A_i} y_i, \quad \varphi_{b_k} = \frac{p^k}{p^l A_i} u .
+
+In open loop ``z = u`` and psi are the sensitivities of the model output. In closed loop z is the input of the model's
+own noise-free loop (González, Classens, Rojas, Welsh and Oomen, *Identification of additive continuous-time systems in
+open and closed loop*, equations (10), (20), (29) and (31)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.filtering.bank import (
+    MODAL_CONDITION_LIMIT,
+    FilterData,
+    plain_array,
+    split_delay,
+    standard_rows,
+)
+from ctid_cli.filtering.free_response import free_response, free_response_size
+from ctid_cli.filtering.loop import simulate_loop
+from ctid_cli.filtering.submodel_map import pooled_modes
+from ctid_cli.filtering.submodel_pass import submodel_pass
+from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.models.controller import DiscreteController
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+IntArray = NDArray[np.int64]
+
+#: State of the filters at the first sample.
+InitialState = Literal["rest", "periodic", "estimated"]
+
+
+@dataclass(frozen=True, eq=False)
+class LoopData:
+    """The feedback around a record, laid out for the compiled pass.
+
+    Parameters
+    ----------
+    reference : ndarray, shape (N,)
+        Reference at the sampling instants; empty in open loop.
+    numerator, denominator : ndarray, shape (nc + 1,)
+        Controller in descending powers of q, monic, both of one length.
+    at_controller : bool
+        Whether the reference enters at the controller, ``u = C (r - y)``, or at the input, ``u = r - C y``.
+    """
+
+    reference: Array
+    numerator: Array
+    denominator: Array
+    at_controller: bool
+
+    @property
+    def closed(self) -> bool:
+        """Whether there is feedback."""
+        return self.reference.size > 0
+
+
+#: No feedback.
+OPEN_LOOP = LoopData(np.zeros(0), np.ones(1), np.ones(1), True)
+
+
+@dataclass(frozen=True, eq=False)
+class SubmodelMoments:
+    """Second moments at one parameter vector, in the terms of the module's equations.
+
+    Parameters
+    ----------
+    instrument_regressor : ndarray, shape (p, p)
+        ``sum psi phi'``.
+    instrument_error : ndarray, shape (p,)
+        ``sum psi eps``.
+    hessian : ndarray, shape (p, p)
+        ``sum psi psi'``.
+    squared_error : float
+        ``sum eps^2`` [output unit^2].
+    output_power : float
+        Sum of squares of the model output driven by z [output unit^2].
+    """
+
+    instrument_regressor: Array
+    instrument_error: Array
+    hessian: Array
+    squared_error: float
+    output_power: float
+
+
+class PooledModes(NamedTuple):
+    """Partial fractions of all submodels, see :func:`ctid_cli.filtering.submodel_map.pooled_modes`."""
+
+    #: Amplification of rounding [-].
+    condition: float
+    #: Poles of all submodels, one of each pair [rad/s].
+    poles: ComplexArray
+    #: Submodel of each mode.
+    owner: IntArray
+    #: Residues of the model output.
+    residues: ComplexArray
+    #: Weights of the integrals of the input in the model output.
+    origin: Array
+    #: Submodel that integrates.
+    origin_owner: int
+    #: Direct feed-through.
+    direct: float
+    #: Submodel with direct feed-through.
+    direct_owner: int
+    #: psi from the rows of the pass, shape (p, q).
+    instruments: Array
+    #: phi from the rows of the pass, shape (p, q).
+    regressors: Array
+    #: Model output driven by z from the rows of the pass, shape (q,).
+    output: Array
+
+
+class SubmodelFilter:
+    """The filters of a record for sums of submodels of one structure.
+
+    Parameters
+    ----------
+    data : FilterData
+        The record.
+    terms : sequence of Term
+        Degrees of the submodels.
+    delay : float, default 0.0
+        Delay of the input [s].
+    loop : LoopData, optional
+        The feedback, on a regular clock; none by default.
+    initial_state : {"rest", "periodic", "estimated"}, default "rest"
+        State at the first sample: at rest; that of a record which is one period of a steady state, on a regular clock
+        without gaps and without integrators; or free responses, whose parameters (see
+        :mod:`ctid_cli.filtering.free_response`) follow those of the model in every vector and matrix.
+
+    Notes
+    -----
+    On a regular clock all submodels are filtered in one compiled pass of their pooled modes. Any other clock, and
+    submodels with (nearly) repeated poles, go through :func:`ctid_cli.filtering.bank.standard_rows` submodel by
+    submodel, several times slower.
+    """
+
+    def __init__(
+        self,
+        data: FilterData,
+        terms: Sequence[Term],
+        delay: float = 0.0,
+        loop: LoopData = OPEN_LOOP,
+        initial_state: InitialState = "rest",
+    ) -> None:
+        self.data = data
+        self.terms = tuple(terms)
+        self.delay = delay
+        self.loop = loop
+        self.periodic = initial_state == "periodic"
+        self.free = free_response_size(terms) if initial_state == "estimated" else 0
+        self.degrees = np.array([(term.poles, term.zeros, term.integrators) for term in terms], dtype=np.int64)
+        self.size = sum(term.size for term in terms)
+        self._u = data.u
+        if self.periodic:
+            assert data.interval is not None
+            shift, _ = split_delay(delay, data.interval)
+            self._u = np.append(np.roll(data.u, shift), data.u[-shift % data.u.size])
+
+    def moments(self, theta: Array) -> SubmodelMoments | None:
+        """Second moments at one parameter vector.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (p,)
+            ``a_1 … a_n, b_0 … b_m`` of each submodel in turn.
+
+        Returns
+        -------
+        SubmodelMoments or None
+            The moments; None where theta describes no model, or something overflows.
+        """
+        if self.free:
+            rows = self.rows(theta)
+            moments = None if rows is None else _moments_of_rows(*rows)
+        else:
+            moments = self._moments(theta)
+        if moments is None:
+            return None
+        finite = np.isfinite(moments.hessian).all() and np.isfinite(moments.instrument_regressor).all()
+        return moments if finite and np.isfinite(moments.squared_error) else None
+
+    def _moments(self, theta: Array) -> SubmodelMoments | None:
+        """Second moments without a free response."""
+        p = self.size
+        fast = self._run(self.data, theta, False)
+        if fast is None:
+            rows = self._general_rows(self.data, theta)
+            return None if rows is None else _moments_of_rows(*rows)
+        maps, _, gram = fast
+        products = maps[:p] @ gram
+        row = self._error_row
+        return SubmodelMoments(
+            products @ maps[p : 2 * p].T,
+            products[:, row].copy(),
+            products @ maps[:p].T,
+            float(gram[row, row]),
+            float(maps[2 * p] @ gram @ maps[2 * p]),
+        )
+
+    def rows(self, theta: Array) -> tuple[Array, Array, Array, Array] | None:
+        """Instruments, regressors, output error and model output at the used samples.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (p,)
+            ``a_1 … a_n, b_0 … b_m`` of each submodel in turn, then the parameters of free responses if there are any.
+
+        Returns
+        -------
+        (psi, phi, eps, x) or None
+            Shapes (count, p), (count, p), (count,), (count,), x driven by z; None where theta describes no model.
+        """
+        if not self.free:
+            return self._rows(self.data, theta)
+        data = self.data
+        parameters, initial = theta[: self.size], theta[self.size :]
+        response = free_response(parameters, initial, self.terms, data.t - data.t[0])
+        if response is None:
+            return None
+        x, by_theta, by_free = response
+        forced = self._rows(replace(data, y=plain_array(data.y - x)), parameters)
+        if forced is None:
+            return None
+        psi, phi, error, output = forced
+        by_theta, by_free = by_theta[data.use], by_free[data.use]
+        return (
+            np.column_stack((psi + by_theta, by_free)),
+            np.column_stack((phi + by_theta, by_free)),
+            error,
+            output + x[data.use],
+        )
+
+    def _rows(self, data: FilterData, theta: Array) -> tuple[Array, Array, Array, Array] | None:
+        """The rows without a free response."""
+        p = self.size
+        fast = self._run(data, theta, True)
+        if fast is None:
+            return self._general_rows(data, theta)
+        maps, rows, _ = fast
+        return rows @ maps[:p].T, rows @ maps[p : 2 * p].T, rows[:, self._error_row].copy(), rows @ maps[2 * p]
+
+    @property
+    def _error_row(self) -> int:
+        return int(3 * self.degrees[:, 0].sum() + self.degrees[:, 2].sum() + 1)
+
+    def _run(self, data: FilterData, theta: Array, want_rows: bool) -> tuple[Array, Array, Array] | None:
+        """The compiled pass: maps, rows and moments; None where it does not apply."""
+        if data.interval is None:
+            return None
+        loop = self.loop
+        modes = PooledModes(*pooled_modes(plain_array(theta), self.degrees, loop.closed))
+        if not modes.condition < MODAL_CONDITION_LIMIT:
+            return None
+        maps = np.concatenate((modes.instruments, modes.regressors, modes.output[None]))
+        width = maps.shape[1]
+        rows = np.zeros((data.count if want_rows else 0, width))
+        gram = np.zeros((0, 0) if want_rows else (width, width))
+        state = np.zeros((modes.poles.size, 4), dtype=np.complex128)
+        if self.periodic:
+            state = self._periodic_state(data, modes)
+        self._pass(data, modes, state, data.y, data.use, rows, gram)
+        return maps, rows, gram
+
+    def _pass(
+        self,
+        data: FilterData,
+        modes: PooledModes,
+        state: ComplexArray,
+        y: Array,
+        use: NDArray[np.bool_],
+        rows: Array,
+        gram: Array,
+    ) -> None:
+        """One pass; ``state`` is overwritten with the state at the end."""
+        assert data.interval is not None
+        shift, fraction = split_delay(self.delay, data.interval)
+        submodel_pass(
+            modes.poles,
+            modes.owner,
+            modes.residues,
+            modes.origin,
+            modes.origin_owner,
+            modes.direct,
+            modes.direct_owner,
+            len(self.terms),
+            data.interval,
+            0 if self.periodic else shift,
+            fraction,
+            self._u,
+            data.input_foh,
+            y,
+            data.y_foh,
+            use,
+            self.loop.reference,
+            self.loop.numerator,
+            self.loop.denominator,
+            self.loop.at_controller,
+            state,
+            np.zeros((2, modes.origin.size)),
+            rows,
+            gram,
+        )
+
+    def _periodic_state(self, data: FilterData, modes: PooledModes) -> ComplexArray:
+        """State of the pass that comes back after one period."""
+        assert data.interval is not None
+        count = data.y.size
+        period = data.interval * count
+        initial = np.zeros((modes.poles.size, 4), dtype=np.complex128)
+        empty = np.zeros((0, 0))
+        decay = np.exp(modes.poles * period)
+        state = initial.copy()
+        self._pass(data, modes, state, data.y, np.zeros(count, dtype=bool), empty, empty)
+        initial[:, 0] = state[:, 0] / (1.0 - decay)
+        initial[:, 1] = (state[:, 1] + period * decay * initial[:, 0]) / (1.0 - decay)
+        # What filters see of the output depends on the output of the model, so it comes second; and once round, back at
+        # the first sample.
+        state = initial.copy()
+        once_round = plain_array(np.append(data.y, data.y[0]))
+        self._pass(data, modes, state, once_round, np.zeros(count + 1, dtype=bool), empty, empty)
+        initial[:, 2] = state[:, 2] / (1.0 - decay)
+        return initial
+
+    def _general_rows(self, data: FilterData, theta: Array) -> tuple[Array, Array, Array, Array] | None:
+        """psi, phi, eps and the model output driven by z, submodel by submodel; any clock, repeated poles."""
+        if self.periodic or not np.isfinite(theta).all():
+            return None
+        try:
+            model = AdditiveModel.from_theta(theta, self.terms, self.delay)
+        except DataError:
+            return None
+        source = data
+        if self.loop.closed:
+            assert data.interval is not None
+            controller = DiscreteController(self.loop.numerator, self.loop.denominator)
+            enters: Literal["controller", "input"] = "controller" if self.loop.at_controller else "input"
+            z = simulate_loop(model, controller, self.loop.reference, np.zeros(data.y.size), data.interval, enters).u
+            source = replace(data, u=plain_array(z))
+        everywhere = replace(data, use=np.ones(data.y.size, dtype=bool))
+        outputs = [self._submodel_output(everywhere, part) for part in model.submodels]
+        error = data.y - np.sum(outputs, axis=0)
+        psi, phi = np.empty((data.count, self.size)), np.empty((data.count, self.size))
+        total = np.zeros(data.count)
+        offset = 0
+        for part, term, output in zip(model.submodels, self.terms, outputs, strict=True):
+            width = term.size
+            left = replace(source, y=plain_array(error + output))
+            psi[:, offset : offset + width] = self._submodel_rows(left, part, term, instruments=True)
+            left = replace(data, y=left.y)
+            phi[:, offset : offset + width] = self._submodel_rows(left, part, term, instruments=False)
+            total += self._submodel_output(source, part)
+            offset += width
+        return psi, phi, error[data.use], total
+
+    def _submodel_output(self, data: FilterData, part: Submodel) -> Array:
+        """Output of one submodel."""
+        direct, a, b = _split_direct(part)
+        if a.size == 1:
+            value = standard_rows(data, np.array([1.0, 1.0]), np.zeros(1), self.delay)[:, 1]
+            return direct * value
+        n = a.size - 1
+        rows = standard_rows(data, a, b, self.delay)
+        return np.asarray(rows[:, :n] @ _rising(b, n) + direct * rows[:, n])
+
+    def _submodel_rows(self, data: FilterData, part: Submodel, term: Term, *, instruments: bool) -> Array:
+        """Columns of psi or phi that belong to one submodel."""
+        direct, a, b = _split_direct(part)
+        n, order_at_origin = term.poles, term.integrators
+        highest = float(part.denominator[0])
+        columns = np.empty((data.count, term.size))
+        if a.size == 1:
+            columns[:, 0] = standard_rows(data, np.array([1.0, 1.0]), np.zeros(1), self.delay)[:, 1]
+            return columns
+        whole = n + order_at_origin
+        rows = standard_rows(data, a, b, self.delay)
+        # p^k/(p^l A) u for k = 0 … n + l, the highest by the equation of the filter.
+        driven = _with_highest(rows[:, :whole], rows[:, whole], a)
+        columns[:, n:] = driven[:, : term.zeros + 1] / highest
+        if n == 0:
+            return columns
+        if instruments:
+            # p^(k + l)/(p^l A) x, x the output of the submodel.
+            x = driven[:, :whole] @ _rising(b, whole)
+            strictly = _with_highest(rows[:, whole + 1 : 2 * whole + 1], x, a)
+            filtered = (strictly + direct * driven)[:, order_at_origin:]
+        else:
+            own = np.asarray(part.denominator, dtype=float) / highest
+            bank = standard_rows(data, own, np.zeros(1), self.delay)
+            filtered = _with_highest(bank[:, 2 * n + 1 : 3 * n + 1], data.y[data.use], own)
+        columns[:, :n] = -filtered[:, 1 : n + 1] / highest
+        return columns
+
+
+def _moments_of_rows(psi: Array, phi: Array, error: Array, output: Array) -> SubmodelMoments:
+    return SubmodelMoments(psi.T @ phi, psi.T @ error, psi.T @ psi, float(error @ error), float(output @ output))
+
+
+def _split_direct(part: Submodel) -> tuple[float, Array, Array]:
+    """Direct feed-through, monic denominator with the integrators, and what is left of the numerator."""
+    whole = np.concatenate((np.asarray(part.denominator, dtype=float), np.zeros(part.integrators)))
+    a = whole / whole[0]
+    b = np.asarray(part.numerator, dtype=float) / whole[0]
+    if b.size < a.size:
+        return 0.0, a, b
+    direct = float(b[0])
+    return direct, a, np.asarray((b - direct * a)[1:]) if a.size > 1 else np.zeros(1)
+
+
+def _rising(b: Array, count: int) -> Array:
+    """Coefficients of p^0, p^1, …, filled up with zeros."""
+    rising = np.zeros(count)
+    rising[: b.size] = b[::-1]
+    return rising
+
+
+def _with_highest(lower: Array, driving: Array, a: Array) -> Array:
+    """Columns ``p^k/A s``, k = 0 … n, from those below n and s itself."""
+    return np.column_stack((lower, driving - lower @ a[:0:-1]))

@@ -1,0 +1,127 @@
+"""Covariance of the parameters of a known system, as one fraction or as a sum of submodels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.models.additive import AdditiveModel, Term
+from ctid_cli.models.factoring import factored, unfactored_jacobian
+from ctid_cli.models.transfer_function import TransferFunction
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterAccuracy:
+    """Parameters of the true system and the covariance of their estimates.
+
+    Parameters
+    ----------
+    model : AdditiveModel or TransferFunction
+        The true system.
+    names : tuple of str
+        What is estimated: the parameters of an additive model, or ``a1 … an, b0 … bm`` of a transfer function, followed
+        by ``delay`` if that is estimated too.
+    values : ndarray, shape (p,)
+        Their true values.
+    covariance : ndarray, shape (p, p)
+        Covariance of their estimates.
+    """
+
+    model: AdditiveModel | TransferFunction
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+
+    @property
+    def standard_errors(self) -> NDArray[np.float64]:
+        """Square roots of the variances, in the units of the parameters, shape (p,)."""
+        errors: Array = np.sqrt(np.diag(self.covariance))
+        return errors
+
+    def factored(self, terms: Sequence[Term] | None = None) -> ParameterAccuracy:
+        """Accuracy of the sum of submodels into which an estimated transfer function is factored.
+
+        Parameters
+        ----------
+        terms : sequence of Term, optional
+            Orders of the submodels, as :func:`ctid_cli.models.factoring.factored` takes them.
+
+        Returns
+        -------
+        ParameterAccuracy
+            Of ``factored(model, terms)``; that of an additive model is returned as it is.
+
+        Raises
+        ------
+        FactoringError
+            If the model is no sum of such submodels.
+
+        Notes
+        -----
+        By the delta method. Factoring undoes the sum of submodels whose numerators have full length, so its derivatives
+        are the inverse of those of the sum; this holds for estimated numerators of any length.
+        """
+        if isinstance(self.model, AdditiveModel):
+            return self
+        additive = factored(self.model, terms)
+        n = self.model.order
+        delays = int(self.names[-1:] == ("delay",))
+        coefficients = len(self.names) - n - delays
+        inverse = np.linalg.inv(unfactored_jacobian(additive))
+        # Of a numerator of full length the last coefficients are estimated; the delay is the same in both forms.
+        columns = np.r_[:n, inverse.shape[1] - coefficients : inverse.shape[1]]
+        size = inverse.shape[0]
+        jacobian = np.zeros((size + delays, len(self.names)))
+        jacobian[:size, : n + coefficients] = inverse[:, columns]
+        jacobian[size:, n + coefficients :] = np.eye(delays)
+        return ParameterAccuracy(
+            additive,
+            additive.names + self.names[len(self.names) - delays :],
+            np.concatenate([additive.theta, self.values[len(self.names) - delays :]]),
+            jacobian @ self.covariance @ jacobian.T,
+        )
+
+
+def estimated_parameters(
+    model: AdditiveModel | TransferFunction, zeros: int | None = None, *, delay: bool = False
+) -> tuple[tuple[str, ...], NDArray[np.float64]]:
+    """Names and true values of what is estimated.
+
+    Parameters
+    ----------
+    model : AdditiveModel or TransferFunction
+        The true system, in the form in which it is estimated.
+    zeros : int, optional
+        Degree of the estimated numerator of a transfer function, if more than the model's own.
+    delay : bool, default False
+        Whether the delay of a transfer function is estimated too.
+
+    Returns
+    -------
+    names : tuple of str
+        The parameters.
+    values : ndarray, shape (p,)
+        Their values.
+
+    Raises
+    ------
+    ValueError
+        If the estimated numerator has a lower degree than the model's, or a higher one than the denominator, or zeros
+        or the delay are asked of an additive model.
+    """
+    if isinstance(model, AdditiveModel):
+        if zeros is not None or delay:
+            raise ValueError("an additive model has its degrees in its terms and a known delay; leave both out")
+        return model.names, model.theta
+    own = model.numerator.size - 1
+    m = own if zeros is None else zeros
+    if not own <= m <= model.order:
+        raise ValueError(f"zeros must be from {own}, as the model has, to its {model.order} poles; got {zeros}")
+    parts = [model.denominator[1:], np.zeros(m - own), model.numerator, np.full(int(delay), model.delay)]
+    return Structure(model.order, m, delay).names, np.concatenate(parts)

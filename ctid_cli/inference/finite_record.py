@@ -1,0 +1,143 @@
+"""Accuracy on a record of given length, from the sensitivities that its own input brings about."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctid_cli.filtering.bank import filter_data, standard_rows
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.inference.covariance import condition_number
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
+
+Array = NDArray[np.float64]
+
+
+def additive_sensitivities(model: AdditiveModel, signal: HeldSignal, times: ArrayLike) -> NDArray[np.float64]:
+    r"""Derivatives of the output of an additive model with respect to its parameters.
+
+    Parameters
+    ----------
+    model : AdditiveModel
+        The model, at rest before the first break of its input.
+    signal : HeldSignal
+        The input; for the instruments of a closed loop the input of the noise-free loop.
+    times : array_like, shape (N,)
+        Instants [s], strictly increasing, on any clock.
+
+    Returns
+    -------
+    ndarray, shape (N, p)
+        ``dx/d theta`` in the order of the model's ``names`` [output unit per parameter unit].
+
+    Notes
+    -----
+    Each is the exact response of a transfer function: ``-p^k B/(p^l A^2)`` for ``a_k`` and ``p^k/(p^l A)`` for
+    ``b_k``.
+    """
+    instants = np.asarray(times, dtype=float)
+    columns = []
+    for submodel in model.submodels:
+        b, a = np.asarray(submodel.numerator, dtype=float), np.asarray(submodel.denominator, dtype=float)
+        origin = np.zeros(submodel.integrators)
+        single = np.concatenate([a, origin])
+        double = np.concatenate([np.convolve(a, a), origin])
+        filters = [(np.concatenate([-b, np.zeros(k)]), double) for k in range(1, a.size)]
+        filters += [(np.eye(1, k + 1)[0], single) for k in range(b.size)]
+        columns += [simulate(TransferFunction(*parts, model.delay), signal, instants) for parts in filters]
+    return np.column_stack(columns)
+
+
+def unfactored_sensitivities(
+    model: TransferFunction,
+    signal: HeldSignal,
+    times: ArrayLike,
+    zeros: int | None = None,
+    *,
+    estimate_delay: bool = False,
+) -> NDArray[np.float64]:
+    """Derivatives of the output of a transfer function with respect to its coefficients and its delay.
+
+    Parameters
+    ----------
+    model : TransferFunction
+        The strictly proper model, at rest before the first break of its input.
+    signal : HeldSignal
+        The input; for the instruments of a closed loop the input of the noise-free loop.
+    times : array_like, shape (N,)
+        Instants [s], strictly increasing, on any clock.
+    zeros : int, optional
+        Degree of the estimated numerator, if more than the model's own.
+    estimate_delay : bool, default False
+        Whether the delay is a parameter too.
+
+    Returns
+    -------
+    ndarray, shape (N, p)
+        ``dx/d(a_1 … a_n, b_0 … b_m[, delay])`` [output unit per parameter unit].
+
+    Raises
+    ------
+    ValueError
+        If the estimated numerator has no lower degree than the denominator, or a lower one than the model's.
+    """
+    own = model.numerator.size - 1
+    degree = own if zeros is None else zeros
+    if not own <= degree < model.order:
+        raise ValueError(f"zeros must be from {own}, as the model has, to below its {model.order} poles; got {zeros}")
+    instants = np.asarray(times, dtype=float)
+    structure = Structure(model.order, degree, estimate_delay)
+    data = filter_data(Record(instants, np.zeros(instants.size), signal), start=-np.inf)
+    rows = standard_rows(data, model.denominator, model.numerator, model.delay)
+    return np.asarray(rows[:, structure.sensitivity_rows] * structure.signs)
+
+
+def finite_record_covariance(psi: ArrayLike, autocovariances: ArrayLike) -> NDArray[np.float64]:
+    r"""Covariance of an unweighted output-error estimate from one record with noise of known autocovariances.
+
+    Parameters
+    ----------
+    psi : array_like, shape (N, p)
+        Sensitivities of the output to the parameters [output unit per parameter unit].
+    autocovariances : array_like, shape (q,)
+        ``R_v(0) … R_v(q - 1)`` of the noise at lags of whole samples [output unit^2], zero at larger ones: the variance
+        alone for white noise.
+
+    Returns
+    -------
+    ndarray, shape (p, p)
+        Covariance of the parameters; NaN where the sensitivities do not determine them.
+
+    Notes
+    -----
+    With ``M = psi' psi`` and the covariance matrix R of the noise, ``M^-1 psi' R psi M^-1``, to first order in the
+    noise: ``sigma^2 M^-1`` for white noise. Unlike the limit of long records it knows the start from rest, which counts
+    as long as the memory of the system or of its loop is not short against the record.
+
+    Examples
+    --------
+    A mean of 4 samples, each correlated by 0.5 with its neighbours:
+
+    >>> finite_record_covariance(np.ones((4, 1)), [1.0, 0.5])
+    array([[0.4375]])
+    """
+    from scipy.linalg import matmul_toeplitz
+
+    sensitivities = np.asarray(psi, dtype=float)
+    lags = np.atleast_1d(np.asarray(autocovariances, dtype=float))
+    count, size = sensitivities.shape
+    hessian = sensitivities.T @ sensitivities
+    if count < size or not condition_number(hessian) <= 1e14:
+        return np.full((size, size), np.nan)
+    scale = 1.0 / np.sqrt(np.diag(hessian))
+    scaled = sensitivities * scale
+    inverse = np.linalg.inv(hessian * np.outer(scale, scale))
+    first_column = np.zeros(count)
+    first_column[: lags.size] = lags[:count]
+    coloured = lags[0] * scaled if lags.size == 1 else matmul_toeplitz(first_column, scaled)
+    covariance: Array = inverse @ (scaled.T @ coloured) @ inverse * np.outer(scale, scale)
+    return 0.5 * (covariance + covariance.T)

@@ -1,0 +1,178 @@
+r"""A model's output and its sensitivities to the parameters as one discrete-time system driven by the held input.
+
+For every submodel ``B/(p^l A)`` of an additive model, and for an unfactored transfer function as the only one with
+``l = 0``, two chains of states are driven one by the other: ``1/(p^l A)`` by the input, ``1/A`` by the output of the
+first. They hold all sensitivities, so the input is filtered once. The first chain is the submodel itself; a
+controller closed around it feeds back the same states that the sensitivities read, and no integrator appears twice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.filtering.bank import plain_array, scaled_denominator, split_delay
+from ctid_cli.filtering.exponential import held_step
+from ctid_cli.filtering.sections import chain, polynomial_roots, time_scale
+from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.checks import require_positive
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DiscreteSystem:
+    """``s(k+1) = A s(k) + B w(k)``, ``o(k) = C s(k) + D w(k)``.
+
+    Parameters
+    ----------
+    A : ndarray, shape (n, n)
+        Transition of the state over one sampling interval [-].
+    B : ndarray, shape (n, i)
+        Effect of the inputs held over it.
+    C : ndarray, shape (o, n)
+        Outputs from the state.
+    D : ndarray, shape (o, i)
+        Outputs from the inputs at the same instant.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+
+    @property
+    def radius(self) -> float:
+        """Spectral radius of A [-]; below 1 the outputs are stationary under a stationary input."""
+        return float(np.abs(np.linalg.eigvals(self.A)).max(initial=0.0))
+
+    def after(self, first: DiscreteSystem) -> DiscreteSystem:
+        """The series of another system and this one.
+
+        Parameters
+        ----------
+        first : DiscreteSystem
+            The one before, with as many outputs as this one has inputs.
+
+        Returns
+        -------
+        DiscreteSystem
+            From the inputs of the one before to the outputs of this one.
+        """
+        n, m = first.A.shape[0], self.A.shape[0]
+        A = np.block([[first.A, np.zeros((n, m))], [self.B @ first.C, self.A]])
+        B = np.vstack([first.B, self.B @ first.D])
+        return DiscreteSystem(A, B, np.hstack([self.D @ first.C, self.C]), self.D @ first.D)
+
+
+def sensitivity_system(
+    model: AdditiveModel | TransferFunction, interval: float, zeros: int | None = None
+) -> DiscreteSystem:
+    r"""System from the held input to the model's output and its sensitivities.
+
+    Parameters
+    ----------
+    model : AdditiveModel or TransferFunction
+        The model; its type chooses the parameters.
+    interval : float
+        Sampling interval, at which the input changes too [s].
+    zeros : int, optional
+        Degree of the estimated numerator of a transfer function, if more than the model's own.
+
+    Returns
+    -------
+    DiscreteSystem
+        One input, the samples of the input. The first output is the model's x; those after it are
+        ``dx/d theta``, for an additive model in the order of its ``names``, for a transfer function
+        ``a_1 ... a_n, b_0 ... b_m``.
+
+    Notes
+    -----
+    Exact for an input held between samples, for any delay: a delay of a broken number of intervals is read off between
+    the samples. For a submodel with the coefficient of ``p^k`` in A and B as the parameter of index k,
+
+    .. math:: \partial x/\partial a_k = -\frac{p^k B}{p^l A^2} u, \qquad \partial x/\partial b_k = \frac{p^k}{p^l A} u,
+
+    and for a monic transfer function with descending powers, k becomes n - i for ``a_i`` and m - j for ``b_j``.
+    """
+    require_positive("interval", interval, "s")
+    shift, fraction = split_delay(model.delay, interval)
+    blocks = [_held(*block, interval, fraction) for block in _blocks(model, zeros)]
+    states = sum(block.A.shape[0] for block in blocks)
+    size = sum(block.C.shape[0] - 1 for block in blocks)
+    A, B = np.zeros((states, states)), np.zeros((states, 1))
+    C, D = np.zeros((1 + size, states)), np.zeros((1 + size, 1))
+    state, row = 0, 1
+    for block in blocks:
+        own = slice(state, state + block.A.shape[0])
+        rows = slice(row, row + block.C.shape[0] - 1)
+        A[own, own], B[own] = block.A, block.B
+        C[0, own], C[rows, own] = block.C[0], block.C[1:]
+        D[0] += block.D[0]
+        D[rows] = block.D[1:]
+        state, row = own.stop, rows.stop
+    held = DiscreteSystem(A, B, C, D)
+    if not shift:
+        return held
+    last = np.zeros((1, shift))
+    last[0, -1] = 1.0
+    line = DiscreteSystem(np.eye(shift, k=-1), np.eye(shift, 1), last, np.zeros((1, 1)))
+    return held.after(line)
+
+
+def _blocks(model: AdditiveModel | TransferFunction, zeros: int | None) -> list[tuple[Array, Array, Array, float]]:
+    """Continuous-time cascade of every submodel, with the rows of its output and sensitivities."""
+    if isinstance(model, TransferFunction):
+        dynamics, gain, of_input, output, of_output, w0 = _cascade(model.numerator, model.denominator, 0)
+        m = model.numerator.size - 1 if zeros is None else zeros
+        return [(dynamics, gain, np.vstack([output, -of_output[-2::-1], of_input[m::-1]]), w0)]
+    blocks = []
+    for submodel in model.submodels:
+        # The submodel's own coefficients are scaled to a constant term of 1; p^k/A then is p^k/(monic A) over the last.
+        b, a = np.asarray(submodel.numerator, dtype=float), np.asarray(submodel.denominator, dtype=float)
+        dynamics, gain, of_input, output, of_output, w0 = _cascade(b / a[0], a / a[0], submodel.integrators)
+        rows = np.vstack([output, -of_output[1:] / a[0], of_input[: b.size] / a[0]])
+        blocks.append((dynamics, gain, rows, w0))
+    return blocks
+
+
+def _cascade(b: Array, a: Array, integrators: int) -> tuple[Array, Array, Array, Array, Array, float]:
+    """Chains ``1/(p^l A)`` and, driven by ``x = B/(p^l A) u``, ``1/A``, in the time unit 1/w0.
+
+    Returns the dynamics, the gain, then as rows over (states, input) ``p^k/(p^l A) u`` for k = 0 … n+l, x, and
+    ``p^k/A x`` for k = 0 … n, and w0.
+    """
+    n = a.size - 1
+    order = n + integrators
+    w0 = time_scale(plain_array(a))
+    poles = polynomial_roots(scaled_denominator(plain_array(a), w0)) if n else np.zeros(0, np.complex128)
+    first, first_entry, first_powers = chain(np.concatenate([poles, np.zeros(integrators)]))
+    second, second_entry, second_powers = chain(poles)
+    size = order + n
+    of_input = np.zeros((order + 1, size + 1))
+    of_input[:order, :order] = first_powers * w0 ** (np.arange(order) - order)[:, None]
+    of_input[order, size] = 1.0
+    of_input[order] -= a[1:] @ of_input[integrators:order][::-1]
+    output = b[::-1] @ of_input[: b.size]
+    of_output = np.zeros((n + 1, size + 1))
+    of_output[:n, order:size] = second_powers * w0 ** (np.arange(n) - n)[:, None]
+    of_output[n] = output - a[1:] @ of_output[:n][::-1]
+    dynamics = np.zeros((size, size))
+    dynamics[:order, :order] = first
+    dynamics[order:, order:] = second
+    dynamics[order:, :order] = np.outer(second_entry, output[:order])
+    gain = np.concatenate([first_entry, second_entry * output[size]])
+    return dynamics, gain, of_input, output, of_output, w0
+
+
+def _held(dynamics: Array, gain: Array, rows: Array, w0: float, interval: float, fraction: float) -> DiscreteSystem:
+    """Exact sampled system, its rows read a fraction of an interval after the samples."""
+    A, B, _ = held_step(dynamics, gain, interval * w0)
+    C, D = rows[:, :-1], rows[:, -1]
+    if fraction > 0.0:
+        part, part_value, _ = held_step(dynamics, gain, fraction * interval * w0)
+        C, D = C @ part, D + C @ part_value
+    return DiscreteSystem(A, B[:, None], C, D[:, None])

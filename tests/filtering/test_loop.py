@@ -1,0 +1,246 @@
+"""The closed loop against python-control, against step-by-step simulation and against known numbers."""
+
+from types import SimpleNamespace
+
+import control
+import numpy as np
+import pytest
+
+from ctid_cli.errors import DataError
+from ctid_cli.filtering import simulate_additive, simulate_loop
+from ctid_cli.filtering.loop import input_sensitivity, loop_radius, loop_state_space
+from ctid_cli.filtering.sampled import sampled_state_space, state_space_response
+from ctid_cli.models import AdditiveModel, DiscreteController, Submodel, TransferFunction
+from ctid_cli.signals import HeldSignal
+
+INTERVAL = 0.05
+TWO_MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
+PID = DiscreteController([0.02329, -0.02058, 0.00454], [1.0, -1.0, 0.0])
+# A rigid body with a flexible mode, a derivative with a lag, and a plant that passes its input on at once.
+RIGID = AdditiveModel([Submodel([0.5], [1.0], 2), Submodel([0.1], [0.01, 0.002, 1.0])])
+LEAD = DiscreteController([2.0, -1.9], [1.0, -0.4])
+BIPROPER = AdditiveModel([Submodel([0.4, 1.0], [0.5, 1.0]), Submodel([1.0], [0.025, 0.05, 1.0])])
+LOOPS = {
+    "two modes": (TWO_MODES, PID),
+    "rigid body": (RIGID, LEAD),
+    "biproper": (BIPROPER, DiscreteController([0.3, 0.1], [1.0, -0.2])),
+    "biproper, strictly proper controller": (BIPROPER, DiscreteController([0.1], [1.0, -0.9])),
+    "gain and gain": (AdditiveModel([Submodel([2.0], [1.0])]), DiscreteController([0.4], [1.0])),
+    "fraction": (TransferFunction([2.0], [1.0, 3.0, 0.0]), DiscreteController([0.5], [1.0])),
+}
+
+
+def parts(model):
+    return [s.transfer_function() for s in model.submodels] if isinstance(model, AdditiveModel) else [model]
+
+
+def with_delay(model, delay):
+    if isinstance(model, AdditiveModel):
+        return AdditiveModel(model.submodels, delay)
+    return TransferFunction(model.numerator, model.denominator, delay)
+
+
+def plant_of_python_control(model, interval):
+    return sum(
+        control.sample_system(control.tf2ss(control.tf(g.numerator, g.denominator)), interval, "zoh")
+        for g in parts(model)
+    )
+
+
+def signals(count=400, seed=0):
+    return np.random.default_rng(seed).standard_normal((2, count)) * np.array([[1.0], [0.1]])
+
+
+def test_known_numbers():
+    rng = np.random.default_rng(5)
+    r, v = rng.standard_normal(3000), 0.1 * rng.standard_normal(3000)
+    u, x = simulate_loop(TWO_MODES, PID, r, v, INTERVAL)
+    np.testing.assert_allclose(u[:4], [-0.0185404823, -0.0333535724, -0.0183051125, -0.0047443714], atol=5e-11)
+    assert np.sum(u**2) == pytest.approx(4.521475672, rel=1e-9)
+    assert np.sum(x**2) == pytest.approx(81.84333235, rel=1e-9)
+
+
+def test_stability_of_a_known_loop():
+    poles = np.linalg.eigvals(loop_state_space(TWO_MODES, PID, INTERVAL)[0])
+    pairs = [0.943928 + 0.310565j, 0.981215 + 0.096960j]
+    known = np.sort_complex([*pairs, *np.conj(pairs), 0.971426, 0.000296])
+    np.testing.assert_allclose(np.sort_complex(poles), known, atol=1e-6)
+    assert loop_radius(TWO_MODES, PID, INTERVAL) == pytest.approx(0.9937056, abs=5e-8)
+    two, five = (DiscreteController(gain * PID.numerator, PID.denominator) for gain in (2.0, 5.0))
+    assert loop_radius(TWO_MODES, two, INTERVAL) < 1.0 < loop_radius(TWO_MODES, five, INTERVAL)
+
+
+@pytest.mark.parametrize("enters", ["controller", "input"])
+@pytest.mark.parametrize("steps", [0, 1, 4])
+@pytest.mark.parametrize("name", LOOPS)
+def test_loop_with_whole_delays_is_that_of_python_control(name, steps, enters):
+    model, controller = LOOPS[name]
+    r, v = signals()
+    plant = plant_of_python_control(model, INTERVAL)
+    for _ in range(steps):
+        plant = control.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], INTERVAL) * plant
+    law = control.tf2ss(control.tf(controller.numerator, controller.denominator, INTERVAL))
+    one = control.ss([], [], [], [[1.0]], INTERVAL)
+    # Signals of the loop as transfer functions of (r, v): u = F r - K v, x = P u.
+    from_noise = -control.feedback(law, plant)
+    from_reference = control.feedback(law, plant) if enters == "controller" else control.feedback(one, plant * law)
+    t = INTERVAL * np.arange(r.size)
+    expected_u = (
+        control.forced_response(from_reference, t, r).outputs + control.forced_response(from_noise, t, v).outputs
+    )
+    expected_x = control.forced_response(plant, t, expected_u).outputs
+    u, x = simulate_loop(with_delay(model, steps * INTERVAL), controller, r, v, INTERVAL, enters)
+    assert np.abs(u - expected_u).max() <= 1e-10 * np.abs(expected_u).max()
+    assert np.abs(x - expected_x).max() <= 1e-10 * np.abs(expected_x).max()
+
+
+@pytest.mark.parametrize("enters", ["controller", "input"])
+@pytest.mark.parametrize("fine_steps", [3, 10, 27])
+@pytest.mark.parametrize("name", ["two modes", "rigid body", "biproper", "fraction"])
+def test_loop_with_any_delay_is_the_one_stepped_through_a_finer_clock(name, fine_steps, enters):
+    # A tenth of the interval holds the delay as whole steps; the plant there is python-control's.
+    model, controller = LOOPS[name]
+    r, v = signals(200)
+    plant = plant_of_python_control(model, INTERVAL / 10)
+    A, B, C, D = (np.asarray(matrix) for matrix in (plant.A, plant.B, plant.C, plant.D))
+    b = np.concatenate((np.zeros(controller.denominator.size - controller.numerator.size), controller.numerator))
+    a = controller.denominator
+    state, u, x, e, output = np.zeros(len(A)), [], [], [], []
+
+    def arriving(j):
+        return u[(j - fine_steps) // 10] if j >= fine_steps else 0.0
+
+    for k in range(r.size):
+        x.append(float(C[0] @ state + D[0, 0] * arriving(10 * k)))
+        e.append((r[k] if enters == "controller" else 0.0) - x[k] - v[k])
+        law = sum(b[i] * e[k - i] for i in range(min(k, a.size - 1) + 1))
+        output.append(law - sum(a[i] * output[k - i] for i in range(1, min(k, a.size - 1) + 1)))
+        u.append(output[k] + (r[k] if enters == "input" else 0.0))
+        for j in range(10 * k, 10 * k + 10):
+            state = A @ state + B[:, 0] * arriving(j)
+    result = simulate_loop(with_delay(model, fine_steps * INTERVAL / 10), controller, r, v, INTERVAL, enters)
+    assert np.abs(result.u - u).max() <= 1e-10 * np.abs(u).max()
+    assert np.abs(result.x - x).max() <= 1e-10 * np.abs(x).max()
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.15, 0.123])
+@pytest.mark.parametrize("name", ["two modes", "rigid body", "biproper"])
+def test_output_is_the_exact_response_to_the_input(name, delay):
+    model, controller = LOOPS[name]
+    model = with_delay(model, delay)
+    u, x = simulate_loop(model, controller, *signals(), INTERVAL)
+    t = INTERVAL * np.arange(u.size)
+    # One instant off the grid makes the simulator step from break to break.
+    expected = simulate_additive(model, HeldSignal(t, u), np.append(t, t[-1] + 0.01))[:-1]
+    assert np.abs(x - expected).max() <= 1e-11 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.1, 0.123])
+def test_without_a_controller_the_loop_is_open(delay):
+    nothing = DiscreteController([0.0], [1.0, -0.5])
+    model = AdditiveModel(TWO_MODES.submodels, delay)
+    r, v = signals()
+    t = INTERVAL * np.arange(r.size)
+    u, x = simulate_loop(model, nothing, r, v, INTERVAL, "input")
+    expected = simulate_additive(model, HeldSignal(t, r), t)
+    assert np.array_equal(u, r)
+    assert np.abs(x - expected).max() <= 1e-14 * np.abs(expected).max()
+    u, x = simulate_loop(model, nothing, r, v, INTERVAL, "controller")
+    assert not u.any()
+    assert not x.any()
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.1, 0.123])
+@pytest.mark.parametrize("enters", ["controller", "input"])
+@pytest.mark.parametrize("name", LOOPS)
+def test_state_space_of_the_loop_makes_the_same_signals(name, enters, delay):
+    model, controller = LOOPS[name]
+    model = with_delay(model, delay)
+    r, v = signals(200)
+    A, B, C, D = loop_state_space(model, controller, INTERVAL, enters)
+    state, expected = np.zeros(len(A)), []
+    for given in zip(r, v, strict=True):
+        expected.append(C @ state + D @ given)
+        state = A @ state + B @ given
+    expected = np.array(expected).T
+    for result, wanted in zip(simulate_loop(model, controller, r, v, INTERVAL, enters), expected, strict=True):
+        assert np.abs(result - wanted).max() <= 1e-11 * np.abs(wanted).max()
+    assert loop_radius(model, controller, INTERVAL) == pytest.approx(
+        np.abs(np.linalg.eigvals(A)).max(initial=0), rel=1e-9
+    )
+
+
+def test_noise_is_seen_as_the_reference_with_the_other_sign():
+    r, v = signals()
+    together = simulate_loop(TWO_MODES, PID, r, v, INTERVAL)
+    difference = simulate_loop(TWO_MODES, PID, r - v, 0.0, INTERVAL)
+    np.testing.assert_allclose(together.u, difference.u, atol=1e-15)
+    np.testing.assert_allclose(together.x, difference.x, atol=1e-15)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.123])
+@pytest.mark.parametrize("name", LOOPS)
+def test_sensitivity_is_the_closed_form(name, delay):
+    model, controller = LOOPS[name]
+    model = with_delay(model, delay)
+    w = np.array([0.3, 1.9, 6.3, 40.0])
+    G = state_space_response(*sampled_state_space(model, INTERVAL), w, INTERVAL)[:, 0, 0]
+    C = controller.frequency_response(w, INTERVAL)
+    result = input_sensitivity(model, controller, INTERVAL, w)
+    np.testing.assert_allclose(result, C / (1 + G * C), rtol=1e-8)
+    result = input_sensitivity(model, controller, INTERVAL, w, "input")
+    np.testing.assert_allclose(result, 1 / (1 + G * C), rtol=1e-8)
+
+
+def test_sensitivity_is_finite_where_model_or_controller_integrate():
+    # An integrating controller leaves u = r / G(0) and, behind it, nothing; an integrating plant needs no input.
+    assert input_sensitivity(TWO_MODES, PID, INTERVAL, [0.0])[0] == pytest.approx(1 / 4, rel=1e-9)
+    assert abs(input_sensitivity(TWO_MODES, PID, INTERVAL, [0.0], "input")[0]) < 1e-12
+    assert abs(input_sensitivity(RIGID, LEAD, INTERVAL, [0.0])[0]) < 1e-9
+
+
+def test_any_object_with_the_two_polynomials_is_a_controller():
+    r, v = signals()
+    lookalike = SimpleNamespace(numerator=[0.04658, -0.04116, 0.00908], denominator=[2.0, -2.0, 0.0])
+    expected = simulate_loop(TWO_MODES, PID, r, v, INTERVAL)
+    np.testing.assert_allclose(simulate_loop(TWO_MODES, lookalike, r, v, INTERVAL).u, expected.u, rtol=1e-9, atol=1e-12)
+
+
+def test_a_read_only_reference_is_taken_and_left_as_it_is():
+    r, v = signals()
+    kept = r.copy()
+    r.setflags(write=False)
+    simulate_loop(TWO_MODES, PID, r, v, INTERVAL, "input")
+    assert np.array_equal(r, kept)
+
+
+def test_what_cannot_be_simulated_is_refused():
+    r, v = signals(3000)
+    five = DiscreteController(5000 * PID.numerator, PID.denominator)
+    with pytest.raises(DataError, match=r"not finite: .* whether the loop is stable; its largest pole .* \d\.\d"):
+        simulate_loop(TWO_MODES, five, r, v, INTERVAL)
+    with pytest.raises(DataError, match="not finite"):
+        simulate_loop(TWO_MODES, PID, np.append(r[:10], np.nan), np.zeros(11), INTERVAL)
+    with pytest.raises(DataError, match=r"equal length; got shapes \(3000,\) and \(2999,\)"):
+        simulate_loop(TWO_MODES, PID, r, v[1:], INTERVAL)
+    with pytest.raises(DataError, match="equal length"):
+        simulate_loop(TWO_MODES, PID, 1.0, 0.0, INTERVAL)
+    with pytest.raises(ValueError, match="enters must be 'controller' or 'input', not 'output'"):
+        simulate_loop(TWO_MODES, PID, r, v, INTERVAL, "output")
+    with pytest.raises(ValueError, match="enters must be"):
+        loop_state_space(TWO_MODES, PID, INTERVAL, "output")
+    with pytest.raises(ValueError, match="sampling interval must be a positive number"):
+        simulate_loop(TWO_MODES, PID, r, v, 0.0)
+
+
+def test_an_algebraic_loop_without_solution_is_refused():
+    # Direct gains of 0.8 and -1.25 round the loop; a delay breaks it open.
+    opposite = DiscreteController([-1.25], [1.0])
+    for function in (
+        lambda g: simulate_loop(g, opposite, [1.0], 0.0, INTERVAL),
+        lambda g: loop_radius(g, opposite, 0.05),
+    ):
+        with pytest.raises(DataError, match="the loop has no solution"):
+            function(BIPROPER)
+        function(AdditiveModel(BIPROPER.submodels, 0.01))
+    assert BIPROPER.submodels[0].numerator[0] / BIPROPER.submodels[0].denominator[0] == 0.8

@@ -1,0 +1,128 @@
+"""The sampled equivalent of a model against python-control and against the exact simulation."""
+
+import control
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctid_cli.errors import DataError
+from ctid_cli.filtering import simulate, simulate_additive
+from ctid_cli.filtering.sampled import sampled_model, sampled_state_space, state_space_response
+from ctid_cli.models import AdditiveModel, Submodel, TransferFunction, unfactored
+from ctid_cli.signals import HeldSignal
+
+INTERVAL = 0.05
+FLEXIBLE = Submodel([1.0], [0.025, 0.01, 1.0])
+FOUR_MODES = AdditiveModel(
+    [
+        Submodel([3.0], [0.501354, 0.250677, 1.0]),
+        Submodel([0.4], [0.0999191, 0.0299757, 1.0]),
+        Submodel([0.2], [0.0300104, 0.0102035, 1.0]),
+        Submodel([0.05], [0.00999499, 0.00999499, 1.0]),
+    ]
+)
+MODELS = {
+    "four modes": FOUR_MODES,
+    "integrator with a lag": AdditiveModel([Submodel([1.0], [0.5, 1.0], 1), FLEXIBLE]),
+    "two integrators": AdditiveModel([Submodel([2.0], [1.0], 2), FLEXIBLE]),
+    "biproper": AdditiveModel([Submodel([0.3, 2.0, 1.0], [0.5, 1.0, 1.0]), FLEXIBLE]),
+    "pure gain": AdditiveModel([FLEXIBLE, Submodel([0.3], [1.0])]),
+    "only a gain": AdditiveModel([Submodel([0.3], [1.0])]),
+    "repeated poles": TransferFunction([1.0, 2.0], [1.0, 6.0, 12.0, 8.0]),
+    "unstable": TransferFunction([1.0], [1.0, -0.2, 1.0]),
+}
+
+
+def parts(model):
+    return [s.transfer_function() for s in model.submodels] if isinstance(model, AdditiveModel) else [model]
+
+
+def with_delay(model, delay):
+    if isinstance(model, AdditiveModel):
+        return AdditiveModel(model.submodels, delay)
+    return TransferFunction(model.numerator, model.denominator, delay)
+
+
+def response(matrices, u):
+    A, B, C, D = matrices
+    state, output = np.zeros(len(A)), []
+    for value in u:
+        output.append(C[0] @ state + D[0, 0] * value)
+        state = A @ state + B[:, 0] * value
+    return np.array(output)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_zero_order_hold_equivalent_is_that_of_python_control(name):
+    model = MODELS[name]
+    tool = sum(
+        control.sample_system(control.tf2ss(control.tf(g.numerator, g.denominator)), INTERVAL, "zoh")
+        for g in parts(model)
+    )
+    u = np.eye(1, 80)[0]
+    expected = control.forced_response(tool, INTERVAL * np.arange(80), u).outputs
+    np.testing.assert_allclose(
+        response(sampled_state_space(model, INTERVAL), u), expected, atol=1e-11 * np.abs(expected).max()
+    )
+    w = np.array([0.5, 6.0, 40.0])
+    gain = state_space_response(*sampled_state_space(model, INTERVAL), w, INTERVAL)[:, 0, 0]
+    np.testing.assert_allclose(gain, [tool(np.exp(1j * x * INTERVAL)) for x in w], rtol=1e-10)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.05, 0.35, 0.013, 0.05 - 1e-4, 0.05 + 1e-4, 0.222])
+@pytest.mark.parametrize("name", MODELS)
+def test_response_is_the_exact_one_whatever_the_delay(name, delay):
+    u = np.random.default_rng(1).standard_normal(120)
+    t = INTERVAL * np.arange(120)
+    model = with_delay(MODELS[name], delay)
+    simulator = simulate_additive if isinstance(model, AdditiveModel) else simulate
+    # One instant off the grid makes the simulator step from break to break.
+    expected = simulator(model, HeldSignal(t, u), np.append(t, t[-1] + 0.01))[:-1]
+    matrices = sampled_state_space(model, INTERVAL)
+    np.testing.assert_allclose(response(matrices, u), expected, atol=1e-12 * np.abs(expected).max())
+    assert len(matrices[0]) == sum(g.order for g in parts(model)) + int(np.ceil(delay / INTERVAL - 1e-9))
+
+
+def test_states_of_the_submodels_do_not_mix():
+    transition = sampled_model(FOUR_MODES, INTERVAL).transition
+    blocks = np.kron(np.eye(4), np.ones((2, 2)))
+    assert transition.shape == (8, 8)
+    assert not transition[blocks == 0].any()
+    poles = np.exp(INTERVAL * FOUR_MODES.poles)
+    np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(transition)), np.sort_complex(poles), rtol=1e-12)
+
+
+@given(st.floats(1e-3, 1e3), st.floats(0.0, 3.0), st.sampled_from(sorted(MODELS)))
+def test_unit_of_time_does_not_matter(unit, delay, name):
+    u = np.random.default_rng(2).standard_normal(30)
+    scaled = []
+    for g in parts(MODELS[name]):
+        b, a = (c * unit ** np.arange(c.size - 1.0, -1.0, -1.0) for c in (g.numerator, g.denominator))
+        scaled.append(response(sampled_state_space(TransferFunction(b, a, unit * delay), unit), u))
+    expected = response(sampled_state_space(with_delay(MODELS[name], delay), 1.0), u)
+    assert np.abs(sum(scaled) - expected).max() <= 1e-10 * max(np.abs(expected).max(), 1e-300)
+
+
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+@pytest.mark.parametrize("name", ["four modes", "integrator with a lag", "two integrators", "biproper"])
+def test_sum_of_submodels_and_single_fraction_simulate_alike(name, hold, regular):
+    rng = np.random.default_rng(3)
+    t = INTERVAL * np.arange(600.0) if regular else np.cumsum(rng.uniform(0.02, 0.08, 600))
+    held = HeldSignal(t, rng.standard_normal(600), hold)
+    for delay in (0.0, 0.07):
+        model = with_delay(MODELS[name], delay)
+        expected = simulate(unfactored(model), held, t)
+        result = simulate_additive(model, held, t)
+        assert np.abs(result - expected).max() <= 1e-11 * np.abs(expected).max()
+
+
+def test_what_has_no_sampled_equivalent_is_refused():
+    with pytest.raises(DataError, match="more zeros than poles"):
+        sampled_state_space(TransferFunction([1.0, 0.0, 0.0], [1.0, 1.0]), 0.1)
+    for interval in (0.0, np.nan):
+        with pytest.raises(ValueError, match="sampling interval must be a positive number"):
+            sampled_state_space(FOUR_MODES, interval)
+    with pytest.raises(DataError, match="increase strictly"):
+        simulate_additive(FOUR_MODES, HeldSignal([0.0], [1.0]), [1.0, 1.0])

@@ -1,0 +1,304 @@
+"""The rows of a sum of submodels: the compiled pass, the general route, and what a simulation says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctid_cli.filtering import filter_data, simulate, simulate_additive, simulate_loop
+from ctid_cli.filtering.kernels import BLOCK
+from ctid_cli.filtering.submodels import OPEN_LOOP, LoopData, SubmodelFilter
+from ctid_cli.models import AdditiveModel, DiscreteController, Term, TransferFunction
+from ctid_cli.signals import HeldSignal, Record
+
+INTERVAL = 0.1
+#: Sums of every kind of submodel; the numbers are a_1 … a_n, b_0 … b_m of each in turn.
+SUMS = {
+    "real pole": ([Term(1, 0)], [0.7, 2.0]),
+    "mode": ([Term(2, 0)], [0.1, 0.25, 2.0]),
+    "overdamped with zero": ([Term(2, 1)], [1.3, 0.25, 2.0, -0.6]),
+    "third order": ([Term(3, 2)], [0.8, 0.35, 0.1, 1.0, 0.3, -0.05]),
+    "biproper": ([Term(2, 2)], [0.1, 0.25, 2.0, 0.3, 0.05]),
+    "biproper, leading coefficient zero": ([Term(1, 1)], [0.7, 2.0, 0.0]),
+    "gain": ([Term(0, 0), Term(2, 0)], [0.4, 0.1, 0.25, 2.0]),
+    "two modes": ([Term(2, 0), Term(2, 1)], [0.1, 0.25, 2.0, 0.01, 0.05, 0.4, 0.02]),
+    "mixed": (
+        [Term(1, 1), Term(2, 0), Term(3, 1)],
+        [0.7, 2.0, 0.2, 0.01, 0.05, 0.4, 0.8, 0.35, 0.1, 1.0, 0.3],
+    ),
+    "integrator": ([Term(0, 0, 1), Term(2, 0)], [0.3, 0.1, 0.25, 2.0]),
+    "integrator with pole": ([Term(2, 0), Term(1, 0, 1)], [0.1, 0.25, 2.0, 0.6, 0.3]),
+    "rigid body": ([Term(0, 0, 2), Term(2, 0)], [0.03, 0.1, 0.25, 2.0]),
+    "rigid body with zero and mode": ([Term(2, 2, 2), Term(1, 0)], [0.1, 0.25, 0.03, -0.2, 0.1, 0.7, 2.0]),
+    "biproper integrator": ([Term(1, 0), Term(1, 2, 1)], [0.7, 2.0, 0.2, 0.3, 0.1, 0.04]),
+    "biproper, integrators only": ([Term(0, 2, 2), Term(2, 1)], [0.03, 0.1, 0.2, 0.1, 0.25, 2.0, 0.1]),
+    "three integrators": ([Term(1, 1, 3)], [0.7, 0.002, 0.001]),
+}
+ALL_SUMS = pytest.mark.parametrize(("terms", "theta"), SUMS.values(), ids=SUMS.keys())
+#: None, part of an interval, whole intervals, and both.
+DELAYS = [0.0, 0.04, 0.3, 0.5371]
+WEAK = DiscreteController.from_pid(0.02, 0.004, 0.03)
+DIRECT = DiscreteController([0.3], [1.0])
+NO_DIRECT = DiscreteController([0.1, -0.02], [1.0, -0.5, 0.06])
+
+
+def record(seed=1, n=300, hold="zoh", interval=INTERVAL, masked=()):
+    """Noise in, noise out: the equalities below hold for any data."""
+    rng = np.random.default_rng(seed)
+    t = 3.0 + interval * np.arange(n)
+    y = rng.standard_normal(n)
+    y[list(masked)] = np.nan
+    return Record(t, y, HeldSignal(t, rng.standard_normal(n), hold))
+
+
+def feedback(controller, n, enters="controller", seed=7):
+    """A loop laid out for the pass."""
+    padded = np.zeros(controller.denominator.size)
+    padded[padded.size - controller.numerator.size :] = controller.numerator
+    reference = np.random.default_rng(seed).standard_normal(n)
+    return LoopData(reference, padded, np.array(controller.denominator), enters == "controller")
+
+
+def assert_rows(rows, expected, tolerance):
+    """psi, phi, error and output, or some of them: each column to a fraction of its rms."""
+    for place, (one, other) in enumerate(zip(rows, expected, strict=True)):
+        one, other = one.reshape(len(one), -1), other.reshape(len(other), -1)
+        assert one.shape == other.shape
+        size = np.sqrt(np.mean(other**2, axis=0))
+        difference = np.abs(one - other).max(axis=0) / np.where(size > 0, size, 1.0)
+        assert difference.max(initial=0.0) <= tolerance, f"rows {place}, column {difference.argmax()}: {difference.max():.1e}"
+
+
+def assert_one_pass(submodels, theta, tolerance=1e-9):
+    """The compiled pass applies, and the general route gives the same."""
+    theta = np.array(theta)
+    assert submodels._run(submodels.data, theta, True) is not None
+    assert_rows(submodels.rows(theta), submodels._general_rows(submodels.data, theta), tolerance)
+
+
+def output_of(terms, theta, delay, signal, times):
+    return simulate_additive(AdditiveModel.from_theta(theta, terms, delay), signal, times)
+
+
+def central_differences(response, theta):
+    """Derivatives of a response by extrapolated central differences."""
+    columns = []
+    for k in range(theta.size):
+        step = np.zeros(theta.size)
+        step[k] = 1e-3 * max(abs(theta[k]), 0.1)
+        one, two = ((response(theta + s * step) - response(theta - s * step)) / (2 * s * step[k]) for s in (1, 2))
+        half = (response(theta + 0.5 * step) - response(theta - 0.5 * step)) / step[k]
+        columns.append((64 * half - 20 * one + two) / 45)
+    return np.column_stack(columns)
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+@pytest.mark.parametrize(("hold", "hold_output"), [("zoh", "foh"), ("foh", "zoh")])
+@ALL_SUMS
+def test_compiled_pass_is_the_general_route(terms, theta, hold, hold_output, delay):
+    data = filter_data(record(hold=hold, masked=(0, 5, 6, 7, 150, 299)), delay, hold_output)
+    assert data.count < 295
+    assert_one_pass(SubmodelFilter(data, terms, delay), theta)
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+@pytest.mark.parametrize("enters", ["controller", "input"])
+@pytest.mark.parametrize("controller", [WEAK, DIRECT, NO_DIRECT])
+@ALL_SUMS
+def test_compiled_pass_is_the_general_route_in_closed_loop(terms, theta, controller, enters, delay):
+    # With a biproper submodel, no delay and a controller that acts at once, the loop is algebraic.
+    data = filter_data(record(masked=(3, 100)), delay)
+    assert_one_pass(SubmodelFilter(data, terms, delay, feedback(controller, 300, enters)), theta)
+
+
+@given(st.data(), st.floats(0, 2), st.sampled_from(["zoh", "foh"]), st.booleans(), st.integers(0, 2**31))
+def test_compiled_pass_is_the_general_route_for_any_sum(draw, delay, hold_output, closed, seed):
+    terms, theta, magnitude, biproper = [], [], 0.3, False
+    rng = np.random.default_rng(seed)
+    for k in range(draw.draw(st.integers(1, 3))):
+        integrators = draw.draw(st.integers(0, 2)) if k == 0 else 0
+        poles = []
+        for _ in range(draw.draw(st.integers(1, 2))):
+            magnitude *= draw.draw(st.floats(1.3, 2.5))
+            angle = draw.draw(st.sampled_from([0.0, 0.55, 0.8])) * np.pi
+            poles += [-magnitude] if angle == 0 else [magnitude * np.exp(s * 1j * angle) for s in (1, -1)]
+        term = Term(len(poles), draw.draw(st.integers(0, len(poles) + integrators - int(biproper))), integrators)
+        biproper |= term.zeros == term.order
+        polynomial = np.poly(poles).real
+        terms.append(term)
+        theta += [*(polynomial / polynomial[-1])[-2::-1], *(rng.uniform(0.1, 1.0, term.zeros + 1) * 0.1)]
+    data = filter_data(record(seed, n=200), delay, hold_output)
+    loop = feedback(WEAK, 200, seed=seed) if closed else OPEN_LOOP
+    assert_one_pass(SubmodelFilter(data, terms, delay, loop), theta, 1e-7)
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+@pytest.mark.parametrize(("hold", "hold_output"), [("zoh", "foh"), ("foh", "zoh")])
+@ALL_SUMS
+def test_rows_are_the_signals_that_a_simulation_gives(terms, theta, hold, hold_output, delay):
+    # Each row by its definition: a transfer function applied to the input, or to what the others leave of the output.
+    r = record(n=120, hold=hold)
+    data = filter_data(r, delay, hold_output)
+    model = AdditiveModel.from_theta(theta, terms, delay)
+    error = r.y - simulate_additive(model, r.input, r.t)
+    phi = []
+    for part in model.submodels:
+        term, a = part.term(), np.asarray(part.denominator)
+        transfer = part.transfer_function()
+        x = simulate(TransferFunction(transfer.numerator, transfer.denominator, delay), r.input, r.t)
+        left = HeldSignal(r.t, error + x, hold_output)
+        power = [np.append(1.0, np.zeros(k)) for k in range(max(term.poles, term.zeros) + 1)]
+        phi += [-simulate(TransferFunction(p, a), left, r.t) for p in power[1 : term.poles + 1]]
+        whole = np.append(a, np.zeros(term.integrators))
+        phi += [simulate(TransferFunction(p, whole, delay), r.input, r.t) for p in power[: term.zeros + 1]]
+    psi = central_differences(lambda values: output_of(terms, values, delay, r.input, r.t), np.array(theta))
+    expected = psi, np.column_stack(phi), error, r.y - error
+    rows = SubmodelFilter(data, terms, delay).rows(np.array(theta))
+    assert_rows(rows, [part[data.use] for part in expected], 1e-6)
+    exact = [part[data.use] for part in expected[1:]]
+    assert_rows(rows[1:], exact, 1e-9)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.5371])
+@pytest.mark.parametrize("enters", ["controller", "input"])
+@pytest.mark.parametrize("controller", [WEAK, DIRECT])
+@ALL_SUMS
+def test_closed_loop_instruments_are_sensitivities_to_the_input_of_the_loop_of_the_model(
+    terms, theta, controller, enters, delay
+):
+    # Derivatives of G(theta) z where z, the input of the noise-free loop, stays what it is; regressors see the record.
+    r = record(n=200)
+    data = filter_data(r, delay)
+    loop = feedback(controller, 200, enters)
+    model = AdditiveModel.from_theta(theta, terms, delay)
+    z = simulate_loop(model, controller, loop.reference, 0.0, INTERVAL, enters)
+    source = HeldSignal(r.t, z.u)
+    psi, phi, error, output = SubmodelFilter(data, terms, delay, loop).rows(np.array(theta))
+    expected = central_differences(lambda values: output_of(terms, values, delay, source, r.t), np.array(theta))
+    _, open_phi, open_error, _ = SubmodelFilter(data, terms, delay).rows(np.array(theta))
+    assert_rows((psi, phi, error, output), (expected[data.use], open_phi, open_error, z.x[data.use]), 1e-6)
+    assert_rows((phi, error, output), (open_phi, open_error, z.x[data.use]), 1e-9)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("name", ["mixed", "rigid body with zero and mode", "biproper integrator"])
+def test_moments_are_the_products_of_the_rows(name, closed):
+    terms, theta = SUMS[name]
+    n = 3 * BLOCK + 17
+    data = filter_data(record(n=n, masked=(0, BLOCK, BLOCK + 1, 2 * BLOCK - 1, n - 1)), 0.25)
+    submodels = SubmodelFilter(data, terms, 0.25, feedback(WEAK, n) if closed else OPEN_LOOP)
+    psi, phi, error, output = submodels.rows(np.array(theta))
+    moments = submodels.moments(np.array(theta))
+    sizes = [np.sqrt((part**2).sum(axis=0)) for part in (psi, phi, error)]
+    for found, expected, scale in (
+        (moments.instrument_regressor, psi.T @ phi, np.outer(sizes[0], sizes[1])),
+        (moments.hessian, psi.T @ psi, np.outer(sizes[0], sizes[0])),
+        (moments.instrument_error, psi.T @ error, sizes[0] * sizes[2]),
+        (moments.squared_error, error @ error, error @ error),
+        (moments.output_power, output @ output, output @ output),
+    ):
+        assert np.abs((found - expected) / scale).max() <= 1e-11
+
+
+@ALL_SUMS
+def test_clock_that_is_not_recognised_as_regular_gives_the_same(terms, theta):
+    data = filter_data(record(hold="foh"), 0.25)
+    regular, irregular = (SubmodelFilter(d, terms, 0.25) for d in (data, replace(data, interval=None)))
+    assert irregular._run(irregular.data, np.array(theta), True) is None
+    assert_rows(irregular.rows(np.array(theta)), regular.rows(np.array(theta)), 1e-9)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("gap", [1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8, 0.0])
+def test_repeated_poles_are_the_limit_of_separate_ones(gap, closed):
+    # (p + 2)(p + 2 + gap), with an oscillating submodel beside it: the rows hardly notice.
+    polynomial = np.poly([-2.0, -2.0 - gap])
+    theta = np.array([*(polynomial / polynomial[-1])[-2::-1], 1.0, 0.2, 0.1, 0.05, 0.4])
+    terms = [Term(2, 1), Term(2, 0)]
+    submodels = SubmodelFilter(filter_data(record()), terms, 0.0, feedback(WEAK, 300) if closed else OPEN_LOOP)
+    assert_rows(submodels.rows(theta), submodels._general_rows(submodels.data, theta), 1e-6)
+    if gap == 0.0:
+        assert submodels._run(submodels.data, theta, True) is None
+
+
+PERIODIC = {name: SUMS[name] for name in ("real pole", "mode", "biproper", "gain", "two modes", "mixed")}
+
+
+@pytest.mark.parametrize("delay", [*DELAYS, 31.0371])
+@pytest.mark.parametrize("hold_output", ["zoh", "foh"])
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+@pytest.mark.parametrize(("terms", "theta"), PERIODIC.values(), ids=PERIODIC.keys())
+def test_periodic_rows_are_those_of_a_long_repetition(terms, theta, hold, hold_output, delay):
+    # A delay may exceed the period: what arrives is some earlier period's input, which is the same.
+    n, repeats = 250, 20
+    one = record(n=n, hold=hold)
+    t = 3.0 + INTERVAL * np.arange(repeats * n)
+    long = Record(t, np.tile(one.y, repeats), HeldSignal(t, np.tile(one.input.values, repeats), hold))
+    periodic = SubmodelFilter(filter_data(one, 0.0, hold_output), terms, delay, initial_state="periodic")
+    rest = SubmodelFilter(filter_data(long, 0.0, hold_output), terms, delay)
+    inner = slice((repeats - 2) * n, (repeats - 1) * n)
+    assert_rows(periodic.rows(np.array(theta)), [part[inner] for part in rest.rows(np.array(theta))], 1e-9)
+    # Moments take another path through the code than rows.
+    psi, phi, _, _ = periodic.rows(np.array(theta))
+    found = periodic.moments(np.array(theta)).instrument_regressor
+    np.testing.assert_allclose(found, psi.T @ phi, atol=1e-10 * np.abs(psi.T @ phi).max())
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+@pytest.mark.parametrize("delay", [0.0, 0.37])
+@ALL_SUMS
+def test_free_responses_add_to_the_forced_ones(terms, theta, delay, hold, closed):
+    # The error falls by the free response, and psi has its sensitivities: -d eps in open loop, all parameters included.
+    if closed and hold == "foh":
+        pytest.skip("a controller makes a held input")
+    data = filter_data(record(n=200, hold=hold), delay)
+    loop = feedback(WEAK, 200) if closed else OPEN_LOOP
+    forced = SubmodelFilter(data, terms, delay, loop)
+    free = SubmodelFilter(data, terms, delay, loop, "estimated")
+    order = sum(term.order for term in terms)
+    assert free.free == order
+    whole = np.concatenate((theta, 0.1 * np.random.default_rng(4).standard_normal(order)))
+    at_rest = np.concatenate((theta, np.zeros(order)))
+    p = len(theta)
+    assert_rows(
+        [part[:, :p] if part.ndim == 2 else part for part in free.rows(at_rest)], forced.rows(np.array(theta)), 1e-12
+    )
+    psi, _, error, output = free.rows(whole)
+    _, _, forced_error, forced_output = forced.rows(np.array(theta))
+    np.testing.assert_allclose(error + output, forced_error + forced_output, atol=1e-9)
+    derivative = -central_differences(lambda values: free.rows(values)[2], whole)
+    columns = slice(p, None) if closed else slice(None)
+    assert_rows([psi[:, columns]], [derivative[:, columns]], 1e-6)
+    if closed:
+        # What the free response adds to the sensitivities does not depend on where the instruments come from.
+        added = psi[:, :p] - forced.rows(np.array(theta))[0]
+        in_open_loop = SubmodelFilter(data, terms, delay, OPEN_LOOP, "estimated").rows(whole)[0][:, :p]
+        np.testing.assert_allclose(
+            added, in_open_loop - SubmodelFilter(data, terms, delay).rows(np.array(theta))[0], atol=1e-9
+        )
+
+
+@pytest.mark.parametrize(
+    "theta",
+    [
+        [0.1, 0.0, 2.0],  # loses a pole
+        [0.0, 0.0, 2.0],
+        [0.1, np.nan, 2.0],
+        [0.1, np.inf, 2.0],
+        [-1e-3, 1e-4, 2.0],  # unstable, grows beyond all numbers within the record
+        [1e-300, 1e-310, 2.0],
+        [1e300, 1e300, 1e300],
+    ],
+)
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("initial_state", ["rest", "periodic", "estimated"])
+def test_parameters_without_a_finite_response_give_nothing(theta, initial_state, closed):
+    if closed and initial_state == "periodic":
+        pytest.skip("periodic states are for open loop")
+    data = filter_data(record(n=2000))
+    loop = feedback(WEAK, 2000) if closed else OPEN_LOOP
+    submodels = SubmodelFilter(data, [Term(2, 0)], 0.0, loop, initial_state)
+    assert submodels.moments(np.concatenate((theta, np.zeros(submodels.free)))) is None
