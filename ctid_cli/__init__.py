@@ -1,4 +1,4 @@
-"""Identification of continuous-time models with a time delay, and Monte Carlo studies of it."""
+"""Identification of continuous-time models, and Monte Carlo studies of it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ctid_cli.estimators import AdditiveSrivc as AdditiveSrivc
     from ctid_cli.estimators import DelayProfile as DelayProfile
     from ctid_cli.estimators import Lowpass as Lowpass
     from ctid_cli.estimators import Srivc as Srivc
@@ -16,12 +17,19 @@ if TYPE_CHECKING:
     from ctid_cli.estimators import identify as identify
     from ctid_cli.estimators import minimise_redundantly as minimise_redundantly
     from ctid_cli.filtering import simulate as simulate
+    from ctid_cli.filtering import simulate_additive as simulate_additive
+    from ctid_cli.filtering import simulate_loop as simulate_loop
     from ctid_cli.inference import Fit as Fit
     from ctid_cli.inference import Status as Status
     from ctid_cli.inference import cramer_rao_bound as cramer_rao_bound
     from ctid_cli.inference import fit_percent as fit_percent
+    from ctid_cli.models import AdditiveModel as AdditiveModel
+    from ctid_cli.models import DiscreteController as DiscreteController
+    from ctid_cli.models import Submodel as Submodel
+    from ctid_cli.models import Term as Term
     from ctid_cli.models import TransferFunction as TransferFunction
     from ctid_cli.signals import HeldSignal as HeldSignal
+    from ctid_cli.signals import Loop as Loop
     from ctid_cli.signals import Record as Record
     from ctid_cli.signals import read_record as read_record
 
@@ -29,16 +37,22 @@ __version__ = "0.1.0"
 
 # Imported when first asked for: `ctid --help` must not wait for numpy and numba.
 _HOME = {
+    "AdditiveModel": "models",
+    "AdditiveSrivc": "estimators",
     "DelayProfile": "estimators",
+    "DiscreteController": "models",
     "Fit": "inference",
     "HeldSignal": "signals",
+    "Loop": "signals",
     "Lowpass": "estimators",
     "Record": "signals",
     "Srivc": "estimators",
     "Start": "estimators",
     "Status": "inference",
+    "Submodel": "models",
     "Svf": "estimators",
     "TdSrivc": "estimators",
+    "Term": "models",
     "TransferFunction": "models",
     "UsefulRedundancy": "estimators",
     "cramer_rao_bound": "inference",
@@ -47,6 +61,8 @@ _HOME = {
     "minimise_redundantly": "estimators",
     "read_record": "signals",
     "simulate": "filtering",
+    "simulate_additive": "filtering",
+    "simulate_loop": "filtering",
 }
 __all__ = ["__version__", *sorted(_HOME)]
 

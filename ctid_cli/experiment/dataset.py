@@ -2,28 +2,53 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
-from ctid_cli.models import TransferFunction
+from ctid_cli.models import AdditiveModel, DiscreteController, TransferFunction
 from ctid_cli.signals import (
+    Enters,
     Excitation,
     HeldSignal,
     Hold,
     InputFile,
+    Loop,
     Noise,
     Record,
     Sampling,
     read_held_signal,
     read_record,
+    regular_interval,
     stream,
 )
 from ctid_cli.signals.csv_file import Offset
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """What closes a loop around a system.
+
+    Parameters
+    ----------
+    controller : DiscreteController
+        Acts at every sample.
+    reference : Excitation, optional
+        Generates the reference of a simulated loop; that of a measured record is in its file.
+    enters : {"controller", "input"}, default "controller"
+        Whether the reference enters before the controller or behind it.
+    """
+
+    controller: DiscreteController
+    reference: Excitation | None = None
+    enters: Enters = "controller"
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +59,7 @@ class DataSet:
     ----------
     record : Record
         What estimators are given.
-    true_model : TransferFunction, optional
+    true_model : TransferFunction or AdditiveModel, optional
         The system, where it was simulated.
     validation : Record, optional
         The whole measured record with the samples of ``record`` masked: the input is there from the beginning, so
@@ -42,7 +67,7 @@ class DataSet:
     """
 
     record: Record
-    true_model: TransferFunction | None = None
+    true_model: TransferFunction | AdditiveModel | None = None
     validation: Record | None = None
 
 
@@ -52,10 +77,10 @@ class SimulatedSource:
 
     Parameters
     ----------
-    system : TransferFunction
+    system : TransferFunction or AdditiveModel
         The system.
-    excitation : Excitation
-        Generates the input.
+    excitation : Excitation or None
+        Generates the input; None in a loop, which makes it.
     sampling : Sampling
         Generates the instants, and says what the estimator is told of the input.
     noise : Noise or None
@@ -63,15 +88,18 @@ class SimulatedSource:
     seed : int
         Seed of the experiment.
     input_sha256 : str, optional
-        Content of the file of an excitation that reads one.
+        Content of the file of an excitation or reference that reads one.
+    loop : LoopOptions, optional
+        What closes a loop around the system, with a reference; None for an open loop.
     """
 
-    system: TransferFunction
-    excitation: Excitation
+    system: TransferFunction | AdditiveModel
+    excitation: Excitation | None
     sampling: Sampling
     noise: Noise | None
     seed: int
     input_sha256: str | None = None
+    loop: LoopOptions | None = None
 
     def dataset(self, replicate: int) -> DataSet:
         """One realisation.
@@ -91,18 +119,46 @@ class SimulatedSource:
         DataError
             If the options make no usable record, or the file of the excitation is not the one that was planned.
         """
-        from ctid_cli.filtering import simulate
-
-        if isinstance(self.excitation, InputFile) and self.input_sha256 is not None:
-            require_content(self.excitation.file, self.input_sha256)
+        generator = self.excitation if self.loop is None else self.loop.reference
+        if isinstance(generator, InputFile) and self.input_sha256 is not None:
+            require_content(generator.file, self.input_sha256)
+        assert generator is not None
         times = self.sampling.times(stream(self.seed, "sampling", replicate))
-        applied = self.excitation.generate(times, stream(self.seed, "input", replicate))
-        output = simulate(self.system, applied, times)
-        noise = 0.0 if self.noise is None else self.noise.generate(output, stream(self.seed, "noise", replicate))
+        applied = generator.generate(times, stream(self.seed, "input", replicate))
+        if self.loop is not None:
+            return DataSet(self._record_in(self.loop, times, applied.at(times), replicate), true_model=self.system)
+        output = self._simulated(applied, times)
         known = applied
         if self.sampling.input_record == "sampled":
             known = HeldSignal(times, applied.at(times), applied.hold)
-        return DataSet(Record(times, output + noise, known, noise_free=output), true_model=self.system)
+        record = Record(times, output + self._drawn(output, replicate), known, noise_free=output)
+        return DataSet(record, true_model=self.system)
+
+    def _simulated(self, applied: HeldSignal, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        from ctid_cli.filtering import simulate, simulate_additive
+
+        if isinstance(self.system, AdditiveModel):
+            return simulate_additive(self.system, applied, times)
+        return simulate(self.system, applied, times)
+
+    def _record_in(
+        self, loop: LoopOptions, times: NDArray[np.float64], reference: NDArray[np.float64], replicate: int
+    ) -> Record:
+        from ctid_cli.filtering import simulate_loop
+
+        interval = regular_interval(times)
+        if interval is None:
+            raise DataError("a closed loop needs a regular clock, since its controller acts at every sample")
+        # The noise comes before the output, because the output answers to it.
+        noise = self._drawn(np.zeros(times.size), replicate)
+        u, x = simulate_loop(self.system, loop.controller, reference, noise, interval, loop.enters)
+        closed = Loop(reference, loop.controller, loop.enters)
+        return Record(times, x + noise, HeldSignal(times, u), noise_free=x, loop=closed)
+
+    def _drawn(self, output: NDArray[np.float64], replicate: int) -> NDArray[np.float64]:
+        if self.noise is None:
+            return np.zeros(output.size)
+        return self.noise.generate(output, stream(self.seed, "noise", replicate))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +179,10 @@ class MeasuredSource:
         Whether the means of the samples used for estimation are subtracted.
     estimation_samples : int, optional
         Identify on the first so many samples and judge on the rest; None identifies on all.
+    reference : str, optional
+        Column of the reference of the loop that the record was taken in.
+    loop : LoopOptions, optional
+        What closed that loop; given where the reference is.
     """
 
     file: str
@@ -133,6 +193,8 @@ class MeasuredSource:
     hold: Hold = "zoh"
     offset: Offset = "none"
     estimation_samples: int | None = None
+    reference: str | None = None
+    loop: LoopOptions | None = None
 
     def dataset(self, replicate: int) -> DataSet:
         """The record.
@@ -167,13 +229,19 @@ class MeasuredSource:
                 f"{self.file}: the input {self.input!r} is constant ({u[0]:g}) over the {count} samples used for "
                 "estimation; it excites nothing to identify"
             )
+        r = self._reference()
         if self.offset == "remove":
             # The remaining samples must not have a say in what the model is made of.
             u = u - u[:count].mean()
             y = y - np.nanmean(y[:count])
+            r = None if r is None else r - r[:count].mean()
         # Without its folder: what an estimator says about the record is part of the results.
         name = Path(self.file).name
-        record = Record(t[:count], y[:count], HeldSignal(t[:count], u[:count], self.hold), name=name)
+        loop = None
+        if r is not None:
+            assert self.loop is not None
+            loop = Loop(r[:count], self.loop.controller, self.loop.enters)
+        record = Record(t[:count], y[:count], HeldSignal(t[:count], u[:count], self.hold), name=name, loop=loop)
         if count == t.size:
             return DataSet(record)
         rest = np.where(np.arange(t.size) < count, np.nan, y)
@@ -181,8 +249,51 @@ class MeasuredSource:
             return DataSet(record)
         return DataSet(record, validation=Record(t, rest, HeldSignal(t, u, self.hold), name=name))
 
+    def _reference(self) -> NDArray[np.float64] | None:
+        if self.reference is None:
+            return None
+        return read_held_signal(self.file, time=self.time, input=self.reference).values
+
 
 Source = SimulatedSource | MeasuredSource
+
+
+def joined(folder: Path, file: str) -> str:
+    """Name of a file as seen from the working directory.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder that the name is relative to.
+    file : str
+        Name as it stands in the specification.
+
+    Returns
+    -------
+    str
+        With slashes, without detours.
+    """
+    return Path(os.path.normpath(folder / file)).as_posix()
+
+
+def located(options: Any, folder: Path) -> Any:
+    """An excitation with the name of its file, if it reads one, as seen from the working directory.
+
+    Parameters
+    ----------
+    options : Any
+        Option dataclass of an excitation.
+    folder : Path
+        Folder that the name of the file is relative to.
+
+    Returns
+    -------
+    Any
+        The same, or a copy.
+    """
+    if not isinstance(options, InputFile):
+        return options
+    return dataclasses.replace(options, file=joined(folder, options.file))
 
 
 def file_sha256(path: str) -> str:

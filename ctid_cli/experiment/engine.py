@@ -335,6 +335,7 @@ def _look(plan: Plan, folder: Path, origin: Origin, *, fresh: bool, allow_mixed:
 def _jobs(plan: Plan, stored: set[Key]) -> list[Job]:
     """The data sets of which estimates are missing, in the order of the plan."""
     seed = (plan.spec.canonical().get("monte_carlo") or {}).get("seed")
+    terms = plan.terms
     jobs = []
     for task in plan.tasks():
         wanted = {}
@@ -343,7 +344,7 @@ def _jobs(plan: Plan, stored: set[Key]) -> list[Job]:
             if key not in stored and key not in wanted:
                 wanted[key] = (key, estimator, start)
         if wanted:
-            jobs.append(Job(plan.data_cells[task.cell], task.replicate, seed, tuple(wanted.values())))
+            jobs.append(Job(plan.data_cells[task.cell], task.replicate, seed, tuple(wanted.values()), terms))
     return jobs
 
 

@@ -12,6 +12,8 @@ Keys of an estimate row
 - ``status``: name of a `Status`, or ``FAILED`` (the estimator raised an exception), ``CRASHED`` (its process died),
   ``TIMEOUT``; ``message``: what that means, or the exception with a short traceback.
 - ``delay`` [s], ``numerator`` and ``denominator`` (monic, descending powers), ``standard_errors`` by parameter name.
+- ``parameters`` of the submodels by name, only in experiments whose system or estimators are additive: ``g1_a1``
+  multiplies the first power of p in the denominator of the submodel with the least natural frequency.
 - ``cost`` [output unit^2], ``fit_percent``, ``validation_fit_percent``, ``iterations``, ``condition_number``.
 - ``seconds``: time for preparing the record and fitting, as if the estimate had been alone [s].
 - one key per swept field. None stands for a value that does not exist or is not finite.
@@ -36,6 +38,7 @@ RESULT_FIELDS = (
     "delay",
     "numerator",
     "denominator",
+    "parameters",
     "standard_errors",
     "cost",
     "fit_percent",
@@ -164,11 +167,29 @@ def assemble(slot: Slot, manifest: Manifest, result: Mapping[str, Any], seconds:
         "replicate": slot.key.replicate,
         "start": slot.key.start,
         "initial_delay": manifest["starts"].get(slot.key.start),
-        **{name: result.get(name) for name in RESULT_FIELDS},
+        **{name: result.get(name) for name in RESULT_FIELDS if name != "parameters" or is_additive(manifest)},
         "seconds": seconds,
         **slot.cell["swept"],
         **slot.estimator["swept"],
     }
+
+
+def is_additive(manifest: Manifest) -> bool:
+    """Whether estimates have parameters of submodels.
+
+    Parameters
+    ----------
+    manifest : dict
+        The plan as plain data.
+
+    Returns
+    -------
+    bool
+        Whether the system or an estimator is a sum of submodels.
+    """
+    # One system for all data cells.
+    system = next((cell["content"].get("system") for cell in manifest["data_cells"]), None)
+    return "additive" in (system or {}) or any("terms" in part["content"] for part in manifest["estimators"])
 
 
 def swept_names(manifest: Manifest) -> list[str]:
@@ -203,3 +224,24 @@ def true_delay(cell: Mapping[str, Any]) -> float | None:
     """
     system = cell["content"].get("system")
     return None if not system else float(system.get("delay") or 0.0)
+
+
+def true_parameters(cell: Mapping[str, Any]) -> dict[str, float] | None:
+    """Parameters of the submodels of the system that a data cell simulates.
+
+    Parameters
+    ----------
+    cell : mapping
+        The data cell as plain data.
+
+    Returns
+    -------
+    dict or None
+        Value by name, submodels by rising natural frequency; None where the system is not a sum of submodels.
+    """
+    from ctid_cli.models import AdditiveModel, Submodel
+
+    system = cell["content"].get("system")
+    if not system or "additive" not in system:
+        return None
+    return AdditiveModel([Submodel(**item) for item in system["additive"]]).sorted().parameters

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from pathlib import Path
+from typing import Any
 
 from ctid_cli.errors import UsageError
-from ctid_cli.estimators import Start
-from ctid_cli.experiment.dataset import DataSet, SimulatedSource, Source
+from ctid_cli.experiment.canonical import content_hash
+from ctid_cli.experiment.dataset import DataSet, LoopOptions, SimulatedSource, Source, located
 from ctid_cli.experiment.manifest import Key
 from ctid_cli.experiment.sections import MAX_COMBINATIONS, Variant, variants
-from ctid_cli.experiment.spec import Spec, UniformStart, content_hash, located
+from ctid_cli.experiment.spec import Spec
+from ctid_cli.experiment.start_points import NO_START, AnyStart, ParameterStart, StartPoint, start_points
 from ctid_cli.experiment.yaml_source import KeyPath
-from ctid_cli.signals import stream
+from ctid_cli.models import AdditiveModel, Term
 
 #: Data sets that one experiment may ask for; beyond this its plan alone would fill the memory.
 MAX_DATA_SETS = 1_000_000
@@ -24,7 +27,7 @@ MAX_DATA_SETS = 1_000_000
 # fmt: off
 RESERVED_COLUMNS = frozenset((
     "id", "experiment", "estimator", "kind", "cell", "replicate", "start", "initial_delay", "start_delay",
-    "status", "message", "delay", "numerator", "denominator", "standard_errors", "cost", "fit_percent",
+    "status", "message", "delay", "numerator", "denominator", "parameters", "standard_errors", "cost", "fit_percent",
     "validation_fit_percent", "iterations", "condition_number", "seconds", "converged", "true_delay", "table",
     "sampling", "method", "n", "failed", "percent", "low", "high", "published_percent", "median_seconds",
 ))
@@ -33,7 +36,7 @@ RESERVED_COLUMNS = frozenset((
 
 @dataclass(frozen=True, eq=False)
 class DataCell:
-    """One combination of system, excitation, sampling, noise and seed, or one measured record.
+    """One combination of system, excitation or loop, sampling, noise and seed, or one measured record.
 
     Parameters
     ----------
@@ -97,56 +100,6 @@ class EstimatorCell:
 
 
 @dataclass(frozen=True)
-class StartPoint:
-    """Where an estimate starts.
-
-    Parameters
-    ----------
-    label : str
-        The start in the identity of an estimate: ``"3"``, ``"uniform(0, 9)"`` or ``"none"``.
-    initial_delay : float, "random" or None
-        Initial delay [s]; None leaves it to the estimator.
-    bounds : (float, float), optional
-        Range of a random one [s].
-    """
-
-    label: str
-    initial_delay: float | str | None
-    bounds: tuple[float, float] | None = None
-
-    def draw(self, seed: int | None, replicate: int) -> Start | None:
-        """The start on one data set.
-
-        Parameters
-        ----------
-        seed : int or None
-            Seed of the experiment; needed for a random start only.
-        replicate : int
-            Which data set.
-
-        Returns
-        -------
-        Start or None
-            None leaves it to the estimator.
-
-        Notes
-        -----
-        Every random start stretches the first number of the replicate's stream over its own range, so that no start
-        depends on which others there are.
-        """
-        if self.bounds is not None:
-            if seed is None:
-                raise ValueError("a random start needs the seed of the experiment")
-            low, high = self.bounds
-            return Start(delay=low + (high - low) * float(stream(seed, "start", replicate).random()))
-        return None if self.initial_delay is None else Start(delay=cast(float, self.initial_delay))
-
-
-#: The start of estimators that need none, and of every estimator where the specification names none.
-NO_START = StartPoint("none", None)
-
-
-@dataclass(frozen=True)
 class Task:
     """One data set.
 
@@ -174,7 +127,7 @@ class Plan:
         In the order of the specification, the last swept field changing fastest.
     estimators : tuple of EstimatorCell
         In the order of the specification.
-    starts : tuple of StartPoint
+    starts : tuple of StartPoint or ParameterStart
         Starts of the specification, and the one of estimators that use none where there are such.
     runs : int
         Data sets of every data cell.
@@ -185,7 +138,7 @@ class Plan:
     spec: Spec
     data_cells: tuple[DataCell, ...]
     estimators: tuple[EstimatorCell, ...]
-    starts: tuple[StartPoint, ...]
+    starts: tuple[AnyStart, ...]
     runs: int
     spec_hash: str
 
@@ -204,7 +157,7 @@ class Plan:
         """
         return [Task(cell, replicate) for replicate in range(self.runs) for cell in range(len(self.data_cells))]
 
-    def keys(self, task: Task) -> list[tuple[Key, EstimatorCell, StartPoint]]:
+    def keys(self, task: Task) -> list[tuple[Key, EstimatorCell, AnyStart]]:
         """The estimates wanted of a data set.
 
         Parameters
@@ -214,19 +167,27 @@ class Plan:
 
         Returns
         -------
-        list of (Key, EstimatorCell, StartPoint)
+        list of (Key, EstimatorCell, StartPoint or ParameterStart)
             Those of one estimator next to each other.
         """
         data_hash = self.data_cells[task.cell].hash
         return [
             (Key(data_hash, task.replicate, cell.hash, start.label), cell, start)
             for cell in self.estimators
-            for start in (self._given_starts if cell.estimator.uses_start else (NO_START,))
+            for start in _starts_of(cell.estimator.start_from, self.starts)
         ]
 
     @property
-    def _given_starts(self) -> tuple[StartPoint, ...]:
-        return tuple(start for start in self.starts if start is not NO_START) or (NO_START,)
+    def terms(self) -> tuple[Term, ...] | None:
+        """Structure of the submodels that estimates of one fraction are also given as; None for none.
+
+        That of the simulated system, by rising natural frequency, or else of the first estimator of submodels.
+        """
+        cell = self.data_cells[0].source
+        if isinstance(cell, SimulatedSource) and isinstance(cell.system, AdditiveModel):
+            return cell.system.sorted().terms
+        found = (getattr(cell.estimator, "terms", None) for cell in self.estimators)
+        return next((tuple(terms) for terms in found if terms is not None), None)
 
 
 def build_plan(spec: Spec, runs: int | None = None) -> Plan:
@@ -275,8 +236,8 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
     estimator_cells = tuple(
         _estimator_cell(name, variant, names) for name, cases in estimators.items() for variant in cases
     )
-    starts = _start_points(spec)
-    if NO_START not in starts and not all(cell.estimator.uses_start for cell in estimator_cells):
+    starts = start_points(spec.starts)
+    if any(NO_START in _starts_of(cell.estimator.start_from, starts) for cell in estimator_cells):
         starts = (*starts, NO_START)
     return Plan(
         spec=spec,
@@ -288,58 +249,65 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
     )
 
 
+def _starts_of(kind: str | None, starts: tuple[AnyStart, ...]) -> tuple[AnyStart, ...]:
+    """The starts that an estimator which takes one of a kind begins from."""
+    wanted = {None: (), "delay": (StartPoint,), "parameters": (ParameterStart,)}[kind]
+    return tuple(start for start in starts if isinstance(start, wanted) and start != NO_START) or (NO_START,)
+
+
 def _data_variants(spec: Spec) -> dict[str, list[Variant]]:
-    """Variants of every section that data are simulated from; none for a measured record."""
-    if spec.data is not None:
-        return {}
-    sections = {"system": spec.system, "excitation": spec.excitation, "sampling": spec.sampling, "noise": spec.noise}
+    """Variants of every section that data are simulated from; of a measured record only those of its loop."""
+    sections = {
+        "system": spec.system,
+        "excitation": spec.excitation,
+        "loop": spec.loop,
+        "sampling": spec.sampling,
+        "noise": spec.noise,
+    }
     return {name: variants(section) for name, section in sections.items() if section is not None}
 
 
 def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[KeyPath, str]) -> tuple[DataCell, ...]:
     seed = None if spec.monte_carlo is None else spec.monte_carlo.seed
-    if spec.data is not None:
-        # The seed decides where random starts lie; the record itself is in the content as a hash.
-        content = {"data": _without_place(spec.data.model_dump(mode="json")), "seed": seed}
-        return (DataCell(content, content_hash(content), {}, spec.data.source(spec.folder.resolve())),)
-    assert seed is not None
     # Absolute, because worker processes may have been started in another working directory.
     folder = spec.folder.resolve()
     cells = []
     for point in itertools.product(*parts.values()):
         chosen = dict(zip(parts, point, strict=True))
-        content = {name: _without_place(variant.values) for name, variant in chosen.items()}
-        content |= {"noise": content.get("noise"), "seed": seed}
-        source = SimulatedSource(
-            system=chosen["system"].options,
-            excitation=located(chosen["excitation"].options, folder),
-            sampling=chosen["sampling"].options,
-            noise=chosen["noise"].options if "noise" in chosen else None,
-            seed=seed,
-            input_sha256=chosen["excitation"].values.get("sha256"),
-        )
+        loop = chosen["loop"].options if "loop" in chosen else None
+        content: dict[str, Any] = {name: _without_place(variant.values) for name, variant in chosen.items()}
+        source: Source
+        if spec.data is not None:
+            # The seed decides where random starts lie; the record itself is in the content as a hash.
+            content = {"data": _without_place(spec.data.model_dump(mode="json")), **content, "seed": seed}
+            source = spec.data.source(folder, loop)
+        else:
+            content |= {"noise": content.get("noise"), "seed": seed}
+            source = _simulated(chosen, loop, folder, spec)
         swept = {names[name, *path]: value for name, v in chosen.items() for path, value in v.swept.items()}
         cells.append(DataCell(content, content_hash(content), swept, source))
     return tuple(cells)
+
+
+def _simulated(chosen: Mapping[str, Variant], loop: LoopOptions | None, folder: Path, spec: Spec) -> SimulatedSource:
+    """Source of the data sets of one combination of the sections' variants."""
+    assert spec.monte_carlo is not None
+    pinned = chosen["excitation"].values if loop is None else chosen["loop"].values["reference"]
+    return SimulatedSource(
+        system=chosen["system"].options,
+        excitation=located(chosen["excitation"].options, folder) if loop is None else None,
+        sampling=chosen["sampling"].options,
+        noise=chosen["noise"].options if "noise" in chosen else None,
+        seed=spec.monte_carlo.seed,
+        input_sha256=pinned.get("sha256"),
+        loop=None if loop is None else dataclasses.replace(loop, reference=located(loop.reference, folder)),
+    )
 
 
 def _estimator_cell(name: str, variant: Variant, names: Mapping[KeyPath, str]) -> EstimatorCell:
     swept = {names["estimator", *path]: value for path, value in variant.swept.items()}
     content = variant.values
     return EstimatorCell(name, content["kind"], variant.options, content, content_hash(content), swept)
-
-
-def _start_points(spec: Spec) -> tuple[StartPoint, ...]:
-    if spec.starts is None:
-        return (NO_START,)
-    points = []
-    for point in spec.starts.points:
-        if isinstance(point, UniformStart):
-            low, high = point.uniform
-            points.append(StartPoint(f"uniform({_short(low)}, {_short(high)})", "random", (low, high)))
-        else:
-            points.append(StartPoint(_short(point), point))
-    return tuple(points)
 
 
 def _column_names(paths: Iterable[KeyPath]) -> dict[KeyPath, str]:
@@ -354,7 +322,11 @@ def _column_names(paths: Iterable[KeyPath]) -> dict[KeyPath, str]:
 
 def _without_place(content: Mapping[str, Any]) -> dict[str, Any]:
     """A section without the name of its file, whose content hash says what matters."""
-    return {key: value for key, value in content.items() if not (key == "file" and "sha256" in content)}
+    return {
+        key: _without_place(value) if isinstance(value, dict) else value
+        for key, value in content.items()
+        if not (key == "file" and "sha256" in content)
+    }
 
 
 def _without_circumstances(canonical: Mapping[str, Any]) -> dict[str, Any]:
@@ -362,8 +334,3 @@ def _without_circumstances(canonical: Mapping[str, Any]) -> dict[str, Any]:
     if content.get("monte_carlo") is not None:
         content["monte_carlo"] = {"seed": content["monte_carlo"]["seed"]}
     return content
-
-
-def _short(value: float) -> str:
-    """The shortest text that is the number again, without a trailing ``.0``."""
-    return repr(value).removesuffix(".0")

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctid_cli.errors import RefusedError, StorageError
-from ctid_cli.experiment.manifest import FAILURES, Key, Manifest, assemble, slots, swept_names
+from ctid_cli.experiment.manifest import FAILURES, Key, Manifest, assemble, is_additive, slots, swept_names
+from ctid_cli.experiment.summary import parameter_names
 from ctid_cli.experiment.version import Origin
 
 if TYPE_CHECKING:
@@ -210,7 +211,10 @@ def _write(file: h5py.File, manifest: Manifest, origins: Sequence[Origin], rows:
     fixed.attrs["unit"] = "s"
     for name in ("numerator", "denominator"):
         _ragged(group, name, [row[name] for row in rows])
-    _standard_errors(group, [row["standard_errors"] for row in rows])
+    _named(group, "standard_errors", "standard_error_names", [row["standard_errors"] for row in rows])
+    if is_additive(manifest):
+        found = [row["parameters"] for row in rows]
+        _named(group, "parameters", "parameter_names", found, parameter_names(found))
     swept = group.create_group("swept")
     for name in swept_names(manifest):
         values = [row.get(name) for row in rows]
@@ -236,18 +240,24 @@ def _ragged(group: h5py.Group, name: str, rows: Sequence[Sequence[float | None] 
     _column(group, f"{name}_length", lengths)
 
 
-def _standard_errors(group: h5py.Group, rows: Sequence[Mapping[str, float | None] | None]) -> None:
-    names = list(dict.fromkeys(name for row in rows if row for name in row))
+def _named(
+    group: h5py.Group,
+    column: str,
+    names_of: str,
+    rows: Sequence[Mapping[str, float | None] | None],
+    order: Sequence[str] = (),
+) -> None:
+    names = list(dict.fromkeys([*order, *(name for row in rows if row for name in row)]))
     values = np.full((len(rows), len(names)), np.nan)
     present = np.zeros((len(rows), len(names)), dtype=np.uint8)
     for k, row in enumerate(rows):
         for name, value in (row or {}).items():
-            column = names.index(name)
-            present[k, column] = 1
-            values[k, column] = np.nan if value is None else value
-    _column(group, "standard_errors", values)
-    _column(group, "standard_errors_present", present)
-    _column(group, "standard_error_names", _encode(names))
+            place = names.index(name)
+            present[k, place] = 1
+            values[k, place] = np.nan if value is None else value
+    _column(group, column, values)
+    _column(group, f"{column}_present", present)
+    _column(group, names_of, _encode(names))
 
 
 def _results(group: h5py.Group) -> dict[Key, dict[str, Any]]:
@@ -255,8 +265,8 @@ def _results(group: h5py.Group) -> dict[Key, dict[str, Any]]:
     numbers = {name: group[name][()].tolist() for name in (*_NUMBERS, "replicate", "iterations")}
     coefficients = {name: group[name][()].tolist() for name in ("numerator", "denominator")}
     lengths = {name: group[f"{name}_length"][()].tolist() for name in ("numerator", "denominator")}
-    names = _decode(group["standard_error_names"][()])
-    errors, present = group["standard_errors"][()].tolist(), group["standard_errors_present"][()].tolist()
+    errors = _read_named(group, "standard_errors", "standard_error_names")
+    parameters = _read_named(group, "parameters", "parameter_names") if "parameters" in group else []
     results = {}
     for k in range(len(texts["cell"])):
         key = Key(texts["cell"][k], numbers["replicate"][k], texts["estimator_hash"][k], texts["start"][k])
@@ -267,10 +277,19 @@ def _results(group: h5py.Group) -> dict[Key, dict[str, Any]]:
         for name, rows in coefficients.items():
             length = lengths[name][k]
             result[name] = None if length == _NO_ITERATIONS else [_none(value) for value in rows[k][:length]]
-        pairs = zip(names, errors[k], present[k], strict=True)
-        result["standard_errors"] = None if failed else {name: _none(value) for name, value, there in pairs if there}
+        result["standard_errors"] = None if failed else errors[k]
+        result["parameters"] = (parameters[k] or None) if parameters else None
         results[key] = result
     return results
+
+
+def _read_named(group: h5py.Group, column: str, names_of: str) -> list[dict[str, float | None]]:
+    names = _decode(group[names_of][()])
+    values, present = group[column][()].tolist(), group[f"{column}_present"][()].tolist()
+    return [
+        {name: _none(value) for name, value, there in zip(names, row, mask, strict=True) if there}
+        for row, mask in zip(values, present, strict=True)
+    ]
 
 
 def _content_checksum(file: h5py.File) -> str:

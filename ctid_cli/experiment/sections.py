@@ -7,6 +7,10 @@ An option dataclass is written once, with its units; this module turns it into a
 - explains in plain words what is wrong, everything in a section at once,
 - carries descriptions and units into the JSON Schema.
 
+Metadata of a field, all optional: ``doc``; ``unit``; ``geometric``, a sweep may be given as its ends and its length;
+``added_later``, left out of the canonical form at its default, so that what was stored before the field existed keeps
+its identity.
+
 Messages are final sentences: they travel through pydantic as custom errors, with their key path as ``loc``.
 """
 
@@ -24,18 +28,31 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    create_model,
+    model_serializer,
+    model_validator,
+)
 from pydantic.functional_validators import ModelWrapValidatorHandler, WrapValidator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from ctid_cli.errors import CtidError
 from ctid_cli.experiment.yaml_source import KeyPath, did_you_mean
+from ctid_cli.signals import geometric_sizes
 
 #: Combinations that one section may sweep, and data cells that one experiment may hold.
 MAX_COMBINATIONS = 10_000
 
 #: Whole numbers beyond this fit no column of a table or archive.
 MAX_WHOLE = 2**63 - 1
+
+#: Keys of a section that are no options of its target.
+_NO_OPTIONS = ("kind", "sha256")
 
 Check = Callable[[Any], Any]
 #: Key path inside a section, and what is wrong there.
@@ -337,6 +354,26 @@ def swept(check: Check) -> Check:
     return checked
 
 
+def spaced(check: Check) -> Check:
+    """Check that also takes a sweep of whole numbers by its ends and its length.
+
+    Parameters
+    ----------
+    check : callable
+        For one value, or a list of values to sweep.
+
+    Returns
+    -------
+    callable
+        Returns what ``check`` returns; for ``{geometric: [first, last, count]}`` that is a list.
+    """
+
+    def checked(value: Any) -> Any:
+        return check(Geometric.model_validate(value).values() if isinstance(value, Mapping) else value)
+
+    return checked
+
+
 def _each(check: Check, values: Sequence[Any]) -> list[Any]:
     items: list[Any] = []
     complaints: list[tuple[KeyPath, str, bool]] = []
@@ -389,6 +426,18 @@ class Section(BaseModel):
     target: ClassVar[type | None] = None
     #: Fields that may be a list of values to sweep.
     sweepable: ClassVar[frozenset[str]] = frozenset()
+    #: Fields that the canonical form leaves out at their default.
+    added_later: ClassVar[frozenset[str]] = frozenset()
+
+    @model_serializer(mode="wrap")
+    def _as_before(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        content: dict[str, Any] = handler(self)
+        fields = type(self).model_fields
+        return {
+            name: value
+            for name, value in content.items()
+            if name not in self.added_later or value != fields[name].get_default()
+        }
 
     @model_validator(mode="wrap")
     @classmethod
@@ -446,6 +495,89 @@ class Section(BaseModel):
         """
         if self.target is not None:
             yield from _option_complaints(self)
+
+    def build(self, values: Mapping[str, Any]) -> Any:
+        """The options that the section describes.
+
+        Parameters
+        ----------
+        values : mapping
+            The section as plain data, with one value per swept field.
+
+        Returns
+        -------
+        Any
+            Instance of the target.
+
+        Raises
+        ------
+        RefusedOptionsError
+            If a part of the section is refused.
+        ValueError, CtidError, ArithmeticError
+            Whatever the option dataclass raises for values that it refuses.
+        """
+        assert self.target is not None
+        return self.target(
+            **{
+                option.name: _argument(getattr(self, option.name), values[option.name], (option.name,))
+                for option in dataclasses.fields(self.target)
+                if option.init and option.name in values
+            }
+        )
+
+
+class Geometric(Section):
+    """Whole numbers to sweep, spaced geometrically and rounded."""
+
+    geometric: Annotated[
+        list[int],
+        Field(min_length=3, max_length=3),
+        checked(list_of(whole(), "three whole numbers: the first value, the last, and how many there are", length=3)),
+    ] = Field(description="The first value, the last, and how many there are")
+
+    def complaints(self) -> Iterator[Complaint]:
+        """Say why there are no such numbers.
+
+        Yields
+        ------
+        tuple
+            Key path inside the section, and message.
+        """
+        if self.geometric[2] > MAX_COMBINATIONS:
+            yield ("geometric", 2), f"{self.geometric[2]} values are too many; at most {MAX_COMBINATIONS} are allowed"
+            return
+        try:
+            self.values()
+        except ValueError as error:
+            yield ("geometric",), str(error)
+
+    def values(self) -> list[int]:
+        """The numbers.
+
+        Returns
+        -------
+        list of int
+            Strictly increasing.
+        """
+        first, last, count = self.geometric
+        return geometric_sizes(first, last, count)
+
+
+class RefusedOptionsError(ValueError):
+    """An option dataclass refused its values; where that is and why.
+
+    Parameters
+    ----------
+    path : tuple
+        Key path inside the section.
+    message : str
+        What is wrong and what is allowed.
+    """
+
+    def __init__(self, path: KeyPath, message: str) -> None:
+        super().__init__(message)
+        self.path = path
+        self.message = message
 
 
 @dataclass(frozen=True)
@@ -540,7 +672,7 @@ def _option_complaints(section: Section) -> Iterator[Complaint]:
     for combination, values in _combinations(section):
         try:
             _instance(section, values)
-        except _RefusedError as refused:
+        except RefusedOptionsError as refused:
             path = refused.path
             message = refused.message
             if path in combination:
@@ -553,15 +685,6 @@ def _option_complaints(section: Section) -> Iterator[Complaint]:
             else:
                 failures.append((path, message, combination))
     yield from grouped(failures, count)
-
-
-class _RefusedError(ValueError):
-    """An option dataclass refused its values; where that is and why."""
-
-    def __init__(self, path: KeyPath, message: str) -> None:
-        super().__init__(message)
-        self.path = path
-        self.message = message
 
 
 def _axes(section: Section, prefix: KeyPath = ()) -> Iterator[tuple[KeyPath, list[Any]]]:
@@ -588,29 +711,28 @@ def _combinations(section: Section) -> Iterator[tuple[dict[KeyPath, Any], dict[s
 
 
 def _instance(section: Section, values: Mapping[str, Any]) -> Any:
-    """The option dataclass of a section with the given values."""
-    target = section.target
-    assert target is not None
-    arguments: dict[str, Any] = {}
-    for option in dataclasses.fields(target):
-        if not option.init or option.name not in values:
-            continue
-        value = values[option.name]
-        inner = getattr(section, option.name)
-        if isinstance(inner, Section):
-            try:
-                value = _instance(inner, value)
-            except _RefusedError as refused:
-                raise _RefusedError((option.name, *refused.path), refused.message) from None
-        elif isinstance(value, list):
-            value = tuple(value)
-        arguments[option.name] = value
+    """The options of a section with the given values."""
     try:
         with np.errstate(all="ignore"):  # what overflows is refused, or found by the section's own complaints
-            return target(**arguments)
+            return section.build(values)
+    except RefusedOptionsError:
+        raise
     except (ValueError, ArithmeticError, CtidError) as error:
         message = str(error).strip() or f"these values were refused ({type(error).__name__})"
-        raise _RefusedError(_field_in(message, list(arguments)), message) from None
+        names = [name for name in type(section).model_fields if name not in _NO_OPTIONS]
+        raise RefusedOptionsError(_field_in(message, names), message) from None
+
+
+def _argument(inner: Any, value: Any, path: KeyPath) -> Any:
+    """What an option dataclass is given for a field: `inner` as the section holds it, `value` as plain data."""
+    if isinstance(inner, Section):
+        try:
+            return _instance(inner, value)
+        except RefusedOptionsError as refused:
+            raise RefusedOptionsError((*path, *refused.path), refused.message) from None
+    if isinstance(value, list):
+        return tuple(_argument(part, item, (*path, k)) for k, (part, item) in enumerate(zip(inner, value, strict=True)))
+    return value
 
 
 def _field_in(message: str, names: Sequence[str]) -> KeyPath:
@@ -638,7 +760,9 @@ class _FieldForm:
     scalar: bool
 
 
-def section_for(target: type, *, kind: str | None = None, extra: Mapping[str, Any] | None = None) -> type[Section]:
+def section_for(
+    target: type, *, kind: str | None = None, extra: Mapping[str, Any] | None = None, sweeping: bool = True
+) -> type[Section]:
     """Section model of an option dataclass.
 
     Parameters
@@ -649,6 +773,8 @@ def section_for(target: type, *, kind: str | None = None, extra: Mapping[str, An
         Value of the section's ``kind`` key; None for a section without one.
     extra : mapping, optional
         Further pydantic fields that the dataclass does not have.
+    sweeping : bool, default True
+        Whether scalar fields may be swept.
 
     Returns
     -------
@@ -663,6 +789,7 @@ def section_for(target: type, *, kind: str | None = None, extra: Mapping[str, An
     hints = get_type_hints(target)
     definitions: dict[str, Any] = {}
     sweepable: set[str] = set()
+    later: set[str] = set()
     if kind is not None:
         definitions["kind"] = (Annotated[Literal[kind], checked(choice(kind))], Field(description="Which one it is"))
     for option in dataclasses.fields(target):
@@ -672,10 +799,15 @@ def section_for(target: type, *, kind: str | None = None, extra: Mapping[str, An
         unit = "" if unit == "-" else unit
         form = _form(hints[option.name], unit, f"{target.__name__}.{option.name}")
         annotation, check = form.annotation, form.check
-        if form.scalar:
+        if form.scalar and sweeping:
             sweepable.add(option.name)
             annotation = Union[annotation, types.GenericAlias(list, (annotation,))]  # noqa: UP007 - built at run time
             check = swept(check)
+            if option.metadata.get("geometric"):
+                annotation = Union[annotation, Geometric]  # noqa: UP007 - built at run time
+                check = spaced(check)
+        if option.metadata.get("added_later"):
+            later.add(option.name)
         default = _default(option, form.check)
         definitions[option.name] = (
             Annotated[annotation, checked(check)],
@@ -685,6 +817,7 @@ def section_for(target: type, *, kind: str | None = None, extra: Mapping[str, An
     model = create_model(target.__name__, __base__=Section, __doc__=_summary(target), **definitions)
     model.target = target
     model.sweepable = frozenset(sweepable)
+    model.added_later = frozenset(later)
     return model
 
 
@@ -748,6 +881,11 @@ def _form(hint: Any, unit: str, name: str) -> _FieldForm:
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         model = section_for(hint)
         return _FieldForm(model.model_validate, model, False)
+    if origin is tuple and arguments[1:] == (Ellipsis,) and dataclasses.is_dataclass(arguments[0]):
+        # A list of such lists would say too little about which of them belong together, so that nothing in it is swept.
+        model = section_for(typing.cast(type, arguments[0]), sweeping=False)
+        what = f"a list of mappings with the keys {', '.join(model.model_fields)}"
+        return _FieldForm(list_of(model.model_validate, what), types.GenericAlias(list, (model,)), False)
     raise TypeError(f"{name}: a field of type {hint} has no form in a specification")
 
 
@@ -760,6 +898,8 @@ def _default(option: dataclasses.Field[Any], check: Check) -> Any:
         default = option.default_factory()
     if dataclasses.is_dataclass(default) and not isinstance(default, type):
         default = dataclasses.asdict(default)
+    elif isinstance(default, tuple):
+        default = [dataclasses.asdict(item) if hasattr(item, "__dataclass_fields__") else item for item in default]
     return check(default)
 
 

@@ -6,6 +6,7 @@ import csv
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +25,18 @@ from ctid_cli.experiment.folder import (
     who_runs,
     write_safely,
 )
-from ctid_cli.experiment.manifest import FAILURES, Key, Manifest, Slot, assemble, slots, swept_names, true_delay
+from ctid_cli.experiment.manifest import (
+    FAILURES,
+    Key,
+    Manifest,
+    Slot,
+    assemble,
+    is_additive,
+    slots,
+    swept_names,
+    true_delay,
+    true_parameters,
+)
 from ctid_cli.experiment.summary import is_converged
 from ctid_cli.experiment.version import Origin
 
@@ -44,7 +56,7 @@ _FLOAT_COLUMNS = (
 )
 _COLUMNS = (
     *("id", "experiment", "estimator", "kind", "cell", "replicate", "start", "initial_delay", "start_delay", "status"),
-    *("message", "delay", "numerator", "denominator", "standard_errors", "cost", "fit_percent"),
+    *("message", "delay", "numerator", "denominator", "parameters", "standard_errors", "cost", "fit_percent"),
     *("validation_fit_percent", "iterations", "condition_number", "seconds"),
 )
 
@@ -88,8 +100,14 @@ class Stored:
             See `ctid_cli.experiment.manifest`.
         """
         row = assemble(slot, self.manifest, self.results[slot.key], self.seconds.get(slot.key))
-        delay = true_delay(slot.cell)
-        return row | {"converged": is_converged(row, self.manifest["success"], delay), "true_delay": delay}
+        delay, parameters = self._truths[slot.key.data_hash]
+        converged = is_converged(row, self.manifest["success"], delay, parameters)
+        return row | {"converged": converged, "true_delay": delay}
+
+    @cached_property
+    def _truths(self) -> dict[str, tuple[float | None, dict[str, float] | None]]:
+        """True delay [s] and true parameters of every data cell."""
+        return {cell["hash"]: (true_delay(cell), true_parameters(cell)) for cell in self.manifest["data_cells"]}
 
     def rows(self) -> list[dict[str, Any]]:
         """All estimate rows, in the order of the sealed file."""
@@ -309,7 +327,8 @@ def load_estimates(folder: Path) -> pd.DataFrame:
     -------
     DataFrame
         One row per estimate in the order of the specification (estimator, data cell, replicate, start), with the
-        columns of `ctid_cli.experiment.manifest`, then ``converged`` (missing where no success rule applies) and
+        columns of `ctid_cli.experiment.manifest` (``parameters`` only where the system or an estimator is a sum of
+        submodels), then ``converged`` (missing where no success rule applies) and
         ``true_delay`` [s]. ``attrs["mixed"]`` tells whether other code or arithmetic computed some of them.
 
     Raises
@@ -326,7 +345,8 @@ def load_estimates(folder: Path) -> pd.DataFrame:
     stored = read_stored(folder)
     rows = stored.rows()
     frame = pd.DataFrame(index=pd.RangeIndex(len(rows)))
-    for name in (*_COLUMNS, *swept_names(stored.manifest), "converged", "true_delay"):
+    own = [name for name in _COLUMNS if name != "parameters" or is_additive(stored.manifest)]
+    for name in (*own, *swept_names(stored.manifest), "converged", "true_delay"):
         frame[name] = _column(name, [row.get(name) for row in rows])
     frame.attrs["mixed"] = len(stored.origins) > 1
     return frame

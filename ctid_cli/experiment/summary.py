@@ -3,17 +3,18 @@
 An estimate has *converged* if it satisfies every condition of the specification's ``success``:
 
 - ``delay_relative_error``: the estimated delay differs from the true one by at most this fraction of it;
-- ``fit_percent``: the fit on the record it was estimated from is at least this [%].
+- ``fit_percent``: the fit on the record it was estimated from is at least this [%];
+- ``parameter_relative_error``: every parameter of the submodels differs from the true one by at most this fraction.
 
 Its status does not matter: an estimate that stopped at the iteration limit with the right delay has converged, one that
 settled elsewhere has not. An estimate without a result (``FAILED``, ``CRASHED``, ``TIMEOUT``) has not converged and
-counts in every percentage. Without ``success``, or without a true delay to compare with, nothing is said.
+counts in every percentage. Without ``success``, or without true values to compare with, nothing is said.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +24,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def is_converged(row: Mapping[str, Any], success: Mapping[str, Any] | None, true_delay: float | None) -> bool | None:
+def is_converged(
+    row: Mapping[str, Any],
+    success: Mapping[str, Any] | None,
+    true_delay: float | None,
+    true_parameters: Mapping[str, float] | None = None,
+) -> bool | None:
     """Whether an estimate satisfies the success rule.
 
     Parameters
@@ -34,26 +40,30 @@ def is_converged(row: Mapping[str, Any], success: Mapping[str, Any] | None, true
         The specification's ``success``.
     true_delay : float or None
         Delay of the simulated system [s].
+    true_parameters : mapping or None, optional
+        Parameters of the simulated submodels by name.
 
     Returns
     -------
     bool or None
         None where no rule applies.
     """
-    tolerance = (success or {}).get("delay_relative_error")
-    least_fit = (success or {}).get("fit_percent")
-    if tolerance is not None and true_delay is None:
-        tolerance = None
-    if tolerance is None and least_fit is None:
+    rule = success or {}
+    conditions = []
+    if rule.get("delay_relative_error") is not None and true_delay is not None:
+        conditions.append(_near(row["delay"], true_delay, rule["delay_relative_error"]))
+    if rule.get("parameter_relative_error") is not None and true_parameters is not None:
+        found, tolerance = row.get("parameters") or {}, rule["parameter_relative_error"]
+        conditions.append(all(_near(found.get(name), true, tolerance) for name, true in true_parameters.items()))
+    if rule.get("fit_percent") is not None:
+        conditions.append(row["fit_percent"] is not None and row["fit_percent"] >= rule["fit_percent"])
+    if not conditions:
         return None
-    if row["status"] in FAILURES:
-        return False
-    if tolerance is not None:
-        delay = row["delay"]
-        assert true_delay is not None
-        if delay is None or not abs(delay - true_delay) <= tolerance * abs(true_delay):
-            return False
-    return least_fit is None or (row["fit_percent"] is not None and row["fit_percent"] >= least_fit)
+    return row["status"] not in FAILURES and all(conditions)
+
+
+def _near(value: float | None, true: float, tolerance: float) -> bool:
+    return value is not None and abs(value - true) <= tolerance * abs(true)
 
 
 def wilson_interval(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
@@ -162,7 +172,8 @@ def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:
     -------
     DataFrame
         The same rows and columns, but coefficients as ``b0, b1, …`` and ``a1, a2, …`` (descending powers, the leading 1
-        of the denominator left out) and standard errors as ``se_b0, …, se_a1, …, se_delay``.
+        of the denominator left out), parameters of submodels, where there are such, as ``g1_a1, …, g1_b0, …``, and
+        standard errors as ``se_b0, …, se_a1, …, se_g1_a1, …, se_delay``.
     """
     import pandas as pd
 
@@ -173,6 +184,9 @@ def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:
         flat[f"b{k}"] = [row[k] if row and k < len(row) else None for row in numerators]
     for k in range(1, max((len(row) for row in denominators if row), default=0)):
         flat[f"a{k}"] = [row[k] if row and k < len(row) else None for row in denominators]
+    parameters = estimates["parameters"].tolist() if "parameters" in estimates else []
+    for name in parameter_names(parameters):
+        flat[name] = [row.get(name) if row else None for row in parameters]
     present = {name for row in errors if row for name in row}
     order = [name for name in (*flat, "delay") if name in present]
     for name in (*order, *sorted(present.difference(order))):
@@ -181,6 +195,32 @@ def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:
     for name in estimates.columns:
         if name == "numerator":
             columns |= {key: pd.Series(values, dtype="float64", index=estimates.index) for key, values in flat.items()}
-        elif name not in ("denominator", "standard_errors"):
+        elif name not in ("denominator", "parameters", "standard_errors"):
             columns[name] = estimates[name]
     return pd.DataFrame(columns)
+
+
+def parameter_names(rows: Iterable[Mapping[str, float | None] | None]) -> list[str]:
+    """Names of the parameters of submodels that any estimate has.
+
+    Parameters
+    ----------
+    rows : iterable of mapping or None
+        Parameters of each estimate by name.
+
+    Returns
+    -------
+    list of str
+        By submodel, the denominator before the numerator, by rising powers.
+
+    Examples
+    --------
+    >>> parameter_names([{"g1_a1": 1.0, "g1_b0": 2.0}, None, {"g1_a1": 1.0, "g1_a2": 3.0, "g1_b0": 2.0}])
+    ['g1_a1', 'g1_a2', 'g1_b0']
+    """
+
+    def place(name: str) -> tuple[int, str, int]:
+        submodel, coefficient = name.split("_")
+        return int(submodel[1:]), coefficient[0], int(coefficient[1:])
+
+    return sorted({name for row in rows if row for name in row}, key=place)

@@ -25,7 +25,9 @@ from ctid_cli.experiment.manifest import RESULT_FIELDS, Key
 
 if TYPE_CHECKING:
     from ctid_cli.experiment.dataset import DataSet
-    from ctid_cli.experiment.plan import DataCell, EstimatorCell, StartPoint
+    from ctid_cli.experiment.plan import DataCell, EstimatorCell
+    from ctid_cli.experiment.start_points import AnyStart
+    from ctid_cli.models import Term
 
 #: Frames of a traceback that are kept, the innermost ones.
 TRACEBACK_FRAMES = 6
@@ -45,14 +47,17 @@ class Job:
         Which realisation.
     seed : int or None
         For random starts; None where nothing is random.
-    wanted : tuple of (Key, EstimatorCell, StartPoint)
+    wanted : tuple of (Key, EstimatorCell, StartPoint or ParameterStart)
         Estimates, those of one estimator next to each other.
+    terms : tuple of Term, optional
+        Structure of the submodels that estimates of one fraction are also given as.
     """
 
     cell: DataCell
     replicate: int
     seed: int | None
-    wanted: tuple[tuple[Key, EstimatorCell, StartPoint], ...]
+    wanted: tuple[tuple[Key, EstimatorCell, AnyStart], ...]
+    terms: tuple[Term, ...] | None = None
 
 
 class Outcome(NamedTuple):
@@ -129,10 +134,10 @@ def run_job(job: Job) -> list[Outcome]:
                 preparing = time.perf_counter() - begun
                 current = cell
             begun = time.perf_counter()
-            drawn = start.draw(job.seed, job.replicate)
+            drawn = start.draw(job.seed, job.replicate, data.true_model)
             fit = prepared.fit(drawn)
             seconds: float | None = preparing + time.perf_counter() - begun
-            result = _result(fit, data, None if drawn is None else drawn.delay)
+            result = _result(fit, data, None if drawn is None else drawn.delay, job.terms)
         except BaseException as error:
             result, seconds = failure(error), None
         outcomes.append(Outcome(key, result, seconds))
@@ -183,8 +188,11 @@ def failed(message: str, status: str) -> dict[str, Any]:
     return dict.fromkeys(RESULT_FIELDS) | {"status": status, "message": message}
 
 
-def _result(fit: Any, data: DataSet, start_delay: float | None) -> dict[str, Any]:
+def _result(fit: Any, data: DataSet, start_delay: float | None, terms: tuple[Term, ...] | None) -> dict[str, Any]:
+    from ctid_cli.experiment.additive_parameters import additive_parameters
+
     model = fit.model
+    parameters, errors = additive_parameters(fit, terms)
     result = {
         "status": fit.status.name,
         "message": str(fit.status.value),
@@ -192,7 +200,8 @@ def _result(fit: Any, data: DataSet, start_delay: float | None) -> dict[str, Any
         "delay": model.delay,
         "numerator": model.numerator,
         "denominator": model.denominator,
-        "standard_errors": fit.standard_errors,
+        "parameters": parameters,
+        "standard_errors": fit.standard_errors | errors,
         "cost": fit.cost,
         "fit_percent": fit.fit_percent,
         "validation_fit_percent": _validation_fit_percent(model, data),
