@@ -51,6 +51,8 @@ PEAKS = 3
 DAMPINGS = (0.15, 0.5)
 #: Real poles that are tried, spread over the band.
 REAL_POLES = 25
+#: Directions of a Gram matrix weaker than this fraction of the strongest are rounding.
+RANK_TOLERANCE = 1e-14
 #: Least damping ratio of a moved pole [-].
 LEAST_DAMPING = 1e-6
 
@@ -326,7 +328,7 @@ def _candidates(lines: Lines, residual: ComplexArray, pairs: bool, reals: bool) 
         explained /= np.maximum(_moving_sum(power, width).real, 1e-12 * width * float(power.max()) + 1e-300)
         for peak in _peaks(explained):
             found += [complex(-part * width * spacing, lines.frequencies[peak]) for part in DAMPINGS]
-        width = int(1.6 * width) + 1 | 1
+        width = 2 * width - 1
     return found
 
 
@@ -350,8 +352,9 @@ def _gain(lines: Lines, residual: Array, known: Array, pole: complex) -> float:
     basis = _basis(lines.s, [pole])
     columns = _stacked(np.hstack((basis * lines.inputs[:, None], basis * lines.weights[:, None])))
     columns /= _norms(columns)
-    new = _orthonormal(columns - known @ (known.T @ columns))
-    return float(np.sum((new.T @ residual) ** 2))
+    columns -= known @ (known.T @ columns)
+    slope = columns.T @ residual
+    return float(slope @ np.linalg.lstsq(columns.T @ columns, slope, rcond=RANK_TOLERANCE)[0])
 
 
 def _basis(s: ComplexArray, poles: Sequence[complex]) -> ComplexArray:
@@ -383,36 +386,45 @@ def _norms(columns: Array) -> Array:
 
 def _orthonormal(columns: Array) -> Array:
     """Orthonormal basis; columns are scaled first, since those of high powers of a frequency would drown others."""
-    basis: Array = np.linalg.qr(columns / _norms(columns))[0]
-    return basis
+    # Many rows and few columns: Gram matrices are several times faster than Householder's reflections, and a second
+    # round makes up for their rounding.
+    return _nearly_orthonormal(_nearly_orthonormal(columns / _norms(columns)))
+
+
+def _nearly_orthonormal(columns: Array) -> Array:
+    values, vectors = np.linalg.eigh(columns.T @ columns)
+    kept = values > RANK_TOLERANCE * values[-1]
+    return np.asarray(columns @ (vectors[:, kept] / np.sqrt(values[kept])))
 
 
 # --- noise level -----------------------------------------------------------------------------------
 
 
 def _edges(count: int) -> IndexArray:
-    """Where blocks of neighbouring lines begin and end."""
-    return np.linspace(0, count, max(count // LOCAL_LINES, 1) + 1).round().astype(np.intp)
+    """Where blocks of equally many neighbouring lines begin; the last takes the rest too."""
+    edges = LOCAL_LINES * np.arange(max(count // LOCAL_LINES, 1) + 1)
+    edges[-1] = count
+    return edges
 
 
 def _local_fits(lines: Lines) -> tuple[IndexArray, Array, Array]:
     """Blocks of lines, the variance that polynomials in w leave in each, and the power per line of the response."""
     edges = _edges(lines.frequencies.size)
-    noise, explained = np.zeros(edges.size - 1), np.zeros(edges.size - 1)
-    for k, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
-        powers = np.linspace(-1.0, 1.0, last - first)[:, None] ** np.arange(LOCAL_DEGREE + 1)
-        transient = np.linalg.qr(powers)[0]
-        output = lines.outputs[first:last] - transient @ (transient.T @ lines.outputs[first:last])
-        columns = powers * lines.inputs[first:last, None]
-        columns = columns - transient @ (transient.T @ columns)
-        response, strength, _ = np.linalg.svd(columns, full_matrices=False)
-        response = response[:, strength > 1e-9 * max(float(strength[0]), 1e-300)]
-        follows = response.conj().T @ output
-        free = last - first - transient.shape[1] - response.shape[1]
-        left = float(np.sum(np.abs(output) ** 2) - np.sum(np.abs(follows) ** 2))
-        noise[k] = max(left, 0.0) / max(free, 1)
-        explained[k] = float(np.sum(np.abs(follows) ** 2)) / max(response.shape[1], 1)
-    return edges, noise, explained
+    blocks = (edges.size - 1, LOCAL_LINES)
+    inputs = lines.inputs[: blocks[0] * blocks[1]].reshape(blocks)
+    outputs = lines.outputs[: blocks[0] * blocks[1]].reshape(blocks)
+    powers = np.linspace(-1.0, 1.0, LOCAL_LINES)[:, None] ** np.arange(LOCAL_DEGREE + 1)
+    transient = np.linalg.qr(powers)[0]
+    without = np.eye(LOCAL_LINES) - transient @ transient.T
+    outputs = outputs @ without
+    response, strength, _ = np.linalg.svd(without @ (powers * inputs[:, :, None]), full_matrices=False)
+    excited = strength > 1e-9 * np.maximum(strength[:, :1], 1e-300)
+    follows = np.where(excited, np.einsum("kij,ki->kj", response.conj(), outputs), 0.0)
+    number = excited.sum(axis=1)
+    explained = np.sum(np.abs(follows) ** 2, axis=1)
+    left = np.sum(np.abs(outputs) ** 2, axis=1) - explained
+    free = LOCAL_LINES - powers.shape[1] - number
+    return edges, np.maximum(left, 0.0) / free, explained / np.maximum(number, 1)
 
 
 def _median_of_neighbours(levels: Array) -> Array:

@@ -151,7 +151,7 @@ class Srivc:
             return "guarded" if self.instruments == "open_loop" else "relaxed"
         return self.variant
 
-    def prepare(self, record: Record) -> PreparedSrivc | PreparedClosedLoopSrivc:
+    def prepare(self, record: Record) -> PreparedSrivc | PreparedSubmodelSrivc:
         """Check a record and lay it out.
 
         Parameters
@@ -161,7 +161,7 @@ class Srivc:
 
         Returns
         -------
-        PreparedSrivc or PreparedClosedLoopSrivc
+        PreparedSrivc or PreparedSubmodelSrivc
             Ready to fit.
 
         Raises
@@ -169,7 +169,9 @@ class Srivc:
         DataError
             If nothing can be estimated from the record, or it lacks the loop that the instruments need.
         """
-        return PreparedSrivc(self, record) if self.instruments == "open_loop" else PreparedClosedLoopSrivc(self, record)
+        if self.step_rule == "relaxed" or self.instruments == "closed_loop":
+            return PreparedSubmodelSrivc(self, record)
+        return PreparedSrivc(self, record)
 
     def fit(self, record: Record, start: Start | None = None) -> Fit:
         """Estimate the coefficients.
@@ -265,15 +267,17 @@ class PreparedSrivc:
         return replace(fit, covariance=covariance)
 
 
-class PreparedClosedLoopSrivc:
-    """A record checked and laid out for :class:`Srivc` with closed-loop instruments (CLSRIVC).
+class PreparedSubmodelSrivc:
+    """A record checked and laid out for :class:`Srivc` as additive SRIVC with a single submodel.
+
+    This is how it runs in closed loop (CLSRIVC), and in open loop where steps are relaxed.
 
     Parameters
     ----------
     options : Srivc
         The estimator.
     record : Record
-        The record, with its loop.
+        The record, with its loop for closed-loop instruments.
     """
 
     def __init__(self, options: Srivc, record: Record) -> None:

@@ -203,45 +203,57 @@ def _loop_block(
     """Input of the noise-free loop over a block; the states of the model are left as they are for the caller's pass."""
     modes = residues.size
     order = memory.size
-    z = state[:, 0].copy()
+    z_re, z_im = state[:, 0].real.copy(), state[:, 0].imag.copy()
+    r_re, r_im = residues.real.copy(), residues.imag.copy()
+    d_re, d_im = weights[:, 0].real.copy(), weights[:, 0].imag.copy()
+    b_re, b_im = weights[:, 2].real.copy(), weights[:, 2].imag.copy()
     s = integrals.copy()
     now = np.zeros(s.size)
+    # The controller's direct part and, if the model has one without delay, the model's close an algebraic loop.
+    own = direct if shift == 0 else 0.0
+    first = numerator[0]
+    closing = 1.0 / (1.0 + first * own)
     for k in range(start, start + count):
         j = k - shift
         x = 0.0
+        before = v[j] if 0 <= j < k else 0.0
         if j >= 0:
             if fraction > 0.0:
                 for i in range(modes):
-                    z_now = part[i, 0] * z[i] + part[i, 2] * v[j]
-                    x += residues[i].real * z_now.real - residues[i].imag * z_now.imag
-                if s.size:
-                    for m in range(s.size):
-                        now[m] = s[m]
-                    _integrate(now, fraction * interval, v[j], 0.0)
-                    for m in range(s.size):
-                        x += origin[m] * now[m]
+                    z_now = part[i, 0] * complex(z_re[i], z_im[i]) + part[i, 2] * before
+                    x += r_re[i] * z_now.real - r_im[i] * z_now.imag
+                for m in range(s.size):
+                    now[m] = s[m]
+                _integrate(now, fraction * interval, before, 0.0)
+                for m in range(s.size):
+                    x += origin[m] * now[m]
             else:
                 for i in range(modes):
-                    x += residues[i].real * z[i].real - residues[i].imag * z[i].imag
+                    x += r_re[i] * z_re[i] - r_im[i] * z_im[i]
                 for m in range(s.size):
                     x += origin[m] * s[m]
             if j < k:
-                x += direct * v[j]
-        # The controller: its direct part and, if the model has one without delay, the model's close an algebraic loop.
-        own = direct if shift == 0 else 0.0
-        error = (reference[k] if at_controller else 0.0) - x
+                x += direct * before
         held = memory[0] if order else 0.0
-        wanted = held + numerator[0] * error + (0.0 if at_controller else reference[k])
-        v[k] = wanted / (1.0 + numerator[0] * own)
-        error -= own * v[k]
-        response = held + numerator[0] * error
+        if at_controller:
+            error = reference[k] - x
+            value = (held + first * error) * closing
+        else:
+            error = -x
+            value = (held + first * error + reference[k]) * closing
+        v[k] = value
+        if j >= 0:
+            driven = value if j == k else before
+            for i in range(modes):
+                re = z_re[i]
+                z_re[i] = (d_re[i] * re - d_im[i] * z_im[i]) + b_re[i] * driven
+                z_im[i] = (d_re[i] * z_im[i] + d_im[i] * re) + b_im[i] * driven
+            _integrate(s, interval, driven, 0.0)
+        error -= own * value
+        response = held + first * error
         for m in range(order):
             following = memory[m + 1] if m + 1 < order else 0.0
             memory[m] = numerator[m + 1] * error - denominator[m + 1] * response + following
-        if j >= 0:
-            for i in range(modes):
-                z[i] = weights[i, 0] * z[i] + weights[i, 2] * v[j]
-            _integrate(s, interval, v[j], 0.0)
 
 
 @njit(cache=True, nogil=True)

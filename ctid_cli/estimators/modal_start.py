@@ -1,0 +1,382 @@
+r"""A start for the estimation of a sum of submodels, from the record alone.
+
+Several sets of poles are found in two ways: mode by mode in the spectra of the record
+(:mod:`ctid_cli.estimators.pole_relocation`), and as those of one transfer function with some poles to spare. Each set
+is shared out among the terms. For given poles the output is linear in the numerators, which least squares on the output
+error supplies; the set whose output errors are least, each band of frequencies compared with its own noise level, wins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations, islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators.common import check_record
+from ctid_cli.estimators.pole_relocation import (
+    Lines,
+    find_poles,
+    local_weights,
+    relocate,
+    residual_weights,
+    spectral_lines,
+)
+from ctid_cli.estimators.problems import CoefficientProblem, least_squares_start, refit_numerator
+from ctid_cli.estimators.refined_iv import iterate
+from ctid_cli.filtering.bank import FilterData, filter_data
+from ctid_cli.filtering.free_response import free_response, free_response_size
+from ctid_cli.filtering.submodels import SubmodelFilter
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.signals.record import Record
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+#: Poles of the transfer function beyond those of the terms, for noise and modes that were not asked for.
+SPARE_POLES = 2
+#: The greatest order of a transfer function that is fitted.
+HIGHEST_ORDER = 12
+#: Cut-offs of the state-variable filter, how many of their estimates are refined, and steps of the refinement.
+CUTOFFS = 6
+REFINED = 3
+REFINEMENT_STEPS = 10
+REFINEMENT_TOLERANCE = 1e-4
+#: Ways of sharing poles out among terms of different structure that are tried.
+MOST_ARRANGEMENTS = 24
+#: Frequencies of a periodogram that share one noise level.
+BAND = 16
+#: A free response must lower the criterion by this many times what its parameters cost in Schwarz's criterion.
+DECISIVE = 2.0
+#: A complex pair that must give two real poles gives them this factor below and above its magnitude.
+SPLIT = 1.25
+
+
+@dataclass(frozen=True, eq=False)
+class ModalStart:
+    """Where the estimation of a sum of submodels may start.
+
+    Parameters
+    ----------
+    model : AdditiveModel
+        Stable but for its integrators, in the order of the terms; those of equal structure by rising natural frequency.
+    method : str
+        How it was found, in a sentence or two.
+    """
+
+    model: AdditiveModel
+    method: str
+
+
+def automatic_start(record: Record, terms: Sequence[Term], delay: float = 0.0) -> ModalStart:
+    r"""Find a start for a sum of submodels.
+
+    Parameters
+    ----------
+    record : Record
+        The record, from open or closed loop, on any clock, at rest or not at its first sample.
+    terms : sequence of Term
+        Structure of the submodels; integrators in one of them at most.
+    delay : float, default 0.0
+        Known delay [s].
+
+    Returns
+    -------
+    ModalStart
+        The start and how it was found.
+
+    Raises
+    ------
+    DataError
+        If the record has too few samples, or no poles can be found in it.
+
+    Notes
+    -----
+    Sets of poles are compared by
+
+    .. math:: J = 2 \sum_b n_b \log \frac{1}{n_b} \sum_{k \in b} |E_k|^2,
+
+    where E is the discrete Fourier transform of the output error and b runs over bands of :math:`n_b` neighbouring
+    frequencies: twice the negative logarithm of the likelihood for noise of an unknown level in each band. The plain
+    output error would prefer a mode that follows a few lines of strong coloured noise to a weak one where noise is low.
+
+    Where the record clearly does not start at rest the numerators are fitted together with a free response. In closed
+    loop the measured input is taken as it is: that biases the numbers a little, which a start may be.
+
+    It fails for modes slower than the record or hidden in the noise, and for two modes that no frequency separates.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli.filtering import simulate_additive
+    >>> from ctid_cli.signals import HeldSignal
+    >>> system = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
+    >>> t = 0.05 * np.arange(1000)
+    >>> u = HeldSignal(t, np.random.default_rng(1).standard_normal(1000))
+    >>> start = automatic_start(Record(t, simulate_additive(system, u, t), u), system.terms)
+    >>> start.model.theta.round(2)
+    array([0.25 , 0.25 , 3.   , 0.01 , 0.02, 1.   ])
+    """
+    structure = tuple(terms)
+    where = f"{record.name}: " if record.name else ""
+    if not structure:
+        raise ValueError("terms must list at least one submodel")
+    data = filter_data(record, delay)
+    check_record(record, data, sum(term.size for term in structure))
+    fitter = _NumeratorFit(data, structure, delay)
+    best: _Fitted | None = None
+    method = ""
+    sets = list(_pole_sets(record, fitter))
+    for way, poles in sets:
+        for groups in islice(_arrangements(poles, structure), MOST_ARRANGEMENTS):
+            fitted = fitter.fit(groups)
+            if fitted is not None and (best is None or fitted.criterion < best.criterion):
+                best, method = fitted, way
+    if best is None:
+        raise DataError(
+            f"{where}no start was found: {data.count} samples show no modes of the structure asked for; take a longer "
+            "record, fewer poles, or give the start"
+        )
+    text = f"{method}; numerators by least squares on the output error; the best of {len(sets)} sets of poles."
+    if best.free:
+        text += " The record does not start at rest: a free response was fitted along with the numerators."
+    return ModalStart(best.model, text)
+
+
+def _pole_sets(record: Record, fitter: _NumeratorFit) -> Iterator[tuple[str, list[complex]]]:
+    """Candidates for all poles but the integrators, one of each conjugate pair, and how they were found."""
+    terms, delay = fitter.terms, fitter.delay
+    pairs, reals = sum(term.poles // 2 for term in terms), sum(term.poles % 2 for term in terms)
+    integrators = sum(term.integrators for term in terms)
+    n = 2 * pairs + reals
+    if n == 0:
+        yield "No poles to be found", []
+        return
+    lines = spectral_lines(record, delay, integrators, any(term.zeros == term.order for term in terms))
+    # Real and imaginary part of each line for numerators, transients and poles.
+    if lines is not None and 2 * lines.frequencies.size > 3 * n + 2 * integrators + 1:
+        for way, weighted in (("", lines), (", weighted by local noise levels", lines.weighted(local_weights(lines)))):
+            poles = find_poles(weighted, pairs, reals)
+            poles = relocate(lines.weighted(residual_weights(weighted, poles)), poles, 6)
+            yield f"Poles from the spectra of the record, mode by mode{way}", poles
+    order = min(n + integrators + SPARE_POLES, HIGHEST_ORDER)
+    if order >= n + integrators:
+        found = _transfer_function_poles(fitter.data, order, delay)
+        if found is not None:
+            yield f"Poles from a transfer function of order {order}", fitter.reduced(found, n)
+
+
+# --- poles of one transfer function ----------------------------------------------------------------
+
+
+def _transfer_function_poles(data: FilterData, order: int, delay: float) -> list[complex] | None:
+    """Poles of the best of a few refined fits; None if there are too few samples or all equations are singular."""
+    structure = Structure(order, order - 1)
+    if data.count <= structure.size:
+        return None
+    problem = CoefficientProblem(data, structure, delay)
+    duration = float(data.t[-1] - data.t[0])
+    fastest = 0.5 * np.pi / float(np.median(np.diff(data.t)))
+    starts: list[tuple[float, Array]] = []
+    for cutoff in np.geomspace(min(4.0 * np.pi / duration, fastest), fastest, CUTOFFS):
+        theta = least_squares_start(data, structure, delay, float(cutoff))
+        if theta is None:
+            continue
+        theta = refit_numerator(data, structure, theta, delay)
+        equations = problem.equations(theta)
+        if equations is not None:
+            starts.append((equations.squared_error, theta))
+    refined: list[tuple[float, Array]] = []
+    for _, theta in sorted(starts, key=lambda start: start[0])[:REFINED]:
+        result = iterate(
+            problem, theta, max_iterations=REFINEMENT_STEPS, tolerance=REFINEMENT_TOLERANCE, variant="guarded"
+        )
+        if result is not None:
+            refined.append((result.equations.squared_error, result.theta))
+    if not refined:
+        return None
+    theta = min(refined, key=lambda found: found[0])[1]
+    roots = np.roots(np.concatenate(([1.0], theta[:order])))
+    return [complex(root) for root in roots if root.imag >= 0 and root.real < 0]
+
+
+# --- poles to terms --------------------------------------------------------------------------------
+
+
+def _size(poles: Sequence[complex]) -> int:
+    """Number of poles, conjugates counted."""
+    return sum(2 if pole.imag else 1 for pole in poles)
+
+
+def _arrangements(poles: Sequence[complex], terms: Sequence[Term]) -> Iterator[list[list[complex]]]:
+    """Ways of giving each term its poles, conjugates not listed.
+
+    Complex pairs beyond the room of the terms become real poles, and real poles that are left over fill pairs as
+    neighbours. Groups go to the terms by rising frequency, in every order of the different structures.
+    """
+    pairs = sorted((pole for pole in poles if pole.imag), key=abs)
+    reals = sorted((pole for pole in poles if not pole.imag), key=abs)
+    single = sum(term.poles % 2 for term in terms)
+    room = sum(term.poles // 2 for term in terms)
+    while len(pairs) > room:
+        # The best damped pair is nearest to two real poles.
+        pole = pairs.pop(int(np.argmax([-pole.real / abs(pole) for pole in pairs])))
+        reals = sorted([*reals, complex(-abs(pole) / SPLIT), complex(-abs(pole) * SPLIT)], key=abs)
+    if len(reals) < single or len(reals) != single + 2 * (room - len(pairs)):
+        return
+    for alone in combinations(range(len(reals)), single):
+        rest = [pole for k, pole in enumerate(reals) if k not in alone]
+        doubles = [[pole] for pole in pairs] + [rest[k : k + 2] for k in range(0, len(rest), 2)]
+        doubles.sort(key=lambda group: abs(group[0]))
+        for order in _distinct_orders(terms):
+            two, one = iter(doubles), iter([reals[k] for k in alone])
+            groups: list[list[complex]] = [[] for _ in terms]
+            for k in order:
+                for _ in range(terms[k].poles // 2):
+                    groups[k] += next(two)
+                if terms[k].poles % 2:
+                    groups[k].append(next(one))
+            yield groups
+
+
+def _distinct_orders(terms: Sequence[Term]) -> Iterator[list[int]]:
+    """Orders of the terms that differ in structure; equal terms keep theirs."""
+    if not terms:
+        yield []
+        return
+    seen: set[Term] = set()
+
+    def extended(left: list[int]) -> Iterator[list[int]]:
+        if not left:
+            yield []
+        used: set[Term] = set()
+        for k in left:
+            if terms[k] not in used:
+                used.add(terms[k])
+                for rest in extended([j for j in left if j != k]):
+                    yield [k, *rest]
+
+    del seen
+    yield from extended(list(range(len(terms))))
+
+
+# --- numerators ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """A model with fitted numerators, what it is judged by, and whether a free response was fitted too."""
+
+    model: AdditiveModel
+    criterion: float
+    free: bool
+
+
+class _NumeratorFit:
+    """Numerators for given poles, by linear least squares on the output error."""
+
+    def __init__(self, data: FilterData, terms: tuple[Term, ...], delay: float) -> None:
+        self.data, self.terms, self.delay = data, terms, delay
+
+    def fit(self, groups: Sequence[Sequence[complex]]) -> _Fitted | None:
+        """Fit with given poles of each term; None where they give no valid model or no finite response."""
+        trial = _with_poles(groups, self.terms, self.delay)
+        columns = None if trial is None else self._columns(trial)
+        if trial is None or columns is None:
+            return None
+        forced, transient = columns
+        theta, y = trial.theta, self.data.y_used
+        numerators = _numerator_places(self.terms)
+        gains = _least_squares(forced, y)
+        best = criterion = _criterion(y - forced @ gains)
+        both = np.hstack((forced, transient))
+        if y.size > both.shape[1]:
+            along = _least_squares(both, y)
+            cost = DECISIVE * transient.shape[1] * np.log(y.size)
+            best = min(criterion, _criterion(y - both @ along) + cost)
+            if best < criterion:
+                gains = along[: gains.size]
+        theta[numerators] = gains
+        try:
+            return _Fitted(AdditiveModel.from_theta(theta, self.terms, self.delay), best, best < criterion)
+        except DataError:
+            return None
+
+    def reduced(self, poles: Sequence[complex], count: int) -> list[complex]:
+        """The poles without which the output error would rise most, in all ``count``, conjugates counted."""
+        kept = list(poles)
+        integrators = tuple(term for term in self.terms if not term.poles) + tuple(
+            Term(0, term.integrators, term.integrators) for term in self.terms if term.poles and term.integrators
+        )
+        while _size(kept) > count:
+            smaller = [kept[:k] + kept[k + 1 :] for k in range(len(kept))]
+            smaller = [poles for poles in smaller if _size(poles) >= count]
+            if not smaller:
+                # One pole too many and only pairs: the best damped one makes room for a real pole.
+                k = int(np.argmax([-pole.real / abs(pole) for pole in kept]))
+                kept[k] = complex(-abs(kept[k]))
+                continue
+            kept = min(smaller, key=lambda poles: self._criterion_of(poles, integrators))
+        return kept
+
+    def _criterion_of(self, poles: Sequence[complex], others: tuple[Term, ...]) -> float:
+        terms = tuple(Term(2, 1) if pole.imag else Term(1, 0) for pole in poles)
+        groups = [[pole] for pole in poles]
+        fitter = _NumeratorFit(self.data, terms + others, self.delay)
+        fitted = fitter.fit(groups + [[] for _ in others])
+        return np.inf if fitted is None else fitted.criterion
+
+    def _columns(self, model: AdditiveModel) -> tuple[Array, Array] | None:
+        """What each numerator coefficient and each initial condition contributes to the output."""
+        rows = SubmodelFilter(self.data, self.terms, self.delay).rows(model.theta)
+        if rows is None or not np.isfinite(rows[0]).all():
+            return None
+        elapsed = np.maximum(self.data.t - self.data.t[0] - self.delay, 0.0)
+        free = free_response(model.theta, np.zeros(free_response_size(self.terms)), self.terms, elapsed)
+        if free is None:
+            return None
+        return rows[0][:, _numerator_places(self.terms)], free[2][self.data.use]
+
+
+def _with_poles(groups: Sequence[Sequence[complex]], terms: Sequence[Term], delay: float) -> AdditiveModel | None:
+    """Model with given poles and numerators 1; None if two terms share a pole."""
+    submodels = []
+    for poles, term in zip(groups, terms, strict=True):
+        conjugates = [pole.conjugate() for pole in poles if pole.imag]
+        denominator = np.real(np.poly([*poles, *conjugates])) if poles else np.ones(1)
+        numerator = np.zeros(term.zeros + 1)
+        numerator[-1] = denominator[-1]
+        submodels.append(Submodel(numerator, denominator, term.integrators))
+    try:
+        return AdditiveModel(submodels, delay)
+    except DataError:
+        return None
+
+
+def _numerator_places(terms: Sequence[Term]) -> NDArray[np.intp]:
+    """Places of the numerators' coefficients in theta."""
+    flags = [k >= term.poles for term in terms for k in range(term.size)]
+    return np.flatnonzero(flags)
+
+
+def _least_squares(columns: Array, y: Array) -> Array:
+    norms = np.linalg.norm(columns, axis=0)
+    norms = np.where(norms > 0, norms, 1.0)
+    return np.asarray(np.linalg.lstsq(columns / norms, y, rcond=None)[0] / norms)
+
+
+def _criterion(error: Array) -> float:
+    """The criterion J of :func:`automatic_start`."""
+    power = np.abs(np.fft.rfft(error)) ** 2
+    edges = BAND * np.arange(max(power.size // BAND, 1))
+    counts = np.diff(np.append(edges, power.size))
+    means = np.add.reduceat(power, edges) / counts
+    floor = np.finfo(float).tiny
+    return float(2.0 * counts @ np.log(np.maximum(means, floor)))
+
+
+__all__ = ["Lines", "ModalStart", "automatic_start"]
