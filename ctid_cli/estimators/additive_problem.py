@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -181,7 +183,7 @@ class AdditiveProblem:
         return whole.denominator, whole.numerator, whole.delay
 
     def admissible(self, theta: Array) -> Array:
-        """Reflect unstable submodels; the static gains stay.
+        """Reflect unstable submodels.
 
         Parameters
         ----------
@@ -192,6 +194,12 @@ class AdditiveProblem:
         -------
         ndarray, shape (p,)
             Parameters of stable submodels; unchanged where they are stable or not finite.
+
+        Notes
+        -----
+        A real pole that changes sides changes the sign of the response either below its frequency or above it. What the
+        record shows must keep its sign: a pole in the lower half of the record's frequencies (in octaves, from one
+        period in the record to two samples) keeps the gain above itself, any other the static gain.
         """
         if not np.isfinite(theta).all():
             return theta
@@ -206,8 +214,23 @@ class AdditiveProblem:
                     stable = reflect_unstable(monic)
                     result = result.copy() if result is theta else result
                     result[offset : offset + n] = stable[-2::-1] / stable[-1]
+                    if self._changes_sign(monic):
+                        result[offset + n : offset + term.size] *= -1.0
             offset += term.size
         return result
+
+    def _changes_sign(self, denominator: Array) -> bool:
+        """Whether the gain above an odd number of slow poles is to be kept by changing the sign of the numerator."""
+        roots = np.roots(denominator)
+        slow = (roots.imag == 0.0) & (roots.real > 0.0) & (np.abs(roots) < self._middle_frequency)
+        return bool(np.count_nonzero(slow) % 2)
+
+    @cached_property
+    def _middle_frequency(self) -> float:
+        """Geometric mean of the lowest and the highest frequency of the record [rad/s]."""
+        t = self.data.t
+        duration = float(t[-1] - t[0])
+        return math.pi * math.sqrt(2.0 * (t.size - 1)) / duration
 
     def equations(self, theta: Array) -> Equations | None:
         """Second moments of the iteration.

@@ -184,7 +184,8 @@ class AdditiveSrivc:
         record : Record
             The record.
         start : Start, optional
-            ``start.model`` has the degrees of the terms; without it a start is found from the record.
+            ``start.model`` has the degrees of the terms, and its delay is not used; without it a start is found from
+            the record.
 
         Returns
         -------
@@ -239,14 +240,14 @@ class PreparedAdditiveSrivc:
         loop = loop_data(record, options.instruments)
         # A record of one period has an input before its first sample: the same one.
         data = filter_data(record, 0.0 if options.initial_state == "periodic" else options.delay, options.hold_output)
-        self.problem = AdditiveProblem(data, options.terms, options.delay, loop, options.initial_state)
-        check_record(record, data, self.problem.size + self.problem.filter.free)
         if options.initial_state == "periodic" and (data.interval is None or not record.valid.all()):
             where = f"{record.name}: " if record.name else ""
             raise DataError(
                 f"{where}one period of a steady state must be sampled on one regular clock without missing samples; "
                 "use initial_state 'estimated'"
             )
+        self.problem = AdditiveProblem(data, options.terms, options.delay, loop, options.initial_state)
+        check_record(record, data, self.problem.size + self.problem.filter.free)
         self._automatic: tuple[AdditiveModel, str] | None = None
 
     def fit(self, start: Start | None = None) -> AdditiveFit:
@@ -255,7 +256,8 @@ class PreparedAdditiveSrivc:
         Parameters
         ----------
         start : Start, optional
-            ``start.model`` has the degrees of the terms; without it a start is found from the record.
+            ``start.model`` has the degrees of the terms, and its delay is not used; without it a start is found from
+            the record.
 
         Returns
         -------

@@ -26,7 +26,7 @@ from ctid_cli.estimators.pole_relocation import (
     spectral_lines,
 )
 from ctid_cli.estimators.problems import CoefficientProblem, least_squares_start, refit_numerator
-from ctid_cli.estimators.refined_iv import iterate
+from ctid_cli.estimators.refined_iv import iterate, scaled_solve
 from ctid_cli.filtering.bank import FilterData, filter_data
 from ctid_cli.filtering.free_response import free_response, free_response_size
 from ctid_cli.filtering.submodels import SubmodelFilter
@@ -37,6 +37,10 @@ from ctid_cli.signals.record import Record
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+#: Noise levels within this factor of each other are not worth a second search with other weights.
+NEARLY_WHITE = 2.0
+#: Moves of the poles found, with the noise levels of what they leave.
+WEIGHTED_MOVES = 6
 #: Poles of the transfer function beyond those of the terms, for noise and modes that were not asked for.
 SPARE_POLES = 2
 #: The greatest order of a transfer function that is fitted.
@@ -45,6 +49,7 @@ HIGHEST_ORDER = 12
 CUTOFFS = 6
 REFINED = 3
 REFINEMENT_STEPS = 10
+REFINEMENT_HALVINGS = 4
 REFINEMENT_TOLERANCE = 1e-4
 #: Ways of sharing poles out among terms of different structure that are tried.
 MOST_ARRANGEMENTS = 24
@@ -122,9 +127,14 @@ def automatic_start(record: Record, terms: Sequence[Term], delay: float = 0.0) -
     array([0.25 , 0.25 , 3.   , 0.01 , 0.02, 1.   ])
     """
     structure = tuple(terms)
-    where = f"{record.name}: " if record.name else ""
     if not structure:
-        raise ValueError("terms must list at least one submodel")
+        raise ValueError("terms must list at least one submodel, for example (Term(poles=2, zeros=0),)")
+    # Any distinct poles: a structure that determines no parameters is refused before the search.
+    _with_poles(
+        [[complex(-k - j / 100) for j in range(1, term.poles + 1)] for k, term in enumerate(structure)],
+        structure,
+        delay,
+    )
     data = filter_data(record, delay)
     check_record(record, data, sum(term.size for term in structure))
     fitter = _NumeratorFit(data, structure, delay)
@@ -137,6 +147,7 @@ def automatic_start(record: Record, terms: Sequence[Term], delay: float = 0.0) -
             if fitted is not None and (best is None or fitted.criterion < best.criterion):
                 best, method = fitted, way
     if best is None:
+        where = f"{record.name}: " if record.name else ""
         raise DataError(
             f"{where}no start was found: {data.count} samples show no modes of the structure asked for; take a longer "
             "record, fewer poles, or give the start"
@@ -159,15 +170,22 @@ def _pole_sets(record: Record, fitter: _NumeratorFit) -> Iterator[tuple[str, lis
     lines = spectral_lines(record, delay, integrators, any(term.zeros == term.order for term in terms))
     # Real and imaginary part of each line for numerators, transients and poles.
     if lines is not None and 2 * lines.frequencies.size > 3 * n + 2 * integrators + 1:
-        for way, weighted in (("", lines), (", weighted by local noise levels", lines.weighted(local_weights(lines)))):
-            poles = find_poles(weighted, pairs, reals)
-            poles = relocate(lines.weighted(residual_weights(weighted, poles)), poles, 6)
-            yield f"Poles from the spectra of the record, mode by mode{way}", poles
+        yield "Poles from the spectra of the record, mode by mode", _spectral_poles(lines, pairs, reals)
+        weights = local_weights(lines)
+        if weights.max() > NEARLY_WHITE * weights.min():
+            poles = _spectral_poles(lines.weighted(weights), pairs, reals)
+            yield "Poles from the spectra of the record, mode by mode, weighted by local noise levels", poles
     order = min(n + integrators + SPARE_POLES, HIGHEST_ORDER)
     if order >= n + integrators:
         found = _transfer_function_poles(fitter.data, order, delay)
         if found is not None:
             yield f"Poles from a transfer function of order {order}", fitter.reduced(found, n)
+
+
+def _spectral_poles(lines: Lines, pairs: int, reals: int) -> list[complex]:
+    """Poles found with the weights of the lines, then moved with those that their residual asks for."""
+    poles = find_poles(lines, pairs, reals)
+    return relocate(lines.weighted(residual_weights(lines, poles)), poles, WEIGHTED_MOVES)
 
 
 # --- poles of one transfer function ----------------------------------------------------------------
@@ -193,7 +211,12 @@ def _transfer_function_poles(data: FilterData, order: int, delay: float) -> list
     refined: list[tuple[float, Array]] = []
     for _, theta in sorted(starts, key=lambda start: start[0])[:REFINED]:
         result = iterate(
-            problem, theta, max_iterations=REFINEMENT_STEPS, tolerance=REFINEMENT_TOLERANCE, variant="guarded"
+            problem,
+            theta,
+            max_iterations=REFINEMENT_STEPS,
+            tolerance=REFINEMENT_TOLERANCE,
+            variant="guarded",
+            halvings=REFINEMENT_HALVINGS,
         )
         if result is not None:
             refined.append((result.equations.squared_error, result.theta))
@@ -248,7 +271,6 @@ def _distinct_orders(terms: Sequence[Term]) -> Iterator[list[int]]:
     if not terms:
         yield []
         return
-    seen: set[Term] = set()
 
     def extended(left: list[int]) -> Iterator[list[int]]:
         if not left:
@@ -260,7 +282,6 @@ def _distinct_orders(terms: Sequence[Term]) -> Iterator[list[int]]:
                 for rest in extended([j for j in left if j != k]):
                     yield [k, *rest]
 
-    del seen
     yield from extended(list(range(len(terms))))
 
 
@@ -284,66 +305,101 @@ class _NumeratorFit:
 
     def fit(self, groups: Sequence[Sequence[complex]]) -> _Fitted | None:
         """Fit with given poles of each term; None where they give no valid model or no finite response."""
-        trial = _with_poles(groups, self.terms, self.delay)
-        columns = None if trial is None else self._columns(trial)
-        if trial is None or columns is None:
-            return None
-        forced, transient = columns
-        theta, y = trial.theta, self.data.y_used
-        numerators = _numerator_places(self.terms)
-        gains = _least_squares(forced, y)
-        best = criterion = _criterion(y - forced @ gains)
-        both = np.hstack((forced, transient))
-        if y.size > both.shape[1]:
-            along = _least_squares(both, y)
-            cost = DECISIVE * transient.shape[1] * np.log(y.size)
-            best = min(criterion, _criterion(y - both @ along) + cost)
-            if best < criterion:
-                gains = along[: gains.size]
-        theta[numerators] = gains
         try:
-            return _Fitted(AdditiveModel.from_theta(theta, self.terms, self.delay), best, best < criterion)
+            model = _with_poles(groups, self.terms, self.delay)
         except DataError:
             return None
+        responses = _responses(self.data, model)
+        found = None if responses is None else responses.fit(self.data.y_used)
+        if found is None:
+            return None
+        gains, criterion, free = found
+        theta = model.theta
+        theta[_numerator_places(self.terms)] = gains
+        return _Fitted(AdditiveModel.from_theta(theta, self.terms, self.delay), criterion, free)
 
     def reduced(self, poles: Sequence[complex], count: int) -> list[complex]:
         """The poles without which the output error would rise most, in all ``count``, conjugates counted."""
         kept = list(poles)
-        integrators = tuple(term for term in self.terms if not term.poles) + tuple(
-            Term(0, term.integrators, term.integrators) for term in self.terms if term.poles and term.integrators
-        )
-        while _size(kept) > count:
-            smaller = [kept[:k] + kept[k + 1 :] for k in range(len(kept))]
-            smaller = [poles for poles in smaller if _size(poles) >= count]
-            if not smaller:
+        terms = [Term(2, 1) if pole.imag else Term(1, 0) for pole in kept]
+        integrators = sum(term.integrators for term in self.terms)
+        if integrators:
+            terms.append(Term(0, integrators - 1, integrators))
+        if any(term.zeros == term.order for term in self.terms):
+            terms.append(Term(0, 0))
+        groups = [[pole] for pole in kept] + [[] for _ in terms[len(kept) :]]
+        try:
+            responses = _responses(self.data, _with_poles(groups, terms, self.delay))
+        except DataError:
+            responses = None
+        places = list(range(len(kept)))
+
+        def criterion(left_out: int) -> float:
+            used = [k for k in range(len(terms)) if k >= len(kept) or (k in places and k != left_out)]
+            found = None if responses is None else responses.of(used).fit(self.data.y_used)
+            return np.inf if found is None else found[1]
+
+        while (size := _size([kept[k] for k in places])) > count:
+            possible = [k for k in places if size - _size([kept[k]]) >= count]
+            if not possible:
                 # One pole too many and only pairs: the best damped one makes room for a real pole.
-                k = int(np.argmax([-pole.real / abs(pole) for pole in kept]))
+                k = max(places, key=lambda k: -kept[k].real / abs(kept[k]))
                 kept[k] = complex(-abs(kept[k]))
                 continue
-            kept = min(smaller, key=lambda poles: self._criterion_of(poles, integrators))
-        return kept
-
-    def _criterion_of(self, poles: Sequence[complex], others: tuple[Term, ...]) -> float:
-        terms = tuple(Term(2, 1) if pole.imag else Term(1, 0) for pole in poles)
-        groups = [[pole] for pole in poles]
-        fitter = _NumeratorFit(self.data, terms + others, self.delay)
-        fitted = fitter.fit(groups + [[] for _ in others])
-        return np.inf if fitted is None else fitted.criterion
-
-    def _columns(self, model: AdditiveModel) -> tuple[Array, Array] | None:
-        """What each numerator coefficient and each initial condition contributes to the output."""
-        rows = SubmodelFilter(self.data, self.terms, self.delay).rows(model.theta)
-        if rows is None or not np.isfinite(rows[0]).all():
-            return None
-        elapsed = np.maximum(self.data.t - self.data.t[0] - self.delay, 0.0)
-        free = free_response(model.theta, np.zeros(free_response_size(self.terms)), self.terms, elapsed)
-        if free is None:
-            return None
-        return rows[0][:, _numerator_places(self.terms)], free[2][self.data.use]
+            places.remove(min(possible, key=criterion))
+        return [kept[k] for k in places]
 
 
-def _with_poles(groups: Sequence[Sequence[complex]], terms: Sequence[Term], delay: float) -> AdditiveModel | None:
-    """Model with given poles and numerators 1; None if two terms share a pole."""
+@dataclass(frozen=True, eq=False)
+class _Responses:
+    """What each numerator coefficient and each initial condition contributes to the output, and whose they are."""
+
+    forced: Array
+    free: Array
+    forced_owner: NDArray[np.intp]
+    free_owner: NDArray[np.intp]
+
+    def of(self, owners: Sequence[int]) -> _Responses:
+        """Those of some submodels."""
+        forced, free = np.isin(self.forced_owner, owners), np.isin(self.free_owner, owners)
+        return _Responses(self.forced[:, forced], self.free[:, free], self.forced_owner[forced], self.free_owner[free])
+
+    def fit(self, y: Array) -> tuple[Array, float, bool] | None:
+        """Numerators, criterion, and whether free responses are worth their parameters; None if all is singular."""
+        best: tuple[Array, float, bool] | None = None
+        for free, columns in ((False, self.forced), (True, np.hstack((self.forced, self.free)))):
+            gram = columns.T @ columns
+            scales = np.diag(gram)
+            solution = scaled_solve(gram, columns.T @ y, scales, scales) if y.size > scales.size else None
+            if solution is None:
+                continue
+            criterion = _criterion(y - columns @ solution) + DECISIVE * free * self.free.shape[1] * np.log(y.size)
+            if best is None or criterion < best[1]:
+                best = solution[: self.forced.shape[1]], criterion, free
+        return best
+
+
+def _responses(data: FilterData, model: AdditiveModel) -> _Responses | None:
+    """Responses of a model's submodels; None where one is not finite."""
+    terms = model.terms
+    rows = SubmodelFilter(data, terms, model.delay).rows(model.theta)
+    if rows is None or not np.isfinite(rows[0]).all():
+        return None
+    # Before the delayed input begins, which is where used samples do, nothing is known of the state.
+    elapsed = np.maximum(data.t - data.t[data.use][0], 0.0)
+    response = free_response(model.theta, np.zeros(free_response_size(terms)), terms, elapsed)
+    if response is None:
+        return None
+    return _Responses(
+        rows[0][:, _numerator_places(terms)],
+        response[2][data.use],
+        np.repeat(np.arange(len(terms)), [term.zeros + 1 for term in terms]),
+        np.repeat(np.arange(len(terms)), [term.order for term in terms]),
+    )
+
+
+def _with_poles(groups: Sequence[Sequence[complex]], terms: Sequence[Term], delay: float) -> AdditiveModel:
+    """Model with given poles and numerators 1; DataError if two terms share a pole."""
     submodels = []
     for poles, term in zip(groups, terms, strict=True):
         conjugates = [pole.conjugate() for pole in poles if pole.imag]
@@ -351,22 +407,13 @@ def _with_poles(groups: Sequence[Sequence[complex]], terms: Sequence[Term], dela
         numerator = np.zeros(term.zeros + 1)
         numerator[-1] = denominator[-1]
         submodels.append(Submodel(numerator, denominator, term.integrators))
-    try:
-        return AdditiveModel(submodels, delay)
-    except DataError:
-        return None
+    return AdditiveModel(submodels, delay)
 
 
 def _numerator_places(terms: Sequence[Term]) -> NDArray[np.intp]:
     """Places of the numerators' coefficients in theta."""
     flags = [k >= term.poles for term in terms for k in range(term.size)]
     return np.flatnonzero(flags)
-
-
-def _least_squares(columns: Array, y: Array) -> Array:
-    norms = np.linalg.norm(columns, axis=0)
-    norms = np.where(norms > 0, norms, 1.0)
-    return np.asarray(np.linalg.lstsq(columns / norms, y, rcond=None)[0] / norms)
 
 
 def _criterion(error: Array) -> float:
@@ -379,4 +426,4 @@ def _criterion(error: Array) -> float:
     return float(2.0 * counts @ np.log(np.maximum(means, floor)))
 
 
-__all__ = ["Lines", "ModalStart", "automatic_start"]
+__all__ = ["ModalStart", "automatic_start"]

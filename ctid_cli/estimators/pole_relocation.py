@@ -46,13 +46,16 @@ MOVES_BETWEEN = 4
 MOVES_AT_THE_END = 15
 #: Poles are settled when none moves by more than this fraction of its magnitude.
 SETTLED = 1e-4
-#: Peaks that are tried at each resolution, and dampings as fractions of its width.
+#: Peaks at each resolution, how many of all are tried, and with which dampings as fractions of their width.
 PEAKS = 3
+MOST_PEAKS = 10
 DAMPINGS = (0.15, 0.5)
 #: Real poles that are tried, spread over the band.
 REAL_POLES = 25
 #: Directions of a Gram matrix weaker than this fraction of the strongest are rounding.
 RANK_TOLERANCE = 1e-14
+#: Gram matrices up to this condition number leave rounding without a second round.
+WELL_CONDITIONED = 1e4
 #: Least damping ratio of a moved pole [-].
 LEAST_DAMPING = 1e-6
 
@@ -85,7 +88,7 @@ class Lines:
     @property
     def s(self) -> ComplexArray:
         """``j w`` [rad/s]."""
-        return 1j * self.frequencies
+        return np.asarray(1j * self.frequencies, dtype=np.complex128)
 
     def weighted(self, weights: Array) -> Lines:
         """The same lines with other weights.
@@ -163,8 +166,10 @@ def local_weights(lines: Lines) -> Array:
     Returns
     -------
     ndarray, shape (K,)
-        Weights.
+        Weights, all one where there are too few lines to tell.
     """
+    if lines.frequencies.size < 2 * LOCAL_LINES:
+        return np.ones(lines.frequencies.size)
     edges, noise, _ = _local_fits(lines)
     return _weights(lines.frequencies, edges, _median_of_neighbours(noise))
 
@@ -308,8 +313,10 @@ def _residual(lines: Lines, poles: Sequence[complex]) -> tuple[Array, Array]:
 
 def _fixed_columns(lines: Lines) -> list[ComplexArray]:
     """Columns without unknown poles: integrators with their transient, and a direct feed-through."""
-    powers = lines.s[:, None] ** -np.arange(1.0, lines.integrators + 1)
-    columns = [powers * lines.inputs[:, None], powers * lines.weights[:, None]] if lines.integrators else []
+    columns: list[ComplexArray] = []
+    if lines.integrators:
+        powers = np.asarray(lines.s[:, None] ** -np.arange(1.0, lines.integrators + 1), dtype=np.complex128)
+        columns += [powers * lines.inputs[:, None], powers * lines.weights[:, None]]
     return [*columns, lines.inputs[:, None]] if lines.direct else columns
 
 
@@ -322,13 +329,18 @@ def _candidates(lines: Lines, residual: ComplexArray, pairs: bool, reals: bool) 
     if not pairs:
         return found
     cross, power = residual * lines.inputs.conj(), np.abs(lines.inputs) ** 2
+    peaks: list[tuple[float, int, int]] = []
     width = 3
     while width == 3 or width <= residual.size // 2:
         explained = np.abs(_moving_sum(cross, width)) ** 2
         explained /= np.maximum(_moving_sum(power, width).real, 1e-12 * width * float(power.max()) + 1e-300)
-        for peak in _peaks(explained):
-            found += [complex(-part * width * spacing, lines.frequencies[peak]) for part in DAMPINGS]
+        padded = np.concatenate(([-np.inf], explained, [-np.inf]))
+        maxima = np.flatnonzero((explained >= padded[:-2]) & (explained > padded[2:]))
+        highest = maxima[np.argsort(-explained[maxima])[:PEAKS]]
+        peaks += [(float(explained[k]), int(k), width) for k in highest]
         width = 2 * width - 1
+    for _, place, width in sorted(peaks, reverse=True)[:MOST_PEAKS]:
+        found += [complex(-part * width * spacing, lines.frequencies[place]) for part in DAMPINGS]
     return found
 
 
@@ -340,21 +352,14 @@ def _moving_sum(values: NDArray[np.generic], width: int) -> ComplexArray:
     return np.asarray(total[np.minimum(place + half + 1, values.size)] - total[np.maximum(place - half, 0)])
 
 
-def _peaks(values: Array) -> IndexArray:
-    """The highest local maxima."""
-    padded = np.concatenate(([-np.inf], values, [-np.inf]))
-    places = np.flatnonzero((values >= padded[:-2]) & (values > padded[2:]))
-    return places[np.argsort(-values[places])[:PEAKS]]
-
-
 def _gain(lines: Lines, residual: Array, known: Array, pole: complex) -> float:
     """By how much one more pole (pair) would lower the squared error."""
     basis = _basis(lines.s, [pole])
     columns = _stacked(np.hstack((basis * lines.inputs[:, None], basis * lines.weights[:, None])))
     columns /= _norms(columns)
-    columns -= known @ (known.T @ columns)
-    slope = columns.T @ residual
-    return float(slope @ np.linalg.lstsq(columns.T @ columns, slope, rcond=RANK_TOLERANCE)[0])
+    along = known.T @ columns
+    gram, slope = columns.T @ columns - along.T @ along, columns.T @ residual
+    return float(slope @ np.linalg.lstsq(gram, slope, rcond=RANK_TOLERANCE)[0])
 
 
 def _basis(s: ComplexArray, poles: Sequence[complex]) -> ComplexArray:
@@ -380,21 +385,23 @@ def _complex(stacked: Array) -> ComplexArray:
 
 
 def _norms(columns: Array) -> Array:
-    norms: Array = np.linalg.norm(columns, axis=0)
+    norms: Array = np.sqrt(np.einsum("ij,ij->j", columns, columns))
     return np.where(norms > 0, norms, 1.0)
 
 
 def _orthonormal(columns: Array) -> Array:
     """Orthonormal basis; columns are scaled first, since those of high powers of a frequency would drown others."""
-    # Many rows and few columns: Gram matrices are several times faster than Householder's reflections, and a second
-    # round makes up for their rounding.
-    return _nearly_orthonormal(_nearly_orthonormal(columns / _norms(columns)))
+    # Many rows and few columns: Gram matrices are several times faster than Householder's reflections; where rounding
+    # matters, a second round makes up for it.
+    basis, condition = _nearly_orthonormal(columns / _norms(columns))
+    return _nearly_orthonormal(basis)[0] if condition > WELL_CONDITIONED else basis
 
 
-def _nearly_orthonormal(columns: Array) -> Array:
+def _nearly_orthonormal(columns: Array) -> tuple[Array, float]:
+    """Orthonormal up to rounding times the condition number of the Gram matrix, and that number."""
     values, vectors = np.linalg.eigh(columns.T @ columns)
     kept = values > RANK_TOLERANCE * values[-1]
-    return np.asarray(columns @ (vectors[:, kept] / np.sqrt(values[kept])))
+    return columns @ (vectors[:, kept] / np.sqrt(values[kept])), float(values[-1] / values[kept][0])
 
 
 # --- noise level -----------------------------------------------------------------------------------
@@ -428,7 +435,7 @@ def _local_fits(lines: Lines) -> tuple[IndexArray, Array, Array]:
 
 
 def _median_of_neighbours(levels: Array) -> Array:
-    """Running median over five blocks: a resonance narrower than a block is no noise."""
+    """Running median over five blocks: what a resonance narrower than a block leaves is no noise."""
     if levels.size < 3:
         return levels
     padded = np.pad(levels, 2, mode="reflect")

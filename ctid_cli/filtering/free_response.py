@@ -15,8 +15,7 @@ from math import factorial
 import numpy as np
 from numpy.typing import NDArray
 
-from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, plain_array
-from ctid_cli.filtering.submodel_map import pooled_modes
+from ctid_cli.filtering.submodel_map import simple_modes
 from ctid_cli.models.additive import Term
 
 Array = NDArray[np.float64]
@@ -72,21 +71,19 @@ def free_response(
     by_theta, by_free = np.zeros((elapsed.size, theta.size)), np.zeros((elapsed.size, free.size))
     if not degrees:
         return np.zeros(elapsed.size), by_theta, by_free
-    condition, poles, _, _, origin, _, _, _, sensitivities, _, output = pooled_modes(
-        plain_array(np.concatenate(combined)), np.array(degrees, dtype=np.int64), False
-    )
-    if not condition < MODAL_CONDITION_LIMIT:
+    modes = simple_modes(np.concatenate(combined), np.array(degrees, dtype=np.int64), False)
+    if modes is None:
         return None
     singles: list[Array] = []
     doubles: list[Array] = []
-    for pole in poles:
+    for pole in modes.poles:
         response = np.exp(pole * elapsed)
         parts = [response.real, response.imag] if pole.imag else [response.real]
         singles += parts
         doubles += [elapsed * part for part in parts]
-    integrals = [elapsed**k / factorial(k) for k in range(origin.size)]
+    integrals = [elapsed**k / factorial(k) for k in range(modes.origin.size)]
     rows = np.column_stack(singles + doubles + integrals)
-    derivatives = rows @ sensitivities[:, : rows.shape[1]].T
+    derivatives = rows @ modes.instruments[:, : rows.shape[1]].T
     place, place_theta, place_free = 0, 0, 0
     for term in terms:
         if term.order:
@@ -96,4 +93,4 @@ def free_response(
             place += term.order
         place_theta += term.size
         place_free += term.order
-    return rows @ output[: rows.shape[1]], by_theta, by_free
+    return rows @ modes.output[: rows.shape[1]], by_theta, by_free

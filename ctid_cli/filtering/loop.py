@@ -29,17 +29,11 @@ NO_GAIN = 1e-12
 
 
 class LoopSignals(NamedTuple):
-    """Signals of a closed loop at the sampling instants.
+    """Signals of a closed loop at the sampling instants, each of shape (N,)."""
 
-    Parameters
-    ----------
-    u : ndarray, shape (N,)
-        Input of the model [input unit].
-    x : ndarray, shape (N,)
-        Its output without the noise [output unit].
-    """
-
+    #: Input of the model [input unit].
     u: Array
+    #: Its output without the noise [output unit].
     x: Array
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ctid_cli.filtering.bank import modal_condition, scaled_denominator
+from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, modal_condition, plain_array, scaled_denominator
 from ctid_cli.filtering.sections import polynomial_roots, time_scale
 
 Array = NDArray[np.float64]
@@ -50,7 +52,7 @@ def _add_mode(mapping: Array, row: int, column: int, paired: bool, weight: compl
         mapping[row, column] += weight.real
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def pooled_modes(
     theta: Array, degrees: IntArray, closed: bool
 ) -> tuple[float, ComplexArray, IntArray, ComplexArray, Array, int, float, int, Array, Array, Array]:
@@ -204,3 +206,54 @@ def pooled_modes(
         regressors,
         output[0].copy(),
     )
+
+
+class PooledModes(NamedTuple):
+    """Partial fractions of all submodels, see :func:`pooled_modes`."""
+
+    #: Amplification of rounding [-].
+    condition: float
+    #: Poles of all submodels, one of each pair [rad/s].
+    poles: ComplexArray
+    #: Submodel of each mode.
+    owner: IntArray
+    #: Residues of the model output.
+    residues: ComplexArray
+    #: Weights of the integrals of the input in the model output.
+    origin: Array
+    #: Submodel that integrates.
+    origin_owner: int
+    #: Direct feed-through.
+    direct: float
+    #: Submodel with direct feed-through.
+    direct_owner: int
+    #: psi from the rows of the pass, shape (p, q).
+    instruments: Array
+    #: phi from the rows of the pass, shape (p, q).
+    regressors: Array
+    #: Model output driven by z from the rows of the pass, shape (q,).
+    output: Array
+
+
+def simple_modes(theta: Array, degrees: IntArray, closed: bool) -> PooledModes | None:
+    """Partial fractions where they are well conditioned.
+
+    Parameters
+    ----------
+    theta : ndarray, shape (p,)
+        ``a_1 … a_n, b_0 … b_m`` of each submodel in turn.
+    degrees : ndarray of int, shape (K, 3)
+        Numbers of poles, zeros and integrators of each submodel.
+    closed : bool
+        Whether the rows are those of a closed loop.
+
+    Returns
+    -------
+    PooledModes or None
+        None where a submodel has (nearly) repeated poles, or its coefficients overflow.
+    """
+    try:
+        modes = PooledModes(*pooled_modes(plain_array(theta), degrees, closed))
+    except (ZeroDivisionError, np.linalg.LinAlgError):
+        return None
+    return modes if modes.condition < MODAL_CONDITION_LIMIT else None

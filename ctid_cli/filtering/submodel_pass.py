@@ -179,7 +179,7 @@ def _integrator_block(
         _integrate(states, interval, value, change)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _loop_block(
     weights: ComplexArray,
     part: ComplexArray,

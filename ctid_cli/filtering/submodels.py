@@ -16,14 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.bank import (
-    MODAL_CONDITION_LIMIT,
     FilterData,
     plain_array,
     split_delay,
@@ -31,7 +30,7 @@ from ctid_cli.filtering.bank import (
 )
 from ctid_cli.filtering.free_response import free_response, free_response_size
 from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.filtering.submodel_map import pooled_modes
+from ctid_cli.filtering.submodel_map import PooledModes, simple_modes
 from ctid_cli.filtering.submodel_pass import submodel_pass
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.controller import DiscreteController
@@ -98,33 +97,6 @@ class SubmodelMoments:
     output_power: float
 
 
-class PooledModes(NamedTuple):
-    """Partial fractions of all submodels, see :func:`ctid_cli.filtering.submodel_map.pooled_modes`."""
-
-    #: Amplification of rounding [-].
-    condition: float
-    #: Poles of all submodels, one of each pair [rad/s].
-    poles: ComplexArray
-    #: Submodel of each mode.
-    owner: IntArray
-    #: Residues of the model output.
-    residues: ComplexArray
-    #: Weights of the integrals of the input in the model output.
-    origin: Array
-    #: Submodel that integrates.
-    origin_owner: int
-    #: Direct feed-through.
-    direct: float
-    #: Submodel with direct feed-through.
-    direct_owner: int
-    #: psi from the rows of the pass, shape (p, q).
-    instruments: Array
-    #: phi from the rows of the pass, shape (p, q).
-    regressors: Array
-    #: Model output driven by z from the rows of the pass, shape (q,).
-    output: Array
-
-
 class SubmodelFilter:
     """The filters of a record for sums of submodels of one structure.
 
@@ -168,9 +140,12 @@ class SubmodelFilter:
         self.size = sum(term.size for term in terms)
         self._u = data.u
         if self.periodic:
-            assert data.interval is not None
+            if data.interval is None:
+                raise ValueError("initial_state periodic needs input and output on one regular clock")
             shift, _ = split_delay(delay, data.interval)
-            self._u = np.append(np.roll(data.u, shift), data.u[-shift % data.u.size])
+            # Two samples more: the last interval leads back to the first sample, where the next slope begins.
+            rolled = np.roll(data.u, shift)
+            self._u = np.concatenate((rolled, rolled[:2]))
 
     def moments(self, theta: Array) -> SubmodelMoments | None:
         """Second moments at one parameter vector.
@@ -185,11 +160,13 @@ class SubmodelFilter:
         SubmodelMoments or None
             The moments; None where theta describes no model, or something overflows.
         """
-        if self.free:
-            rows = self.rows(theta)
-            moments = None if rows is None else _moments_of_rows(*rows)
-        else:
-            moments = self._moments(theta)
+        # What overflows is found by the sums not being finite.
+        with np.errstate(all="ignore"):
+            if self.free:
+                rows = self.rows(theta)
+                moments = None if rows is None else _moments_of_rows(*rows)
+            else:
+                moments = self._moments(theta)
         if moments is None:
             return None
         finite = np.isfinite(moments.hessian).all() and np.isfinite(moments.instrument_regressor).all()
@@ -264,8 +241,8 @@ class SubmodelFilter:
         if data.interval is None:
             return None
         loop = self.loop
-        modes = PooledModes(*pooled_modes(plain_array(theta), self.degrees, loop.closed))
-        if not modes.condition < MODAL_CONDITION_LIMIT:
+        modes = simple_modes(theta, self.degrees, loop.closed)
+        if modes is None:
             return None
         maps = np.concatenate((modes.instruments, modes.regressors, modes.output[None]))
         width = maps.shape[1]
@@ -342,16 +319,14 @@ class SubmodelFilter:
         if self.periodic or not np.isfinite(theta).all():
             return None
         try:
-            model = AdditiveModel.from_theta(theta, self.terms, self.delay)
-        except DataError:
+            return self._composed_rows(data, AdditiveModel.from_theta(theta, self.terms, self.delay))
+        except (DataError, np.linalg.LinAlgError, ZeroDivisionError):
+            # Coefficients that make no model, or one whose response overflows.
             return None
-        source = data
-        if self.loop.closed:
-            assert data.interval is not None
-            controller = DiscreteController(self.loop.numerator, self.loop.denominator)
-            enters: Literal["controller", "input"] = "controller" if self.loop.at_controller else "input"
-            z = simulate_loop(model, controller, self.loop.reference, np.zeros(data.y.size), data.interval, enters).u
-            source = replace(data, u=plain_array(z))
+
+    def _composed_rows(self, data: FilterData, model: AdditiveModel) -> tuple[Array, Array, Array, Array]:
+        """The same, of a model."""
+        source = replace(data, u=plain_array(self._loop_input(data, model))) if self.loop.closed else data
         everywhere = replace(data, use=np.ones(data.y.size, dtype=bool))
         outputs = [self._submodel_output(everywhere, part) for part in model.submodels]
         error = data.y - np.sum(outputs, axis=0)
@@ -367,6 +342,13 @@ class SubmodelFilter:
             total += self._submodel_output(source, part)
             offset += width
         return psi, phi, error[data.use], total
+
+    def _loop_input(self, data: FilterData, model: AdditiveModel) -> Array:
+        """Input of the noise-free loop of a model."""
+        assert data.interval is not None
+        controller = DiscreteController(self.loop.numerator, self.loop.denominator)
+        enters: Literal["controller", "input"] = "controller" if self.loop.at_controller else "input"
+        return simulate_loop(model, controller, self.loop.reference, np.zeros(data.y.size), data.interval, enters).u
 
     def _submodel_output(self, data: FilterData, part: Submodel) -> Array:
         """Output of one submodel."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.models.additive import AdditiveModel, Term
-from ctid_cli.models.factoring import factored, unfactored_jacobian
+from ctid_cli.models.factoring import FactoringError, factored, unfactored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
@@ -74,6 +74,11 @@ class ParameterAccuracy:
         delays = int(self.names[-1:] == ("delay",))
         coefficients = len(self.names) - n - delays
         inverse = np.linalg.inv(unfactored_jacobian(additive))
+        if n + coefficients > inverse.shape[1]:
+            raise FactoringError(
+                "the estimated numerator has the degree of the denominator, and the true one a lower one: submodels of "
+                "the true system leave no room for a direct feedthrough"
+            )
         # Of a numerator of full length the last coefficients are estimated; the delay is the same in both forms.
         columns = np.r_[:n, inverse.shape[1] - coefficients : inverse.shape[1]]
         size = inverse.shape[0]

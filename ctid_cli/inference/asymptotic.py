@@ -12,6 +12,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.filtering.loop import NO_GAIN
 from ctid_cli.filtering.sampled import sampled_model
 from ctid_cli.inference.accuracy import ParameterAccuracy, estimated_parameters
+from ctid_cli.inference.covariance import condition_number
 from ctid_cli.inference.sensitivity_system import DiscreteSystem, sensitivity_system
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.controller import DiscreteController
@@ -282,10 +283,12 @@ def _sandwich(
     require_integer("samples", samples, 1)
     require_not_negative("innovation_variance", innovation_variance, "output unit^2")
     M = _covariance(system, deviations)[1:, 1:]
-    diagonal = np.diag(M)
-    if not (diagonal > 0).all():
-        raise DataError("some parameters have no effect on the output; the excitation does not determine them")
-    scale = 1.0 / np.sqrt(diagonal)
+    if not condition_number(M) <= 1e14:
+        raise DataError(
+            "the parameters are not determined, even by endless data: some of them have no effect of their own on the "
+            "output, as where a pole cancels a zero or a gain is zero"
+        )
+    scale = 1.0 / np.sqrt(np.diag(M))
     inverse = np.linalg.inv(M * np.outer(scale, scale)) * np.outer(scale, scale)
     # H(q) psi is psi driven by inputs filtered by H, one filter for each.
     single = _filter(noise_filter)

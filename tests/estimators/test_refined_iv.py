@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.estimators.problems import CoefficientProblem, DelayProblem
-from ctid_cli.estimators.refined_iv import Equations, iterate, relative_change, scaled_solve
+from ctid_cli.estimators.refined_iv import PATIENCE, RELAXATIONS, Equations, iterate, relative_change, scaled_solve
 from ctid_cli.filtering import filter_data, standard_rows
 from ctid_cli.inference import Status, Structure
 from tests.estimators.records import CASE_1, CASE_2, make_record, theta_of
@@ -132,6 +132,9 @@ def equations(hessian=1.0, error=1.0, cost=1.0):
         ([equations(), equations(error=0.0, cost=0.0)], "guarded", Status.CONVERGED),
         ([equations(hessian=0.0)], "plain", Status.SINGULAR),
         ([equations(hessian=0.0)], "guarded", Status.SINGULAR),
+        ([equations(hessian=0.0)], "relaxed", Status.SINGULAR),
+        ([equations(), equations(error=0.0)], "relaxed", Status.CONVERGED),
+        ([equations()], "relaxed", Status.DIVERGED),
         ([equations()], "plain", Status.DIVERGED),
         ([equations()] + [equations(cost=2.0)] * 100, "guarded", Status.STALLED),
         ([equations(error=1e-9)] + [equations(cost=2.0)] * 50, "guarded", Status.CONVERGED),
@@ -164,3 +167,92 @@ def test_singular_equations_have_no_solution():
     assert scaled_solve(np.ones((2, 2)), ones, ones, ones) is None
     assert scaled_solve(np.eye(2), ones, np.array([1.0, 0.0]), ones) is None
     assert scaled_solve(np.full((2, 2), np.nan), ones, ones, ones) is None
+
+
+class Scalar:
+    """One parameter whose full step is a function of it; no equations where it is too large."""
+
+    def __init__(self, step, largest=np.inf):
+        self.step = step
+        self.largest = largest
+
+    def equations(self, theta):
+        if abs(theta[0]) > self.largest:
+            return None
+        # The regressor is twice the instrument: the step is not that of Gauss and Newton.
+        return Equations(np.array([[2.0]]), np.array([2.0 * self.step(theta[0])]), np.eye(1), 1.0 + theta[0] ** 2, 1.0)
+
+    def admissible(self, theta):
+        return theta
+
+
+def path(problem, begin, variant, **options):
+    """All parameters on the way, and how it ended."""
+    seen = []
+    options = {"max_iterations": 200, "tolerance": 1e-9, **options}
+    result = iterate(
+        problem, np.array([begin]), variant=variant, on_step=lambda theta, _: seen.append(theta[0]), **options
+    )
+    return np.array(seen), result
+
+
+def test_relaxed_steps_end_a_cycle_that_full_steps_never_leave():
+    # theta becomes -theta for ever.
+    cycle = Scalar(lambda theta: -2.0 * theta)
+    seen, result = path(cycle, 1.0, "plain")
+    assert result.status is Status.MAX_ITERATIONS
+    assert set(seen) == {-1.0, 1.0}
+    seen, result = path(cycle, 1.0, "relaxed")
+    assert result.status is Status.CONVERGED
+    assert result.iterations < 40
+    ratios = seen[1:] / seen[:-1]
+    np.testing.assert_allclose(ratios[:PATIENCE], -1.0)
+    np.testing.assert_allclose(ratios[PATIENCE:], -0.4)
+    assert abs(result.theta[0]) < 1e-9
+
+
+def test_half_steps_where_seven_tenths_do_not_settle_either():
+    # theta becomes -2 theta, then -1.1 theta, then -theta/2.
+    seen, result = path(Scalar(lambda theta: -3.0 * theta), 1.0, "relaxed")
+    assert result.status is Status.CONVERGED
+    expected = np.repeat(1.0 - 3.0 * np.array(RELAXATIONS), PATIENCE)
+    np.testing.assert_allclose(seen[1 : 3 * PATIENCE + 1] / seen[: 3 * PATIENCE], expected)
+
+
+def test_cycle_that_is_entered_from_within_is_left_by_the_first_relaxation():
+    # From close to the solution, which full steps leave: how short they were there does not matter later.
+    seen, result = path(Scalar(lambda theta: -2.7 * np.tanh(theta)), 0.01, "relaxed", max_iterations=500)
+    assert result.status is Status.CONVERGED
+    assert np.abs(seen).max() > 0.5
+    assert seen[-1] / seen[-2] == pytest.approx(1.0 - 0.7 * 2.7, rel=1e-6)
+
+
+@pytest.mark.parametrize("factor", [-0.9, -0.3, 0.5, 0.95])
+def test_relaxed_steps_that_become_shorter_are_full_ones(factor):
+    # However slowly: every one is shorter than all before.
+    seen, result = path(Scalar(lambda theta: (factor - 1.0) * theta), 1.0, "relaxed", max_iterations=1000)
+    assert result.status is Status.CONVERGED
+    np.testing.assert_allclose(seen, factor ** np.arange(seen.size), rtol=1e-9)
+    plain, _ = path(Scalar(lambda theta: (factor - 1.0) * theta), 1.0, "plain", max_iterations=1000)
+    assert plain.tolist() == seen.tolist()
+
+
+def test_relaxed_steps_into_the_void_are_halved_and_the_cost_may_rise():
+    # 1 -> 1 + 4 lies outside, 1 + 2 too, 1 + 1 does not: there the cost is higher, which guarded steps do not take.
+    problem = Scalar(lambda theta: 4.0 if theta == 1.0 else 0.0, largest=2.5)
+    seen, result = path(problem, 1.0, "relaxed")
+    assert result.status is Status.CONVERGED
+    assert seen[1] == 2.0
+    _, result = path(problem, 1.0, "plain")
+    assert result.status is Status.DIVERGED
+    seen, _ = path(problem, 1.0, "guarded")
+    assert seen.tolist() == [1.0]
+
+
+def test_relaxed_iteration_that_finds_nothing_admissible_ends():
+    _, result = path(Scalar(lambda theta: 1e9, largest=2.5), 1.0, "relaxed")
+    assert result.status is Status.DIVERGED
+    assert result.theta.tolist() == [1.0]
+    # Full steps that are too long are no convergence because a small fraction of them is taken.
+    _, result = path(Scalar(lambda theta: 4.0 - theta, largest=2.5), 1.0, "relaxed", tolerance=1e-3)
+    assert result.status is not Status.CONVERGED

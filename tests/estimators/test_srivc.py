@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators import ESTIMATORS, DelayProfile, Srivc, Start, Svf, TdSrivc, UsefulRedundancy
+from ctid_cli.estimators import ESTIMATORS, AdditiveSrivc, DelayProfile, Srivc, Start, Svf, TdSrivc, UsefulRedundancy
 from ctid_cli.filtering import simulate
 from ctid_cli.inference import Status, fit_percent, r_squared
 from ctid_cli.models import TransferFunction
@@ -134,6 +134,7 @@ def test_registry_holds_every_estimator_by_its_kind():
         ("td_srivc", TdSrivc),
         ("useful_redundancy", UsefulRedundancy),
         ("delay_profile", DelayProfile),
+        ("additive_srivc", AdditiveSrivc),
     ]
 
 

@@ -68,7 +68,9 @@ def assert_rows(rows, expected, tolerance):
         assert one.shape == other.shape
         size = np.sqrt(np.mean(other**2, axis=0))
         difference = np.abs(one - other).max(axis=0) / np.where(size > 0, size, 1.0)
-        assert difference.max(initial=0.0) <= tolerance, f"rows {place}, column {difference.argmax()}: {difference.max():.1e}"
+        assert difference.max(initial=0.0) <= tolerance, (
+            f"rows {place}, column {difference.argmax()}: {difference.max():.1e}"
+        )
 
 
 def assert_one_pass(submodels, theta, tolerance=1e-9):
@@ -103,9 +105,11 @@ def test_compiled_pass_is_the_general_route(terms, theta, hold, hold_output, del
     assert_one_pass(SubmodelFilter(data, terms, delay), theta)
 
 
-@pytest.mark.parametrize("delay", DELAYS)
-@pytest.mark.parametrize("enters", ["controller", "input"])
-@pytest.mark.parametrize("controller", [WEAK, DIRECT, NO_DIRECT])
+@pytest.mark.parametrize("delay", [0.0, 0.04, 0.3])
+@pytest.mark.parametrize(
+    ("controller", "enters"),
+    [(WEAK, "controller"), (NO_DIRECT, "controller"), (DIRECT, "controller"), (DIRECT, "input")],
+)
 @ALL_SUMS
 def test_compiled_pass_is_the_general_route_in_closed_loop(terms, theta, controller, enters, delay):
     # With a biproper submodel, no delay and a controller that acts at once, the loop is algebraic.
@@ -134,7 +138,7 @@ def test_compiled_pass_is_the_general_route_for_any_sum(draw, delay, hold_output
     assert_one_pass(SubmodelFilter(data, terms, delay, loop), theta, 1e-7)
 
 
-@pytest.mark.parametrize("delay", DELAYS)
+@pytest.mark.parametrize("delay", [0.0, 0.5371])
 @pytest.mark.parametrize(("hold", "hold_output"), [("zoh", "foh"), ("foh", "zoh")])
 @ALL_SUMS
 def test_rows_are_the_signals_that_a_simulation_gives(terms, theta, hold, hold_output, delay):
@@ -162,8 +166,7 @@ def test_rows_are_the_signals_that_a_simulation_gives(terms, theta, hold, hold_o
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.5371])
-@pytest.mark.parametrize("enters", ["controller", "input"])
-@pytest.mark.parametrize("controller", [WEAK, DIRECT])
+@pytest.mark.parametrize(("controller", "enters"), [(WEAK, "controller"), (DIRECT, "input")])
 @ALL_SUMS
 def test_closed_loop_instruments_are_sensitivities_to_the_input_of_the_loop_of_the_model(
     terms, theta, controller, enters, delay
@@ -226,9 +229,8 @@ def test_repeated_poles_are_the_limit_of_separate_ones(gap, closed):
 PERIODIC = {name: SUMS[name] for name in ("real pole", "mode", "biproper", "gain", "two modes", "mixed")}
 
 
-@pytest.mark.parametrize("delay", [*DELAYS, 31.0371])
-@pytest.mark.parametrize("hold_output", ["zoh", "foh"])
-@pytest.mark.parametrize("hold", ["zoh", "foh"])
+@pytest.mark.parametrize("delay", [0.0, 0.3, 0.5371, 31.0371])
+@pytest.mark.parametrize(("hold", "hold_output"), [("zoh", "foh"), ("foh", "foh"), ("foh", "zoh")])
 @pytest.mark.parametrize(("terms", "theta"), PERIODIC.values(), ids=PERIODIC.keys())
 def test_periodic_rows_are_those_of_a_long_repetition(terms, theta, hold, hold_output, delay):
     # A delay may exceed the period: what arrives is some earlier period's input, which is the same.
@@ -246,14 +248,10 @@ def test_periodic_rows_are_those_of_a_long_repetition(terms, theta, hold, hold_o
     np.testing.assert_allclose(found, psi.T @ phi, atol=1e-10 * np.abs(psi.T @ phi).max())
 
 
-@pytest.mark.parametrize("closed", [False, True])
-@pytest.mark.parametrize("hold", ["zoh", "foh"])
-@pytest.mark.parametrize("delay", [0.0, 0.37])
+@pytest.mark.parametrize(("closed", "hold", "delay"), [(False, "zoh", 0.37), (False, "foh", 0.0), (True, "zoh", 0.37)])
 @ALL_SUMS
 def test_free_responses_add_to_the_forced_ones(terms, theta, delay, hold, closed):
     # The error falls by the free response, and psi has its sensitivities: -d eps in open loop, all parameters included.
-    if closed and hold == "foh":
-        pytest.skip("a controller makes a held input")
     data = filter_data(record(n=200, hold=hold), delay)
     loop = feedback(WEAK, 200) if closed else OPEN_LOOP
     forced = SubmodelFilter(data, terms, delay, loop)
@@ -293,12 +291,21 @@ def test_free_responses_add_to_the_forced_ones(terms, theta, delay, hold, closed
         [1e300, 1e300, 1e300],
     ],
 )
-@pytest.mark.parametrize("closed", [False, True])
-@pytest.mark.parametrize("initial_state", ["rest", "periodic", "estimated"])
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize(
+    ("initial_state", "closed"),
+    [("rest", False), ("periodic", False), ("estimated", False), ("rest", True), ("estimated", True)],
+)
 def test_parameters_without_a_finite_response_give_nothing(theta, initial_state, closed):
-    if closed and initial_state == "periodic":
-        pytest.skip("periodic states are for open loop")
     data = filter_data(record(n=2000))
     loop = feedback(WEAK, 2000) if closed else OPEN_LOOP
     submodels = SubmodelFilter(data, [Term(2, 0)], 0.0, loop, initial_state)
     assert submodels.moments(np.concatenate((theta, np.zeros(submodels.free)))) is None
+
+
+@pytest.mark.parametrize("polynomial", [[1.0, 4.0, 4.0], [1.3, 4.0, 4.0]], ids=["double pole", "two poles"])
+def test_loop_that_grows_beyond_all_numbers_gives_nothing(polynomial):
+    # Whichever of the two routes simulates it: an iteration halves its step then.
+    theta = np.array([polynomial[1], polynomial[0], 50.0 * polynomial[2]]) / polynomial[2]
+    loop = feedback(DiscreteController([3.0], [1.0]), 3000)
+    assert SubmodelFilter(filter_data(record(n=3000)), [Term(2, 0)], 0.0, loop).moments(theta) is None

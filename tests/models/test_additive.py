@@ -202,6 +202,13 @@ def test_poles_close_to_each_other_may_belong_to_two_submodels():
         AdditiveModel([Submodel([1.0], np.poly([-0.3, -0.3])), Submodel([1.0], [1.0, 0.3])])
 
 
+def test_closeness_of_poles_is_a_matter_of_proportion():
+    slow = [Submodel([1.0], [constant, 1.0]) for constant in (1e9, 2e9)]
+    assert AdditiveModel(slow).order == 2
+    with pytest.raises(DataError, match="in common"):
+        AdditiveModel([Submodel([1.0], [constant, 1.0]) for constant in (1e-9, 1e-9 * (1 + 1e-9))])
+
+
 def test_one_term_is_a_transfer_function_of_any_structure():
     model = AdditiveModel([Submodel([1.0, 2.0, 3.0], [4.0, 5.0, 6.0, 2.0])], delay=0.7)
     w = np.array([0.1, 1.0])

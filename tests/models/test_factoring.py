@@ -170,6 +170,8 @@ def test_feedthrough_goes_to_the_term_that_can_hold_it():
     fraction = unfactored(MODELS["biproper mode"])
     assert factored(fraction, [Term(2, 0), Term(2, 2)]).terms == (Term(2, 1), Term(2, 2))
     assert factored(fraction, [Term(2, 1), Term(2, 1), Term(0, 0)]).terms == (Term(2, 1), Term(2, 1), Term(0, 0))
+    # Without a feedthrough there is nothing to take.
+    assert factored(unfactored(TWO_MODES), [Term(2, 2), Term(2, 0)]).terms == (Term(2, 1), Term(2, 1))
     assert factored(fraction).submodels[-1].numerator == pytest.approx(fraction.numerator[0])
 
 

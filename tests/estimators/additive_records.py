@@ -1,0 +1,66 @@
+"""The two published sums of submodels and a flexible beam, with seeded records, for the tests beside this file."""
+
+import numpy as np
+from scipy.signal import lfilter
+
+from ctid_cli.filtering import simulate_additive, simulate_loop
+from ctid_cli.models import AdditiveModel, DiscreteController, Submodel, Term
+from ctid_cli.signals import HeldSignal, Loop, Record
+
+INTERVAL = 0.05
+MODE = Term(2, 0)
+
+
+def modes(theta, delay=0.0):
+    """Second-order submodels without zeros: a1, a2, b0 of each."""
+    return AdditiveModel.from_theta(theta, [MODE] * (len(theta) // 3), delay)
+
+
+#: Eight poles in four modes (González et al., section 6.1): static gains and poles as printed.
+FOUR_MODES = AdditiveModel(
+    Submodel([gain], [1.0 / abs(pole) ** 2, -2.0 * pole.real / abs(pole) ** 2, 1.0])
+    for gain, pole in ((3.0, -0.25 + 1.39j), (0.4, -0.15 + 3.16j), (0.2, -0.17 + 5.77j), (0.05, -0.5 + 9.99j))
+)
+#: The closed-loop example (section 6.2).
+TWO_MODES = modes([0.25, 0.25, 3.0, 0.01, 0.025, 1.0])
+PID = DiscreteController.from_pid(0.0115, 0.00725, 0.00454)
+#: The modes of a flexible beam as printed (section 7), and the values that its identification started from.
+BEAM = modes([0.0024, 0.023, 11.81, 2.33e-5, 1.65e-4, 0.159, 8.59e-7, 1.03e-5, 3.19e-4, 7.55e-7, 3.55e-6, 1.27e-4])
+BEAM_START = modes([0.001, 0.025, 10.0, 5e-5, 1.5e-4, 0.2, 8.5e-7, 2e-5, 0.001, 7.5e-7, 5e-6, 0.01])
+
+
+def open_record(system, n, noise, seed, *, interval=INTERVAL, hold="zoh", times=None):
+    """Gaussian input, white output noise of a standard deviation."""
+    rng = np.random.default_rng(seed)
+    t = interval * np.arange(n) if times is None else times
+    u = HeldSignal(t, rng.standard_normal(n), hold)
+    x = simulate_additive(system, u, t)
+    return Record(t, x + noise * rng.standard_normal(n), u, noise_free=x)
+
+
+def loop_record(
+    system, n, noise, seed, *, controller=PID, interval=INTERVAL, enters="controller", filter=([1.0], [1.0])
+):
+    """Gaussian reference, output noise that goes round the loop."""
+    rng = np.random.default_rng(seed)
+    r = rng.standard_normal(n)
+    v = noise * lfilter(*filter, rng.standard_normal(n))
+    u, x = simulate_loop(system, controller, r, v, interval, enters)
+    t = interval * np.arange(n)
+    return Record(t, x + v, HeldSignal(t, u), noise_free=x, loop=Loop(r, controller, enters))
+
+
+def disturbed(system, seed, by=0.05):
+    """A start: every parameter wrong by up to a fraction."""
+    change = np.random.default_rng(seed).uniform(-by, by, system.theta.size)
+    return AdditiveModel.from_theta(system.theta * (1.0 + change), system.terms, system.delay)
+
+
+def deviations(fit, system):
+    """Errors of an estimate in its own standard errors, submodels sorted on both sides."""
+    return (fit.additive.theta - system.sorted().theta) / np.sqrt(np.diag(fit.covariance))
+
+
+def assert_parameters(fit, system, tolerance):
+    """Equal parameters, relative to each one's size."""
+    np.testing.assert_allclose(fit.additive.theta, system.sorted().theta, rtol=tolerance)

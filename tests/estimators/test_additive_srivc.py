@@ -1,0 +1,491 @@
+"""Additive SRIVC in open loop: the published iteration, reference numbers, invariances, states, accuracy, refusals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators import AdditiveSrivc, Srivc, Start
+from ctid_cli.estimators.additive_problem import AdditiveProblem
+from ctid_cli.estimators.refined_iv import iterate
+from ctid_cli.filtering import filter_data, simulate, simulate_additive
+from ctid_cli.inference import Status
+from ctid_cli.models import AdditiveModel, Submodel, Term, TransferFunction, factored, unfactored
+from ctid_cli.signals import HeldSignal, Record
+from tests.estimators.additive_records import (
+    BEAM,
+    BEAM_START,
+    FOUR_MODES,
+    INTERVAL,
+    MODE,
+    TWO_MODES,
+    assert_parameters,
+    deviations,
+    disturbed,
+    modes,
+    open_record,
+)
+from tests.estimators.records import assert_same_model
+
+FOUR = (MODE,) * 4
+TWO = (MODE, MODE)
+MIXED = AdditiveModel([Submodel([0.2, 2.0], [0.7, 1.0]), Submodel([0.4], [0.05, 0.01, 1.0])], 0.12)
+#: One over p and one over p^2, each with a flexible mode.
+DRIVE = AdditiveModel([Submodel([0.5], [0.4, 1.0], 1), Submodel([0.2], [0.02, 0.02, 1.0])])
+RIGID = AdditiveModel([Submodel([0.3], [1.0], 2), Submodel([0.2], [0.02, 0.02, 1.0])])
+
+
+def fitted(record, start, **options):
+    model = start if isinstance(start, AdditiveModel) else disturbed(*start)
+    return AdditiveSrivc(terms=model.terms, delay=model.delay, **options).fit(record, Start(model=model))
+
+
+def published_step(record, model, hold_output):
+    """Equation (29) to the letter: a right-hand side for every submodel; the matrix of all of them."""
+    x = [simulate(TransferFunction(*_of(part), model.delay), record.input, record.t) for part in model.submodels]
+    psi, phi, targets = [], [], []
+    for part, own in zip(model.submodels, x, strict=True):
+        term, a, b = part.term(), part.denominator, part.numerator
+        origin = np.zeros(term.integrators)
+        left = HeldSignal(record.t, record.y - np.sum(x, axis=0) + own, hold_output)
+
+        def of_input(numerator, denominator):
+            return simulate(TransferFunction(numerator, denominator, model.delay), record.input, record.t)
+
+        for k in range(1, term.poles + 1):
+            power = np.append(1.0, np.zeros(k))
+            psi.append(-of_input(np.polymul(power, b), np.append(np.polymul(a, a), origin)))
+            phi.append(-simulate(TransferFunction(power, a), left, record.t))
+        for k in range(term.zeros + 1):
+            psi.append(of_input(np.append(1.0, np.zeros(k)), np.append(a, origin)))
+            phi.append(psi[-1])
+        targets.append(simulate(TransferFunction([1.0], a), left, record.t) if term.poles else left.at(record.t))
+    used = record.t >= record.t[0] + model.delay - 1e-9
+    psi, phi, targets = (np.column_stack(part)[used] for part in (psi, phi, targets))
+    size = np.sqrt((psi**2).sum(axis=0))
+    return np.linalg.solve((psi / size).T @ (phi / size), (psi / size).T @ targets) / size[:, None]
+
+
+def _of(part):
+    return part.numerator, np.append(part.denominator, np.zeros(part.integrators))
+
+
+@pytest.mark.parametrize("hold_output", ["zoh", "foh"])
+@pytest.mark.parametrize("system", [TWO_MODES, MIXED, DRIVE, RIGID], ids=["modes", "mixed", "drive", "rigid"])
+def test_step_is_the_published_one(system, hold_output):
+    # Diagonal blocks are the new parameters; off the diagonal there is nothing but the common change.
+    record = open_record(system, 600, 0.1, 3)
+    start = disturbed(system, 4)
+    problem = AdditiveProblem(filter_data(record, system.delay, hold_output), system.terms, system.delay)
+    result = iterate(problem, start.theta, max_iterations=1, tolerance=1e-12, variant="plain")
+    change = result.theta - start.theta
+    expected = np.tile(change[:, None], (1, len(system.terms)))
+    first = 0
+    for k, term in enumerate(system.terms):
+        expected[first : first + term.size, k] += start.theta[first : first + term.size]
+        first += term.size
+    found = published_step(record, start, hold_output)
+    assert np.abs((found - expected) / (np.abs(start.theta) + np.abs(change))[:, None]).max() <= 1e-9
+
+
+def reference_record():
+    rng = np.random.default_rng(0)
+    t = INTERVAL * np.arange(5000)
+    u = HeldSignal(t, rng.standard_normal(5000))
+    v = lfilter([1.0, 0.5], [1.0, -0.85], np.sqrt(0.02) * rng.standard_normal(5000))
+    return Record(t, simulate_additive(FOUR_MODES, u, t) + v, u)
+
+
+@pytest.mark.parametrize("variant", ["plain", "relaxed", "guarded"])
+def test_reference_estimate_of_four_modes(variant):
+    # Numbers of an independent implementation.
+    fit = fitted(reference_record(), (FOUR_MODES, 1), variant=variant, tolerance=1e-10)
+    assert fit.status is Status.CONVERGED
+    gains = [2.90641429, 0.40364981, 0.19854286, 0.06228051]
+    np.testing.assert_allclose([part.dc_gain for part in fit.additive.submodels], gains, rtol=1e-6)
+    assert fit.cost == pytest.approx(0.16533830866, rel=1e-8)
+
+
+def test_reference_estimate_of_the_unfactored_model():
+    fit = Srivc(8, 6, tolerance=1e-10).fit(reference_record(), Start(model=disturbed(FOUR_MODES, 1)))
+    assert fit.status is Status.CONVERGED
+    gains = [2.9075898, 0.40822627, 0.19897482, 0.05737992]
+    np.testing.assert_allclose([part.dc_gain for part in factored(fit.model).submodels], gains, rtol=1e-6)
+    assert fit.cost == pytest.approx(0.16515278298, rel=1e-8)
+
+
+class WithInstrumentsAsRegressors:
+    """A problem whose steps are those of Gauss and Newton."""
+
+    def __init__(self, problem):
+        self.problem = problem
+
+    def equations(self, theta):
+        found = self.problem.equations(theta)
+        return found and replace(found, instrument_regressor=found.hessian)
+
+    def admissible(self, theta):
+        return self.problem.admissible(theta)
+
+
+@pytest.mark.parametrize("initial_state", ["rest", "estimated"])
+@pytest.mark.parametrize("system", [TWO_MODES, MIXED, DRIVE], ids=["modes", "mixed", "drive"])
+def test_hold_of_the_output_does_not_move_the_estimate(system, initial_state):
+    record = open_record(system, 3000, 0.3, 5)
+    options = {"initial_state": initial_state, "tolerance": 1e-11}
+    one, two = (fitted(record, (system, 2, 0.02), hold_output=hold, **options) for hold in ("foh", "zoh"))
+    assert one.status is two.status is Status.CONVERGED
+    np.testing.assert_allclose(one.additive.theta, two.additive.theta, rtol=1e-8)
+    assert one.history[1].denominator != two.history[1].denominator
+    problem = AdditiveProblem(
+        filter_data(record, system.delay), system.terms, system.delay, initial_state=initial_state
+    )
+    begin = np.concatenate((disturbed(system, 2, 0.005).theta, np.zeros(problem.filter.free)))
+    newton = iterate(
+        WithInstrumentsAsRegressors(problem), begin, max_iterations=100, tolerance=1e-11, variant="guarded"
+    )
+    assert newton.status is Status.CONVERGED
+    np.testing.assert_allclose(problem.model(newton.theta).sorted().theta, one.additive.theta, rtol=1e-8)
+
+
+@pytest.mark.parametrize("terms", [Term(2, 0), Term(3, 2), Term(1, 0)])
+@pytest.mark.parametrize("delay", [0.0, 0.13])
+def test_one_submodel_is_srivc(terms, delay):
+    system = {
+        Term(2, 0): AdditiveModel([Submodel([2.0], [0.25, 0.2, 1.0])], delay),
+        Term(3, 2): AdditiveModel([Submodel([0.02, -0.3, 1.0], [0.1, 0.35, 0.8, 1.0])], delay),
+        Term(1, 0): AdditiveModel([Submodel([2.0], [0.7, 1.0])], delay),
+    }[terms]
+    record = open_record(system, 2000, 0.3, 6)
+    start = Start(model=disturbed(system, 7))
+    one = AdditiveSrivc(terms=system.terms, delay=delay, tolerance=1e-12).fit(record, start)
+    two = Srivc(terms.poles, terms.zeros, delay=delay, tolerance=1e-12).fit(record, start)
+    assert one.status is two.status is Status.CONVERGED
+    assert_same_model(one.model, two.model, 1e-10)
+    assert one.cost == pytest.approx(two.cost, rel=1e-10)
+    assert one.fit_percent == pytest.approx(two.fit_percent, rel=1e-10)
+    assert one.count == two.count == 2000 - int(np.ceil(delay / INTERVAL - 1e-9))
+
+
+def test_order_of_the_terms_does_not_matter():
+    # Submodels of different structure, so that they can be told from each other.
+    system = AdditiveModel([*TWO_MODES.submodels, Submodel([0.3, 1.5], [0.2, 1.0])])
+    record = open_record(system, 3000, 0.2, 8)
+    start = disturbed(system, 3)
+    turned = AdditiveModel([start.submodels[k] for k in (1, 2, 0)])
+    one, two = (fitted(record, model, tolerance=1e-11) for model in (start, turned))
+    assert one.additive.terms == two.additive.terms
+    assert one.parameter_names == two.parameter_names == one.additive.names
+    np.testing.assert_allclose(one.additive.theta, two.additive.theta, rtol=1e-9)
+    size = np.sqrt(np.diag(one.covariance))
+    np.testing.assert_allclose(one.covariance / np.outer(size, size), two.covariance / np.outer(size, size), atol=1e-8)
+    frequencies = [part.natural_frequency for part in one.additive.submodels]
+    assert frequencies == sorted(frequencies)
+
+
+@pytest.mark.parametrize("stretch", [1e-6, 1e5])
+def test_unit_of_time_does_not_matter(stretch):
+    # a_k and b_k carry the k-th power of the unit of time; nothing else changes, even far from seconds.
+    record = open_record(MIXED, 2000, 0.2, 9)
+    other = Record(record.t * stretch, record.y, HeldSignal(record.input.t * stretch, record.input.values))
+    powers = np.array([int(name[-1]) for name in MIXED.names])
+    start = disturbed(MIXED, 3)
+    scaled = AdditiveModel.from_theta(start.theta * stretch**powers, start.terms, start.delay * stretch)
+    one, two = fitted(record, start, tolerance=1e-11), fitted(other, scaled, tolerance=1e-11)
+    powers = np.array([int(name[-1]) for name in one.additive.names])
+    np.testing.assert_allclose(two.additive.theta, one.additive.theta * stretch**powers, rtol=1e-8)
+    assert two.condition_number == pytest.approx(one.condition_number, rel=1e-6)
+
+
+def test_missing_samples_and_irregular_clocks_only_cost_accuracy():
+    rng = np.random.default_rng(10)
+    gone = rng.choice(3000, 300, replace=False)
+    record = open_record(TWO_MODES, 3000, 0.2, 10)
+    y = record.y.copy()
+    y[gone] = np.nan
+    fit = fitted(Record(record.t, y, record.input), (TWO_MODES, 1))
+    assert (fit.status, fit.count) == (Status.CONVERGED, 2700)
+    assert np.abs(deviations(fit, TWO_MODES)).max() < 4
+    times = np.cumsum(rng.uniform(0.02, 0.08, 2000))
+    irregular = open_record(TWO_MODES, 2000, 0.2, 11, times=times)
+    assert irregular.interval is None
+    for covariance in ("white", "sandwich"):
+        fit = fitted(irregular, (TWO_MODES, 1), covariance=covariance)
+        assert fit.status is Status.CONVERGED
+        assert np.abs(deviations(fit, TWO_MODES)).max() < 4
+        assert fit.fit_percent > 80
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("system", [DRIVE, RIGID], ids=["integrator and pole", "rigid body"])
+def test_integrators(system, seed):
+    record = open_record(system, 2000, 0.1, seed)
+    fit = fitted(record, (system, seed))
+    assert fit.status is Status.CONVERGED
+    assert fit.iterations <= 15
+    assert np.abs(deviations(fit, system)).max() < 4
+    assert fit.additive.submodels[0].integrators == system.submodels[0].integrators
+
+
+def multisine(n, seed):
+    rng = np.random.default_rng(seed)
+    spectrum = np.zeros(n // 2 + 1, complex)
+    spectrum[1 : n // 4] = np.exp(2j * np.pi * rng.random(n // 4 - 1))
+    return np.fft.irfft(spectrum, n) * np.sqrt(n)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.12, 0.15])
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+def test_one_period_of_a_steady_state_is_fitted_exactly(hold, delay):
+    # The modes take some 60 s to die out and the period is 25 s: the start of the period matters a great deal.
+    system = AdditiveModel([*TWO_MODES.submodels, Submodel([0.2, 0.5], [0.7, 1.0])], delay)
+    n, periods = 500, 20
+    t = INTERVAL * np.arange(n)
+    u = multisine(n, 1)
+    long = INTERVAL * np.arange(n * periods)
+    x = simulate_additive(system, HeldSignal(long, np.tile(u, periods), hold), long)[-2 * n : -n]
+    record = Record(t, x, HeldSignal(t, u, hold))
+    start = disturbed(system, 1, 0.02)
+    fit = fitted(record, start, initial_state="periodic", tolerance=1e-10)
+    assert fit.status is Status.CONVERGED
+    assert fit.count == n
+    assert_parameters(fit, system, 1e-6)
+    at_rest = fitted(record, start, tolerance=1e-10)
+    assert np.abs(at_rest.additive.theta[0] / system.sorted().theta[0] - 1) > 0.01
+
+
+@pytest.mark.parametrize("system", [TWO_MODES, MIXED, DRIVE, RIGID], ids=["modes", "mixed", "drive", "rigid"])
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+def test_record_that_starts_in_motion_is_fitted_exactly(system, hold):
+    whole = open_record(system, 1100, 0.0, 2, hold=hold)
+    cut = slice(100, None)
+    record = Record(whole.t[cut], whole.y[cut], HeldSignal(whole.t[cut], whole.input.values[cut], hold))
+    start = disturbed(system, 1, 0.02)
+    fit = fitted(record, start, initial_state="estimated", tolerance=1e-10)
+    assert fit.status is Status.CONVERGED
+    assert_parameters(fit, system, 1e-6)
+    assert fit.covariance.shape == (system.theta.size,) * 2
+    at_rest = fitted(record, start, tolerance=1e-10)
+    assert np.abs(at_rest.additive.theta / system.sorted().theta - 1).max() > 1e-3
+
+
+def test_estimated_state_costs_little_accuracy_and_its_standard_errors_hold():
+    whole = open_record(TWO_MODES, 2100, 0.3, 12)
+    record = Record(whole.t[100:], whole.y[100:], HeldSignal(whole.t[100:], whole.input.values[100:]))
+    fit = fitted(record, (TWO_MODES, 1), initial_state="estimated")
+    assert fit.status is Status.CONVERGED
+    assert np.abs(deviations(fit, TWO_MODES)).max() < 4
+    at_rest = fitted(open_record(TWO_MODES, 2000, 0.3, 12), (TWO_MODES, 1))
+    ratio = np.sqrt(np.diag(fit.covariance) / np.diag(at_rest.covariance))
+    assert (ratio < 1.5).all()
+
+
+def test_every_record_of_four_modes_converges():
+    # Coloured noise at 9 dB; starts wrong by up to 5 %.
+    for seed in range(15):
+        rng = np.random.default_rng(100 + seed)
+        t = INTERVAL * np.arange(7368)
+        u = HeldSignal(t, rng.standard_normal(t.size))
+        v = lfilter([1.0, 0.5], [1.0, -0.85], np.sqrt(0.02) * rng.standard_normal(t.size + 200))[200:]
+        record = Record(t, simulate_additive(FOUR_MODES, u, t) + v, u)
+        fit = fitted(record, (FOUR_MODES, seed))
+        assert fit.status is Status.CONVERGED
+        assert fit.iterations <= 40
+        frequencies = [part.natural_frequency for part in fit.additive.submodels]
+        np.testing.assert_allclose(frequencies, [p.natural_frequency for p in FOUR_MODES.submodels], rtol=0.05)
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+def test_standard_errors_are_those_of_repeated_experiments(coloured):
+    # The ratio of 100 observed to stated standard deviations lies within 0.72 and 1.28 with 99.99 % confidence; the
+    # covariance that ignores the colour of the noise is caught.
+    system = modes([0.25, 0.25, 3.0, 0.02, 0.025, 1.0])
+    n = 1000
+    t = INTERVAL * np.arange(n)
+    u = HeldSignal(t, np.random.default_rng(20).standard_normal(n))
+    x = simulate_additive(system, u, t)
+    rng = np.random.default_rng(21)
+    estimates, stated = [], {"white": [], "sandwich": []}
+    for run in range(100):
+        e = 0.2 * rng.standard_normal(n + 200)
+        record = Record(t, x + (lfilter([1.0], [1.0, -0.9], e) if coloured else e)[200:], u)
+        for covariance, found in stated.items():
+            if covariance == "white" or run < 20:  # stated errors hardly differ from run to run
+                fit = fitted(record, system, covariance=covariance)
+                assert fit.status is Status.CONVERGED
+                found.append(np.sqrt(np.diag(fit.covariance)))
+        estimates.append(fit.additive.theta)
+    observed = np.std(estimates, axis=0, ddof=1)
+    ratios = {name: np.sqrt(np.mean(np.square(found), axis=0)) / observed for name, found in stated.items()}
+    assert ((ratios["sandwich"] > 0.72) & (ratios["sandwich"] < 1.28)).all()
+    if coloured:
+        assert (ratios["white"][:3] < 0.5).all()
+    else:
+        assert ((ratios["white"] > 0.72) & (ratios["white"] < 1.28)).all()
+
+
+def beam_record(seed, n=8192, delay=4, noise=1e-5):
+    """Random-phase multisine of 0.5 to 500 Hz, 4096 Hz, from rest."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) / 4096
+    spectrum = np.zeros(n // 2 + 1, complex)
+    spectrum[1 : 500 * n // 4096 + 1] = np.exp(2j * np.pi * rng.random(500 * n // 4096))
+    u = np.fft.irfft(spectrum)
+    held = HeldSignal(t, u / u.std())
+    x = simulate_additive(AdditiveModel(BEAM.submodels, delay / 4096), held, t)
+    sigma = noise * np.sqrt(np.mean(x**2))
+    return Record(t, x + sigma * rng.standard_normal(n), held), sigma
+
+
+def beam_fit(record, delay, **options):
+    start = AdditiveModel(BEAM_START.submodels, delay / 4096)
+    return fitted(record, start, **options)
+
+
+def test_flexible_beam_from_rough_initial_values():
+    # Frequencies wrong by up to a half; the upper modes contribute 57 dB less than the first.
+    reached = 0
+    for seed in range(8):
+        record, sigma = beam_record(seed)
+        fit = beam_fit(record, 4)
+        if fit.status is Status.CONVERGED and fit.cost < 1.2 * sigma**2:
+            reached += 1
+            frequencies = [part.natural_frequency for part in fit.additive.submodels]
+            np.testing.assert_allclose(frequencies, [p.natural_frequency for p in BEAM.submodels], rtol=1e-5)
+            assert np.abs(deviations(fit, BEAM)).max() < 5
+    assert reached >= 7
+
+
+def test_only_the_right_delay_explains_the_beam():
+    record, sigma = beam_record(0)
+    costs = {}
+    for delay in (2, 3, 4, 5, 6):
+        fit = beam_fit(record, delay, max_iterations=40)
+        costs[delay] = fit.cost / sigma**2
+    assert 0.9 < costs.pop(4) < 1.1
+    assert min(np.nan_to_num(cost, nan=np.inf) for cost in costs.values()) > 1e3
+
+
+def test_history_and_report_are_those_of_the_simulated_model():
+    record = open_record(MIXED, 2000, 0.3, 13)
+    fit = fitted(record, (MIXED, 2))
+    used = record.t >= MIXED.delay - 1e-9
+    x = simulate_additive(fit.additive, record.input, record.t)
+    assert fit.count == used.sum()
+    assert fit.cost == pytest.approx(np.mean((record.y - x)[used] ** 2), rel=1e-9)
+    assert len(fit.history) == fit.iterations + 1
+    assert fit.history[-1].cost == pytest.approx(fit.cost, rel=1e-12)
+    np.testing.assert_allclose(fit.history[-1].denominator, fit.model.denominator, rtol=1e-12)
+    assert fit.model.delay == fit.additive.delay == MIXED.delay
+    assert_same_model(fit.model, unfactored(fit.additive), 1e-12)
+    assert tuple(fit.parameters) == fit.parameter_names == tuple(fit.standard_errors)
+    assert np.isnan(fit.loop_radius)
+    np.testing.assert_allclose(fit.start.theta, disturbed(MIXED, 2).theta)
+    assert "given" in fit.start_method
+
+
+def test_unstable_start_is_reflected():
+    start = modes([-0.25, 0.26, 2.9, 0.0102, 0.0253, 1.05])
+    fit = fitted(open_record(TWO_MODES, 2000, 0.1, 14), start)
+    assert fit.status is Status.CONVERGED
+    assert np.abs(deviations(fit, TWO_MODES)).max() < 4
+
+
+def test_start_that_loses_a_pole_ends_in_words():
+    # Whatever happens on the way, a fit ends with a status or a sentence.
+    for theta in ([1e-5, 1e-12, 1.0, 0.01, 0.025, 1.0], [50.0, 900.0, 1.0, 0.01, 0.0251, 1.0], [9.0, 1e-9, 0, 1, 1, 0]):
+        for variant in ("plain", "relaxed", "guarded"):
+            fit = fitted(open_record(TWO_MODES, 400, 1.0, 15), modes(theta), variant=variant)
+            assert isinstance(fit.status, Status)
+            assert fit.covariance.shape == (6, 6)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"terms": ()}, "at least one submodel"),
+        ({"terms": (Term(0, 0, 1), Term(1, 0, 1))}, "integrators in one submodel only"),
+        ({"terms": (Term(2, 2), Term(1, 1))}, "as many zeros as poles in one submodel only"),
+        ({"terms": (Term(0, 0), Term(0, 1, 1))}, "as many zeros as poles in one submodel only"),
+        ({"terms": (Term(21, 0), Term(20, 0))}, "41 poles together; at most 40"),
+        ({"delay": -1.0}, r"delay must be zero or a positive number \[s\]"),
+        ({"delay": np.nan}, r"delay must be zero or a positive number \[s\]"),
+        ({"instruments": "closed"}, "instruments must be .*'closed_loop'.* not 'closed'"),
+        ({"initial_state": "zero"}, "initial_state must be .*'estimated'.* not 'zero'"),
+        ({"covariance": "robust"}, "covariance must be .*'sandwich'.* not 'robust'"),
+        ({"variant": "auto"}, "variant must be .*'relaxed'.* not 'auto'"),
+        ({"hold_output": "linear"}, "hold_output must be .*'foh'.* not 'linear'"),
+        ({"max_iterations": 0}, "max_iterations must be .*1.*0"),
+        ({"tolerance": 0.0}, "tolerance must lie between 0 and 1, not 0.0"),
+        ({"instruments": "closed_loop", "variant": "guarded"}, "guarded is for open-loop .* use relaxed or plain"),
+        ({"instruments": "closed_loop", "initial_state": "periodic"}, "periodic is for open-loop .* rest or estimated"),
+        ({"terms": (Term(1, 0, 1),), "initial_state": "periodic"}, "periodic needs terms without integrators"),
+    ],
+)
+def test_impossible_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        AdditiveSrivc(**{"terms": TWO, **options})
+
+
+@pytest.mark.parametrize(
+    ("start", "message"),
+    [
+        (modes([0.25, 0.25, 3.0]), r"\{poles: 2, zeros: 0\} and the estimator \{poles: 2, zeros: 0\}, \{poles: 2"),
+        (MIXED, r"\{poles: 1, zeros: 1\}, \{poles: 2, zeros: 0\} and the estimator"),
+        (RIGID, r"\{poles: 0, zeros: 0, integrators: 2\}"),
+    ],
+)
+def test_start_of_another_structure_is_refused(start, message):
+    with pytest.raises(DataError, match=message):
+        AdditiveSrivc(terms=TWO).fit(open_record(TWO_MODES, 200, 0.1, 1), Start(model=start))
+
+
+def test_unfactored_start_of_another_structure_is_refused():
+    with pytest.raises(DataError, match="the start has 4 poles and 2 zeros, and the estimator 4 and 1"):
+        Srivc(4, 1).fit(open_record(TWO_MODES, 200, 0.1, 1), Start(model=TWO_MODES))
+    with pytest.raises(DataError, match="the start has 4 poles and 2 zeros, and the estimator 3 and 2"):
+        Srivc(3, 2).fit(open_record(TWO_MODES, 200, 0.1, 1), Start(model=TWO_MODES))
+
+
+def test_terms_that_share_a_pole_are_no_start():
+    with pytest.raises(DataError, match=r"g1 and g2 have .* in common; submodels must not share poles"):
+        modes([0.25, 0.25, 3.0, 0.25, 0.25, 1.0])
+
+
+def changed(record, **changes):
+    named = Record(record.t, record.y, record.input, name="beam.csv", loop=record.loop)
+    return replace(named, **changes)
+
+
+@pytest.mark.parametrize(
+    ("record", "options", "message"),
+    [
+        (open_record(TWO_MODES, 6, 0.1, 1), {}, "beam.csv: 6 usable samples for 6 parameters"),
+        (open_record(TWO_MODES, 10, 0.1, 1), {"initial_state": "estimated"}, "10 usable samples for 10 parameters"),
+        (open_record(TWO_MODES, 100, 0.1, 1), {"instruments": "closed_loop"}, "beam.csv: .*instruments 'open_loop'"),
+    ],
+)
+def test_records_that_do_not_suffice_are_refused(record, options, message):
+    with pytest.raises(DataError, match=message):
+        AdditiveSrivc(terms=TWO, **options).fit(changed(record), Start(model=TWO_MODES))
+
+
+def test_records_that_cannot_be_one_period_are_refused():
+    estimator = AdditiveSrivc(terms=TWO, initial_state="periodic")
+    record = open_record(TWO_MODES, 100, 0.1, 1)
+    y = record.y.copy()
+    y[5] = np.nan
+    times = np.cumsum(np.random.default_rng(1).uniform(0.02, 0.08, 100))
+    for bad in (changed(record, y=y), changed(open_record(TWO_MODES, 100, 0.1, 1, times=times))):
+        with pytest.raises(DataError, match=r"beam.csv: one period .* regular clock .* use initial_state 'estimated'"):
+            estimator.fit(bad, Start(model=TWO_MODES))
+
+
+def test_constant_signals_are_refused():
+    record = open_record(TWO_MODES, 100, 0.1, 1)
+    with pytest.raises(DataError, match=r"beam.csv: the input is constant"):
+        AdditiveSrivc(terms=TWO).fit(changed(record, input=HeldSignal(record.t, np.ones(100))), Start(model=TWO_MODES))
+    with pytest.raises(DataError, match=r"beam.csv: the output is constant"):
+        AdditiveSrivc(terms=TWO).fit(changed(record, y=np.zeros(100)), Start(model=TWO_MODES))

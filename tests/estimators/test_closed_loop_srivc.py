@@ -1,0 +1,400 @@
+"""Closed-loop instruments: reference numbers, CLSRIVC, invariances, integrators, limit cycles, bias, refusals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, lfilter
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators import AdditiveSrivc, Srivc, Start
+from ctid_cli.estimators.additive_problem import AdditiveProblem, loop_data
+from ctid_cli.estimators.refined_iv import iterate
+from ctid_cli.filtering import filter_data, simulate_loop
+from ctid_cli.filtering.loop import loop_radius
+from ctid_cli.inference import Status
+from ctid_cli.models import AdditiveModel, DiscreteController, Submodel, Term, factored, factored_jacobian, unfactored
+from ctid_cli.signals import HeldSignal, Loop, Record
+from tests.estimators.additive_records import (
+    INTERVAL,
+    MODE,
+    PID,
+    TWO_MODES,
+    assert_parameters,
+    deviations,
+    disturbed,
+    loop_record,
+    modes,
+    open_record,
+)
+from tests.estimators.records import assert_same_model
+
+TWO = (MODE, MODE)
+#: PD control of what integrates.
+PD = DiscreteController.from_pid(0.5, 0.0, 2.0)
+DRIVE = AdditiveModel([Submodel([0.5], [0.4, 1.0], 1), Submodel([0.05], [0.02, 0.02, 1.0])])
+RIGID = AdditiveModel([Submodel([0.3], [1.0], 2), Submodel([0.02], [0.02, 0.02, 1.0])])
+DELAYED = AdditiveModel(TWO_MODES.submodels, 0.12)
+BIPROPER = AdditiveModel([TWO_MODES.submodels[0], Submodel([0.3, 0.5], [0.1, 1.0])])
+
+
+def fitted(record, start, **options):
+    model = start if isinstance(start, AdditiveModel) else disturbed(*start)
+    options = {"instruments": "closed_loop", **options}
+    return AdditiveSrivc(terms=model.terms, delay=model.delay, **options).fit(record, Start(model=model))
+
+
+def reference_record():
+    rng = np.random.default_rng(5)
+    r, v = rng.standard_normal(3000), 0.1 * rng.standard_normal(3000)
+    u, x = simulate_loop(TWO_MODES, PID, r, v, INTERVAL)
+    t = INTERVAL * np.arange(3000)
+    return Record(t, x + v, HeldSignal(t, u), noise_free=x, loop=Loop(r, PID))
+
+
+def test_reference_record():
+    record = reference_record()
+    u = record.input.values
+    first = [-0.0185404823, -0.0333535724, -0.0183051125, -0.0047443714]
+    np.testing.assert_allclose(u[:4], first, atol=1e-10)
+    assert np.sum(u**2) == pytest.approx(4.521475672, rel=1e-9)
+    assert np.sum(record.noise_free**2) == pytest.approx(81.84333235, rel=1e-9)
+
+
+@pytest.mark.parametrize("variant", ["plain", "relaxed"])
+def test_reference_estimate(variant):
+    fit = fitted(reference_record(), (TWO_MODES, 1), variant=variant, tolerance=1e-10)
+    assert fit.status is Status.CONVERGED
+    expected = [0.2525147842, 0.2520988224, 2.9731573318, 0.0105729478, 0.0250662962, 1.055782623]
+    np.testing.assert_allclose(fit.additive.theta, expected, rtol=1e-6)
+    assert fit.cost == pytest.approx(0.010247018062, rel=1e-8)
+    assert fit.loop_radius == pytest.approx(loop_radius(fit.additive, PID, INTERVAL), rel=1e-9)
+    assert fit.loop_radius < 1
+
+
+# Of the two published forms with one transfer function: a1, a2, b0, b1 of each mode after factoring.
+DIRECT = [
+    0.2614989003,
+    0.2620573993,
+    3.006078987,
+    0.1293118982,
+    0.01026209494,
+    0.02494293123,
+    1.000089481,
+    -0.0123080584,
+]
+CLOSED = [
+    0.2601848654,
+    0.2619285108,
+    2.995978495,
+    0.1261494879,
+    0.01026263713,
+    0.02493611947,
+    1.004863998,
+    -0.0120096842,
+]
+
+
+@pytest.mark.parametrize(("instruments", "expected"), [("open_loop", DIRECT), ("closed_loop", CLOSED)])
+def test_reference_estimates_of_the_unfactored_model(instruments, expected):
+    estimator = Srivc(4, 2, instruments=instruments, tolerance=1e-10)
+    fit = estimator.fit(reference_record(), Start(model=disturbed(TWO_MODES, 1)))
+    assert fit.status is Status.CONVERGED
+    np.testing.assert_allclose(factored(fit.model).theta, expected, rtol=1e-6)
+
+
+def filtered(matrix, gain, source):
+    """States of a filter driven by a held signal, at the samples."""
+    dynamics, drive, *_ = cont2discrete((matrix, gain, np.eye(len(matrix)), np.zeros_like(gain)), INTERVAL)
+    states = np.zeros((source.size, len(matrix)))
+    for k in range(source.size - 1):
+        states[k + 1] = dynamics @ states[k] + drive[:, 0] * source[k]
+    return states
+
+
+def test_estimate_with_closed_loop_instruments_solves_the_equations_of_clsrivc():
+    # By companion matrices and difference equations: sum psi eps = 0, psi from the noise-free loop of the estimate.
+    record = reference_record()
+    fit = Srivc(4, 2, instruments="closed_loop", tolerance=1e-11).fit(record, Start(model=disturbed(TWO_MODES, 1)))
+    a, b, n = fit.model.denominator, fit.model.numerator, 4
+    A, B, C = np.vstack((-a[1:], np.eye(n)[:-1])), np.eye(n, 1), np.concatenate(([0.0], b))[None]
+    numerator, denominator, *_ = cont2discrete((b, a), INTERVAL)
+    closed = np.polyadd(np.polymul(denominator, PID.denominator), np.polymul(numerator[0], PID.numerator))
+    z = lfilter(np.polymul(PID.numerator, denominator), closed, record.loop.reference)
+    eps = record.y - filtered(A, B, record.input.values) @ C[0]
+    double = np.block([[A, np.zeros((n, n))], [B @ C, A]])
+    states = filtered(double, np.vstack((B, 0 * B)), z)
+    psi = np.column_stack((-states[:, n:], states[:, n - b.size : n]))
+    correlation = psi.T @ eps / np.sqrt((psi**2).sum(axis=0) * (eps @ eps))
+    assert np.abs(correlation).max() < 1e-8
+    # The direct estimate is another point.
+    direct = Srivc(4, 2, tolerance=1e-11).fit(record, Start(model=disturbed(TWO_MODES, 1)))
+    assert np.abs(direct.model.numerator / b - 1).max() > 1e-4
+
+
+@pytest.mark.parametrize("covariance", ["white", "sandwich"])
+@pytest.mark.parametrize(
+    "system", [modes([0.25, 0.25, 3.0]), AdditiveModel([Submodel([0.3, 2.0], [0.1, 0.3, 1.0], 0)], 0.12)]
+)
+def test_one_submodel_is_srivc_with_closed_loop_instruments(system, covariance):
+    record = loop_record(system, 2000, 0.05, 4)
+    start = Start(model=disturbed(system, 2))
+    options = {"instruments": "closed_loop", "covariance": covariance, "tolerance": 1e-12, "delay": system.delay}
+    one = AdditiveSrivc(terms=system.terms, **options).fit(record, start)
+    term = system.terms[0]
+    two = Srivc(term.poles, term.zeros, **options).fit(record, start)
+    assert one.status is two.status is Status.CONVERGED
+    assert_same_model(one.model, two.model, 1e-10)
+    assert (one.count, one.iterations) == (two.count, two.iterations)
+    # The covariance of the anti-monic form is that of the monic one by the delta method.
+    jacobian = factored_jacobian(two.model, system.terms)
+    if term.zeros:
+        converted = jacobian @ two.covariance @ jacobian.T
+        size = np.sqrt(np.diag(one.covariance))
+        np.testing.assert_allclose(converted / np.outer(size, size), one.covariance / np.outer(size, size), atol=1e-7)
+    theta = two.parameters
+    a2 = 1 / theta["a2"]
+    gradient = np.array([0.0, -(a2**2), 0.0] + [0.0] * term.zeros)
+    assert one.covariance[1, 1] == pytest.approx(gradient @ two.covariance @ gradient, rel=1e-8)
+
+
+@pytest.mark.parametrize("hold", ["foh", "zoh", "gauss-newton"])
+@pytest.mark.parametrize("system", [TWO_MODES, DELAYED], ids=["no delay", "delay"])
+def test_hold_of_the_output_does_not_move_the_estimate(system, hold):
+    record = loop_record(system, 3000, 0.1, 6)
+    expected = fitted(record, (system, 1), tolerance=1e-12)
+    assert expected.status is Status.CONVERGED
+    if hold != "gauss-newton":
+        fit = fitted(record, (system, 1), tolerance=1e-12, hold_output=hold)
+        np.testing.assert_allclose(fit.additive.theta, expected.additive.theta, rtol=1e-8)
+        return
+    problem = AdditiveProblem(
+        filter_data(record, system.delay), system.terms, system.delay, loop_data(record, "closed_loop")
+    )
+
+    class Newton:
+        def equations(self, theta):
+            found = problem.equations(theta)
+            return found and replace(found, instrument_regressor=found.hessian)
+
+        def admissible(self, theta):
+            return problem.admissible(theta)
+
+    found = iterate(Newton(), disturbed(system, 1, 0.01).theta, max_iterations=200, tolerance=1e-12, variant="relaxed")
+    assert found.status is Status.CONVERGED
+    np.testing.assert_allclose(found.theta, expected.additive.theta, rtol=1e-8)
+
+
+def test_no_controller_is_open_loop():
+    # u = r - 0 y: instruments of the loop are those of the input.
+    plain = open_record(TWO_MODES, 2000, 0.2, 7)
+    looped = Record(
+        plain.t, plain.y, plain.input, loop=Loop(plain.input.values, DiscreteController([0.0], [1.0]), "input")
+    )
+    one = fitted(plain, (TWO_MODES, 1), instruments="open_loop")
+    two = fitted(looped, (TWO_MODES, 1))
+    np.testing.assert_allclose(two.additive.theta, one.additive.theta, rtol=1e-11)
+    np.testing.assert_allclose(two.covariance, one.covariance, rtol=1e-9)
+    assert one.iterations == two.iterations
+    assert two.loop_radius < 1
+    assert np.isnan(one.loop_radius)
+
+
+@pytest.mark.parametrize("enters", ["controller", "input"])
+@pytest.mark.parametrize("system", [TWO_MODES, DELAYED, BIPROPER], ids=["modes", "delay", "biproper"])
+def test_noise_free_loop_returns_the_true_model(system, enters):
+    record = loop_record(system, 1500, 0.0, 8, enters=enters)
+    for instruments in ("open_loop", "closed_loop"):
+        fit = fitted(record, (system, 1, 0.02), instruments=instruments, tolerance=1e-11)
+        assert fit.status is Status.CONVERGED
+        assert_parameters(fit, system, 1e-7)
+
+
+@pytest.mark.parametrize("enters", ["controller", "input"])
+def test_where_the_reference_enters_matters(enters):
+    # Both estimates are within their errors of the truth, and a wrong statement would not simulate the loop.
+    record = loop_record(TWO_MODES, 4000, 0.1, 9, enters=enters)
+    fit = fitted(record, (TWO_MODES, 1))
+    assert fit.status is Status.CONVERGED
+    assert np.abs(deviations(fit, TWO_MODES)).max() < 4
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("system", [DRIVE, RIGID], ids=["integrator and pole", "rigid body"])
+def test_integrators_in_a_loop(system, seed):
+    record = loop_record(system, 2000, 0.01, seed, controller=PD)
+    assert loop_radius(system, PD, INTERVAL) < 1
+    fit = fitted(record, (system, seed))
+    assert fit.status is Status.CONVERGED
+    assert fit.iterations <= 15
+    assert np.abs(deviations(fit, system)).max() < 4
+    assert fit.loop_radius < 1
+
+
+@pytest.mark.parametrize("system", [TWO_MODES, DELAYED])
+def test_record_of_a_loop_in_motion_is_fitted_exactly(system):
+    whole = loop_record(system, 1300, 0.0, 10)
+    cut = slice(100, None)
+    record = Record(
+        whole.t[cut],
+        whole.y[cut],
+        HeldSignal(whole.t[cut], whole.input.values[cut]),
+        loop=Loop(whole.loop.reference[cut], PID),
+    )
+    start = disturbed(system, 1, 0.02)
+    fit = fitted(record, start, initial_state="estimated", tolerance=1e-11)
+    assert fit.status is Status.CONVERGED
+    assert_parameters(fit, system, 1e-6)
+    at_rest = fitted(record, start, tolerance=1e-11)
+    assert np.abs(at_rest.additive.theta / system.theta - 1).max() > 1e-3
+
+
+def test_every_record_of_the_loop_converges():
+    for seed in range(20):
+        record = loop_record(TWO_MODES, 3140, 0.1, 200 + seed)
+        start = disturbed(TWO_MODES, seed)
+        fits = [fitted(record, start, variant=variant) for variant in ("plain", "relaxed")]
+        fits += [Srivc(4, 2, instruments="closed_loop", tolerance=1e-8).fit(record, Start(model=start))]
+        for fit in fits:
+            assert fit.status is Status.CONVERGED
+        np.testing.assert_allclose(fits[0].additive.theta, fits[1].additive.theta, rtol=1e-5)
+
+
+@pytest.mark.parametrize("seed", [150])
+def test_relaxed_steps_end_a_cycle_of_full_ones(seed):
+    # A short record on which full steps never settle.
+    record = loop_record(TWO_MODES, 500, 0.1, seed)
+    start = disturbed(TWO_MODES, 1000 + seed)
+    assert fitted(record, start, variant="plain").status is Status.MAX_ITERATIONS
+    fit = fitted(record, start, variant="relaxed")
+    assert fit.status is Status.CONVERGED
+    assert fit.iterations < 60
+    # It is a root of the same equations.
+    problem = AdditiveProblem(filter_data(record), TWO, 0.0, loop_data(record, "closed_loop"))
+    equations = problem.equations(fit.additive.theta)
+    lengths = np.sqrt(np.diag(equations.hessian) * equations.squared_error)
+    assert np.abs(equations.instrument_error / lengths).max() < 1e-6
+
+
+def test_coloured_noise_in_a_loop_biases_direct_instruments_only():
+    # v = e/(1 - 0.9 q^-1) of variance 0.01: the direct estimates of the second mode are off by several deviations.
+    estimates = {"open_loop": [], "closed_loop": []}
+    for seed in range(12):
+        record = loop_record(TWO_MODES, 20000, 0.1 * np.sqrt(1 - 0.81), 300 + seed, filter=([1.0], [1.0, -0.9]))
+        for instruments, found in estimates.items():
+            fit = fitted(record, (TWO_MODES, seed), instruments=instruments, covariance="sandwich")
+            assert fit.status is Status.CONVERGED
+            found.append(deviations(fit, TWO_MODES))
+    closed, direct = (np.array(estimates[name]) for name in ("closed_loop", "open_loop"))
+    # The mean of 12 unbiased standardised estimates lies within 4/sqrt(12) = 1.15 of zero with 99.99 % confidence.
+    assert np.abs(closed.mean(axis=0)).max() < 1.15
+    assert (np.abs(direct.mean(axis=0))[[3, 5]] > 2.5).all()
+    # So do they scatter by one deviation: the mean square of 72 lies within 0.5 and 1.7.
+    assert 0.5 < np.mean((closed - closed.mean(axis=0)) ** 2) * 12 / 11 < 1.7
+
+
+def test_standard_errors_are_those_of_repeated_loops():
+    # 80 observed to stated standard deviations: their ratio lies within 0.7 and 1.35 with 99.9 % confidence.
+    system = modes([0.25, 0.25, 3.0, 0.02, 0.025, 1.0])
+    estimates, stated = [], []
+    for seed in range(80):
+        fit = fitted(loop_record(system, 3000, 0.1, 400 + seed), system)
+        assert fit.status is Status.CONVERGED
+        estimates.append(fit.additive.theta)
+        stated.append(np.diag(fit.covariance))
+    ratio = np.sqrt(np.mean(stated, axis=0)) / np.std(estimates, axis=0, ddof=1)
+    assert ((ratio > 0.7) & (ratio < 1.35)).all()
+
+
+def test_masked_samples_and_delay():
+    record = loop_record(DELAYED, 4000, 0.1, 12)
+    y = record.y.copy()
+    y[np.random.default_rng(1).choice(4000, 400, replace=False)] = np.nan
+    fit = fitted(replace(record, y=y), (DELAYED, 1))
+    assert fit.status is Status.CONVERGED
+    assert fit.count < 3601
+    assert np.abs(deviations(fit, DELAYED)).max() < 4
+    assert fit.loop_radius == pytest.approx(loop_radius(fit.additive, PID, INTERVAL))
+
+
+ESTIMATORS = [
+    (AdditiveSrivc(terms=TWO, instruments="closed_loop"), TWO_MODES),
+    (Srivc(4, 2, instruments="closed_loop"), TWO_MODES),
+]
+
+
+@pytest.mark.parametrize(("estimator", "model"), ESTIMATORS, ids=["additive", "srivc"])
+def test_record_without_a_loop_is_refused(estimator, model):
+    record = open_record(TWO_MODES, 200, 0.1, 1)
+    with pytest.raises(DataError, match=r"need the reference and the controller.* or use instruments 'open_loop'"):
+        estimator.fit(record, Start(model=model))
+    irregular = open_record(TWO_MODES, 200, 0.1, 1, times=np.cumsum(np.random.default_rng(1).uniform(0.02, 0.08, 200)))
+    with pytest.raises(DataError, match="need the reference and the controller"):
+        estimator.fit(irregular, Start(model=model))
+    with pytest.raises(DataError, match="a closed loop needs a regular clock"):
+        replace(irregular, loop=Loop(np.zeros(200), PID))
+    with pytest.raises(DataError, match="in a closed loop the input is held"):
+        replace(record, input=HeldSignal(record.t, record.input.values, "foh"), loop=Loop(np.zeros(200), PID))
+    with pytest.raises(DataError, match="the reference has 199 values for 200 samples"):
+        replace(record, loop=Loop(np.zeros(199), PID))
+
+
+@pytest.mark.parametrize("estimator", [AdditiveSrivc, Srivc])
+def test_guarding_a_cost_that_is_not_minimised_is_refused(estimator):
+    options = {"terms": TWO} if estimator is AdditiveSrivc else {"poles": 4, "zeros": 2}
+    with pytest.raises(ValueError, match=r"guarded is for open-loop instruments.*use relaxed or plain"):
+        estimator(**options, instruments="closed_loop", variant="guarded")
+    assert Srivc(4, 2).step_rule == "guarded"
+    assert Srivc(4, 2, instruments="closed_loop").step_rule == "relaxed"
+
+
+@pytest.mark.parametrize(("estimator", "model"), ESTIMATORS, ids=["additive", "srivc"])
+def test_start_that_makes_an_unstable_loop_is_refused(estimator, model):
+    record = loop_record(TWO_MODES, 2000, 0.1, 1)
+    wild = modes([0.25, 0.25, 60.0, 0.01, 0.025, 40.0])
+    radius = loop_radius(wild, PID, INTERVAL)
+    assert radius > 1.05
+    with pytest.raises(
+        DataError, match=r"start makes an unstable loop .*magnitude 1\.\d+.* start closer, or .*'open_loop'"
+    ):
+        estimator.fit(record, Start(model=wild))
+
+
+def test_start_that_makes_a_slightly_unstable_loop_is_not():
+    # The loop of the start grows slowly; the record can be simulated with it, and the estimate makes it stable.
+    record = loop_record(TWO_MODES, 1000, 0.05, 2)
+    start = modes([0.25, 0.25, 3.0, 0.004, 0.025, 2.0])
+    assert 1 < loop_radius(start, PID, INTERVAL) < 1.01
+    fit = fitted(record, start)
+    assert fit.status is Status.CONVERGED
+    assert fit.loop_radius < 1
+    assert np.abs(deviations(fit, TWO_MODES)).max() < 4
+
+
+def test_loop_without_a_solution_is_refused():
+    # A direct gain of -1 round the loop at the start: there is no input that satisfies both sides.
+    record = open_record(BIPROPER, 200, 0.1, 1)
+    looped = replace(record, loop=Loop(np.ones(200), DiscreteController([-1 / 3.0], [1.0])))
+    assert BIPROPER.submodels[1].transfer_function().numerator[0] == pytest.approx(3.0)
+    with pytest.raises(DataError, match="the loop has no solution"):
+        AdditiveSrivc(terms=BIPROPER.terms, instruments="closed_loop").fit(looped, Start(model=BIPROPER))
+
+
+def test_unstable_estimate_of_an_open_loop_record_says_so():
+    # Instruments of the input need no loop, and none is looked at.
+    record = loop_record(TWO_MODES, 1000, 0.1, 3)
+    fit = fitted(record, (TWO_MODES, 1), instruments="open_loop")
+    assert np.isnan(fit.loop_radius)
+    assert unfactored(fit.additive).order == 4
+    assert fit.additive.terms == (Term(2, 0), Term(2, 0))
+
+
+@pytest.mark.parametrize("enters", ["controller", "input"])
+@pytest.mark.parametrize("controller", [PID, PD, DiscreteController([0.02, -0.004], [1.0, -0.5, 0.06])])
+def test_loop_of_the_record_is_the_one_that_instruments_are_simulated_in(controller, enters):
+    # A controller that acts a sample late has fewer numerator coefficients than the others.
+    record = loop_record(DELAYED, 400, 0.1, 13, controller=controller, enters=enters)
+    problem = AdditiveProblem(filter_data(record), DELAYED.terms, DELAYED.delay, loop_data(record, "closed_loop"))
+    *_, output = problem.filter.rows(DELAYED.theta)
+    expected = simulate_loop(DELAYED, controller, record.loop.reference, 0.0, INTERVAL, enters).x
+    np.testing.assert_allclose(output, expected, atol=1e-9 * np.abs(expected).max())

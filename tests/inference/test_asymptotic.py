@@ -1,0 +1,314 @@
+"""Asymptotic accuracy against known numbers, frequency-domain integrals and sums over impulse responses."""
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, lfilter, tf2ss
+
+from ctid_cli.errors import DataError
+from ctid_cli.filtering import simulate_loop
+from ctid_cli.inference.asymptotic import closed_loop_accuracy, open_loop_accuracy, output_variance
+from ctid_cli.inference.finite_record import additive_sensitivities, unfactored_sensitivities
+from ctid_cli.models import TransferFunction
+from ctid_cli.models.additive import AdditiveModel, Submodel
+from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.factoring import factored, factored_jacobian, unfactored
+from ctid_cli.signals import HeldSignal
+
+INTERVAL = 0.05
+
+
+def mode(pole, gain):
+    return Submodel([gain], [1 / abs(pole) ** 2, -2 * pole.real / abs(pole) ** 2, 1.0])
+
+
+# The two simulation examples of Gonzalez, Classens, Rojas, Welsh and Oomen, sections 6.1 and 6.2.
+POLES = (-0.25 + 1.39j, -0.15 + 3.16j, -0.17 + 5.77j, -0.5 + 9.99j)
+FOUR_MODES = AdditiveModel([mode(pole, gain) for pole, gain in zip(POLES, (3.0, 0.4, 0.2, 0.05), strict=True)])
+TWO_MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
+PID = DiscreteController.from_pid(0.0115, 0.00725, 0.00454)
+COLOURED = ([1.0, 0.5], [1.0, -0.85])
+OPEN = {"input_standard_deviation": 1.0, "innovation_variance": 0.02, "noise_filter": COLOURED, "samples": 1}
+CLOSED = {"reference_standard_deviation": 1.0, "innovation_variance": 0.01, "samples": 1}
+
+
+def variances(accuracy, letter):
+    """N times the variances of the parameters whose name ends so, by submodel."""
+    return [v for name, v in zip(accuracy.names, np.diag(accuracy.covariance), strict=True) if name.endswith(letter)]
+
+
+def largest_relative_error(covariance, expected):
+    deviations = np.sqrt(np.diag(expected))
+    return np.abs((covariance - expected) / np.outer(deviations, deviations)).max()
+
+
+def test_known_variances_of_four_modes_in_open_loop():
+    additive = open_loop_accuracy(FOUR_MODES, INTERVAL, **OPEN)
+    np.testing.assert_allclose(variances(additive, "b0"), [35.60, 2.700, 0.4405, 0.2240], rtol=2e-4)
+    np.testing.assert_allclose(variances(additive, "a1"), [0.48853, 0.029072, 0.0021642, 0.014862], rtol=5e-5)
+    np.testing.assert_allclose(variances(additive, "a2"), [0.11691, 1.3780e-3, 3.0539e-5, 6.0108e-5], rtol=5e-5)
+    unconstrained = open_loop_accuracy(unfactored(FOUR_MODES), INTERVAL, **OPEN).factored()
+    np.testing.assert_allclose(variances(unconstrained, "b0"), [36.75, 3.645, 0.5341, 0.2322], rtol=2e-4)
+    np.testing.assert_allclose(variances(unconstrained, "a1"), [0.49374, 0.033565, 0.0023801, 0.014823], rtol=5e-5)
+    np.testing.assert_allclose(variances(unconstrained, "a2"), [0.23860, 2.9082e-3, 6.4791e-5, 1.7786e-4], rtol=5e-5)
+    # The white formula at the same total variance is no substitute.
+    white = open_loop_accuracy(
+        FOUR_MODES, INTERVAL, input_standard_deviation=1.0, innovation_variance=0.151351, samples=1
+    )
+    assert variances(additive, "b0")[0] / variances(white, "b0")[0] == pytest.approx(11, rel=0.05)
+
+
+def test_known_signal_to_noise_ratio():
+    noise = 0.02 * (1 + 1.35**2 / (1 - 0.85**2))
+    output = output_variance(FOUR_MODES, INTERVAL, input_standard_deviation=1.0)
+    assert output == pytest.approx(1.16984, rel=1e-5)
+    assert 10 * np.log10(output / noise) == pytest.approx(8.881, abs=5e-4)
+    assert output_variance(FOUR_MODES, INTERVAL, input_standard_deviation=3.0) == pytest.approx(9 * output)
+    assert output_variance(unfactored(FOUR_MODES), INTERVAL, input_standard_deviation=1.0) == pytest.approx(output)
+
+
+def test_known_variances_of_two_modes_in_closed_loop():
+    additive = closed_loop_accuracy(TWO_MODES, INTERVAL, PID, **CLOSED)
+    np.testing.assert_allclose(variances(additive, "a1"), [0.20003, 1.28798e-3], rtol=3e-5)
+    np.testing.assert_allclose(variances(additive, "a2"), [0.035010, 1.52180e-5], rtol=3e-5)
+    np.testing.assert_allclose(variances(additive, "b0"), [14.287, 6.7705], rtol=4e-5)
+    unconstrained = closed_loop_accuracy(unfactored(TWO_MODES), INTERVAL, PID, **CLOSED)
+    factors = unconstrained.factored()
+    np.testing.assert_allclose(variances(factors, "a1"), [0.22218, 1.37704e-3], rtol=3e-5)
+    np.testing.assert_allclose(variances(factors, "a2"), [0.090118, 2.49911e-5], rtol=3e-5)
+    np.testing.assert_allclose(variances(factors, "b0"), [14.683, 8.0467], rtol=4e-5)
+    # The input is S (r - v), and v has the variance 0.01: with the input itself the noise excites too.
+    direct = closed_loop_accuracy(unfactored(TWO_MODES), INTERVAL, PID, instruments="open_loop", **CLOSED)
+    np.testing.assert_allclose(1.01 * direct.covariance, unconstrained.covariance, rtol=1e-6)
+
+
+def sampled_response(numerator, denominator, z):
+    """Zero-order-hold equivalent of a filter on the unit circle, from SciPy."""
+    A, B, C, D, _ = cont2discrete(tf2ss(numerator, denominator), INTERVAL)
+    states = np.linalg.solve(z[:, None, None] * np.eye(A.shape[0]) - A, np.broadcast_to(B, (z.size, *B.shape)))
+    return (C @ states + D)[:, 0, 0]
+
+
+def spectra(model, z):
+    """Responses of the sensitivities of an additive model to its input, and of the model, on the unit circle."""
+    rows, total = [], 0.0
+    for submodel in model.submodels:
+        b, a = submodel.numerator, submodel.denominator
+        square = np.polymul(a, a)
+        rows += [-sampled_response(np.append(b, np.zeros(k)), square, z) for k in range(1, a.size)]
+        rows += [sampled_response(np.append(1.0, np.zeros(k)), a, z) for k in range(b.size)]
+        total = total + sampled_response(b, a, z)
+    return np.array(rows), total
+
+
+def integral(rows, power):
+    """Covariance from a spectrum, by the trapezoidal rule over the unit circle."""
+    return np.real((rows * power) @ rows.conj().T) / rows.shape[1]
+
+
+def sandwich(rows, power, noise_power):
+    inverse = np.linalg.inv(integral(rows, power))
+    return inverse @ integral(rows, power * noise_power) @ inverse
+
+
+Z = np.exp(2j * np.pi * np.arange(8192) / 8192)
+H_POWER = np.abs((1 + 0.5 / Z) / (1 - 0.85 / Z)) ** 2
+
+
+def test_open_loop_is_an_integral_over_the_unit_circle():
+    rows, _ = spectra(FOUR_MODES, Z)
+    expected = sandwich(rows, 4.0, 0.02 * H_POWER)
+    accuracy = open_loop_accuracy(FOUR_MODES, INTERVAL, **OPEN | {"input_standard_deviation": 2.0})
+    assert largest_relative_error(accuracy.covariance, expected) < 1e-8
+
+
+@pytest.mark.parametrize("enters", ["controller", "input"])
+def test_closed_loop_is_an_integral_over_the_unit_circle(enters):
+    rows, G = spectra(TWO_MODES, Z)
+    # The integrator of the controller makes 1/(1 + G C) vanish at zero frequency, where C alone is infinite.
+    numerator, denominator = (np.polyval(part, Z) for part in (PID.numerator, PID.denominator))
+    S = (numerator if enters == "controller" else denominator) / (denominator + G * numerator)
+    power = 0.25 * np.abs(S) ** 2
+    options = {"reference_standard_deviation": 0.5, "innovation_variance": 0.01, "enters": enters, "samples": 1}
+    accuracy = closed_loop_accuracy(TWO_MODES, INTERVAL, PID, **options)
+    assert largest_relative_error(accuracy.covariance, sandwich(rows, power, 0.01)) < 1e-8
+    coloured = closed_loop_accuracy(TWO_MODES, INTERVAL, PID, noise_filter=COLOURED, **options)
+    assert largest_relative_error(coloured.covariance, sandwich(rows, power, 0.01 * H_POWER)) < 1e-8
+    # Where the reference enters at the input, the noise still comes through the controller.
+    noise = 0.01 * np.abs(numerator / (denominator + G * numerator)) ** 2
+    direct = closed_loop_accuracy(TWO_MODES, INTERVAL, PID, instruments="open_loop", **options)
+    assert largest_relative_error(direct.covariance, sandwich(rows, power + noise, 0.01)) < 1e-8
+
+
+def pulse(count, values=(1.0,)):
+    samples = np.zeros(count)
+    samples[: len(values)] = values
+    return HeldSignal(INTERVAL * np.arange(count), samples)
+
+
+def sum_of_responses(psi, standard_deviation, innovation_variance, noise_filter=((1.0,), (1.0,))):
+    """The sandwich from impulse responses of psi, ``E psi psi' = sum over their samples``."""
+    assert np.abs(psi[-1]).max() < 1e-9 * np.abs(psi).max()  # they have died away
+    inverse = np.linalg.inv(standard_deviation**2 * psi.T @ psi)
+    filtered = lfilter(*noise_filter, psi, axis=0)
+    sigma = innovation_variance * standard_deviation**2 * filtered.T @ filtered
+    return inverse @ sigma @ inverse
+
+
+FAST = AdditiveModel([Submodel([0.5, 1.0], [0.04, 0.1, 1.0]), Submodel([0.7], [0.5, 1.0])], 0.13)
+
+
+def test_a_delay_matters_in_open_loop_only_by_its_fraction_of_an_interval():
+    options = {"input_standard_deviation": 2.0, "innovation_variance": 0.3, "noise_filter": COLOURED, "samples": 1}
+    count = 1200
+    times = INTERVAL * np.arange(count)
+    for model in (FAST, unfactored(FAST)):
+        sensitivities = additive_sensitivities if model is FAST else unfactored_sensitivities
+        expected = sum_of_responses(sensitivities(model, pulse(count), times), 2.0, 0.3, COLOURED)
+        accuracy = open_loop_accuracy(model, INTERVAL, **options)
+        assert largest_relative_error(accuracy.covariance, expected) < 1e-8
+    moved = [
+        open_loop_accuracy(AdditiveModel(FAST.submodels, delay), INTERVAL, **options).covariance
+        for delay in (0.0, 0.13, 0.43)
+    ]
+    np.testing.assert_allclose(moved[2], moved[1], rtol=1e-9)
+    assert largest_relative_error(moved[0], moved[1]) > 0.01
+
+
+RIGID = AdditiveModel([Submodel([0.4], [0.3, 1.0], integrators=1), Submodel([0.1], [0.01, 0.1, 1.0])])
+DOUBLE = AdditiveModel([Submodel([0.2, 0.4], [1.0], integrators=2), Submodel([0.1], [0.02, 0.1, 1.0])], 0.02)
+# As many zeros as poles: the output answers to the input at once, also round the loop.
+DIRECT = AdditiveModel([Submodel([0.02, 0.3, 1.0], [0.04, 0.1, 1.0]), Submodel([0.7], [0.5, 1.0])])
+DIRECT_RIGID = AdditiveModel([Submodel([0.1, 0.2, 0.4], [0.3, 1.0], integrators=1)])
+PD = DiscreteController.from_pid(0.5, 0.0, 0.5)
+FIRM = DiscreteController.from_pid(3.0, 0.0, 0.5)
+STIFF = DiscreteController.from_pid(8.0, 0.0, 8.0)
+
+
+@pytest.mark.parametrize("enters", ["controller", "input"])
+@pytest.mark.parametrize(
+    ("model", "controller"),
+    [(FAST, PD), (RIGID, STIFF), (DOUBLE, STIFF), (DIRECT, PD), (DIRECT_RIGID, FIRM)],
+    ids=["delay", "1 integrator", "2 integrators", "direct", "direct, 1 integrator"],
+)
+def test_closed_loop_is_a_sum_over_impulse_responses(model, controller, enters):
+    count = 1200
+    z = simulate_loop(model, controller, pulse(count).values, 0.0, INTERVAL, enters).u
+    psi = additive_sensitivities(model, pulse(count, z), INTERVAL * np.arange(count))
+    options = {"reference_standard_deviation": 1.5, "innovation_variance": 0.1, "enters": enters, "samples": 1}
+    accuracy = closed_loop_accuracy(model, INTERVAL, controller, noise_filter=COLOURED, **options)
+    assert largest_relative_error(accuracy.covariance, sum_of_responses(psi, 1.5, 0.1, COLOURED)) < 1e-7
+    white = closed_loop_accuracy(model, INTERVAL, controller, **options)
+    assert largest_relative_error(white.covariance, sum_of_responses(psi, 1.5, 0.1)) < 1e-7
+
+
+def test_a_loop_without_a_controller_is_open():
+    open_loop = open_loop_accuracy(FAST, INTERVAL, **OPEN)
+    loop = closed_loop_accuracy(
+        FAST,
+        INTERVAL,
+        DiscreteController([0.0], [1.0]),
+        reference_standard_deviation=1.0,
+        innovation_variance=0.02,
+        noise_filter=COLOURED,
+        samples=1,
+        enters="input",
+    )
+    np.testing.assert_allclose(loop.covariance, open_loop.covariance, rtol=1e-9)
+
+
+def test_a_reaction_at_once_of_the_model_is_solved_for():
+    # y = b u + ..., biproper: u (1 + C(inf) b) = ...; a pure gain in a proportional loop has S = C/(1 + b C).
+    gain = AdditiveModel([Submodel([2.0], [1.0])])
+    accuracy = closed_loop_accuracy(gain, INTERVAL, DiscreteController([0.25], [1.0]), **CLOSED)
+    assert accuracy.covariance.item() == pytest.approx(0.01 * (1.5 / 0.25) ** 2)
+    with pytest.raises(DataError, match="correlated with the noise at the same sample"):
+        closed_loop_accuracy(gain, INTERVAL, DiscreteController([0.25], [1.0]), instruments="open_loop", **CLOSED)
+    with pytest.raises(DataError, match="no solution"):
+        closed_loop_accuracy(gain, INTERVAL, DiscreteController([-0.5], [1.0]), **CLOSED)
+
+
+def test_standard_errors_follow_the_units_and_the_number_of_samples():
+    base = open_loop_accuracy(FOUR_MODES, INTERVAL, **OPEN)
+    longer = open_loop_accuracy(FOUR_MODES, INTERVAL, **OPEN | {"samples": 400})
+    np.testing.assert_allclose(longer.standard_errors, np.sqrt(np.diag(base.covariance)) / 20)
+    louder = open_loop_accuracy(FOUR_MODES, INTERVAL, **OPEN | {"input_standard_deviation": 10.0})
+    np.testing.assert_allclose(100 * louder.covariance, base.covariance, rtol=1e-9)
+    # In another unit of time, c of the old one: a_k scales with c^-k.
+    unit = 1e-3
+    scaled = AdditiveModel(
+        [Submodel(s.numerator, s.denominator * unit ** np.arange(2, -1, -1)) for s in FOUR_MODES.submodels]
+    )
+    other = open_loop_accuracy(scaled, INTERVAL * unit, **OPEN)
+    np.testing.assert_allclose(scaled.theta / other.standard_errors, base.values / base.standard_errors, rtol=1e-8)
+
+
+def test_the_two_forms_tell_the_same_of_one_submodel():
+    # One term with a numerator of full length is the unfactored model in other coordinates.
+    model = AdditiveModel([Submodel([0.5, 1.0], [0.04, 0.1, 1.0])], 0.07)
+    expected = open_loop_accuracy(model, INTERVAL, **OPEN)
+    accuracy = open_loop_accuracy(unfactored(model), INTERVAL, **OPEN).factored()
+    assert accuracy.names == expected.names
+    np.testing.assert_allclose(accuracy.values, expected.values, rtol=1e-12)
+    np.testing.assert_allclose(accuracy.covariance, expected.covariance, rtol=1e-9)
+    assert expected.factored() is expected
+
+
+def test_factoring_passes_the_covariance_on_by_its_derivatives():
+    model = unfactored(TWO_MODES)
+    accuracy = closed_loop_accuracy(model, INTERVAL, PID, **CLOSED)
+    jacobian = factored_jacobian(model)
+    expected = jacobian @ accuracy.covariance @ jacobian.T
+    assert largest_relative_error(accuracy.factored().covariance, expected) < 1e-9
+
+
+def test_a_longer_numerator_costs_accuracy():
+    model = unfactored(TWO_MODES)
+    short = closed_loop_accuracy(model, INTERVAL, PID, **CLOSED)
+    long = closed_loop_accuracy(model, INTERVAL, PID, zeros=3, **CLOSED)
+    assert short.names == ("a1", "a2", "a3", "a4", "b0", "b1", "b2")
+    assert long.names == ("a1", "a2", "a3", "a4", "b0", "b1", "b2", "b3")
+    assert (np.diag(long.covariance)[:4] > np.diag(short.covariance)[:4]).all()
+    assert long.values[4] == 0.0
+    # The derivatives of factoring by differences, the leading coefficient of the numerator moved from zero.
+    steps = 1e-6 * np.append(np.abs(long.values[:4]), np.full(4, 100.0))
+    columns = []
+    for k, step in enumerate(steps):
+        moved = []
+        for sign in (1, -1):
+            theta = long.values.copy()
+            theta[k] += sign * step
+            moved.append(factored(TransferFunction(theta[4:], np.append(1.0, theta[:4]))).theta)
+        columns.append((moved[0] - moved[1]) / (2 * step))
+    jacobian = np.column_stack(columns)
+    expected = jacobian @ long.covariance @ jacobian.T
+    assert largest_relative_error(long.factored().covariance, expected) < 1e-5
+
+
+def test_refusals_say_why():
+    with pytest.raises(DataError, match=r"an integrator counts.*record of given length"):
+        open_loop_accuracy(RIGID, INTERVAL, **OPEN)
+    assert output_variance(RIGID, INTERVAL, input_standard_deviation=1.0) == np.inf
+    with pytest.raises(DataError, match=r"pole at the origin.*additive model keeps its integrators fixed"):
+        closed_loop_accuracy(unfactored(RIGID), INTERVAL, STIFF, **CLOSED)
+    with pytest.raises(DataError, match=r"loop is not stable.*magnitude 1\."):
+        closed_loop_accuracy(TWO_MODES, INTERVAL, DiscreteController(5 * PID.numerator, PID.denominator), **CLOSED)
+    closed_loop_accuracy(TWO_MODES, INTERVAL, DiscreteController(2 * PID.numerator, PID.denominator), **CLOSED)
+    with pytest.raises(DataError, match=r"coloured.*ask for closed_loop instruments"):
+        closed_loop_accuracy(TWO_MODES, INTERVAL, PID, noise_filter=COLOURED, instruments="open_loop", **CLOSED)
+    with pytest.raises(DataError, match="noise filter is not stable"):
+        open_loop_accuracy(TWO_MODES, INTERVAL, **OPEN | {"noise_filter": ([1.0], [1.0, -1.0])})
+    silent = AdditiveModel([Submodel([0.0], [0.25, 0.25, 1.0])])
+    cancelling = TransferFunction([1.0, 1.0], [1.0, 3.0, 2.0])
+    for model in (silent, cancelling):
+        with pytest.raises(DataError, match="no effect of their own on the output"):
+            open_loop_accuracy(model, INTERVAL, **OPEN)
+    with pytest.raises(ValueError, match=r"zeros must be from 2.*to its 4 poles; got 1"):
+        open_loop_accuracy(unfactored(TWO_MODES), INTERVAL, zeros=1, **OPEN)
+    with pytest.raises(ValueError, match="leave both out"):
+        open_loop_accuracy(TWO_MODES, INTERVAL, zeros=1, **OPEN)
+    with pytest.raises(ValueError, match="interval must be a positive number"):
+        open_loop_accuracy(TWO_MODES, 0.0, **OPEN)
+    with pytest.raises(ValueError, match="input_standard_deviation must be a positive"):
+        open_loop_accuracy(TWO_MODES, INTERVAL, **OPEN | {"input_standard_deviation": 0.0})
+    with pytest.raises(ValueError, match="instruments must be"):
+        closed_loop_accuracy(TWO_MODES, INTERVAL, PID, instruments="direct", **CLOSED)
