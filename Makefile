@@ -2,6 +2,9 @@
 # make test       everything that CI runs
 # make reproduce  the whole study, its tables and figures, compared with the committed ones; stop it and run it again at
 #                 will, it goes on where it was
+# make reproduce-additive
+#                 the study of additive models in open and closed loop, with as many data sets as its specifications say;
+#                 with RUNS=20 fewer, which publishes nothing
 # make bench      speed, measured against other tools
 # make clean      remove what the other targets built (never results)
 
@@ -14,8 +17,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 STUDY := $(sort $(wildcard configs/useful_redundancy/*.yaml))
+ADDITIVE := open_loop closed_loop closed_loop_coloured coverage_open_loop coverage_closed_loop flexible_beam
+# The number of data sets, where it was asked for: not the default of above.
+FEWER := $(if $(filter file,$(origin RUNS)),,--runs $(RUNS))
 
-.PHONY: demo test reproduce bench clean
+.PHONY: demo test reproduce reproduce-additive bench clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -38,6 +44,13 @@ reproduce: $(VENV)/.installed
 	$(BIN)/ctid table --out "$(OUT)"
 	$(BIN)/ctid table --check --out "$(OUT)"
 	@if [ "$(RUNS)" -ge 100 ]; then $(BIN)/python experiments/useful_redundancy/publish.py --results "$(OUT)"; fi
+
+reproduce-additive: $(VENV)/.installed
+	set -e; for name in $(ADDITIVE); do \
+	  $(BIN)/ctid run configs/additive/$$name.yaml $(FEWER) --jobs $(JOBS) --out "$(OUT)"; done
+	$(BIN)/ctid figure additive --out "$(OUT)"
+	@if [ -z "$(FEWER)" ]; then set -e; $(BIN)/python -m experiments.additive.publish --results "$(OUT)"; \
+	  $(BIN)/python -m experiments.additive.acceptance --results "$(OUT)"; fi
 
 bench: $(VENV)/.test-installed
 	set -e; for benchmark in benchmarks/bench_*.py; do $(BIN)/python "$$benchmark"; done

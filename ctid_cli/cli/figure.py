@@ -14,7 +14,10 @@ from ctid_cli.cli._common import Out, guarded
 def figure(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME]...", help="Figure (2, useful-redundancy/2) or study (useful-redundancy)."),
+        typer.Argument(
+            metavar="[NAME]...",
+            help="Figure (2, useful-redundancy/2, additive/3) or study (useful-redundancy, additive).",
+        ),
     ] = None,
     out: Out = Path("results"),
     file: Annotated[
@@ -23,20 +26,22 @@ def figure(
 ) -> None:
     """Draw figures of a study as SVG files.
 
-    They are computed from the study's specifications and need no results. Each goes to
-    OUT/<study>_figures/figure_<number>.svg, and its path is printed.
+    Most are computed from the study's specifications and need no results: all of useful-redundancy, additive/2 and
+    additive/6. The others of additive are drawn from results in OUT; where these are missing, the answer says what to
+    run first. Each goes to OUT/<study>_figures/figure_<number>.svg, and its path is printed.
 
     Without a name: all figures of the useful-redundancy study.
     """
     from ctid_cli.errors import StorageError, UsageError
-    from ctid_cli.reporting.figures.registry import find_figures
+    from ctid_cli.reporting.figures.registry import find_figures, require_results
 
     figures = find_figures(names or [])
     if file is not None and len(figures) != 1:
         raise UsageError(f"--file takes one figure, not {len(figures)}; --out names the folder of several")
+    require_results(figures, out)
     for item in figures:
         path = out / item.place if file is None else file
-        content = item.svg()
+        content = item.svg(out)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)

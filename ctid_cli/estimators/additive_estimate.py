@@ -57,6 +57,11 @@ class History(Sequence[IterationRecord]):
         """
         self._entries.append((stage, iteration, theta.copy(), cost))
 
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the iterations within their stages, 0 for a start."""
+        return [entry[1] for entry in self._entries]
+
     def __len__(self) -> int:
         return len(self._entries)
 
@@ -148,7 +153,8 @@ def estimate_submodels(
 
     Notes
     -----
-    Where the iteration does not converge it is run once more with the other interpolation of the output.
+    Where the iteration does not converge it is run once more with the other interpolation of the output; and in open
+    loop, if that does not help, goes on with guarded steps.
     """
     p, data = problem.size, problem.data
     whole = np.concatenate((theta, np.zeros(problem.filter.free)))
@@ -160,22 +166,23 @@ def estimate_submodels(
         )
     history = History(problem)
 
-    def run(stage: str, problem: AdditiveProblem) -> Iterated | None:
+    def run(stage: str, problem: AdditiveProblem, start: Array, variant: StepRule) -> Iterated | None:
         begun = len(history)
 
         def record_step(theta: Array, equations: Equations) -> None:
             history.add(stage, len(history) - begun, theta, equations.squared_error / data.count)
 
         return iterate(
-            problem, whole, max_iterations=max_iterations, tolerance=tolerance, variant=variant, on_step=record_step
+            problem, start, max_iterations=max_iterations, tolerance=tolerance, variant=variant, on_step=record_step
         )
 
-    result = run("refine", problem)
-    iterations = 0 if result is None else result.iterations
+    result = run("refine", problem, whole, variant)
     if result is None or result.status is not Status.CONVERGED:
-        other = run("refine_again", problem.with_other_hold())
-        iterations += 0 if other is None else other.iterations
-        result = _better(result, other)
+        result = _better(result, run("refine_again", problem.with_other_hold(), whole, variant))
+    if result is not None and result.status is Status.MAX_ITERATIONS and not problem.filter.loop.closed:
+        # Slow on its way to a minimum: near it the cost may guard the steps, and Gauss-Newton is faster.
+        result = _better(result, run("refine_guarded", problem, result.theta, "guarded"))
+    iterations = sum(number > 0 for number in history.numbers)
     nan = float("nan")
     undefined = np.full((p, p), nan)
     if result is None:

@@ -107,7 +107,6 @@ class DelayProfile:
     """
 
     kind: ClassVar[str] = "delay_profile"
-    uses_start: ClassVar[bool] = False
     start_from: ClassVar[StartFrom | None] = None
 
     poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})

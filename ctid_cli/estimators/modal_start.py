@@ -251,6 +251,7 @@ def _arrangements(poles: Sequence[complex], terms: Sequence[Term]) -> Iterator[l
         reals = sorted([*reals, complex(-abs(pole) / SPLIT), complex(-abs(pole) * SPLIT)], key=abs)
     if len(reals) < single or len(reals) != single + 2 * (room - len(pairs)):
         return
+    tried: list[list[list[complex]]] = []
     for alone in combinations(range(len(reals)), single):
         rest = [pole for k, pole in enumerate(reals) if k not in alone]
         doubles = [[pole] for pole in pairs] + [rest[k : k + 2] for k in range(0, len(rest), 2)]
@@ -263,7 +264,10 @@ def _arrangements(poles: Sequence[complex], terms: Sequence[Term]) -> Iterator[l
                     groups[k] += next(two)
                 if terms[k].poles % 2:
                     groups[k].append(next(one))
-            yield groups
+            # Exchanging a term of one pole with one of two changes nothing.
+            if groups not in tried:
+                tried.append(groups)
+                yield groups
 
 
 def _distinct_orders(terms: Sequence[Term]) -> Iterator[list[int]]:
@@ -313,10 +317,9 @@ class _NumeratorFit:
         found = None if responses is None else responses.fit(self.data.y_used)
         if found is None:
             return None
-        gains, criterion, free = found
         theta = model.theta
-        theta[_numerator_places(self.terms)] = gains
-        return _Fitted(AdditiveModel.from_theta(theta, self.terms, self.delay), criterion, free)
+        theta[_numerator_places(self.terms)] = found.gains
+        return _Fitted(AdditiveModel.from_theta(theta, self.terms, self.delay), found.criterion, found.free)
 
     def reduced(self, poles: Sequence[complex], count: int) -> list[complex]:
         """The poles without which the output error would rise most, in all ``count``, conjugates counted."""
@@ -334,10 +337,10 @@ class _NumeratorFit:
             responses = None
         places = list(range(len(kept)))
 
-        def criterion(left_out: int) -> float:
+        def squared_error(left_out: int) -> float:
             used = [k for k in range(len(terms)) if k >= len(kept) or (k in places and k != left_out)]
             found = None if responses is None else responses.of(used).fit(self.data.y_used)
-            return np.inf if found is None else found[1]
+            return np.inf if found is None else found.squared_error
 
         while (size := _size([kept[k] for k in places])) > count:
             possible = [k for k in places if size - _size([kept[k]]) >= count]
@@ -346,7 +349,7 @@ class _NumeratorFit:
                 k = max(places, key=lambda k: -kept[k].real / abs(kept[k]))
                 kept[k] = complex(-abs(kept[k]))
                 continue
-            places.remove(min(possible, key=criterion))
+            places.remove(min(possible, key=squared_error))
         return [kept[k] for k in places]
 
 
@@ -364,19 +367,30 @@ class _Responses:
         forced, free = np.isin(self.forced_owner, owners), np.isin(self.free_owner, owners)
         return _Responses(self.forced[:, forced], self.free[:, free], self.forced_owner[forced], self.free_owner[free])
 
-    def fit(self, y: Array) -> tuple[Array, float, bool] | None:
-        """Numerators, criterion, and whether free responses are worth their parameters; None if all is singular."""
-        best: tuple[Array, float, bool] | None = None
+    def fit(self, y: Array) -> _Gains | None:
+        """Numerators, with free responses where they are worth their parameters; None if all is singular."""
+        best: _Gains | None = None
         for free, columns in ((False, self.forced), (True, np.hstack((self.forced, self.free)))):
             gram = columns.T @ columns
             scales = np.diag(gram)
             solution = scaled_solve(gram, columns.T @ y, scales, scales) if y.size > scales.size else None
             if solution is None:
                 continue
-            criterion = _criterion(y - columns @ solution) + DECISIVE * free * self.free.shape[1] * np.log(y.size)
-            if best is None or criterion < best[1]:
-                best = solution[: self.forced.shape[1]], criterion, free
+            error = y - columns @ solution
+            criterion = _criterion(error) + DECISIVE * free * self.free.shape[1] * np.log(y.size)
+            if best is None or criterion < best.criterion:
+                best = _Gains(solution[: self.forced.shape[1]], criterion, float(error @ error), free)
         return best
+
+
+@dataclass(frozen=True, eq=False)
+class _Gains:
+    """Numerators in the order of the terms, what they leave, and whether free responses were fitted too."""
+
+    gains: Array
+    criterion: float
+    squared_error: float
+    free: bool
 
 
 def _responses(data: FilterData, model: AdditiveModel) -> _Responses | None:

@@ -37,9 +37,9 @@ LONGEST_STRETCH = 8192
 LOCAL_LINES = 12
 LOCAL_DEGREE = 2
 #: A band of that many lines counts as excited by the input from this ratio of explained to noise power on.
-CLEARLY_EXPLAINED = 6.0
+CLEARLY_EXPLAINED = 10.0
 #: Lines are kept up to the highest clearly explained frequency times this: weaker modes may lie beyond it.
-HEADROOM = 2.0
+HEADROOM = 2.5
 FEWEST_LINES = 128
 #: Moves of all poles after each new mode, and after the last.
 MOVES_BETWEEN = 4
@@ -72,18 +72,18 @@ class Lines:
         Spectra of delayed input and output, divided by the noise level.
     weights : ndarray, shape (K,)
         What they were multiplied with: the spectrum of a transient.
+    direct : ndarray, shape (K,) or (0,)
+        Spectrum of what a direct feed-through adds to the output, weighted likewise; empty where there is none.
     integrators : int
         Poles at the origin.
-    direct : bool
-        Whether the input feeds through.
     """
 
     frequencies: Array
     inputs: ComplexArray
     outputs: ComplexArray
     weights: Array
+    direct: ComplexArray
     integrators: int
-    direct: bool
 
     @property
     def s(self) -> ComplexArray:
@@ -105,7 +105,30 @@ class Lines:
         """
         weights = weights / float(np.median(weights))
         change = weights / self.weights
-        return replace(self, inputs=self.inputs * change, outputs=self.outputs * change, weights=weights)
+        direct = self.direct * change if self.direct.size else self.direct
+        return replace(self, inputs=self.inputs * change, outputs=self.outputs * change, weights=weights, direct=direct)
+
+    def lowest(self, count: int) -> Lines:
+        """The lines of the lowest frequencies.
+
+        Parameters
+        ----------
+        count : int
+            Their number.
+
+        Returns
+        -------
+        Lines
+            The lines.
+        """
+        return Lines(
+            self.frequencies[:count],
+            self.inputs[:count],
+            self.outputs[:count],
+            self.weights[:count],
+            self.direct[:count],
+            self.integrators,
+        )
 
 
 def spectral_lines(record: Record, delay: float, integrators: int = 0, direct: bool = False) -> Lines | None:
@@ -128,31 +151,34 @@ def spectral_lines(record: Record, delay: float, integrators: int = 0, direct: b
         Lines of weight one up to somewhat beyond the highest frequency at which the output clearly follows the input;
         None for a record too short to have any.
     """
-    stretch = record
-    if record.n_samples > LONGEST_STRETCH:
-        early = record.input.t <= record.t[LONGEST_STRETCH - 1]
-        held = HeldSignal(record.input.t[early], record.input.values[early], record.input.hold)
-        stretch = Record(record.t[:LONGEST_STRETCH], record.y[:LONGEST_STRETCH], held, name=record.name)
     try:
+        stretch = _beginning(record)
         spectra = record_spectra(stretch, delay, np.inf, delay, keep_mean=False)
     except DataError:
         return None
     count = spectra.frequencies.size
-    lines = Lines(spectra.frequencies, spectra.inputs(delay), spectra.outputs, np.ones(count), integrators, direct)
+    through = np.zeros(0, dtype=np.complex128)
+    if direct:
+        # Spectra join the samples of an output by straight lines: what feeds through has to be taken likewise.
+        sampled = Record(stretch.t, stretch.input.at(stretch.t - delay), stretch.input)
+        through = record_spectra(sampled, delay, np.inf, delay, keep_mean=False).outputs
+    lines = Lines(spectra.frequencies, spectra.inputs(delay), spectra.outputs, np.ones(count), through, integrators)
     if count < 2 * LOCAL_LINES:
         return lines
     edges, noise, explained = _local_fits(lines)
     clear = np.flatnonzero(explained > CLEARLY_EXPLAINED * _median_of_neighbours(noise))
     if not clear.size:
         return lines
-    kept = int(min(max(HEADROOM * edges[clear[-1] + 1], FEWEST_LINES), count))
-    return replace(
-        lines,
-        frequencies=lines.frequencies[:kept],
-        inputs=lines.inputs[:kept],
-        outputs=lines.outputs[:kept],
-        weights=lines.weights[:kept],
-    )
+    return lines.lowest(int(min(max(HEADROOM * edges[clear[-1] + 1], FEWEST_LINES), count)))
+
+
+def _beginning(record: Record) -> Record:
+    """The first samples of a long record."""
+    if record.n_samples <= LONGEST_STRETCH:
+        return record
+    early = record.input.t <= record.t[LONGEST_STRETCH - 1]
+    held = HeldSignal(record.input.t[early], record.input.values[early], record.input.hold)
+    return Record(record.t[:LONGEST_STRETCH], record.y[:LONGEST_STRETCH], held)
 
 
 def local_weights(lines: Lines) -> Array:
@@ -317,7 +343,7 @@ def _fixed_columns(lines: Lines) -> list[ComplexArray]:
     if lines.integrators:
         powers = np.asarray(lines.s[:, None] ** -np.arange(1.0, lines.integrators + 1), dtype=np.complex128)
         columns += [powers * lines.inputs[:, None], powers * lines.weights[:, None]]
-    return [*columns, lines.inputs[:, None]] if lines.direct else columns
+    return [*columns, lines.direct[:, None]] if lines.direct.size else columns
 
 
 def _candidates(lines: Lines, residual: ComplexArray, pairs: bool, reals: bool) -> list[complex]:

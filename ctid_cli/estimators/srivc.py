@@ -106,7 +106,6 @@ class Srivc:
     """
 
     kind: ClassVar[str] = "srivc"
-    uses_start: ClassVar[bool] = False
     start_from: ClassVar[StartFrom | None] = "parameters"
 
     poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})
@@ -129,9 +128,12 @@ class Srivc:
     )
     hold_output: Hold = field(default="foh", metadata={"doc": "Interpolation of the measured output between samples"})
     instruments: Instruments = field(
-        default="open_loop", metadata={"doc": "From the measured input, or from the noise-free loop of the model"}
+        default="open_loop",
+        metadata={"doc": "From the measured input, or from the noise-free loop of the model", "added_later": True},
     )
-    covariance: Covariance = field(default="white", metadata={"doc": "Noise that the standard errors hold for"})
+    covariance: Covariance = field(
+        default="white", metadata={"doc": "Noise that the standard errors hold for", "added_later": True}
+    )
 
     def __post_init__(self) -> None:
         check_structure(self.poles, self.zeros)

@@ -51,7 +51,6 @@ class Svf:
     """
 
     kind: ClassVar[str] = "svf"
-    uses_start: ClassVar[bool] = False
     start_from: ClassVar[StartFrom | None] = None
 
     poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})

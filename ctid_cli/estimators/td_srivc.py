@@ -89,7 +89,6 @@ class TdSrivc:
     """
 
     kind: ClassVar[str] = "td_srivc"
-    uses_start: ClassVar[bool] = True
     start_from: ClassVar[StartFrom | None] = "delay"
 
     poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})

@@ -168,7 +168,6 @@ class UsefulRedundancy:
     """
 
     kind: ClassVar[str] = "useful_redundancy"
-    uses_start: ClassVar[bool] = True
     start_from: ClassVar[StartFrom | None] = "delay"
 
     poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})

@@ -39,9 +39,10 @@ def additive_parameters(fit: Any, terms: Sequence[Term] | None) -> tuple[dict[st
     if terms is None:
         return None, {}
     try:
-        model = factored(fit.model, terms)
-        jacobian = factored_jacobian(fit.model, terms)
-    except DataError:
+        with np.errstate(all="ignore"):  # what overflows is refused
+            model = factored(fit.model, terms)
+            jacobian = factored_jacobian(fit.model, terms)
+    except (DataError, np.linalg.LinAlgError):
         return None, {}
     a, b = fit.model.denominator, fit.model.numerator
     coefficients = [f"a{k}" for k in range(1, a.size)] + [f"b{k}" for k in range(b.size)]

@@ -182,7 +182,7 @@ class MeasuredSource:
     reference : str, optional
         Column of the reference of the loop that the record was taken in.
     loop : LoopOptions, optional
-        What closed that loop; given where the reference is.
+        What closed that loop; the record has no loop unless both are given.
     """
 
     file: str
@@ -238,8 +238,7 @@ class MeasuredSource:
         # Without its folder: what an estimator says about the record is part of the results.
         name = Path(self.file).name
         loop = None
-        if r is not None:
-            assert self.loop is not None
+        if r is not None and self.loop is not None:
             loop = Loop(r[:count], self.loop.controller, self.loop.enters)
         record = Record(t[:count], y[:count], HeldSignal(t[:count], u[:count], self.hold), name=name, loop=loop)
         if count == t.size:

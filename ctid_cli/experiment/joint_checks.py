@@ -203,29 +203,35 @@ def _start_complaints(spec: Spec, starts: StartsSection) -> Iterator[Complaint]:
     random = [k for k, point in enumerate(starts.delays) if isinstance(point, UniformStart)]
     if spec.data is not None and random and spec.monte_carlo is None:
         yield ("starts", "initial_delay", random[0]), "a random start needs a seed; add monte_carlo: {runs: 1, seed: 1}"
+    drawn = [k for k, parameters in enumerate(starts.parameter_sets) if isinstance(parameters, RelativeStart)]
     for k, parameters in enumerate(starts.parameter_sets):
         path = ("starts", "parameters", k)
-        if isinstance(parameters, RelativeStart):
-            if spec.data is not None:
-                yield path, "the parameters of a measured record are not known; give values: {additive: [submodels]}"
-            if spec.system is None:
-                continue
+        if not isinstance(parameters, RelativeStart):
+            yield from _structure_complaints(spec, path, variants(parameters)[0].options)
+        elif k != drawn[0]:
+            continue  # all of them have the structure of the system
+        elif spec.data is not None:
+            yield path, "the parameters of a measured record are not known; give values: {additive: [submodels]}"
+        elif spec.system is not None:
             try:
                 model = additive_form(variants(spec.system)[0].options)
             except DataError as error:
                 yield path, f"the system cannot be written as a sum of submodels: {error}; give values: {{additive: …}}"
-                continue
-        else:
-            model = variants(parameters)[0].options
-        for name, section in spec.estimators.items():
-            cases = variants(section)
-            failures = [
-                (path, f"{message} of estimator {name!r}", variant.swept)
-                for variant in cases
-                if variant.options.start_from == "parameters"
-                for message in _mismatch(model, variant.options)
-            ]
-            yield from grouped(failures, len(cases))
+            else:
+                yield from _structure_complaints(spec, path, model)
+
+
+def _structure_complaints(spec: Spec, path: KeyPath, model: AdditiveModel) -> Iterator[Complaint]:
+    """Say which estimators cannot start from a model."""
+    for name, section in spec.estimators.items():
+        cases = variants(section)
+        failures = [
+            (path, f"{message} of estimator {name!r}", variant.swept)
+            for variant in cases
+            if variant.options.start_from == "parameters"
+            for message in _mismatch(model, variant.options)
+        ]
+        yield from grouped(failures, len(cases))
 
 
 def _mismatch(model: AdditiveModel, options: Any) -> Iterator[str]:
@@ -324,9 +330,14 @@ def _unstable(system: Any, loop: LoopOptions, interval: float) -> str:
     from ctid_cli.filtering.loop import loop_radius
 
     try:
-        radius = loop_radius(system, loop.controller, interval)
+        with np.errstate(all="ignore"):
+            radius = loop_radius(system, loop.controller, interval)
     except DataError as error:
         return str(error)
+    except np.linalg.LinAlgError:
+        return (
+            f"the loop cannot be simulated: its numbers overflow at intervals of {interval:g} s; scale the coefficients"
+        )
     if radius < 1.0:
         return ""
     return (

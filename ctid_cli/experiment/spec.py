@@ -54,7 +54,6 @@ from ctid_cli.experiment.yaml_source import (
 _EXPERIMENT_PATTERN = r"(?!.*\.\.)(?=.{1,200}\Z)[A-Za-z0-9][A-Za-z0-9._-]*(?:/[A-Za-z0-9][A-Za-z0-9._-]*)*"
 _EXPERIMENT_RULE = "use letters, digits, '-', '_' and '.', with '/' between parts, no '..', 200 characters at most"
 _SIMULATED = ("system", "excitation", "sampling")
-_MADE_UP = "belongs to simulated data, and 'data' names a measured record; keep one of the two"
 
 
 class MeasuredSection(Section):
@@ -246,9 +245,10 @@ class Spec(Section):
         if "data" in present:
             for name in (*_SIMULATED, "noise"):
                 if name in present:
-                    yield (name,), _MADE_UP
+                    yield (name,), "belongs to simulated data, and 'data' names a measured record; keep one of the two"
             if has_reference:
-                yield ("loop", "reference"), f"{_MADE_UP}: its reference is a column, data.reference"
+                message = "belongs to simulated data; the reference of a measured record is a column, data.reference"
+                yield ("loop", "reference"), message
             data = raw["data"]
             column = isinstance(data, Mapping) and data.get("reference") is not None
             if column and loop is None:

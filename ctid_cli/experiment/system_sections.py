@@ -18,6 +18,7 @@ from ctid_cli.experiment.sections import (
     number,
     several_wrong,
     swept,
+    variants,
     whole,
 )
 from ctid_cli.models import AdditiveModel, Submodel, TransferFunction
@@ -102,7 +103,7 @@ class SubmodelSection(Section):
         yield from problems
         if problems:
             return
-        submodel = self.build(self.model_dump())
+        submodel = variants(self)[0].options
         if not (np.isfinite(submodel.numerator).all() and np.isfinite(submodel.denominator).all()):
             yield ("denominator",), "its last coefficient is too small for the others; scale the coefficients"
         elif not submodel.numerator.any():
@@ -165,8 +166,7 @@ class AdditiveSystemSection(AdditiveSection):
         yield from problems
         if problems:
             return
-        for k, section in enumerate(self.additive):
-            submodel = section.build(section.model_dump())
+        for k, submodel in enumerate(variants(self)[0].options.submodels):
             if submodel.order > MAX_ORDER:
                 yield ("additive", k), f"{submodel.order} poles are too many; at most {MAX_ORDER} can be simulated"
             elif not submodel.is_stable:

@@ -1,5 +1,8 @@
 """Accuracy and quality of an estimate, whichever algorithm found it."""
 
+from ctid_cli.inference.accuracy import ParameterAccuracy
+from ctid_cli.inference.additive_derived import additive_derived
+from ctid_cli.inference.asymptotic import closed_loop_accuracy, open_loop_accuracy
 from ctid_cli.inference.conditioning import describe_conditioning
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
 from ctid_cli.inference.cramer_rao import cramer_rao_bound
@@ -10,7 +13,7 @@ from ctid_cli.inference.criteria import (
     young_information_criterion,
 )
 from ctid_cli.inference.delay_interval import DelayInterval, profile_likelihood_interval, quadratic_is_doubtful
-from ctid_cli.inference.derived import DerivedParameter, derived_parameters, pole_jacobian
+from ctid_cli.inference.derived import DerivedParameter, derived_parameters
 from ctid_cli.inference.diagnostics import fit_percent, percent_from_r_squared, r_squared
 from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
@@ -18,6 +21,7 @@ from ctid_cli.inference.residuals import ResidualTests, residual_tests
 from ctid_cli.inference.robust import sandwich_covariance
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
+from ctid_cli.models.factoring import pole_jacobian
 
 __all__ = [
     "DelayInterval",
@@ -26,9 +30,12 @@ __all__ = [
     "InformationCriteria",
     "IterationRecord",
     "NoiseModel",
+    "ParameterAccuracy",
     "ResidualTests",
     "Status",
     "Structure",
+    "additive_derived",
+    "closed_loop_accuracy",
     "condition_number",
     "cramer_rao_bound",
     "derived_parameters",
@@ -36,6 +43,7 @@ __all__ = [
     "fit_noise_model",
     "fit_percent",
     "information_criteria",
+    "open_loop_accuracy",
     "percent_from_r_squared",
     "pole_jacobian",
     "profile_likelihood_interval",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,9 +44,9 @@ class Term:
     3
     """
 
-    poles: int
-    zeros: int
-    integrators: int = 0
+    poles: int = field(metadata={"doc": "Number of poles of a submodel, integrators not counted"})
+    zeros: int = field(metadata={"doc": "Number of zeros of a submodel, at most its poles and integrators"})
+    integrators: int = field(default=0, metadata={"doc": "Number of poles at the origin, in one submodel only"})
 
     def __post_init__(self) -> None:
         require_integer("the number of poles of a submodel", self.poles, 0)

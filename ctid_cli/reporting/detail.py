@@ -114,11 +114,7 @@ def detail_text(found: FoundEstimate, again: Repeated | None, out: Path) -> str:
         lines.append("It meets the success rule." if row["converged"] else "It does not meet the success rule.")
     shown = parameters_of(found)
     if shown:
-        lines += [
-            "",
-            parameter_table(shown),
-            "Monic denominator, descending powers; low and high are estimate -+ 1.96 errors.",
-        ]
+        lines += ["", parameter_table(shown), *_conventions(shown)]
     if row.get("true_delay") is not None:
         lines.append(f"True delay: {number(row['true_delay'])} s.")
     lines += [
@@ -190,8 +186,9 @@ def repeat(found: FoundEstimate) -> Repeated:
             continue
         for key, estimator, start in plan.keys(task):
             if key.id == row["id"]:
-                record = cell.dataset(task.replicate).record
-                fit = estimator.estimator.prepare(record).fit(start.draw(found.seed, task.replicate))
+                data = cell.dataset(task.replicate)
+                drawn = start.draw(found.seed, task.replicate, data.true_model)
+                fit = estimator.estimator.prepare(data.record).fit(drawn)
                 model = {
                     "numerator": plain(fit.model.numerator),
                     "denominator": plain(fit.model.denominator),
@@ -241,6 +238,22 @@ def _settings(content: Mapping[str, Any]) -> list[str]:
     return [f"  {key}: {json.dumps(value, ensure_ascii=False)}" for key, value in content.items()]
 
 
+def _conventions(shown: list[Parameter]) -> list[str]:
+    """What the names and columns of a table of parameters mean."""
+    interval = "low and high are estimate -+ 1.96 errors."
+    submodels = any(item.name.startswith("g") for item in shown)
+    if not submodels:
+        return [f"Monic denominator, descending powers; {interval}"]
+    lines = [
+        "g1: submodel of the least natural frequency; g1_a2: coefficient of p^2 in its denominator, which ends in 1."
+    ]
+    if any(item.name == "a1" for item in shown):
+        lines.append("a1, b0: all submodels as one fraction with a monic denominator, descending powers.")
+    return [*lines, interval.capitalize()]
+
+
 def _start(row: Mapping[str, Any]) -> str:
+    if row["initial_delay"] is None:
+        return str(row["start"])
     label = delay_label(row["initial_delay"])
     return f"{label} ({number(row['start_delay'])} s)" if label == "random" else label

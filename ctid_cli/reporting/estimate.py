@@ -60,6 +60,8 @@ class Units:
     >>> units = Units("min", "%", "degC")
     >>> units.of("b0", poles=2, zeros=1), units.of("a2", poles=2, zeros=1), units.gain
     ('degC/%/min', '1/min^2', 'degC/%')
+    >>> units.of_submodel("g1_a2"), units.of_submodel("g1_b1"), units.of_submodel("g1_b0", integrators=1)
+    ('min^2', 'degC/%*min', 'degC/%/min')
     """
 
     time: str = "s"
@@ -100,6 +102,31 @@ class Units:
             return self._over_time("1", k)
         return self._over_time(self.gain, poles - zeros + k) if kind == "b" else self._over_time(self.output, k - 1)
 
+    def of_submodel(self, name: str, integrators: int = 0) -> str:
+        """Unit of a parameter of a submodel, whose denominator has the constant term 1.
+
+        Parameters
+        ----------
+        name : str
+            ``g1_a1 …``, ``g1_b0 …``; the last number is the power of p.
+        integrators : int, default 0
+            Poles of the submodel at the origin.
+
+        Returns
+        -------
+        str
+            The unit.
+        """
+        coefficient = name.split("_")[1]
+        power = int(coefficient[1:])
+        if coefficient[0] == "b":
+            power -= integrators
+            return f"{self.gain}*{self._power(power)}" if power > 0 else self._over_time(self.gain, -power)
+        return self._power(power)
+
+    def _power(self, power: int) -> str:
+        return self.time if power == 1 else f"{self.time}^{power}"
+
     def _over_time(self, unit: str, power: int) -> str:
         if power == 0:
             return unit
@@ -113,7 +140,7 @@ class Parameter:
     Parameters
     ----------
     name : str
-        ``b0``, ``a1``, ..., or ``delay``.
+        ``b0``, ``a1``, ..., ``g1_a1``, ... of submodels, or ``delay``.
     estimate : float or None
         Its value, in ``unit``.
     standard_error : float or None
@@ -148,14 +175,16 @@ def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None
     Parameters
     ----------
     estimate : mapping
-        A stored estimate: ``numerator``, ``denominator``, ``delay``, ``standard_errors``.
+        A stored estimate: ``numerator``, ``denominator``, ``delay``, ``standard_errors``, and ``parameters`` of
+        submodels where there are such.
     delay_bounds : sequence of float, optional
         Range that the delay was searched in [s]; without one the delay was fixed.
 
     Returns
     -------
     list of Parameter
-        Numerator, denominator (without its leading 1), delay; empty if there is no model.
+        Numerator, denominator (without its leading 1), parameters of submodels, delay; empty if there is no model. What
+        was estimated as a sum of submodels has the latter two only.
 
     Examples
     --------
@@ -175,6 +204,14 @@ def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None
         _parameter(name, value, errors.get(name), units.of(name, poles, zeros), "free")
         for name, value in values.items()
     ]
+    submodels = estimate.get("parameters") or {}
+    if submodels and not values.keys() & errors.keys():
+        found = []
+    # Integrators have the least natural frequency of all, so that they are those of the first submodel.
+    integrators = next(k for k, value in enumerate(reversed(denominator)) if value != 0)
+    for name, value in submodels.items():
+        unit = units.of_submodel(name, integrators if name.startswith("g1_") else 0)
+        found.append(_parameter(name, value, errors.get(name), unit, "free"))
     delay = estimate.get("delay")
     status = "fixed"
     if delay_bounds is not None:
@@ -228,11 +265,13 @@ def as_object(estimate: Mapping[str, Any]) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``ESTIMATE_KEYS`` in order, then the others.
+        ``ESTIMATE_KEYS`` in order, ``parameters`` of submodels before the standard errors where there are such, then
+        the others.
     """
-    return {key: estimate.get(key) for key in ESTIMATE_KEYS} | {
-        key: value for key, value in estimate.items() if key not in ESTIMATE_KEYS
-    }
+    keys = list(ESTIMATE_KEYS)
+    if "parameters" in estimate:
+        keys.insert(keys.index("standard_errors"), "parameters")
+    return {key: estimate.get(key) for key in keys} | {key: item for key, item in estimate.items() if key not in keys}
 
 
 def _parameter(name: str, value: float | None, error: float | None, unit: str, status: str) -> Parameter:

@@ -134,6 +134,8 @@ def success_sentence(settings: Mapping[str, Any]) -> str:
     parts = []
     if rule.get("delay_relative_error") is not None:
         parts.append(f"delay estimate lies within {100 * rule['delay_relative_error']:g} % of the true delay")
+    if rule.get("parameter_relative_error") is not None:
+        parts.append(f"parameters all lie within {100 * rule['parameter_relative_error']:g} % of the true ones")
     if rule.get("fit_percent") is not None:
         parts.append(f"model fits to at least {rule['fit_percent']:g} %")
     if not parts:

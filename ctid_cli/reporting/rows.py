@@ -103,6 +103,8 @@ def experiment_rows(results: Results, table: int | str, fields: Mapping[str, str
     manifest = results.manifest
     down, across = _swept(manifest["data_cells"]), _swept(manifest["estimators"])
     constant = {name: lookup(results.settings, path) for name, path in (fields or ALWAYS).items()}
+    # Several sets of initial parameters are told apart by their names, as initial delays are by their values.
+    given = {label for label, delay in manifest["starts"].items() if delay is None and label != "none"}
     groups = results.summaries(["cell", "estimator", *across, "start"])
     counted = {tuple(group[name] for name in ("cell", "estimator", *across, "start")): group for group in groups}
     rows = []
@@ -110,13 +112,14 @@ def experiment_rows(results: Results, table: int | str, fields: Mapping[str, str
         for estimator in manifest["estimators"]:
             own = {name: estimator["swept"].get(name) for name in across}
             for start in estimator["starts"]:
+                named = {"start": start if start in given else None} if len(given) > 1 else {}
                 group = counted.get((cell["hash"], estimator["name"], *own.values(), start), {})
                 rows.append(
                     Row(
                         table=table,
                         experiment=results.experiment,
                         sampling=results.sampling,
-                        settings=constant | {name: cell["swept"].get(name) for name in down} | own,
+                        settings=constant | {name: cell["swept"].get(name) for name in down} | named | own,
                         initial_delay=manifest["starts"].get(start),
                         method=estimator["name"],
                         n=group.get("n", 0),

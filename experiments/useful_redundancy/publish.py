@@ -4,18 +4,16 @@ After ``make reproduce``: ``.venv/bin/python experiments/useful_redundancy/publi
 """
 
 import argparse
-import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
 from ctid_cli.reporting.failures import FAILING_COLUMNS, failing_estimates
+from ctid_cli.reporting.publication import copy_figures, environment
 from ctid_cli.reporting.results import experiments_in, read_results
 from ctid_cli.reporting.study import load_study
 from ctid_cli.reporting.tables import csv_text
 
-#: What is kept of a session: nothing that names a machine, a user or a folder.
-KEPT = ("started", "stopped", "computed", "failed", "jobs", "processors", "code_version", "numeric_platform")
 #: Methods whose failures are not listed one by one: from most initial delays this one is meant to fail.
 UNLISTED = ("existing",)
 
@@ -30,7 +28,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for suffix in ("md", "csv"):
         shutil.copyfile(chosen.results / f"useful_redundancy.{suffix}", chosen.out / f"tables.{suffix}")
     (chosen.out / "failures.csv").write_text(failures(chosen.results), encoding="utf-8")
-    (chosen.out / "environment.json").write_text(environment(chosen.results), encoding="utf-8")
+    (chosen.out / "environment.json").write_text(
+        environment(chosen.results, load_study().experiments), encoding="utf-8"
+    )
     copy_figures(chosen.results / "useful_redundancy_figures", chosen.out / "figures")
 
 
@@ -41,28 +41,6 @@ def failures(results: Path) -> str:
     found = [read_results(results, name) for name in study.experiments if name in experiments_in(results)]
     rows = failing_estimates(found, methods)
     return csv_text(rows, list(dict.fromkeys([*FAILING_COLUMNS, *(name for row in rows for name in row)])))
-
-
-def environment(results: Path) -> str:
-    """Sessions of every experiment, as JSON."""
-    sessions: dict[str, list[dict[str, object]]] = {}
-    for name in sorted(load_study().experiments):
-        for file in sorted((results / name / "provenance").glob("*.json")):
-            session = json.loads(file.read_text(encoding="utf-8"))
-            sessions.setdefault(name.rpartition("/")[2], []).append({key: session[key] for key in (*KEPT, "packages")})
-    return json.dumps(sessions, indent=2) + "\n"
-
-
-def copy_figures(source: Path, target: Path) -> None:
-    """The figures in place of those of an earlier reproduction; nothing where none were drawn."""
-    figures = sorted(source.glob("*.svg"))
-    if not figures:
-        return
-    target.mkdir(exist_ok=True)
-    for old in target.glob("*.svg"):
-        old.unlink()
-    for figure in figures:
-        shutil.copyfile(figure, target / figure.name)
 
 
 if __name__ == "__main__":

@@ -104,7 +104,7 @@ def test_help_of_the_group_and_of_the_check(ctid):
     text = ctid("check", "--help").stdout
     assert "FILE" in text.splitlines()[0]
     assert "--input COLUMN" in text
-    assert re.search(r"^  filters  Say whether a set of low-pass filters ", text, re.MULTILINE)
+    assert re.search(r"^  filters +Say whether a set of low-pass filters ", text, re.MULTILINE)
     text = ctid("check", "filters", "-h").stdout
     assert text.splitlines()[0].endswith("check filters [OPTIONS]")
     assert "--largest-error SECONDS" in text

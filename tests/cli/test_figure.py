@@ -51,10 +51,10 @@ def test_one_file_for_several_figures_is_refused(ctid, tmp_path):
 
 
 def test_an_installed_package_without_specifications_says_so(ctid, tmp_path, monkeypatch):
-    from ctid_cli.reporting.figures import redundant_search, useful_redundancy
+    from ctid_cli.reporting.figures import specification, useful_redundancy
 
     useful_redundancy._computed.cache_clear()
-    monkeypatch.setattr(redundant_search, "data_folder", lambda name: tmp_path / "none")
+    monkeypatch.setattr(specification, "data_folder", lambda name: tmp_path / "none")
     done = ctid("figure", "3", "--out", tmp_path, code=2)
     assert "an installed package does not carry" in done.stderr
     assert len(done.stderr.splitlines()) == 1
@@ -64,3 +64,35 @@ def test_a_file_that_cannot_be_written_is_a_storage_error(ctid, tmp_path):
     (tmp_path / "taken").write_text("")
     done = ctid("figure", "1", "--file", tmp_path / "taken" / "x.svg", code=6)
     assert "cannot be written" in done.stderr
+
+
+def test_figures_of_the_additive_study_that_need_no_results(ctid, tmp_path):
+    done = ctid("figure", "additive/2", "--out", tmp_path)
+    file = tmp_path / "additive_figures" / "figure_2.svg"
+    assert done.stdout == f"{file}\n"
+    assert ElementTree.parse(file).getroot().tag.endswith("svg")
+
+
+@pytest.mark.parametrize(
+    ("name", "configs"),
+    [
+        ("additive/3", ["open_loop"]),
+        ("additive/4", ["closed_loop"]),
+        ("additive/coloured", ["closed_loop_coloured"]),
+        ("additive/coverage", ["coverage_open_loop", "coverage_closed_loop"]),
+    ],
+)
+def test_figures_of_results_say_what_to_run_first(ctid, tmp_path, name, configs):
+    done = ctid("figure", "additive/2", name, "--out", tmp_path, code=2)
+    assert done.stdout == ""
+    command = " ".join(f"configs/additive/{config}.yaml" for config in configs)
+    assert done.stderr == (
+        f"ctid: there are no results in {tmp_path} to draw this from; run first: ctid run {command} --out {tmp_path}\n"
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_help_says_which_figures_need_results(ctid):
+    text = " ".join(ctid("figure", "--help").stdout.split())
+    assert "additive/3" in text
+    assert "run first" in text

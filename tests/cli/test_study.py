@@ -32,7 +32,7 @@ def test_one_data_set_fills_its_cells(ctid, out, case, sampling, tables):
     rows = json.loads(ctid("table", *tables, "--format", "json", "--out", out).stdout)
     mine = [row for row in rows if row["sampling"] == sampling and row["n"]]
     plan = build_plan(load_spec(CONFIGS / f"{case}_{sampling}.yaml"))
-    starts = {cell.name: cell.estimator.uses_start for cell in plan.estimators}
+    starts = {cell.name: cell.estimator.start_from == "delay" for cell in plan.estimators}
     methods = sorted(starts, key=list(load_study().methods).index)
     assert [(row["table"], row["snr_db"], row["initial_delay"], row["method"]) for row in mine] == [
         (int(table), 15, delay if starts[method] else None, method)

@@ -28,19 +28,17 @@ MODE_1 = Submodel([3.0], [0.25, 0.25, 1.0])
 MODE_2 = Submodel([1.0], [0.025, 0.01, 1.0])
 
 
-def beam_record(noise, seed, *, periodic=False):
-    """Two seconds of a multisine up to 500 Hz on a beam with a delay of four samples, from rest or the second period."""
+def beam_record(noise, seed, *, period=1):
+    """Two seconds of a multisine up to 500 Hz on a beam with a delay of four samples; from rest in its first period."""
     rng = np.random.default_rng(seed)
     n, rate = 8192, 4096.0
     spectrum = np.zeros(n // 2 + 1, complex)
     spectrum[1:1001] = np.exp(2j * np.pi * rng.uniform(size=1000))
     u = np.fft.irfft(spectrum, n)
     u /= u.std()
-    # Modes ring for half a minute: a steady state takes many periods.
-    periods = 80 if periodic else 1
-    t = np.arange(n * periods) / rate
+    t = np.arange(n * period) / rate
     system = AdditiveModel(BEAM.submodels, 4 / rate)
-    x = simulate_additive(system, HeldSignal(t, np.tile(u, periods)), t)[-n:]
+    x = simulate_additive(system, HeldSignal(t, np.tile(u, period)), t)[-n:]
     y = x + noise * np.sqrt(np.mean(x**2)) * rng.standard_normal(n)
     return Record(t[:n], y, HeldSignal(t[:n], u)), system
 
@@ -59,13 +57,24 @@ def assert_in_basin(record, system, **options):
     return start
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_four_modes_in_coloured_noise(seed):
+def coloured_record(seed):
+    """Four modes with the published noise, strong where the first two are."""
     rng = np.random.default_rng(seed)
     t = 0.05 * np.arange(2000)
     u = HeldSignal(t, rng.standard_normal(2000))
     v = lfilter([1.0, 0.5], [1.0, -0.85], np.sqrt(0.02) * rng.standard_normal(2200))[200:]
-    assert_in_basin(Record(t, simulate_additive(FOUR_MODES, u, t) + v, u), FOUR_MODES)
+    return Record(t, simulate_additive(FOUR_MODES, u, t) + v, u)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_four_modes_in_coloured_noise(seed):
+    assert_in_basin(coloured_record(seed), FOUR_MODES)
+
+
+def test_spectra_alone_would_do_in_coloured_noise(monkeypatch):
+    monkeypatch.setattr(modal_start, "_transfer_function_poles", lambda *_: None)
+    start = assert_in_basin(coloured_record(1), FOUR_MODES)
+    assert "weighted by local noise levels" in start.method
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -78,9 +87,13 @@ def test_beam_from_rest():
     assert "free response" not in start.method
 
 
-def test_beam_in_steady_state():
-    start = assert_in_basin(*beam_record(1e-4, 1, periodic=True), initial_state="periodic")
+def test_beam_that_still_rings():
+    record, system = beam_record(1e-5, 1, period=3)
+    start = automatic_start(record, system.terms, system.delay)
     assert start.method.endswith("a free response was fitted along with the numerators.")
+    # Damping shows little in two seconds of modes that ring for half a minute.
+    np.testing.assert_allclose(start.model.theta[1::3], system.theta[1::3], rtol=1e-3)
+    np.testing.assert_allclose(start.model.theta[2::3], system.theta[2::3], rtol=0.05)
 
 
 def test_noise_free_record_gives_the_system():
@@ -104,6 +117,8 @@ def test_noise_free_record_gives_the_system():
 @pytest.mark.parametrize("mode_first", [True, False])
 def test_every_structure(others, mode_first):
     system = AdditiveModel([MODE_2, *others] if mode_first else [*others, MODE_2])
+    if len(set(system.terms)) == 1:
+        system = system.sorted()
     start = automatic_start(open_record(system, 2000, 0.0, 2, interval=0.02), system.terms)
     assert start.model.terms == system.terms
     assert start.model.is_marginally_stable
@@ -187,7 +202,7 @@ def test_errors_are_sentences():
     record = open_record(TWO_MODES, 200, 0.1, 12)
     with pytest.raises(ValueError, match="at least one submodel"):
         automatic_start(record, [])
-    with pytest.raises(DataError, match="pole in common, at the origin"):
+    with pytest.raises(DataError, match="at the origin"):
         automatic_start(record, [Term(0, 0, 1), Term(1, 0, 1)])
     with pytest.raises(DataError, match="as many zeros as poles"):
         automatic_start(record, [Term(0, 0), Term(1, 1)])
@@ -208,7 +223,7 @@ def test_no_way_finds_anything(monkeypatch):
 
 def test_pairs_and_real_poles_are_shared_out():
     pair, slow, middle, fast = -1 + 5j, -0.1 + 0j, -1 + 0j, -10 + 0j
-    assert list(_arrangements([pair, slow], (Term(1, 0), MODE))) == [[[slow], [pair]], [[slow], [pair]]]
+    assert list(_arrangements([pair, slow], (Term(1, 0), MODE))) == [[[slow], [pair]]]
     # Of three real poles any one may be the single one; the others are a term's two poles.
     three = list(_arrangements([slow, middle, fast], (MODE, Term(1, 0))))
     assert [[slow, middle], [fast]] in three
@@ -240,7 +255,6 @@ def test_criterion_is_a_likelihood_with_a_level_for_each_band():
     error = np.random.default_rng(14).standard_normal(400)
     power = np.abs(np.fft.rfft(error)) ** 2
     bands = np.split(power, 16 * np.arange(1, 12))
-    bands[-2:] = [np.concatenate(bands[-2:])]
     expected = 2 * sum(band.size * np.log(band.mean()) for band in bands)
     np.testing.assert_allclose(_criterion(error), expected, rtol=1e-12)
     np.testing.assert_allclose(_criterion(10 * error) - _criterion(error), 4 * power.size * np.log(10), rtol=1e-12)

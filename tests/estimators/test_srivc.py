@@ -115,7 +115,7 @@ def test_start_is_ignored_and_preparing_is_fitting(estimator):
     prepared = estimator.prepare(record)
     for start in (None, Start(), Start(delay=3.0)):
         assert prepared.fit(start).parameters == fit.parameters
-    assert not estimator.uses_start
+    assert estimator.start_from != "delay"
 
 
 def test_nothing_of_the_record_changes():

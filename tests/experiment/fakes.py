@@ -147,7 +147,7 @@ class FakeStartPoint:
     label: str
     initial_delay: float | str | None
 
-    def draw(self, seed: int, replicate: int) -> FakeStart | None:
+    def draw(self, seed: int, replicate: int, true_model: object = None) -> FakeStart | None:
         if self.initial_delay == "random":
             return FakeStart(float(np.random.default_rng([seed, 3, replicate]).uniform(0, 9)))
         return None if self.initial_delay is None else FakeStart(float(self.initial_delay))
@@ -178,6 +178,8 @@ class FakeSpec:
 
 class FakePlan:
     """Same surface as the real plan: cells of several noise levels, estimators, starts, runs."""
+
+    terms = None
 
     def __init__(
         self,

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError, UsageError
+from ctid_cli.experiment.canonical import content_hash
 from ctid_cli.experiment.plan import StartPoint, Task, build_plan
-from ctid_cli.experiment.spec import content_hash, load_spec, spec_from_canonical
+from ctid_cli.experiment.spec import load_spec, spec_from_canonical
 from ctid_cli.signals import read_record, stream
 
 SPEC = """\

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from ctid_cli.errors import SpecError, UsageError
 from ctid_cli.estimators import ESTIMATORS
+from ctid_cli.experiment.canonical import canonical_json, content_hash
 from ctid_cli.experiment.plan import build_plan
-from ctid_cli.experiment.spec import canonical_json, content_hash, json_schema, load_spec, spec_from_canonical
+from ctid_cli.experiment.spec import json_schema, load_spec, spec_from_canonical
 from ctid_cli.signals import EXCITATIONS, NOISES, SAMPLINGS
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -82,7 +83,7 @@ BROKEN = {
     "missing nested key": ("cutoff: 0.2, ", "", 15, 5, "estimators.one.lowpass.cutoff", "[rad/s]"),
     "missing kind": ("  kind: prbs\n", "", 3, 1, "excitation.kind", "prbs, multisine, gaussian, step, file"),
     "unknown kind": ("kind: prbs", "kind: prsb", 4, 9, "excitation.kind", "did you mean 'prbs'?"),
-    "kind is a list": ("kind: white", "kind: [white]", 8, 15, "noise.kind", "must be one of white, not a list"),
+    "kind is a list": ("kind: white", "kind: [white]", 8, 15, "noise.kind", "must be one of white, arma, not a list"),
     "unknown estimator": ("kind: td_srivc", "kind: tdsrivc", 11, 11, "estimators.one.kind", "'td_srivc'"),
     "text for a number": ("stages: 10", "stages: ten", 5, 11, "excitation.stages", "whole number, not the text 'ten'"),
     "quoted number": ("0.05, samples", "'0.05', samples", 7, 37, "sampling.interval", "a number [s], not the text"),
@@ -107,7 +108,7 @@ BROKEN = {
     "option refused in a sweep": ("stages: 10", "stages: [4, 30]", 5, 15, "excitation.stages[1]", "not 30"),
     "nested option refused": ("order: 2", "order: 40", 15, 35, "estimators.one.lowpass.order", "from 1 to 20, not 40"),
     "options that exclude each other": (
-        "[5, 15]", "[5, 15], standard_deviation: 1", 8, 1, "noise", "both were given"
+        "[5, 15]", "[5, 15], standard_deviation: 1", 8, 1, "noise", "snr_db and standard_deviation were given"
     ),
     "zeros not fewer than poles": ("zeros: 0", "zeros: 2", 10, 3, "estimators.one", "strictly proper"),
     "zeros not fewer than poles in a sweep": (

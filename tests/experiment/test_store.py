@@ -13,9 +13,10 @@ from ctid_cli.errors import RefusedError, StorageError, UsageError
 from ctid_cli.experiment.engine import run_experiment
 from ctid_cli.experiment.folder import experiment_folders
 from ctid_cli.experiment.journal import open_journal, read_journal
-from ctid_cli.experiment.manifest import build_manifest, slots
+from ctid_cli.experiment.manifest import build_manifest, slots, true_parameters
 from ctid_cli.experiment.sealed import read_sealed, seal_image
 from ctid_cli.experiment.store import experiment_status, find_estimate, load_estimates, read_stored
+from ctid_cli.experiment.summary import export_rows
 from ctid_cli.experiment.version import current_origin
 from ctid_cli.experiment.worker import failed
 from tests.experiment.fakes import FakePlan, Toy
@@ -139,6 +140,7 @@ def test_sealing_extreme_contents_gives_them_back(tmp_path: Path) -> None:
         "delay": 5e-324,
         "numerator": [None, -0.0, 1.7976931348623157e308],
         "denominator": [1.0],
+        "parameters": None,
         "standard_errors": {},
         "cost": None,
         "fit_percent": -1e300,
@@ -154,6 +156,59 @@ def test_sealing_extreme_contents_gives_them_back(tmp_path: Path) -> None:
         assert (read.checksum, count) == (checksum, len(results))
         assert read.manifest == manifest
         assert read.origins == (current_origin(),)
+
+
+def additive(manifest: dict[str, Any]) -> dict[str, Any]:
+    """The same plan for a system of two submodels, the faster one first."""
+    submodels = [{"numerator": [2.0], "denominator": [0.1, 1.0]}, {"numerator": [3.0], "denominator": [2.0, 1.0]}]
+    cells = [
+        cell | {"content": cell["content"] | {"system": {"additive": submodels, "delay": 0.0}}}
+        for cell in manifest["data_cells"]
+    ]
+    return manifest | {"data_cells": cells}
+
+
+def test_parameters_of_submodels_are_sealed(tmp_path: Path) -> None:
+    plan = FakePlan(Toy(), runs=2, levels=(1,))
+    plain = build_manifest(plan)  # type: ignore[arg-type]
+    manifest = additive(plain)
+    keys = [slot.key for slot in slots(manifest)]
+    result = failed("", "CONVERGED") | {"numerator": [1.0], "denominator": [1.0, 2.0], "iterations": 3}
+    results = {
+        keys[0]: result | {"parameters": {"g1_a1": 2.0, "g1_b0": 3.0}, "standard_errors": {"g1_a1": 0.1}},
+        keys[1]: result | {"parameters": {"g1_a1": 2.5, "g1_b0": None, "g1_b1": 0.0}, "standard_errors": {}},
+        keys[2]: result | {"parameters": None, "standard_errors": {"a1": 0.2}},
+        keys[3]: failed("died", "CRASHED"),
+    }
+    (tmp_path / "runs.h5").write_bytes(seal_image(manifest, [current_origin()], results)[0])
+    assert read_sealed(tmp_path / "runs.h5").results == results
+    frame = load_estimates(tmp_path)
+    assert frame["parameters"].tolist() == [results[key]["parameters"] for key in keys]
+    assert "g1_b1" in export_rows(frame)
+    # Where nothing is additive, there is no trace of it, neither in the file nor in the rows.
+    image, _, _ = seal_image(plain, [current_origin()], {key: result | {"standard_errors": {}} for key in keys})
+    (tmp_path / "runs.h5").write_bytes(image)
+    with h5py.File(tmp_path / "runs.h5") as file:
+        assert not [name for name in file["estimates"] if "parameter" in name]
+    assert "parameters" not in load_estimates(tmp_path)
+    assert not any("parameters" in row for row in read_stored(tmp_path).rows())
+
+
+def test_true_parameters_are_those_of_the_sorted_submodels(tmp_path: Path) -> None:
+    plain = build_manifest(FakePlan(Toy(), runs=1, levels=(1,)))  # type: ignore[arg-type]
+    manifest = additive(plain)
+    assert true_parameters(plain["data_cells"][0]) is None
+    truth = true_parameters(manifest["data_cells"][0])
+    assert truth == {"g1_a1": 2.0, "g1_b0": 3.0, "g2_a1": 0.1, "g2_b0": 2.0}
+    assert true_parameters({"content": {"data": {}}}) is None
+    manifest["success"] = {"parameter_relative_error": 0.1}
+    near, far = truth, truth | {"g2_b0": 2.3}
+    results = {
+        slot.key: failed("", "CONVERGED") | {"parameters": found, "standard_errors": {}}
+        for slot, found in zip(slots(manifest), (near, far), strict=True)
+    }
+    (tmp_path / "runs.h5").write_bytes(seal_image(manifest, [current_origin()], results)[0])
+    assert load_estimates(tmp_path)["converged"].tolist() == [True, False]
 
 
 def test_find_an_estimate_by_the_beginning_of_its_id(place: Path) -> None:

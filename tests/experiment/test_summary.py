@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ctid_cli.experiment.summary import export_rows, is_converged, summarise, wilson_interval
+from ctid_cli.experiment.summary import export_rows, is_converged, parameter_names, summarise, wilson_interval
 
 # R. G. Newcombe, Statistics in Medicine 17 (1998) 857-872, Table I, method 3.
 NEWCOMBE = [
@@ -69,6 +69,31 @@ def test_success_rule(
     assert is_converged(estimate, success, true_delay) is expected
 
 
+TRUE = {"g1_a1": 0.25, "g1_b0": -3.0}
+
+
+@pytest.mark.parametrize(
+    ("found", "status", "expected"),
+    [
+        ({"g1_a1": 0.27, "g1_b0": -3.2}, "CONVERGED", True),
+        ({"g1_a1": 0.27, "g1_b0": -3.2, "g1_b1": 9.0}, "MAX_ITERATIONS", True),
+        ({"g1_a1": 0.28, "g1_b0": -3.2}, "CONVERGED", False),
+        ({"g1_a1": 0.25, "g1_b0": 3.0}, "CONVERGED", False),
+        ({"g1_a1": 0.25, "g1_b0": None}, "CONVERGED", False),
+        ({"g1_a1": 0.25}, "CONVERGED", False),
+        (None, "CONVERGED", False),
+        ({"g1_a1": 0.25, "g1_b0": -3.0}, "FAILED", False),
+    ],
+)
+def test_success_rule_of_parameters(found: Any, status: str, expected: bool) -> None:
+    estimate = row(status) | {"parameters": found}
+    success = {"parameter_relative_error": 0.1, "delay_relative_error": None, "fit_percent": None}
+    assert is_converged(estimate, success, 0.0, TRUE) is expected
+    # Together with another rule both must hold, and without true parameters there is nothing to compare with.
+    assert is_converged(estimate, success | {"fit_percent": 96.0}, 0.0, TRUE) is False
+    assert is_converged(estimate, success, 0.0, None) is None
+
+
 def frame() -> pd.DataFrame:
     return pd.DataFrame(
         {
@@ -120,3 +145,29 @@ def test_export_has_a_column_for_every_coefficient() -> None:
     np.testing.assert_array_equal(lists, expected)
     np.testing.assert_array_equal(flat["se_delay"], [nan, 0.1, nan, nan, nan])
     assert len(flat) == 5
+
+
+def test_export_has_a_column_for_every_parameter_of_submodels() -> None:
+    estimates = frame()
+    found = [{"g1_a1": 1.0, "g1_b0": 2.0}, {"g1_a1": 3.0, "g1_a10": 4.0, "g1_a2": None, "g1_b0": 5.0}, None, None, {}]
+    estimates["parameters"] = pd.Series(found, dtype="object")
+    estimates["standard_errors"] = pd.Series(
+        [{"g1_b0": 0.5}, {"a1": 0.25, "g1_a10": 0.1}, None, {}, {}], dtype="object"
+    )
+    flat = export_rows(estimates)
+    assert flat.columns.tolist() == [
+        *("estimator", "initial_delay", "status", "converged", "seconds"),
+        *("b0", "b1", "a1", "a2", "g1_a1", "g1_a2", "g1_a10", "g1_b0", "se_a1", "se_g1_a10", "se_g1_b0"),
+    ]
+    nan = np.nan
+    np.testing.assert_array_equal(flat["g1_a1"], [1.0, 3.0, nan, nan, nan])
+    np.testing.assert_array_equal(flat["g1_a2"], [nan] * 5)
+    np.testing.assert_array_equal(flat["se_g1_b0"], [0.5, nan, nan, nan, nan])
+
+
+def test_parameters_are_named_by_submodel_and_power() -> None:
+    names = ["g10_a1", "g2_b0", "g2_a2", "g2_a1", "g1_b10", "g1_b9", "g1_a1"]
+    assert parameter_names([dict.fromkeys(names, 1.0)]) == [
+        *("g1_a1", "g1_b9", "g1_b10", "g2_a1", "g2_a2", "g2_b0", "g10_a1"),
+    ]
+    assert parameter_names([None, {}]) == []

@@ -1,14 +1,26 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pytest
 
 from ctid_cli.experiment.manifest import RESULT_FIELDS, Key
 from ctid_cli.experiment.worker import Job, failure, plain, run_job
-from tests.experiment.fakes import STARTS, FakeCell, FakeEstimatorCell, FakeRecord, Prepared, Toy
+from ctid_cli.models import Term, TransferFunction
+from tests.experiment.fakes import (
+    STARTS,
+    FakeCell,
+    FakeData,
+    FakeEstimatorCell,
+    FakeFit,
+    FakeRecord,
+    FakeStart,
+    Prepared,
+    Toy,
+)
 
 
 @dataclass(frozen=True)
@@ -91,3 +103,52 @@ def test_messages_are_the_same_in_every_process() -> None:
 def test_plain_values() -> None:
     value = {"a": np.array([1.0, np.nan]), "b": (np.float64(np.inf), np.int64(3)), 4: [None, True, "x"]}
     assert plain(value) == {"a": [1.0, None], "b": [None, 3], "4": [None, True, "x"]}
+
+
+@dataclass(frozen=True)
+class FractionFit(FakeFit):
+    """A fit with what the conversion to submodels needs."""
+
+    parameter_names: tuple[str, ...] = ("a1", "a2", "b0")
+    covariance: np.ndarray[Any, Any] = field(default_factory=lambda: np.diag([0.01, 0.04, 0.09]))
+
+
+@dataclass(frozen=True)
+class Fraction(Toy):
+    """Estimates a second-order fraction, and keeps what it was told to start from."""
+
+    def prepare(self, record: FakeRecord) -> Any:
+        return self
+
+    def fit(self, start: Any) -> FractionFit:
+        assert start.delay is None
+        return FractionFit(TransferFunction([2.0], [1.0, 3.0, 4.0]), {"b0": 0.3, "a1": 0.1, "a2": 0.2}, 1.0)
+
+
+def test_starts_are_told_the_true_system_and_fractions_the_submodels_to_find() -> None:
+    told: list[Any] = []
+
+    @dataclass(frozen=True)
+    class Start:
+        label: str = "near"
+
+        def draw(self, seed: int, replicate: int, true_model: Any) -> FakeStart:
+            told.append((seed, replicate, true_model))
+            return FakeStart(None)
+
+    class Source(FakeCell):
+        def dataset(self, replicate: int) -> Any:
+            return FakeData(FakeRecord(np.ones(3), replicate), true_model="the truth")  # type: ignore[arg-type]
+
+    cell = FakeEstimatorCell("fraction", Fraction(), ())
+    wanted = ((Key("data", 3, "fraction", "near"), cell, Start()),)
+    (untouched,) = run_job(Job(Source({}, {}), 3, 7, wanted))  # type: ignore[arg-type]
+    assert told == [(7, 3, "the truth")]
+    assert untouched.result["parameters"] is None
+    assert untouched.result["standard_errors"].keys() == {"b0", "a1", "a2"}
+    (factored,) = run_job(Job(Source({}, {}), 3, 7, wanted, (Term(2, 0),)))  # type: ignore[arg-type]
+    assert factored.result["parameters"] == pytest.approx({"g1_a1": 0.75, "g1_a2": 0.25, "g1_b0": 0.5, "g1_b1": 0.0})
+    # a_1 = a1/a2: the relative variances of both add up.
+    assert factored.result["standard_errors"]["g1_a1"] == pytest.approx(0.75 * np.hypot(0.1 / 3, 0.2 / 4))
+    assert factored.result["standard_errors"].keys() == {"b0", "a1", "a2", *factored.result["parameters"]}
+    assert json.loads(json.dumps(factored.result, allow_nan=False)) == factored.result

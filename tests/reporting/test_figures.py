@@ -9,7 +9,7 @@ import pytest
 
 from ctid_cli.errors import UsageError
 from ctid_cli.filtering import FilterSet, check_filters, extrema, ideal_cost
-from ctid_cli.reporting.figures import redundant_search, useful_redundancy
+from ctid_cli.reporting.figures import specification, useful_redundancy
 from ctid_cli.reporting.figures.redundant_search import landscape, published_search
 from ctid_cli.reporting.figures.registry import STUDIES, find_figures
 from ctid_cli.reporting.figures.search_plot import costs_svg, trajectory_svg
@@ -207,7 +207,7 @@ def test_settings_are_those_of_the_specification_or_published(case):
 
 
 def test_without_specifications_the_message_says_so(monkeypatch, tmp_path):
-    monkeypatch.setattr(redundant_search, "data_folder", lambda name: tmp_path)
+    monkeypatch.setattr(specification, "data_folder", lambda name: tmp_path)
     with pytest.raises(UsageError, match=r"case1_regular\.yaml, which an installed package does not carry; run"):
         published_search(CASE_1.experiment, 15.0, True, CASE_1.published)
 

@@ -150,3 +150,16 @@ def test_differing_settings_are_named(results):
     assert differences(results.settings, reference, {"noise.snr_db"}) == ["sampling.samples = 4000 (not 500)"]
     reference["starts"]["initial_delay"] = [{"uniform": [0.0, 15.0]}]
     assert len(differences(results.settings, reference, {"noise.snr_db"})) == 2
+
+
+def test_several_initial_parameters_are_told_apart(make_results, estimate):
+    results = make_results({(15.0, "0.0"): [estimate(8.0)], (15.0, RANDOM): [estimate(3.0)]}, snrs=(15.0,), swept=False)
+    assert not any("start" in row.settings for row in experiment_rows(results, "e"))
+    starts = results.manifest["starts"]
+    starts.clear()
+    starts |= {"0.0": None, RANDOM: None, "none": None}
+    rows = experiment_rows(results, "e")
+    assert [(row.settings["start"], row.percent) for row in rows] == [("0.0", 100.0), (RANDOM, 0.0)]
+    del starts[RANDOM]
+    results.manifest["estimators"][0]["starts"] = ["0.0", "none"]
+    assert not any("start" in row.settings for row in experiment_rows(results, "e"))

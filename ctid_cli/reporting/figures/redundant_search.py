@@ -14,9 +14,8 @@ from ctid_cli.estimators.delay_search import Minimum
 from ctid_cli.estimators.filtered_costs import FilteredCost
 from ctid_cli.estimators.useful_redundancy import NOTHING, PreparedUsefulRedundancy, RedundantFit, UsefulRedundancy
 from ctid_cli.experiment.dataset import DataSet
-from ctid_cli.experiment.plan import build_plan
-from ctid_cli.experiment.spec import load_spec
-from ctid_cli.reporting.study import data_folder, load_study
+from ctid_cli.reporting.figures.specification import published_plan
+from ctid_cli.reporting.study import load_study
 from ctid_cli.signals.record import Record
 
 Array = NDArray[np.float64]
@@ -112,16 +111,11 @@ def published_search(
     UsageError
         If there is no specification of the experiment to be found, or none with this SNR.
     """
-    file = data_folder("configs") / load_study().experiments[experiment].config
-    if not file.is_file():
-        raise UsageError(
-            f"this figure is computed from the specification {file.parent.name}/{file.name}, which an installed "
-            "package does not carry; run ctid figure in a checkout of the repository"
-        )
-    plan = build_plan(load_spec(file))
+    config = load_study().experiments[experiment].config
+    plan = published_plan(config)
     cells = [cell for cell in plan.data_cells if cell.swept.get("snr_db") == snr_db]
     if not cells:
-        raise UsageError(f"{file}: this figure shows a data set of SNR {snr_db:g} dB; add that to noise.snr_db")
+        raise UsageError(f"{config}: this figure shows a data set of SNR {snr_db:g} dB; add that to noise.snr_db")
     data_set = cells[0].dataset(0)
     if not noise:
         record = data_set.record

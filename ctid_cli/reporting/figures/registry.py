@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.figures import useful_redundancy
+from ctid_cli.reporting.figures import additive, useful_redundancy
+from ctid_cli.reporting.figures.from_results import FromResults, not_run
 from ctid_cli.reporting.study import DEFAULT_STUDY
 
-#: Figures of every study: number, and what draws it as an SVG file.
-STUDIES: Mapping[str, Mapping[str, Callable[[], bytes]]] = {"useful-redundancy": useful_redundancy.FIGURES}
+#: Figures of every study: number or name, and what draws it as an SVG file.
+STUDIES: Mapping[str, Mapping[str, Callable[[], bytes] | FromResults]] = {
+    "useful-redundancy": useful_redundancy.FIGURES,
+    "additive": additive.FIGURES,
+}
 
 
 @dataclass(frozen=True)
@@ -24,7 +28,7 @@ class StudyFigure:
     study : str
         Its study.
     number : str
-        Its number there.
+        Its number or name there.
     """
 
     study: str
@@ -35,15 +39,26 @@ class StudyFigure:
         """Its file, relative to the results folder."""
         return Path(f"{self.study.replace('-', '_')}_figures") / f"figure_{self.number}.svg"
 
-    def svg(self) -> bytes:
+    def svg(self, out: Path) -> bytes:
         """Draw it.
+
+        Parameters
+        ----------
+        out : Path
+            Results folder, for figures that are drawn from results.
 
         Returns
         -------
         bytes
             An SVG file.
+
+        Raises
+        ------
+        UsageError
+            If these results or a specification are missing.
         """
-        return STUDIES[self.study][self.number]()
+        drawn = STUDIES[self.study][self.number]
+        return drawn.svg(out) if isinstance(drawn, FromResults) else drawn()
 
 
 def find_figures(names: Sequence[str]) -> list[StudyFigure]:
@@ -82,6 +97,27 @@ def find_figures(names: Sequence[str]) -> list[StudyFigure]:
         else:
             raise UsageError(_unknown(name))
     return list(dict.fromkeys(found))
+
+
+def require_results(figures: Iterable[StudyFigure], out: Path) -> None:
+    """Refuse figures whose results are missing, before any is drawn.
+
+    Parameters
+    ----------
+    figures : iterable of StudyFigure
+        The figures.
+    out : Path
+        Results folder.
+
+    Raises
+    ------
+    UsageError
+        If some are missing, with the command that makes them.
+    """
+    drawn = [STUDIES[figure.study][figure.number] for figure in figures]
+    missing = [config for item in drawn if isinstance(item, FromResults) for config in item.missing(out)]
+    if missing:
+        raise not_run(list(dict.fromkeys(missing)), out)
 
 
 def _unknown(name: str) -> str:

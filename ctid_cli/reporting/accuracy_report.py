@@ -1,0 +1,219 @@
+"""What ``ctid check accuracy`` says: standard errors that the estimators of an experiment can reach."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import Any
+
+import numpy as np
+
+from ctid_cli.errors import DataError, UsageError
+from ctid_cli.experiment.dataset import SimulatedSource
+from ctid_cli.experiment.plan import DataCell, EstimatorCell, Plan
+from ctid_cli.reporting.expected_accuracy import expected_accuracy
+from ctid_cli.reporting.layout import count, number, text_table
+from ctid_cli.reporting.tables import setting_text, setting_title
+
+#: Lines of text are no longer than this.
+WIDTH = 100
+#: Different numbers of samples that are shown, of all that are swept.
+SIZES = 4
+#: Combinations of the other swept settings that are shown.
+SETTINGS = 6
+#: Half width of a 95 % interval in standard errors.
+QUANTILE = 1.959964
+
+
+def accuracy_object(plan: Plan) -> dict[str, Any]:
+    """Expected accuracy of every estimator of an experiment as JSON-able content.
+
+    Parameters
+    ----------
+    plan : Plan
+        The experiment.
+
+    Returns
+    -------
+    dict
+        ``experiment``; ``left_out``, how many data cells are not shown; ``estimates``, one entry for each data cell
+        that is shown and each estimator: ``settings`` of the data and ``options`` of the estimator (swept ones by
+        name), ``samples``, ``estimator``, ``kind``, ``scales`` (whether the standard errors fall with the square root
+        of the number of samples), ``formula``, a sentence, and ``parameters``, each with ``name``, ``value``,
+        ``standard_error``, ``relative_percent`` of the value and ``half_width_95`` of an interval. Where theory has no
+        answer, ``reason`` says why in place of ``formula``, and ``parameters`` is empty.
+
+    Raises
+    ------
+    UsageError
+        If the experiment is about a measured record.
+    """
+    cells = [(cell, cell.source) for cell in plan.data_cells if isinstance(cell.source, SimulatedSource)]
+    if not cells:
+        raise UsageError(
+            f"{plan.experiment} is about a measured record, whose true system is not known; "
+            "its estimates carry their standard errors: ctid fit, or ctid run and ctid table"
+        )
+    shown = _shown([cell for cell, _ in cells])
+    estimates = [
+        _entry(cell, source, estimator, plan)
+        for cell, source in cells
+        if cell in shown
+        for estimator in plan.estimators
+    ]
+    return {"experiment": plan.experiment, "left_out": len(cells) - len(shown), "estimates": estimates}
+
+
+def _shown(cells: list[DataCell]) -> list[DataCell]:
+    """Data cells of the first settings, each at a few numbers of samples from the least to the greatest."""
+    by_settings: dict[str, dict[int, DataCell]] = {}
+    for cell in cells:
+        settings = {name: value for name, value in cell.swept.items() if not _is_samples(name)}
+        by_settings.setdefault(repr(settings), {})[cell.source.sampling.samples] = cell  # type: ignore[union-attr]
+    shown = []
+    for sizes in list(by_settings.values())[:SETTINGS]:
+        ordered = sorted(sizes)
+        places = np.unique(np.linspace(0, len(ordered) - 1, SIZES).round().astype(int))
+        shown += [sizes[ordered[k]] for k in places]
+    return shown
+
+
+def _is_samples(name: str) -> bool:
+    return name.split(".")[-1] == "samples"
+
+
+def _entry(cell: DataCell, source: SimulatedSource, estimator: EstimatorCell, plan: Plan) -> dict[str, Any]:
+    own = {name: value for name, value in cell.swept.items() if not _is_samples(name)}
+    entry: dict[str, Any] = {
+        "settings": own,
+        "samples": source.sampling.samples,
+        "estimator": estimator.name,
+        "options": dict(estimator.swept),
+        "kind": estimator.kind,
+    }
+    try:
+        expected = expected_accuracy(source, estimator.estimator, plan.terms)
+    except DataError as error:
+        return entry | {"scales": False, "reason": str(error), "parameters": []}
+    found = expected.parameters
+    rows = [
+        {
+            "name": name,
+            "value": float(value),
+            "standard_error": float(error),
+            "relative_percent": float(100 * error / abs(value)) if value else None,
+            "half_width_95": float(QUANTILE * error),
+        }
+        for name, value, error in zip(found.names, found.values, found.standard_errors, strict=True)
+    ]
+    return entry | {"scales": expected.limit, "formula": expected.formula, "parameters": rows}
+
+
+def accuracy_text(content: dict[str, Any]) -> str:
+    """Expected accuracy of every estimator of an experiment for people.
+
+    Parameters
+    ----------
+    content : dict
+        From :func:`accuracy_object`.
+
+    Returns
+    -------
+    str
+        Tables, one for estimators that can do the same; the formulas; and what all of them assume.
+    """
+    parts = [
+        f"{content['experiment']}: standard errors to expect by theory, before any data are taken. The half width is "
+        "that of an interval of 95 %, 1.96 standard errors."
+    ]
+    tables: dict[tuple[str, str], list[str]] = {}
+    unknown: dict[str, list[str]] = {}
+    for entries in _by_size(content["estimates"]):
+        first = entries[0]
+        title = _title(first)
+        known = [entry for entry in entries if entry["parameters"]]
+        if known:
+            where = f" at {_settings(first['settings'])}" if first["settings"] else ""
+            tables.setdefault((where, _table(known)), []).append(title)
+        for entry in entries:
+            if not entry["parameters"]:
+                unknown.setdefault(entry["reason"], []).append(title)
+    # Estimators that can do the same share a table.
+    for (where, table), titles in tables.items():
+        parts.append(f"{_wrapped(f'{_listed(titles)}: standard errors{where}')}\n{table}")
+    parts += [f"{_listed(titles)}: no theory: {reason}." for reason, titles in unknown.items()]
+    parts += _formulas(content["estimates"])
+    if content["left_out"]:
+        parts.append(
+            f"Not shown: {count(content['left_out'], 'further combination')} of swept settings and numbers of samples; "
+            "--set gives a swept key one value."
+        )
+    parts.append(
+        "All this is to first order in the noise: it holds where the estimator converges to the right solution and the "
+        "standard errors are small against the parameters. It takes the noise to be as the experiment says and the "
+        "system to be at rest before the first sample; initial states and offsets that an estimator determines besides "
+        "are not counted."
+    )
+    return "\n\n".join(part if "\n" in part else _wrapped(part) for part in parts)
+
+
+def _wrapped(text: str) -> str:
+    return textwrap.fill(text, WIDTH, break_on_hyphens=False, break_long_words=False)
+
+
+def _by_size(estimates: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+    """Entries that differ by the number of samples only, the least first."""
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for entry in estimates:
+        groups.setdefault(repr((entry["settings"], _title(entry))), []).append(entry)
+    return [sorted(group, key=lambda entry: int(entry["samples"])) for group in groups.values()]
+
+
+def _table(entries: list[dict[str, Any]]) -> str:
+    """Parameters down, numbers of samples across; the last columns are about the greatest number."""
+    last = entries[-1]
+    rows = [
+        [
+            row["name"],
+            number(row["value"]),
+            *(number(entry["parameters"][k]["standard_error"], 3) for entry in entries),
+            number(row["relative_percent"], 3),
+            number(row["half_width_95"], 3),
+        ]
+        for k, row in enumerate(last["parameters"])
+    ]
+    sizes = [f"N = {entry['samples']}" for entry in entries]
+    header = ["parameter", "true value", *sizes, "relative [%]", "half width"]
+    table = text_table(header, rows, "l" + "r" * (len(header) - 1))
+    return table if len(entries) == 1 else f"{table}\nrelative, half width: of {last['samples']} samples."
+
+
+def _formulas(estimates: list[dict[str, Any]]) -> list[str]:
+    """Each formula once, with the numbers of samples and the estimators that it is for."""
+    used: dict[str, list[dict[str, Any]]] = {}
+    for entry in estimates:
+        if entry["parameters"]:
+            used.setdefault(entry["formula"], []).append(entry)
+    lines = []
+    for formula, entries in used.items():
+        sizes = [str(size) for size in sorted({entry["samples"] for entry in entries})]
+        names = list(dict.fromkeys(entry["estimator"] for entry in entries))
+        scaling = " Standard errors fall with the square root of N." if entries[0]["scales"] else ""
+        lines.append(f"{_listed(names)}, N = {', '.join(sizes)}: {formula}.{scaling}")
+    return lines
+
+
+def _title(entry: dict[str, Any]) -> str:
+    """Name of an estimator with its swept options and its kind."""
+    name, kind = entry["estimator"], entry["kind"]
+    if entry["options"]:
+        name = f"{name} with {_settings(entry['options'])}"
+    return str(name) if name == kind else f"{name} ({kind})"
+
+
+def _settings(settings: dict[str, Any]) -> str:
+    return ", ".join(f"{setting_title(key)} {setting_text(key, value)}" for key, value in settings.items())
+
+
+def _listed(names: list[str]) -> str:
+    distinct = list(dict.fromkeys(names))
+    return distinct[0] if len(distinct) == 1 else f"{', '.join(distinct[:-1])} and {distinct[-1]}"

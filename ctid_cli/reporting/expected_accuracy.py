@@ -1,0 +1,299 @@
+"""How accurate an estimator of a simulated experiment can be, by theory, and by which formula."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.experiment.dataset import SimulatedSource
+from ctid_cli.filtering.loop import simulate_loop
+from ctid_cli.inference.accuracy import ParameterAccuracy, estimated_parameters
+from ctid_cli.inference.asymptotic import (
+    closed_loop_accuracy,
+    open_loop_accuracy,
+    output_variance,
+    require_uncorrelated_input,
+)
+from ctid_cli.inference.finite_record import (
+    additive_sensitivities,
+    finite_record_covariance,
+    unfactored_sensitivities,
+)
+from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.models.factoring import factored, unfactored
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.excitation import Gaussian
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.sampling import RegularSampling
+
+Array = NDArray[np.float64]
+
+#: From so many samples on the limit for long records is taken.
+LONG = 5000
+#: Data sets whose covariances are averaged otherwise: so many, and so many samples altogether.
+MOST_SETS, SET_SAMPLES = 10, 20_000
+#: A known delay may differ from the true one by this fraction of it.
+SAME_DELAY = 1e-6
+#: A coefficient of partial fractions below this fraction of the others, or of its standard error, is zero in truth.
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedAccuracy:
+    """What theory says of one estimator on one kind of data.
+
+    Parameters
+    ----------
+    parameters : ParameterAccuracy
+        True values, and the covariance of the estimates from that many samples.
+    samples : int
+        Number of samples of the output.
+    limit : bool
+        Whether it is the limit for long records, which falls with the number of samples; else it is that of the first
+        data sets.
+    formula : str
+        The formula, its symbols, and why this one: a sentence without its full stop.
+    """
+
+    parameters: ParameterAccuracy
+    samples: int
+    limit: bool
+    formula: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Estimated:
+    """The true system in the form in which an estimator has it."""
+
+    model: AdditiveModel | TransferFunction
+    zeros: int | None
+    delay_from: float | None  # samples before this time [s] are not used; None where the delay is known
+    instruments: str
+
+
+def expected_accuracy(
+    source: SimulatedSource, estimator: Any, terms: tuple[Term, ...] | None = None
+) -> ExpectedAccuracy:
+    """Accuracy of an estimator on the data sets of a source.
+
+    Parameters
+    ----------
+    source : SimulatedSource
+        Makes the data sets.
+    estimator : Any
+        The option dataclass of the estimator.
+    terms : tuple of Term, optional
+        How many poles each submodel takes into which an estimate of one fraction is factored; None leaves fractions as
+        they are.
+
+    Returns
+    -------
+    ExpectedAccuracy
+        Of the parameters of submodels where there are terms and the system has no integrator; of the estimator's own
+        parameters otherwise.
+
+    Raises
+    ------
+    DataError
+        If there is no theory for this estimator on these data: a sentence that begins with its subject.
+    """
+    if source.noise is None:
+        raise DataError("the data have no noise, so nothing but rounding limits the accuracy")
+    estimated = _estimated(source.system, estimator)
+    loop, sampling = source.loop, source.sampling
+    if loop is not None and estimated.instruments == "open_loop" and isinstance(sampling, RegularSampling):
+        require_uncorrelated_input(source.system, sampling.interval, loop.controller, source.noise.filter)
+    why_not = _why_no_limit(source, estimated)
+    accuracy = _of_records(source, estimated, why_not) if why_not else _of_long_records(source, estimated)
+    if terms is None or not source.system.is_stable:
+        return accuracy
+    parameters = accuracy.parameters.factored(terms)
+    # Of a coefficient that is zero in truth the partial fractions leave rounding.
+    rounding = np.abs(parameters.values) < ROUNDING * parameters.standard_errors
+    return replace(accuracy, parameters=replace(parameters, values=np.where(rounding, 0.0, parameters.values)))
+
+
+def _estimated(system: AdditiveModel | TransferFunction, estimator: Any) -> _Estimated:
+    """The system as the estimator has it, or why it cannot hold the system."""
+    if estimator.kind == "svf":
+        raise DataError("svf is the least-squares start of other estimators; noise biases it, by an unknown amount")
+    delay_from = None
+    bounds = getattr(estimator, "delay_bounds", None)
+    if bounds is not None:
+        if not bounds[0] <= system.delay <= bounds[1]:
+            raise DataError(
+                f"the delay is sought from {bounds[0]:g} to {bounds[1]:g} s and the true one is {system.delay:g} s: "
+                "the estimate is biased"
+            )
+        delay_from = bounds[1] if bounds[0] < bounds[1] else None
+    elif abs(estimator.delay - system.delay) > SAME_DELAY * system.delay:
+        raise DataError(
+            f"the estimator takes the delay as {estimator.delay:g} s and the true one is {system.delay:g} s: the "
+            "estimate is biased"
+        )
+    instruments = getattr(estimator, "instruments", "open_loop")
+    if hasattr(estimator, "terms"):
+        return _Estimated(_in_terms(system, estimator.terms), None, delay_from, instruments)
+    if estimator.zeros >= estimator.poles:
+        raise DataError("the model has as many zeros as poles, and theory is given here for fewer zeros only")
+    fraction = unfactored(system) if isinstance(system, AdditiveModel) else system
+    zeros = fraction.numerator.size - 1
+    has = f"{estimator.poles} poles and {estimator.zeros} zeros, the system {fraction.order} and {zeros}"
+    if estimator.poles < fraction.order or estimator.zeros < zeros:
+        raise DataError(f"the model has {has}: it cannot hold the system, and its estimate is biased")
+    if estimator.poles > fraction.order:
+        raise DataError(f"the model has {has}: no data determine the poles in excess")
+    return _Estimated(fraction, estimator.zeros, delay_from, instruments)
+
+
+def _in_terms(system: AdditiveModel | TransferFunction, terms: tuple[Term, ...]) -> AdditiveModel:
+    """The system as a sum of submodels with the degrees of an estimator's terms, by rising natural frequency."""
+    if isinstance(system, AdditiveModel):
+        submodels = list(system.submodels)
+    else:
+        submodels = [_without_rounding(submodel) for submodel in factored(system, terms).submodels]
+    # In the order given if that is possible; else short numerators where they suffice.
+    for order in (terms, sorted(terms, key=lambda term: term.zeros)):
+        found = _matched(submodels, order)
+        if found is not None:
+            return AdditiveModel(found, system.delay).sorted()
+    raise DataError(
+        f"the estimator's terms ({len(terms)}) do not match the submodels of the system ({len(submodels)}): they "
+        "cannot hold it, or no data determine what they have in excess"
+    )
+
+
+def _matched(submodels: list[Submodel], terms: Sequence[Term]) -> list[Submodel] | None:
+    """Submodels with numerators of the degrees of the terms, the first term that is left and fits for each."""
+    left = list(terms)
+    found = []
+    for submodel in submodels:
+        own = submodel.term()
+        fitting = [t for t in left if (t.poles, t.integrators) == (own.poles, own.integrators) and t.zeros >= own.zeros]
+        if not fitting:
+            return None
+        left.remove(fitting[0])
+        numerator = np.concatenate([np.zeros(fitting[0].zeros - own.zeros), submodel.numerator])
+        found.append(Submodel(numerator, submodel.denominator, submodel.integrators))
+    return None if left else found
+
+
+def _without_rounding(submodel: Submodel) -> Submodel:
+    """A submodel of partial fractions without the leading coefficients that are zero in truth."""
+    sizes = np.abs(submodel.numerator) * submodel.natural_frequency ** np.arange(submodel.numerator.size)[::-1]
+    numerator = np.trim_zeros(np.where(sizes > ROUNDING * sizes.max(), submodel.numerator, 0.0), "f")
+    return Submodel(numerator, submodel.denominator, submodel.integrators)
+
+
+def _why_no_limit(source: SimulatedSource, estimated: _Estimated) -> str:
+    """Why the limit for long records is not taken, in a clause; empty where it is."""
+    sampling, signal = source.sampling, source.excitation if source.loop is None else source.loop.reference
+    if estimated.delay_from is not None:
+        return "the delay is estimated too"
+    if not isinstance(sampling, RegularSampling):
+        return "the clock is irregular"
+    if not isinstance(signal, Gaussian) or signal.clock_period not in (None, sampling.interval):
+        name = "input" if source.loop is None else "reference"
+        return f"the {name} is not white Gaussian noise held from sample to sample"
+    if sampling.samples < LONG:
+        return f"there are fewer than {LONG} samples"
+    if not estimated.model.is_stable and (source.loop is None or isinstance(estimated.model, TransferFunction)):
+        return "the system integrates, and what it knows grows with the record"
+    return ""
+
+
+def _of_long_records(source: SimulatedSource, estimated: _Estimated) -> ExpectedAccuracy:
+    sampling, noise, loop = source.sampling, source.noise, source.loop
+    assert isinstance(sampling, RegularSampling)
+    assert noise is not None
+    signal = source.excitation if loop is None else loop.reference
+    assert isinstance(signal, Gaussian)
+    options: dict[str, Any] = {"noise_filter": noise.filter, "samples": sampling.samples, "zeros": estimated.zeros}
+    if loop is None:
+        power = output_variance(estimated.model, sampling.interval, input_standard_deviation=signal.standard_deviation)
+        parameters = open_loop_accuracy(
+            estimated.model,
+            sampling.interval,
+            input_standard_deviation=signal.standard_deviation,
+            # A level relative to the output counts from its mean square.
+            innovation_variance=noise.innovation_variance_of(np.sqrt([power])),
+            **options,
+        )
+    else:
+        parameters = closed_loop_accuracy(
+            estimated.model,
+            sampling.interval,
+            loop.controller,
+            reference_standard_deviation=signal.standard_deviation,
+            innovation_variance=noise.innovation_variance_of(),
+            enters=loop.enters,
+            instruments="closed_loop" if estimated.instruments == "closed_loop" else "open_loop",
+            **options,
+        )
+    matrices = "M = E psi psi'"
+    if noise.coloured:
+        matrices += ", Sigma = sigma_e^2 cov(H psi), H the filter and sigma_e^2 the innovation variance of the noise"
+    drive = "input" if loop is None else "reference"
+    formula = (
+        f"the limit for long records, {'M^-1 Sigma M^-1' if noise.coloured else 'sigma^2 M^-1'} / N with {matrices}, "
+        f"psi {_sensitivities(source, estimated)}; by discrete Lyapunov equations, as the {drive} is white Gaussian "
+        "noise"
+    )
+    return ExpectedAccuracy(parameters, sampling.samples, True, formula)
+
+
+def _of_records(source: SimulatedSource, estimated: _Estimated, why: str) -> ExpectedAccuracy:
+    assert source.noise is not None
+    samples = source.sampling.samples
+    sets = max(1, min(MOST_SETS, SET_SAMPLES // samples))
+    covariance = np.mean([_record_covariance(source, estimated, replicate) for replicate in range(sets)], axis=0)
+    if not np.isfinite(covariance).all():
+        raise DataError("the data would not determine the parameters, even without noise")
+    sought = estimated.delay_from is not None
+    names, values = estimated_parameters(estimated.model, estimated.zeros, delay=sought)
+    if source.noise.coloured:
+        start = "(psi' psi)^-1 psi' R psi (psi' psi)^-1, R the covariance matrix of the noise"
+    else:
+        # Instruments other than the input itself are not the best there are.
+        best = estimated.instruments == "open_loop"
+        start = f"{'the Cramér-Rao bound ' if best else ''}sigma^2 (psi' psi)^-1"
+    where = "in the first data set" if sets == 1 else f"averaged over the first {sets} data sets"
+    formula = f"{start}, psi {_sensitivities(source, estimated)}, {where}, as {why}"
+    return ExpectedAccuracy(ParameterAccuracy(estimated.model, names, values, covariance), samples, False, formula)
+
+
+def _record_covariance(source: SimulatedSource, estimated: _Estimated, replicate: int) -> Array:
+    """Covariance of an estimate from one data set; NaN where it does not determine the parameters."""
+    assert source.noise is not None
+    record = source.dataset(replicate).record
+    signal = record.input
+    if estimated.instruments == "closed_loop":
+        assert record.loop is not None
+        assert record.interval is not None
+        assert source.loop is not None
+        reference, controller, enters = record.loop.reference, source.loop.controller, source.loop.enters
+        loop = simulate_loop(source.system, controller, reference, 0.0, record.interval, enters)
+        signal = HeldSignal(record.t, loop.u)
+    model = estimated.model
+    if isinstance(model, AdditiveModel):
+        psi = additive_sensitivities(model, signal, record.t)
+    else:
+        sought = estimated.delay_from is not None
+        psi = unfactored_sensitivities(model, signal, record.t, estimated.zeros, estimate_delay=sought)
+    if estimated.delay_from is not None:
+        psi = psi[record.t >= record.input.t[0] + estimated.delay_from]
+    lags = np.arange(psi.shape[0] if source.noise.coloured else 1)
+    return finite_record_covariance(psi, source.noise.autocovariance(lags, record.noise_free))
+
+
+def _sensitivities(source: SimulatedSource, estimated: _Estimated) -> str:
+    """What psi are, in words."""
+    text = "the sensitivities of the output to the parameters"
+    if source.loop is None:
+        return text
+    return f"{text} in the {'noise-free loop' if estimated.instruments == 'closed_loop' else 'loop, noise included'}"

@@ -1,0 +1,265 @@
+"""Figures of the study of additive models: 2, 3, 4 and 6 of the paper, and two of our own.
+
+Numbers are those of González, Classens, Rojas, Welsh and Oomen, "Identification of Additive Continuous-time Systems in
+Open and Closed-loop" (arXiv:2401.01263). Figures 2 and 6 are computed from the specifications; the others show results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.experiment.dataset import SimulatedSource
+from ctid_cli.models import AdditiveModel
+from ctid_cli.reporting.figures.frequency_plot import Response, dense_frequencies, response_svg
+from ctid_cli.reporting.figures.from_results import FromResults
+from ctid_cli.reporting.figures.parameter_plot import Method, bias_svg, coverage_svg, mse_svg
+from ctid_cli.reporting.figures.specification import published_plan
+from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, ramp
+from ctid_cli.reporting.parameter_errors import ParameterErrors, parameter_errors, parameter_estimates
+from ctid_cli.reporting.results import Results
+from ctid_cli.signals import Record
+
+#: Experiments of the study and their specifications.
+CONFIGS: Mapping[str, str] = {
+    f"additive/{name.replace('_', '-')}": f"additive/{name}.yaml"
+    for name in (
+        "open_loop",
+        "closed_loop",
+        "closed_loop_coloured",
+        "coverage_open_loop",
+        "coverage_closed_loop",
+        "flexible_beam",
+    )
+}
+#: Estimators of the open-loop experiment.
+OPEN_LOOP = (Method("additive", "sum of four submodels"), Method("srivc", "SRIVC, 8 poles and 6 zeros, factored"))
+#: Estimators of the closed-loop experiment.
+CLOSED_LOOP = (
+    Method("additive", "sum of two submodels, closed loop"),
+    Method("clsrivc", "CLSRIVC, factored"),
+    Method("srivc", "SRIVC (direct), factored"),
+)
+#: Estimators under coloured noise in the loop.
+COLOURED = (
+    *CLOSED_LOOP,
+    Method("additive_direct", "sum of two submodels, instruments from the input"),
+)
+#: Formulas of standard errors in open loop, where the noise is coloured.
+COVERAGE_OPEN_LOOP = (Method("sandwich", "sandwich"), Method("white", "white formula, misused"))
+#: The formula of standard errors in closed loop, where the noise is white.
+COVERAGE_CLOSED_LOOP = (Method("white", "white formula"),)
+
+
+def figure_2() -> bytes:
+    """Frequency response of the eighth-order system.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    model = _system("additive/open-loop")
+    frequencies = np.geomspace(0.1, 50.0, 1200)
+    submodels = [
+        Response(
+            f"submodel {k}", frequencies, submodel.frequency_response(frequencies), line | {"linewidth": 0.9}, False
+        )
+        for k, (submodel, line) in enumerate(zip(model.submodels, ramp(len(model.submodels)), strict=True), 1)
+    ]
+    whole = Response("system", frequencies, model.frequency_response(frequencies), {"color": MARK, "linewidth": 1.5})
+    return response_svg(
+        [*submodels, whole], "Section 6.1: the eighth-order system and its four submodels", unit="rad/s"
+    )
+
+
+def figure_3(results: Results) -> bytes:
+    """Mean-square errors of the static gains in open loop.
+
+    Parameters
+    ----------
+    results : Results
+        The open-loop experiment.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    gains = [f"g{k}_b0" for k in range(1, 5)]
+    title = "Section 6.1, open loop, coloured noise: mean-square errors of the static gains"
+    return mse_svg(_errors(results), OPEN_LOOP, gains, 2, title)
+
+
+def figure_4(results: Results) -> bytes:
+    """Mean-square errors of all parameters in closed loop.
+
+    Parameters
+    ----------
+    results : Results
+        The closed-loop experiment.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    rows = _errors(results)
+    title = "Section 6.2, closed loop, white noise: mean-square errors of the parameters"
+    return mse_svg(rows, CLOSED_LOOP, _parameters(rows), 3, title)
+
+
+def figure_6() -> bytes:
+    """Frequency response of a simulated beam: true, estimated, and where the estimation started.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    plan = published_plan(CONFIGS["additive/flexible-beam"])
+    cell = plan.data_cells[0]
+    true, data = _system("additive/flexible-beam"), cell.dataset(0)
+    start = plan.starts[0].draw(cell.content["seed"], 0, true)
+    assert start is not None
+    assert start.model is not None
+    fit = plan.estimators[0].estimator.fit(data.record, start)
+    lowest, highest = np.pi, 1000 * np.pi
+    tones, measured = empirical_response(data.record, lowest, highest)
+    begun = AdditiveModel(start.model.submodels, fit.additive.delay)
+    curves = [
+        Response(
+            "non-parametric estimate, every 0.5 Hz",
+            tones / (2 * np.pi),
+            measured,
+            {"color": LIGHT, "marker": ".", "markersize": 2.5, "linestyle": "none"},
+        )
+    ]
+    for label, model, style in (
+        ("start of the iterations", begun, {"color": MIDDLE, "linestyle": "--", "linewidth": 0.9}),
+        ("true simulated system", true, {"color": DARK, "linewidth": 2.4, "alpha": 0.5}),
+        ("estimate", fit.additive, {"color": MARK, "linewidth": 0.9}),
+    ):
+        frequencies = dense_frequencies(model, lowest, highest)
+        curves.append(Response(label, frequencies / (2 * np.pi), model.frequency_response(frequencies), style))
+    return response_svg(
+        curves,
+        "SIMULATED stand-in for the flexible beam of section 7, no measured data: 2 s from rest, 4096 Hz,\n"
+        f"noise 100 dB below the output, a delay of 4 samples; {fit.iterations} iterations, {fit.status.name}",
+        unit="Hz",
+        unwrap=False,
+    )
+
+
+def figure_coloured(results: Results) -> bytes:
+    """Biases under coloured noise in closed loop.
+
+    Parameters
+    ----------
+    results : Results
+        The closed-loop experiment with coloured noise.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    rows = _errors(results)
+    title = (
+        r"Biases in the loop of section 6.2 with noise $v = e/(1 - 0.9 q^{-1})$ of variance 0.01, "
+        f"N = {_samples(rows)}"
+    )
+    return bias_svg(rows, COLOURED, _parameters(rows), title)
+
+
+def figure_coverage(open_loop: Results, closed_loop: Results) -> bytes:
+    """How often 95 % intervals contain the true parameters.
+
+    Parameters
+    ----------
+    open_loop, closed_loop : Results
+        The two experiments on coverage.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    ours, theirs = _errors(open_loop), _errors(closed_loop)
+    return coverage_svg(
+        [
+            (f"open loop, coloured noise, N = {_samples(ours)}", ours, COVERAGE_OPEN_LOOP),
+            (f"closed loop, N = {_samples(theirs)}", theirs, COVERAGE_CLOSED_LOOP),
+        ],
+        "95 % intervals from the standard errors of single estimates of the sum of submodels",
+    )
+
+
+def empirical_response(
+    record: Record, lowest: float, highest: float
+) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+    r"""Frequency response as the quotient of windowed spectra, without a model.
+
+    Parameters
+    ----------
+    record : Record
+        Regular samples of the output, and an input that is held between them.
+    lowest, highest : float
+        Ends of the range [rad/s].
+
+    Returns
+    -------
+    frequencies : ndarray, shape (K,)
+        Multiples of ``2 pi/(N h)`` in the range [rad/s].
+    response : ndarray of complex, shape (K,)
+        Response [output unit/input unit].
+
+    Notes
+    -----
+    The system does not repeat itself within the record, least of all from rest: the Hann window takes the ends of the
+    record out. The spectrum of the held input is that of its samples times ``(1 - exp(-jwh))/(jwh)``.
+    """
+    h = record.interval
+    assert h is not None
+    window = np.hanning(record.t.size)
+    whole = np.asarray(2 * np.pi * np.fft.rfftfreq(record.t.size, h), dtype=float)
+    inside = (whole > lowest * (1 - 1e-9)) & (whole < highest * (1 + 1e-9))
+    frequencies = whole[inside]
+    outputs, inputs = (np.fft.rfft(window * signal)[inside] for signal in (record.y, record.input.at(record.t)))
+    hold = (1 - np.exp(-1j * frequencies * h)) / (1j * frequencies * h)
+    return frequencies, np.asarray(outputs / (inputs * hold))
+
+
+def _system(experiment: str) -> AdditiveModel:
+    source = published_plan(CONFIGS[experiment]).data_cells[0].source
+    assert isinstance(source, SimulatedSource)
+    assert isinstance(source.system, AdditiveModel)
+    return source.system
+
+
+def _errors(results: Results) -> list[ParameterErrors]:
+    return parameter_errors(parameter_estimates(results))
+
+
+def _parameters(rows: list[ParameterErrors]) -> list[str]:
+    return list(dict.fromkeys(row.parameter for row in rows))
+
+
+def _samples(rows: list[ParameterErrors]) -> str:
+    return ", ".join(dict.fromkeys(str(row.samples) for row in rows))
+
+
+def _of_results(draw: Callable[..., bytes], *experiments: str) -> FromResults:
+    return FromResults({name: CONFIGS[name] for name in experiments}, draw)
+
+
+FIGURES: Mapping[str, Callable[[], bytes] | FromResults] = {
+    "2": figure_2,
+    "3": _of_results(figure_3, "additive/open-loop"),
+    "4": _of_results(figure_4, "additive/closed-loop"),
+    "6": figure_6,
+    "coloured": _of_results(figure_coloured, "additive/closed-loop-coloured"),
+    "coverage": _of_results(figure_coverage, "additive/coverage-open-loop", "additive/coverage-closed-loop"),
+}

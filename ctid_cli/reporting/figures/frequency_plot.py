@@ -1,0 +1,114 @@
+"""Drawings of frequency responses: magnitude and phase over the frequency."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.models import AdditiveModel
+from ctid_cli.reporting.figures.style import svg
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """One curve.
+
+    Parameters
+    ----------
+    label : str
+        What it is.
+    frequencies : ndarray, shape (K,)
+        Frequencies, in the unit of the figure, rising.
+    values : ndarray of complex, shape (K,)
+        Response [output unit/input unit].
+    style : mapping
+        Keywords of ``Axes.plot``.
+    phase : bool
+        Whether its phase is drawn too.
+    """
+
+    label: str
+    frequencies: Array
+    values: NDArray[np.complex128]
+    style: Mapping[str, Any] = field(default_factory=dict)
+    phase: bool = True
+
+
+def response_svg(curves: Sequence[Response], title: str, unit: str, *, unwrap: bool = True) -> bytes:
+    """Magnitude and phase of frequency responses.
+
+    Parameters
+    ----------
+    curves : sequence of Response
+        The curves, drawn in this order.
+    title : str
+        What they belong to.
+    unit : str
+        Unit of their frequencies, ``rad/s`` or ``Hz``.
+    unwrap : bool, default True
+        Whether phases are followed beyond 180 degrees; otherwise they are drawn between -180 and 180.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+
+    def draw(figure: Figure) -> None:
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1.7, 1])
+        for curve in curves:
+            above.semilogx(curve.frequencies, 20 * np.log10(np.abs(curve.values)), label=curve.label, **curve.style)
+            if curve.phase:
+                below.semilogx(curve.frequencies, _phase(curve.values, unwrap), **curve.style)
+        above.set_ylabel("magnitude [dB]")
+        below.set_ylabel("phase [°]")
+        below.set_xlabel(rf"frequency $\omega$ [{unit}]" if unit == "rad/s" else f"frequency [{unit}]")
+        if not unwrap:
+            below.set_ylim(-190, 190)
+            below.set_yticks([-180, -90, 0, 90, 180])
+        above.margins(x=0.0)
+        figure.legend(loc="outside lower center", ncols=3, frameon=False)
+        figure.suptitle(title)
+
+    return svg(7.5, 5.2, draw)
+
+
+def _phase(values: NDArray[np.complex128], unwrap: bool) -> Array:
+    """Phase in degrees; where it jumps from one end of the range to the other, the curve is interrupted."""
+    angle = np.angle(values)
+    if unwrap:
+        return np.asarray(np.rad2deg(np.unwrap(angle)))
+    angle[:-1][np.abs(np.diff(angle)) > np.pi] = np.nan
+    return np.asarray(np.rad2deg(angle))
+
+
+def dense_frequencies(model: AdditiveModel, lowest: float, highest: float) -> Array:
+    """Frequencies that show every resonance of a model, however narrow.
+
+    Parameters
+    ----------
+    model : AdditiveModel
+        The model.
+    lowest, highest : float
+        Ends of the range [rad/s].
+
+    Returns
+    -------
+    ndarray
+        Frequencies [rad/s], rising: evenly on a logarithmic axis, and closer and closer around the natural frequencies.
+    """
+    distances = np.geomspace(1e-6, 0.1, 60)
+    near = [
+        model.natural_frequency * np.concatenate([1 - distances, [1.0], 1 + distances]) for model in model.submodels
+    ]
+    every = np.concatenate([np.geomspace(lowest, highest, 600), *near])
+    return np.unique(every[(every >= lowest) & (every <= highest)])

@@ -1,0 +1,271 @@
+"""Drawings of parameter errors: mean squares over the number of samples, biases, and coverage of intervals."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ctid_cli.reporting.figures.style import BAND, DARK, MARK, MIDDLE, svg
+from ctid_cli.reporting.parameter_errors import QUANTILE, ParameterErrors
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Looks of up to four estimators, told apart by colour, marker and line.
+LOOKS: tuple[dict[str, Any], ...] = (
+    {"color": DARK, "marker": "o", "markerfacecolor": DARK, "linestyle": "-"},
+    {"color": MARK, "marker": "s", "markerfacecolor": "none", "linestyle": "--"},
+    {"color": MIDDLE, "marker": "^", "markerfacecolor": "none", "linestyle": "-."},
+    {"color": "#3a7d34", "marker": "x", "linestyle": ":"},
+)
+#: Bias [standard errors of the mean] within which a parameter counts as unbiased: 1 in 1000, two-sided.
+UNBIASED = 3.3
+
+
+@dataclass(frozen=True)
+class Method:
+    """An estimator as figures show it.
+
+    Parameters
+    ----------
+    name : str
+        Its name in the specification.
+    label : str
+        What it is called in the figure.
+    """
+
+    name: str
+    label: str
+
+
+def symbol(parameter: str) -> str:
+    """A parameter of a submodel as a formula.
+
+    Parameters
+    ----------
+    parameter : str
+        Its name.
+
+    Returns
+    -------
+    str
+        Text for matplotlib.
+
+    Examples
+    --------
+    >>> symbol("g2_b0")
+    '$b_{2,0}$'
+    """
+    return re.sub(r"^g(\d+)_([ab])(\d+)$", r"$\2_{\1,\3}$", parameter)
+
+
+def mse_svg(
+    rows: Sequence[ParameterErrors], methods: Sequence[Method], parameters: Sequence[str], columns: int, title: str
+) -> bytes:
+    """Mean-square errors over the number of samples, one panel for each parameter.
+
+    Parameters
+    ----------
+    rows : sequence of ParameterErrors
+        Errors of one experiment.
+    methods : sequence of Method
+        Estimators to draw, four at most.
+    parameters : sequence of str
+        Parameters to draw.
+    columns : int
+        Panels side by side.
+    title : str
+        What is shown; the number of data sets is added.
+
+    Returns
+    -------
+    bytes
+        An SVG file: markers are simulated, lines are what theory predicts for long records.
+    """
+    lines = -(-len(parameters) // columns)
+
+    def draw(figure: Figure) -> None:
+        from matplotlib.ticker import NullFormatter
+
+        panels = figure.subplots(lines, columns, sharex=True, squeeze=False)
+        for axes, parameter in zip(panels.flat, parameters, strict=False):
+            for method, look in zip(methods, LOOKS, strict=False):
+                found = [row for row in rows if (row.estimator, row.parameter) == (method.name, parameter)]
+                found.sort(key=lambda row: row.samples)
+                theory = [(row.samples, row.theory / row.samples) for row in found if row.theory is not None]
+                if theory:
+                    axes.plot(*np.transpose(theory), color=look["color"], linestyle=look["linestyle"], linewidth=0.9)
+                points = [(row.samples, row.mse) for row in found if row.mse is not None]
+                if points:
+                    axes.plot(
+                        *np.transpose(points), **look | {"linestyle": "none"}, markersize=3.2, markeredgewidth=0.8
+                    )
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            axes.xaxis.set_minor_formatter(NullFormatter())
+            axes.yaxis.set_minor_formatter(NullFormatter())
+            axes.set_title(symbol(parameter), loc="left")
+        for axes in panels[:, 0]:
+            axes.set_ylabel("mean-square error")
+        for axes in panels[-1]:
+            axes.set_xlabel("number of samples $N$")
+        for axes in list(panels.flat)[len(parameters) :]:
+            axes.set_visible(False)
+        _legend(figure, methods, rows, "simulated (marker), theory for long records (line)")
+        figure.suptitle(f"{title} ({_data_sets(rows)})")
+
+    return svg(7.5, 1.4 + 2.1 * lines, draw)
+
+
+def bias_svg(
+    rows: Sequence[ParameterErrors], methods: Sequence[Method], parameters: Sequence[str], title: str
+) -> bytes:
+    """Biases in standard deviations of one estimate, one line for each parameter.
+
+    Parameters
+    ----------
+    rows : sequence of ParameterErrors
+        Errors of one experiment at one number of samples.
+    methods : sequence of Method
+        Estimators to draw, four at most.
+    parameters : sequence of str
+        Parameters to draw, from the top.
+    title : str
+        What is shown.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    counted = min((row.counted for row in rows), default=0)
+    band = UNBIASED / np.sqrt(counted) if counted else 0.0
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        axes.axvspan(-band, band, color=BAND, linewidth=0)
+        axes.axvline(0.0, color=MIDDLE, linewidth=0.8)
+        for k, (method, look) in enumerate(zip(methods, LOOKS, strict=False)):
+            for place, parameter in enumerate(parameters):
+                height = -place + 0.17 * (0.5 * (len(methods) - 1) - k)
+                for row in rows:
+                    if (row.estimator, row.parameter) != (method.name, parameter) or row.bias_per_deviation is None:
+                        continue
+                    axes.plot([0.0, row.bias_per_deviation], [height] * 2, color=look["color"], linewidth=0.8)
+                    axes.plot([row.bias_per_deviation], [height], **look | {"linestyle": "none"}, markersize=5)
+        axes.set_yticks([-place for place in range(len(parameters))], [symbol(name) for name in parameters])
+        axes.set_xlabel("bias / standard deviation of one estimate [-]")
+        axes.grid(False, axis="y")
+        _legend(figure, methods, rows, f"grey: within {UNBIASED:g} standard errors of zero", line=False)
+        figure.suptitle(f"{title} ({_data_sets(rows)})")
+
+    return svg(7.5, 1.5 + 0.5 * len(parameters), draw)
+
+
+def coverage_svg(panels: Sequence[tuple[str, Sequence[ParameterErrors], Sequence[Method]]], title: str) -> bytes:
+    """Percentages of 95 % intervals that contain the true parameter.
+
+    Parameters
+    ----------
+    panels : sequence of (str, sequence of ParameterErrors, sequence of Method)
+        What each panel shows, the errors of one experiment at one number of samples, and the estimators to draw.
+    title : str
+        What is shown.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    widths = [len({row.parameter for row in rows}) for _, rows, _ in panels]
+
+    def draw(figure: Figure) -> None:
+        drawn = figure.subplots(1, len(panels), sharey=True, squeeze=False, width_ratios=[max(w, 3) for w in widths])[0]
+        for axes, (name, rows, methods) in zip(drawn, panels, strict=True):
+            parameters = list(dict.fromkeys(row.parameter for row in rows))
+            counted = min((row.counted for row in rows), default=0)
+            half = 100 * QUANTILE * np.sqrt(0.95 * 0.05 / counted) if counted else 0.0
+            axes.axhspan(95 - half, min(95 + half, 100), color=BAND, linewidth=0)
+            axes.axhline(95, color=MIDDLE, linewidth=0.8)
+            for k, (method, look) in enumerate(zip(methods, LOOKS, strict=False)):
+                found = {
+                    row.parameter: row for row in rows if row.estimator == method.name and row.coverage is not None
+                }
+                at = np.array([parameters.index(parameter) for parameter in found]) + 0.16 * (
+                    k - 0.5 * (len(methods) - 1)
+                )
+                middle = np.array([row.coverage for row in found.values()], dtype=float)
+                ends = np.array([(row.low, row.high) for row in found.values()], dtype=float).reshape(-1, 2).T
+                axes.errorbar(
+                    at,
+                    middle,
+                    # Rounding puts an end on the wrong side by a hair.
+                    np.maximum(np.abs(ends - middle), 0.0),
+                    **look | {"linestyle": "none"},
+                    markersize=4,
+                    elinewidth=0.8,
+                    label=labelled(method, rows),
+                )
+            axes.set_xticks(range(len(parameters)), [symbol(parameter) for parameter in parameters], fontsize=8)
+            axes.set_title(f"{name}, {_data_sets(rows)}", loc="left", fontsize=8)
+            axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), frameon=False)
+            axes.grid(False, axis="x")
+        drawn[0].set_ylabel("intervals that contain the true value [%]")
+        figure.suptitle(title)
+
+    return svg(7.5, 3.8, draw)
+
+
+def labelled(method: Method, rows: Sequence[ParameterErrors]) -> str:
+    """What an estimator is called, and how many of its estimates are not as they should be.
+
+    Parameters
+    ----------
+    method : Method
+        The estimator.
+    rows : sequence of ParameterErrors
+        Errors of one experiment.
+
+    Returns
+    -------
+    str
+        For example ``SRIVC (3 of 9000 not converged)``: these count; those without a value cannot.
+    """
+    # Every parameter of a group carries the same counts.
+    own = {(row.samples, row.start): row for row in rows if row.estimator == method.name}.values()
+    runs, counted = sum(row.runs for row in own), sum(row.counted for row in own)
+    unfinished = sum(row.failed + row.not_converged for row in own)
+    notes = [f"{unfinished} of {runs} not converged"] if unfinished else []
+    notes += [f"{runs - counted} without a value"] if counted < runs else []
+    return f"{method.label} ({', '.join(notes)})" if notes else method.label
+
+
+def _data_sets(rows: Sequence[ParameterErrors]) -> str:
+    runs = {row.runs for row in rows}
+    text = " to ".join(map(str, sorted({min(runs, default=0), max(runs, default=0)})))
+    return f"{text} data sets{' a point' if len({row.samples for row in rows}) > 1 else ''}"
+
+
+def _legend(
+    figure: Figure, methods: Sequence[Method], rows: Sequence[ParameterErrors], note: str, *, line: bool = True
+) -> None:
+    from matplotlib.lines import Line2D
+
+    off = {} if line else {"linestyle": "none"}
+    handles = [
+        Line2D([], [], **look | off, markersize=4, linewidth=0.9, label=labelled(method, rows))
+        for method, look in zip(methods, LOOKS, strict=False)
+    ]
+    wide = max(len(str(handle.get_label())) for handle in handles) > 40 or len(handles) > 3
+    figure.legend(
+        handles=handles,
+        loc="outside lower center",
+        ncols=2 if wide else 3,
+        frameon=False,
+        title=note,
+        title_fontsize=8,
+    )

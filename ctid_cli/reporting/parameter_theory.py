@@ -1,0 +1,65 @@
+"""The variances that theory predicts on long records for the parameters of a Monte Carlo experiment."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from ctid_cli.errors import DataError
+from ctid_cli.experiment.canonical import content_hash
+from ctid_cli.experiment.dataset import SimulatedSource
+from ctid_cli.experiment.plan import Plan
+from ctid_cli.reporting.expected_accuracy import LONG, expected_accuracy
+from ctid_cli.signals import RegularSampling
+
+
+def long_record_variances(plan: Plan) -> dict[tuple[str, str], dict[str, float]]:
+    """Variances of the parameters of submodels that estimates approach on long records.
+
+    Parameters
+    ----------
+    plan : Plan
+        The experiment.
+
+    Returns
+    -------
+    dict
+        By hash of the data cell and hash of the estimator: N times the variance by parameter name, for N samples.
+        A pair is missing where `ctid_cli.reporting.expected_accuracy.expected_accuracy` knows no limit.
+
+    Notes
+    -----
+    The limit is taken whatever the number of samples of the cell: short records do not reach it.
+    """
+    found: dict[tuple[str, str], dict[str, float]] = {}
+    # Cells that differ in the number of samples have the same limit.
+    known: dict[str, dict[str, float] | None] = {}
+    for cell in plan.data_cells:
+        for part in plan.estimators:
+            same = content_hash([_without_length(cell.content), part.content])
+            if same not in known:
+                known[same] = _variances(cell.source, part.estimator, plan)
+            variances = known[same]
+            if variances is not None:
+                found[cell.hash, part.hash] = variances
+    return found
+
+
+def _without_length(content: Mapping[str, Any]) -> dict[str, Any]:
+    sampling = {key: value for key, value in (content.get("sampling") or {}).items() if key != "samples"}
+    return {key: value for key, value in content.items() if key != "seed"} | {"sampling": sampling}
+
+
+def _variances(source: Any, estimator: Any, plan: Plan) -> dict[str, float] | None:
+    if not isinstance(source, SimulatedSource) or not isinstance(source.sampling, RegularSampling):
+        return None
+    long = dataclasses.replace(source, sampling=dataclasses.replace(source.sampling, samples=LONG))
+    try:
+        expected = expected_accuracy(long, estimator, plan.terms)
+    except DataError:
+        return None
+    if not expected.limit:
+        return None
+    covariance = expected.samples * expected.parameters.covariance
+    return dict(zip(expected.parameters.names, covariance.diagonal().tolist(), strict=True))

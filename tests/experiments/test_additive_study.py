@@ -1,0 +1,235 @@
+"""The study of additive models: its specifications are the published settings, and its checks tell right from wrong."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ctid_cli.experiment.plan import build_plan
+from ctid_cli.experiment.sealed import seal_image
+from ctid_cli.experiment.spec import load_spec
+from ctid_cli.reporting.figures.additive import CONFIGS
+from ctid_cli.reporting.parameter_errors import parameter_errors
+from ctid_cli.reporting.study import data_folder
+from experiments.additive import acceptance, publish
+from tests.reporting.ideal_results import ideal_results
+
+FILES = sorted(config.rpartition("/")[2] for config in CONFIGS.values())
+#: What is found under coloured noise in closed loop.
+BIASES = {"g1_a1": -0.6, "g1_a2": -1.1, "g1_b0": -0.7, "g2_a1": -5.7, "g2_a2": 1.4, "g2_b0": -6.1}
+
+
+def published(file, overrides=()):
+    return load_spec(data_folder("configs") / "additive" / file, overrides)
+
+
+def source_of(file):
+    return build_plan(published(file)).data_cells[0].source
+
+
+def test_there_are_as_many_specifications_as_the_study_has():
+    there = {file.name for file in (data_folder("configs") / "additive").glob("*.yaml")}
+    assert there >= set(FILES)
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_specifications_have_no_warnings(file):
+    assert published(file).warnings == ()
+
+
+@pytest.mark.parametrize("file", ["open_loop.yaml", "coverage_open_loop.yaml"])
+def test_the_open_loop_system_has_the_printed_poles(file):
+    source = source_of(file)
+    poles = [-0.25 + 1.39j, -0.15 + 3.16j, -0.17 + 5.77j, -0.5 + 9.99j]
+    for submodel, pole, gain in zip(source.system.submodels, poles, (3, 0.4, 0.2, 0.05), strict=True):
+        assert sorted(submodel.poles, key=np.imag) == pytest.approx([pole.conjugate(), pole], rel=1e-12)
+        assert submodel.dc_gain == gain
+        assert submodel.numerator.size == 1
+    assert source.noise.variance_of() == pytest.approx(0.02 * (1 + 1.35**2 / (1 - 0.85**2)))
+    assert (source.sampling.interval, source.excitation.standard_deviation) == (0.05, 1.0)
+
+
+@pytest.mark.parametrize("file", ["closed_loop.yaml", "closed_loop_coloured.yaml", "coverage_closed_loop.yaml"])
+def test_the_loop_is_the_printed_one(file):
+    source = source_of(file)
+    assert source.system.theta.tolist() == [0.25, 0.25, 3.0, 0.01, 0.025, 1.0]
+    controller = source.loop.controller
+    z = np.exp(0.3j)
+    gain = np.polyval(controller.numerator, z) / np.polyval(controller.denominator, z)
+    assert gain == pytest.approx(0.0115 + 0.00725 * z / (z - 1) + 0.00454 * (z - 1) / z)
+    assert source.loop.enters == "controller"
+    assert source.loop.reference.standard_deviation == 1.0
+    assert source.noise.variance_of() == pytest.approx(0.01)
+    assert source.sampling.interval == 0.05
+
+
+def test_sizes_runs_and_settings():
+    for file, first, last, count in (("open_loop.yaml", 2000, 100000, 30), ("closed_loop.yaml", 500, 123036, 50)):
+        plan = build_plan(published(file))
+        sizes = [cell.source.sampling.samples for cell in plan.data_cells]
+        assert (sizes[0], sizes[-1], len(sizes), plan.runs) == (first, last, count, 300)
+        assert np.diff(np.log(sizes)) == pytest.approx(np.log(last / first) / (count - 1), rel=0.02)
+        for part in plan.estimators:
+            assert part.estimator.max_iterations == 100
+            assert part.estimator.tolerance <= 1e-7
+        assert [start.spread for start in plan.starts] == [0.05]
+    covering = [build_plan(published(file)) for file in ("coverage_open_loop.yaml", "coverage_closed_loop.yaml")]
+    assert [plan.runs for plan in covering] == [1000, 1000]
+    assert {cell.source.sampling.samples for plan in covering for cell in plan.data_cells} == {20000}
+
+
+def test_every_experiment_has_data_sets_of_its_own():
+    assert len({published(file).monte_carlo.seed for file in FILES}) == len(FILES)
+
+
+def test_the_beam_is_the_printed_model_and_says_that_it_is_simulated():
+    plan = build_plan(published("flexible_beam.yaml"))
+    source = plan.data_cells[0].source
+    printed = [0.0024, 0.023, 11.81, 2.33e-5, 1.65e-4, 0.159, 8.59e-7, 1.03e-5, 3.19e-4, 7.55e-7, 3.55e-6, 1.27e-4]
+    begun = [0.001, 0.025, 10, 5e-5, 1.5e-4, 0.2, 8.5e-7, 2e-5, 0.001, 7.5e-7, 5e-6, 0.01]
+    assert source.system.theta.tolist() == pytest.approx(printed, rel=1e-15)
+    assert plan.starts[0].draw(1, 0, None).model.theta.tolist() == pytest.approx(begun, rel=1e-15)
+    assert source.system.delay * 4096 == plan.estimators[0].estimator.delay * 4096 == 4
+    assert source.sampling.interval * 4096 == 1
+    assert source.excitation.frequencies / np.pi == pytest.approx(np.arange(1, 1001))
+    assert "SIMULATED" in published("flexible_beam.yaml").text
+
+
+@pytest.fixture(scope="module")
+def ideal(tmp_path_factory):
+    """A study that came out as theory expects, with fewer data sets and numbers of samples."""
+    out = tmp_path_factory.mktemp("ideal")
+    overrides = {
+        "open_loop.yaml": ["sampling.samples=[5000, 20000, 50000]", "monte_carlo.runs=400"],
+        "closed_loop.yaml": ["sampling.samples=[500, 25000, 60000]", "monte_carlo.runs=400"],
+        "closed_loop_coloured.yaml": ["monte_carlo.runs=400"],
+        "coverage_open_loop.yaml": ["monte_carlo.runs=1000"],
+    }
+    for file in FILES:
+        plan = build_plan(published(file, overrides.get(file, ())))
+        bias = {"srivc": BIASES, "additive_direct": BIASES} if "coloured" in file else None
+        results = ideal_results(
+            plan, out, bias=bias, width={"white": 0.4} if file == "coverage_open_loop.yaml" else None
+        )
+        if file == "flexible_beam.yaml":
+            for value in results.stored.results.values():
+                truth = plan.data_cells[0].source.system.parameters
+                value["parameters"] = {name: 1.000001 * true for name, true in truth.items()}
+        folder = out / plan.experiment
+        folder.mkdir(parents=True)
+        image, _, _ = seal_image(results.manifest, results.stored.origins, results.stored.results)
+        (folder / "runs.h5").write_bytes(image)
+    return out
+
+
+@pytest.fixture(scope="module")
+def study(ideal):
+    return acceptance.read_study(ideal)
+
+
+def failures(checks):
+    return [check.claim for check in checks if check.passed is False]
+
+
+def changed(study, name, change):
+    """The study with the estimates of one experiment changed."""
+    found = study[name]
+    estimates = [change(group) for group in found.estimates]
+    return {**study, name: replace(found, estimates=estimates, errors=parameter_errors(estimates))}
+
+
+def test_a_study_as_theory_expects_is_accepted(study):
+    checks = acceptance.acceptance(study)
+    assert failures(checks) == []
+    assert sum(check.passed is True for check in checks) >= 28
+    written = acceptance.write(checks, "md")
+    assert written.count("\n") == len(checks) + 1
+
+
+def test_each_check_sees_what_it_is_for(study):
+    def scaled(group, estimator, factor, shift=0.0):
+        if group.estimator != estimator:
+            return group
+        deviation = group.values.std(axis=0)
+        return replace(group, values=group.truth + factor * (group.values - group.truth) + shift * deviation)
+
+    def stopped(group, estimator, least, count):
+        there = group.estimator == estimator and group.samples >= least
+        return replace(group, not_converged=count) if there else group
+
+    def wide(group):
+        return replace(group, standard_errors=1.3 * group.standard_errors)
+
+    cases = [
+        ("open-loop", lambda g: scaled(g, "additive", 1.4), "N MSE / theory"),
+        ("open-loop", lambda g: scaled(g, "srivc", 0.6), "MSE of srivc / MSE of additive, g2_b0"),
+        ("closed-loop", lambda g: scaled(g, "clsrivc", 0.6), "MSE of clsrivc / MSE of additive, g1_a2"),
+        ("closed-loop", lambda g: scaled(g, "additive", 1.0, 0.4), "bias below"),
+        ("open-loop", lambda g: stopped(g, "additive", 0, 1), "additive converges"),
+        ("open-loop", lambda g: stopped(g, "srivc", 7000, 1), "srivc converges, N from 20000"),
+        ("closed-loop", lambda g: stopped(g, "clsrivc", 0, 5), "clsrivc converges"),
+        ("closed-loop-coloured", lambda g: scaled(g, "additive", 1.0, 0.4), "bias of additive, "),
+        ("closed-loop-coloured", lambda g: scaled(g, "srivc", 1.0, 5.0), "bias of srivc, g2_a1"),
+        ("coverage-open-loop", wide, "coverage outside"),
+    ]
+    for name, change, claim in cases:
+        wrong = failures(acceptance.acceptance(changed(study, name, change)))
+        assert any(claim in text for text in wrong), (name, claim, wrong)
+
+
+def test_a_few_estimates_that_did_not_converge_may_be_forgiven(study):
+    def stopped(group):
+        return replace(group, not_converged=3 if group.samples < 7000 or group.estimator != "additive" else 0)
+
+    assert failures(acceptance.acceptance(changed(study, "closed-loop", stopped))) == []
+    wrong = failures(acceptance.acceptance(changed(study, "open-loop", stopped)))
+    assert wrong == ["additive converges, N from 5000 to 50000", "srivc converges, N from 20000 to 50000"]
+
+
+def test_what_was_not_run_does_not_hold(study):
+    checks = acceptance.acceptance({name: study[name] for name in ("open-loop",)})
+    assert len(failures(checks)) == 5
+    assert {check.claim for check in checks if check.passed is False} == {"was run"}
+
+
+def test_the_command_answers_with_its_exit_code(ideal, tmp_path, capsys):
+    acceptance.main(["--results", str(ideal)])
+    assert capsys.readouterr().out.rstrip().endswith("hold")
+    with pytest.raises(SystemExit) as stopped:
+        acceptance.main(["--results", str(tmp_path)])
+    assert stopped.value.code == 1
+    assert capsys.readouterr().out.rstrip().endswith("0 of 6 hold")
+
+
+def test_what_is_published(ideal, tmp_path):
+    target = tmp_path / "published"
+    (ideal / "additive_figures").mkdir(exist_ok=True)
+    (ideal / "additive_figures" / "figure_3.svg").write_text("<svg/>", encoding="utf-8")
+    arguments = ["--results", str(ideal), "--out", str(target)]
+    publish.main(arguments)
+    files = {"errors.csv", "ratios.csv", "coverage.csv", "unfinished.csv", "tables.md", "acceptance.md"}
+    assert {file.name for file in target.iterdir()} == files | {"environment.json", "figures"}
+    assert [file.name for file in (target / "figures").iterdir()] == ["figure_3.svg"]
+    assert json.loads((target / "environment.json").read_text(encoding="utf-8")) == {}
+    tables = {}
+    for name in ("errors", "ratios", "coverage", "unfinished"):
+        with (target / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+            tables[name] = list(csv.DictReader(file))
+    assert len(tables["errors"]) == 2 * 3 * 12 + 3 * 3 * 6 + 4 * 6 + 2 * 12 + 6 + 12
+    assert len(tables["ratios"]) == 3 * 12 + 2 * 3 * 6 + 6
+    assert [row["misused"] for row in tables["coverage"]] == ["no"] * 12 + ["yes"] * 12 + ["no"] * 6
+    assert tables["unfinished"] == []
+    for row in tables["ratios"]:
+        assert float(row["ratio"]) == pytest.approx(float(row["theory"]), abs=6 * float(row["standard_error"]))
+    text = (target / "tables.md").read_text(encoding="utf-8")
+    for heading in ("Open loop, section 6.1", "Closed loop, section 6.2", "SIMULATED stand-in", "Coverage of 95 %"):
+        assert heading in text
+
+
+def test_nothing_is_published_without_results(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        publish.main(["--results", str(tmp_path), "--out", str(tmp_path / "published")])
+    assert "run first: make reproduce-additive" in capsys.readouterr().err
+    assert not (tmp_path / "published").exists()
