@@ -12,9 +12,12 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimators.additive_estimate import Covariance, SubmodelEstimate, estimate_submodels
 from ctid_cli.estimators.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
 from ctid_cli.estimators.common import Start, StartFrom, check_iteration, check_record
+from ctid_cli.estimators.modal_start import automatic_start
 from ctid_cli.estimators.refined_iv import StepRule
 from ctid_cli.filtering.bank import filter_data
 from ctid_cli.filtering.submodels import InitialState
+from ctid_cli.inference.additive_derived import additive_derived
+from ctid_cli.inference.derived import DerivedParameter
 from ctid_cli.inference.diagnostics import percent_from_r_squared
 from ctid_cli.inference.fit import Fit
 from ctid_cli.models.additive import AdditiveModel, Term
@@ -52,6 +55,22 @@ class AdditiveFit(Fit):
     def parameters(self) -> dict[str, float]:
         """Parameters by name: ``g1_a1 … g1_b0 …, g2_a1 …``, where the number is the power of p."""
         return self.additive.parameters
+
+    def derived(self, level: float = 0.95) -> tuple[DerivedParameter, ...]:
+        """Poles, natural frequencies, damping and static gains of the submodels.
+
+        Parameters
+        ----------
+        level : float, default 0.95
+            Confidence level of the intervals [-].
+
+        Returns
+        -------
+        tuple of DerivedParameter
+            With standard errors by the delta method, see
+            :func:`~ctid_cli.inference.additive_derived.additive_derived`.
+        """
+        return additive_derived(self.additive, self.covariance, level=level)
 
 
 @dataclass(frozen=True)
@@ -116,9 +135,10 @@ class AdditiveSrivc:
     >>> u = HeldSignal(t, rng.standard_normal(4000))
     >>> y = simulate_additive(system, u, t) + 0.1 * rng.standard_normal(4000)
     >>> fit = AdditiveSrivc(terms=(Term(2, 0), Term(2, 0))).fit(Record(t, y, u))
-    >>> {name: f"{value:.3f} +- {fit.standard_errors[name]:.3f}" for name, value in fit.parameters.items()}
-    ... # doctest: +NORMALIZE_WHITESPACE
-    {}
+    >>> for name in ("g1_b0", "g2_b0"):
+    ...     print(f"{name} = {fit.parameters[name]:.3f} +- {fit.standard_errors[name]:.3f}")
+    g1_b0 = 3.017 +- 0.007
+    g2_b0 = 0.999 +- 0.001
     """
 
     kind: ClassVar[str] = "additive_srivc"
@@ -277,8 +297,6 @@ class PreparedAdditiveSrivc:
                 raise DataError(f"the start has the submodels {given} and the estimator {wanted}")
         else:
             if self._automatic is None:
-                from ctid_cli.estimators.modal_start import automatic_start
-
                 found = automatic_start(self.record, options.terms, options.delay)
                 self._automatic = found.model, found.method
             model, method = self._automatic
