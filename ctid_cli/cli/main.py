@@ -17,6 +17,7 @@ from ctid_cli.cli.schema import schema
 from ctid_cli.cli.show import show
 from ctid_cli.cli.status import status
 from ctid_cli.cli.table import table
+from ctid_cli.cli.track import track
 from ctid_cli.cli.validate import validate
 
 # Plain help and error texts: they read well in log files, and leave rich out of the start-up.
@@ -52,7 +53,7 @@ def _root(
 
 
 app.command(cls=CheckCommand)(check)
-for _command in (fit, run, status, table, figure, show, export, validate, schema):
+for _command in (fit, track, run, status, table, figure, show, export, validate, schema):
     app.command()(_command)
 
 

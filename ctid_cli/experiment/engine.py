@@ -371,8 +371,16 @@ def _check_first_records(jobs: list[Job]) -> None:
 
 def _compile_kernels(plan: Plan) -> float:
     from ctid_cli.estimators import compile_kernels
+    from ctid_cli.experiment.frequency_runs import FrequencyEstimation, SignalSource
 
-    return compile_kernels(cell.estimator for cell in plan.estimators)
+    source = plan.data_cells[0].source
+    if not isinstance(source, SignalSource):
+        return compile_kernels(cell.estimator for cell in plan.estimators)
+    begun = time.perf_counter()
+    for cell in plan.estimators:
+        if isinstance(cell.estimator, FrequencyEstimation):
+            cell.estimator.compile(source.sampling.interval)
+    return time.perf_counter() - begun
 
 
 def _make(folder: Path) -> None:

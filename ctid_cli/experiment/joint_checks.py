@@ -12,9 +12,11 @@ import numpy as np
 from ctid_cli.errors import DataError
 from ctid_cli.experiment.dataset import LoopOptions, located
 from ctid_cli.experiment.sections import Complaint, Section, Variant, grouped, variants
+from ctid_cli.experiment.signal_checks import signal_complaints, signal_warnings, world_complaints
 from ctid_cli.experiment.start_points import additive_form
 from ctid_cli.experiment.start_sections import RelativeStart, StartsSection, UniformStart
 from ctid_cli.experiment.yaml_source import KeyPath
+from ctid_cli.frequency import FREQUENCY_ESTIMATORS
 from ctid_cli.models import AdditiveModel, Term, unfactored
 from ctid_cli.signals import stream
 
@@ -62,8 +64,18 @@ def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool
     tuple
         Key path, and message.
     """
+    yield from world_complaints(spec, broken)
+    if spec.signal is not None:
+        yield from too_long_complaints(variants(spec.sampling) if spec.sampling is not None else [])
+        yield from signal_complaints(spec)
+        return
     extents = _extents(spec) if files_are_good else []
-    for name, section in spec.estimators.items():
+    estimators = {
+        name: section
+        for name, section in spec.estimators.items()
+        if getattr(section, "kind", None) not in FREQUENCY_ESTIMATORS
+    }
+    for name, section in estimators.items():
         cases = variants(section)
         failures = [
             (("estimators", name, *path), message, {**variant.swept, **extent.combination})
@@ -98,6 +110,8 @@ def joint_warnings(spec: Spec) -> list[Complaint]:
     list of Complaint
         Key path, and message.
     """
+    if spec.signal is not None:
+        return signal_warnings(spec)
     warnings: list[Complaint] = []
     if spec.system is not None and spec.sampling is not None:
         fastest = float(np.abs(variants(spec.system)[0].options.poles).max(initial=0.0))
@@ -228,7 +242,7 @@ def _structure_complaints(spec: Spec, path: KeyPath, model: AdditiveModel) -> It
         failures = [
             (path, f"{message} of estimator {name!r}", variant.swept)
             for variant in cases
-            if variant.options.start_from == "parameters"
+            if getattr(variant.options, "start_from", None) == "parameters"
             for message in _mismatch(model, variant.options)
         ]
         yield from grouped(failures, len(cases))
@@ -346,16 +360,37 @@ def _unstable(system: Any, loop: LoopOptions, interval: float) -> str:
     )
 
 
-def _simulation_complaints(spec: Spec, extents: Sequence[_Extent]) -> Iterator[Complaint]:
-    """What the sections that data are simulated from have against each other."""
-    samplings = variants(spec.sampling) if spec.sampling is not None else []
+def too_long_complaints(samplings: Sequence[Variant]) -> Iterator[Complaint]:
+    """Say that a record has too many samples.
+
+    Parameters
+    ----------
+    samplings : sequence of Variant
+        Sampling schemes.
+
+    Yields
+    ------
+    tuple
+        Key path, and message.
+    """
     too_long: list[Failure] = [
-        (("sampling", "samples"), f"more than {MAX_SAMPLES} samples in a record are not supported", {})
+        (
+            ("sampling", "duration" if "duration" in variant.values else "samples"),
+            f"more than {MAX_SAMPLES} samples in a record are not supported",
+            {},
+        )
         for variant in samplings
         if variant.options.samples > MAX_SAMPLES
     ]
+    yield from grouped(too_long, 1)
+
+
+def _simulation_complaints(spec: Spec, extents: Sequence[_Extent]) -> Iterator[Complaint]:
+    """What the sections that data are simulated from have against each other."""
+    samplings = variants(spec.sampling) if spec.sampling is not None else []
+    too_long = list(too_long_complaints(samplings))
     if too_long:
-        yield from grouped(too_long, 1)
+        yield from too_long
         return
     if spec.system is not None:
         delays = variants(spec.system)

@@ -15,6 +15,8 @@ Keys of an estimate row
 - ``parameters`` of the submodels by name, only in experiments whose system or estimators are additive: ``g1_a1``
   multiplies the first power of p in the denominator of the submodel with the least natural frequency.
 - ``cost`` [output unit^2], ``fit_percent``, ``validation_fit_percent``, ``iterations``, ``condition_number``.
+- ``measures`` of estimated frequencies by name, only in experiments on a signal; see
+  `ctid_cli.experiment.frequency_measures`. Their ``status`` is ``VALID`` or ``INVALID``, or one of the failures.
 - ``seconds``: time for preparing the record and fitting, as if the estimate had been alone [s].
 - one key per swept field. None stands for a value that does not exist or is not finite.
 """
@@ -168,6 +170,7 @@ def assemble(slot: Slot, manifest: Manifest, result: Mapping[str, Any], seconds:
         "start": slot.key.start,
         "initial_delay": manifest["starts"].get(slot.key.start),
         **{name: result.get(name) for name in RESULT_FIELDS if name != "parameters" or is_additive(manifest)},
+        **({"measures": result.get("measures")} if is_of_signal(manifest) else {}),
         "seconds": seconds,
         **slot.cell["swept"],
         **slot.estimator["swept"],
@@ -190,6 +193,22 @@ def is_additive(manifest: Manifest) -> bool:
     # One system for all data cells.
     system = next((cell["content"].get("system") for cell in manifest["data_cells"]), None)
     return "additive" in (system or {}) or any("terms" in part["content"] for part in manifest["estimators"])
+
+
+def is_of_signal(manifest: Manifest) -> bool:
+    """Whether the estimates are frequencies of a signal.
+
+    Parameters
+    ----------
+    manifest : dict
+        The plan as plain data.
+
+    Returns
+    -------
+    bool
+        Whether the data cells hold a signal.
+    """
+    return any("signal" in cell["content"] for cell in manifest["data_cells"])
 
 
 def swept_names(manifest: Manifest) -> list[str]:

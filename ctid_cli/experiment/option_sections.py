@@ -9,6 +9,7 @@ from pydantic import Field
 
 from ctid_cli.estimators import ESTIMATORS
 from ctid_cli.experiment.sections import Check, Section, by_kind, checked, optional, plain_text, section_for
+from ctid_cli.frequency import FREQUENCY_ESTIMATORS
 from ctid_cli.signals import EXCITATIONS, NOISES, SAMPLINGS, InputFile
 
 #: Check of a content hash that may be missing.
@@ -33,7 +34,7 @@ else:
     ExcitationSection = by_kind(_kinds(EXCITATIONS))
     SamplingSection = by_kind(_kinds(SAMPLINGS))
     NoiseSection = by_kind(_kinds(NOISES))
-    EstimatorSection = by_kind(_kinds(ESTIMATORS))
+    EstimatorSection = by_kind(_kinds(ESTIMATORS | FREQUENCY_ESTIMATORS))
 
 
 def check_of(annotation: Any) -> Check:

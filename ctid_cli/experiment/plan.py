@@ -12,12 +12,15 @@ from typing import Any
 
 from ctid_cli.errors import UsageError
 from ctid_cli.experiment.canonical import content_hash
-from ctid_cli.experiment.dataset import DataSet, LoopOptions, SimulatedSource, Source, located
+from ctid_cli.experiment.dataset import LoopOptions, SimulatedSource, Source, located
+from ctid_cli.experiment.frequency_measures import Measuring
+from ctid_cli.experiment.frequency_runs import FrequencyEstimation, SignalSource
 from ctid_cli.experiment.manifest import Key
 from ctid_cli.experiment.sections import MAX_COMBINATIONS, Variant, variants
 from ctid_cli.experiment.spec import Spec
 from ctid_cli.experiment.start_points import NO_START, AnyStart, ParameterStart, StartPoint, start_points
 from ctid_cli.experiment.yaml_source import KeyPath
+from ctid_cli.frequency import FREQUENCY_ESTIMATORS
 from ctid_cli.models import AdditiveModel, Term
 
 #: Data sets that one experiment may ask for; beyond this its plan alone would fill the memory.
@@ -46,16 +49,16 @@ class DataCell:
         `content_hash` of ``content``.
     swept : dict
         Column and value of every swept field.
-    source : SimulatedSource or MeasuredSource
+    source : SimulatedSource, MeasuredSource or SignalSource
         Makes the data sets.
     """
 
     content: dict[str, Any]
     hash: str
     swept: dict[str, Any]
-    source: Source
+    source: Source | SignalSource
 
-    def dataset(self, replicate: int) -> DataSet:
+    def dataset(self, replicate: int) -> Any:
         """One data set.
 
         Parameters
@@ -65,7 +68,7 @@ class DataCell:
 
         Returns
         -------
-        DataSet
+        DataSet or SignalDataSet
             The same for the same replicate, whenever and wherever it is made.
         """
         return self.source.dataset(replicate)
@@ -263,6 +266,8 @@ def _data_variants(spec: Spec) -> dict[str, list[Variant]]:
         "loop": spec.loop,
         "sampling": spec.sampling,
         "noise": spec.noise,
+        "signal": spec.signal,
+        "disturbance": spec.disturbance,
     }
     return {name: variants(section) for name, section in sections.items() if section is not None}
 
@@ -276,8 +281,14 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
         chosen = dict(zip(parts, point, strict=True))
         loop = chosen["loop"].options if "loop" in chosen else None
         content: dict[str, Any] = {name: _without_place(variant.values) for name, variant in chosen.items()}
-        source: Source
-        if spec.data is not None:
+        source: Source | SignalSource
+        if spec.signal is not None:
+            # What is measured of an estimate is stored with it, so that it belongs to its identity.
+            measuring = _measuring(spec)
+            content |= {"disturbance": content.get("disturbance"), "seed": seed}
+            content["measuring"] = dataclasses.asdict(measuring)
+            source = _of_signal(chosen, spec, measuring)
+        elif spec.data is not None:
             # The seed decides where random starts lie; the record itself is in the content as a hash.
             content = {"data": _without_place(spec.data.model_dump(mode="json")), **content, "seed": seed}
             source = spec.data.source(folder, loop)
@@ -304,10 +315,31 @@ def _simulated(chosen: Mapping[str, Variant], loop: LoopOptions | None, folder: 
     )
 
 
+def _measuring(spec: Spec) -> Measuring:
+    """What is measured of the frequencies of a signal."""
+    band = None if spec.success is None else spec.success.band
+    if spec.tracks is None:
+        return Measuring(band)
+    low_high = spec.tracks.window
+    window = None if low_high is None else (low_high[0], low_high[1])
+    return Measuring(band, window, spec.tracks.interval, spec.tracks.runs)
+
+
+def _of_signal(chosen: Mapping[str, Variant], spec: Spec, measuring: Measuring) -> SignalSource:
+    """Source of the data sets of one combination of the sections' variants."""
+    assert spec.monte_carlo is not None
+    disturbance = chosen["disturbance"].options if "disturbance" in chosen else None
+    return SignalSource(
+        chosen["signal"].options, disturbance, chosen["sampling"].options, spec.monte_carlo.seed, measuring
+    )
+
+
 def _estimator_cell(name: str, variant: Variant, names: Mapping[KeyPath, str]) -> EstimatorCell:
     swept = {names["estimator", *path]: value for path, value in variant.swept.items()}
     content = variant.values
-    return EstimatorCell(name, content["kind"], variant.options, content, content_hash(content), swept)
+    of_frequencies = content["kind"] in FREQUENCY_ESTIMATORS
+    estimator = FrequencyEstimation(variant.options) if of_frequencies else variant.options
+    return EstimatorCell(name, content["kind"], estimator, content, content_hash(content), swept)
 
 
 def _column_names(paths: Iterable[KeyPath]) -> dict[KeyPath, str]:

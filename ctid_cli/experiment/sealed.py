@@ -17,7 +17,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctid_cli.errors import RefusedError, StorageError
-from ctid_cli.experiment.manifest import FAILURES, Key, Manifest, assemble, is_additive, slots, swept_names
+from ctid_cli.experiment.frequency_measures import MEASURE_UNITS, measure_names, unpack_track
+from ctid_cli.experiment.manifest import (
+    FAILURES,
+    Key,
+    Manifest,
+    assemble,
+    is_additive,
+    is_of_signal,
+    slots,
+    swept_names,
+)
 from ctid_cli.experiment.summary import parameter_names
 from ctid_cli.experiment.version import Origin
 
@@ -90,8 +100,14 @@ def seal_image(
         for slot in slots(manifest)
         if slot.key in results
     ]
+    tracks = {
+        slot.key.id: results[slot.key]["track"]
+        for slot in slots(manifest)
+        if results.get(slot.key, {}).get("track") is not None
+    }
     with h5py.File("runs.h5", "w", driver="core", backing_store=False) as file:
         _write(file, manifest, sorted(origins, key=_origin_text), rows)
+        _write_tracks(file, tracks)
         checksum = _content_checksum(file)
         file.attrs["checksum"] = checksum
         file.flush()
@@ -122,6 +138,31 @@ def read_sealed(path: Path) -> SealedRuns:
         manifest = json.loads(_text(file["manifest"]))
         origins = tuple(_origin(entry) for entry in json.loads(str(file.attrs["origins"])))
         return SealedRuns(manifest, origins, _results(file["estimates"]), checksum)
+
+
+def read_sealed_tracks(path: Path) -> dict[str, dict[str, np.ndarray[Any, Any]]]:
+    """The tracks in a sealed file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    dict
+        By id of the estimate: ``t`` [s], ``omega`` and ``uncertainty`` [rad/s], ``flags``.
+
+    Raises
+    ------
+    StorageError
+        If it is missing, damaged, or no sealed file.
+    RefusedError
+        If a newer ctid wrote it.
+    """
+    with _checked(path) as (file, _):
+        tracks = file.get("tracks", {})
+        return {name: {column: tracks[name][column][()] for column in tracks[name]} for name in tracks}
 
 
 def verify_sealed(path: Path) -> str:
@@ -215,6 +256,9 @@ def _write(file: h5py.File, manifest: Manifest, origins: Sequence[Origin], rows:
     if is_additive(manifest):
         found = [row["parameters"] for row in rows]
         _named(group, "parameters", "parameter_names", found, parameter_names(found))
+    if is_of_signal(manifest):
+        measures = [row["measures"] for row in rows]
+        _named(group, "measures", "measure_names", measures, measure_names(measures))
     swept = group.create_group("swept")
     for name in swept_names(manifest):
         values = [row.get(name) for row in rows]
@@ -222,6 +266,14 @@ def _write(file: h5py.File, manifest: Manifest, origins: Sequence[Origin], rows:
             _column(swept, name, _floats(values))
         else:
             _column(swept, name, _encode([json.dumps(value, sort_keys=True) for value in values]))
+
+
+def _write_tracks(file: h5py.File, tracks: Mapping[str, Mapping[str, Any]]) -> None:
+    units = {"t": "s", "omega": MEASURE_UNITS["omega"], "flags": "-", "uncertainty": "rad/s"}
+    for identifier, packed in tracks.items():
+        group = file.require_group("tracks").create_group(identifier)
+        for name, values in unpack_track(packed).items():
+            _column(group, name, values).attrs["unit"] = units[name]
 
 
 def _column(group: h5py.Group, name: str, values: np.ndarray[Any, Any]) -> h5py.Dataset:
@@ -267,6 +319,7 @@ def _results(group: h5py.Group) -> dict[Key, dict[str, Any]]:
     lengths = {name: group[f"{name}_length"][()].tolist() for name in ("numerator", "denominator")}
     errors = _read_named(group, "standard_errors", "standard_error_names")
     parameters = _read_named(group, "parameters", "parameter_names") if "parameters" in group else []
+    measures = _read_named(group, "measures", "measure_names") if "measures" in group else []
     results = {}
     for k in range(len(texts["cell"])):
         key = Key(texts["cell"][k], numbers["replicate"][k], texts["estimator_hash"][k], texts["start"][k])
@@ -279,6 +332,8 @@ def _results(group: h5py.Group) -> dict[Key, dict[str, Any]]:
             result[name] = None if length == _NO_ITERATIONS else [_none(value) for value in rows[k][:length]]
         result["standard_errors"] = None if failed else errors[k]
         result["parameters"] = (parameters[k] or None) if parameters else None
+        if measures:
+            result["measures"] = measures[k] or None
         results[key] = result
     return results
 

@@ -720,7 +720,7 @@ def _instance(section: Section, values: Mapping[str, Any]) -> Any:
     except (ValueError, ArithmeticError, CtidError) as error:
         message = str(error).strip() or f"these values were refused ({type(error).__name__})"
         names = [name for name in type(section).model_fields if name not in _NO_OPTIONS]
-        raise RefusedOptionsError(_field_in(message, names), message) from None
+        raise RefusedOptionsError(field_in(message, names), message) from None
 
 
 def _argument(inner: Any, value: Any, path: KeyPath) -> Any:
@@ -735,8 +735,21 @@ def _argument(inner: Any, value: Any, path: KeyPath) -> Any:
     return value
 
 
-def _field_in(message: str, names: Sequence[str]) -> KeyPath:
-    """The only field that a message names; the whole section if it names none or several."""
+def field_in(message: str, names: Sequence[str]) -> KeyPath:
+    """The only field that a message names.
+
+    Parameters
+    ----------
+    message : str
+        What an option dataclass says about its values.
+    names : sequence of str
+        Its fields.
+
+    Returns
+    -------
+    tuple
+        Key path of the field; that of the whole section if the message names none or several.
+    """
     rest = re.sub(r"(?<=\w)-(?=\w)", "", message)  # "cut-off" means the field "cutoff"
     found: list[str] = []
     for name in sorted(names, key=len, reverse=True):
@@ -870,6 +883,10 @@ def _form(hint: Any, unit: str, name: str) -> _FieldForm:
     if origin in (Union, types.UnionType) and len(arguments) == 2 and type(None) in arguments:
         inner = _form(next(a for a in arguments if a is not type(None)), unit, name)
         return _FieldForm(optional(inner.check), inner.annotation | None, inner.scalar)
+    if origin in (Union, types.UnionType) and len(arguments) == 2 and arguments[0] in (float, int):
+        usual, other = (_form(argument, unit, name) for argument in arguments)
+        annotation = usual.annotation | other.annotation
+        return _FieldForm(_either(usual, other), annotation, usual.scalar and other.scalar)
     if origin in (tuple, list) and arguments and all(a in (float, int, Ellipsis) for a in arguments):
         item = _form(arguments[0], unit, name)
         length = len(arguments) if origin is tuple and Ellipsis not in arguments else None
@@ -887,6 +904,21 @@ def _form(hint: Any, unit: str, name: str) -> _FieldForm:
         what = f"a list of mappings with the keys {', '.join(model.model_fields)}"
         return _FieldForm(list_of(model.model_validate, what), types.GenericAlias(list, (model,)), False)
     raise TypeError(f"{name}: a field of type {hint} has no form in a specification")
+
+
+def _either(usual: _FieldForm, other: _FieldForm) -> Check:
+    """Check for a number, or else a list if such is the other form, or a word."""
+    kind: Any = str if other.scalar else (list, tuple)
+
+    def check(value: Any) -> Any:
+        if isinstance(value, kind):
+            return other.check(value)
+        try:
+            return usual.check(value)
+        except PydanticCustomError as error:
+            raise wrong(f"{error.message()}; {'a word' if other.scalar else 'a list'} is allowed too") from None
+
+    return check
 
 
 def _default(option: dataclasses.Field[Any], check: Check) -> Any:

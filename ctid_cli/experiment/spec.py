@@ -24,7 +24,6 @@ from ctid_cli.experiment.option_sections import (
     EstimatorSection,
     ExcitationSection,
     NoiseSection,
-    SamplingSection,
     check_of,
 )
 from ctid_cli.experiment.sections import (
@@ -41,6 +40,13 @@ from ctid_cli.experiment.sections import (
     whole,
     wrong,
 )
+from ctid_cli.experiment.signal_sections import (
+    AnySamplingSection,
+    DisturbanceSection,
+    SignalSection,
+    TracksSection,
+    sampling_section,
+)
 from ctid_cli.experiment.start_sections import StartsSection
 from ctid_cli.experiment.system_sections import AdditiveSystemSection, SystemSection, system_section
 from ctid_cli.experiment.yaml_source import (
@@ -54,6 +60,8 @@ from ctid_cli.experiment.yaml_source import (
 _EXPERIMENT_PATTERN = r"(?!.*\.\.)(?=.{1,200}\Z)[A-Za-z0-9][A-Za-z0-9._-]*(?:/[A-Za-z0-9][A-Za-z0-9._-]*)*"
 _EXPERIMENT_RULE = "use letters, digits, '-', '_' and '.', with '/' between parts, no '..', 200 characters at most"
 _SIMULATED = ("system", "excitation", "sampling")
+#: Sections that belong to the identification of systems.
+_OF_SYSTEMS = ("system", "excitation", "loop", "noise", "data", "starts")
 
 
 class MeasuredSection(Section):
@@ -128,7 +136,7 @@ class MonteCarloSection(Section):
 class SuccessSection(Section):
     """When an estimate counts as converged; all that is given must hold."""
 
-    added_later: ClassVar[frozenset[str]] = frozenset({"parameter_relative_error"})
+    added_later: ClassVar[frozenset[str]] = frozenset({"parameter_relative_error", "band", "by"})
 
     delay_relative_error: Annotated[float | None, checked(optional(number(above=0.0)))] = Field(
         default=None, description="Largest error of the delay, as a fraction of the true delay [-]"
@@ -138,6 +146,12 @@ class SuccessSection(Section):
     )
     parameter_relative_error: Annotated[float | None, checked(optional(number(above=0.0)))] = Field(
         default=None, description="Largest error of a parameter of the submodels, as a fraction of the true value [-]"
+    )
+    band: Annotated[float | None, checked(optional(number("rad/s", above=0.0)))] = Field(
+        default=None, description="Largest error of a settled frequency of a signal [rad/s]"
+    )
+    by: Annotated[float | None, checked(optional(number("s", above=0.0)))] = Field(
+        default=None, description="Frequencies must settle so soon after the start and after their last step [s]"
     )
 
     def complaints(self) -> Iterator[Complaint]:
@@ -150,6 +164,8 @@ class SuccessSection(Section):
         """
         if all(getattr(self, name) is None for name in type(self).model_fields):
             yield (), f"give {', '.join(type(self).model_fields)} or several of them, or leave the section out"
+        if self.by is not None and self.band is None:
+            yield ("by",), "is the time of settling into a band; add band [rad/s]"
 
 
 def _estimators_check(value: Any) -> dict[str, Section]:
@@ -183,9 +199,9 @@ _estimator_check = check_of(EstimatorSection)
 
 
 class Spec(Section):
-    """One experiment: simulated or measured data, estimators, starts, and what counts as success."""
+    """One experiment: simulated or measured data or a signal, estimators, starts, and what counts as success."""
 
-    added_later: ClassVar[frozenset[str]] = frozenset({"loop"})
+    added_later: ClassVar[frozenset[str]] = frozenset({"loop", "signal", "disturbance", "tracks"})
 
     experiment: Annotated[str, checked(plain_text(_EXPERIMENT_PATTERN, _EXPERIMENT_RULE))] = Field(
         description="Name of the experiment and of its results folder; '/' makes folders in folders"
@@ -199,7 +215,13 @@ class Spec(Section):
     loop: Annotated[LoopSection | None, checked(optional(LoopSection.model_validate))] = Field(
         default=None, description="What makes the input from the output, in place of excitation"
     )
-    sampling: Annotated[SamplingSection | None, checked(optional(check_of(SamplingSection)))] = Field(
+    signal: Annotated[SignalSection | None, checked(optional(SignalSection.model_validate))] = Field(
+        default=None, description="A sum of sinusoids whose frequencies are estimated, in place of a system"
+    )
+    disturbance: Annotated[DisturbanceSection | None, checked(optional(check_of(DisturbanceSection)))] = Field(
+        default=None, description="What is added to the signal; none by default"
+    )
+    sampling: Annotated[AnySamplingSection | None, checked(optional(sampling_section))] = Field(
         default=None, description="When the output is sampled"
     )
     noise: Annotated[NoiseSection | None, checked(optional(check_of(NoiseSection)))] = Field(
@@ -219,6 +241,9 @@ class Spec(Section):
     )
     success: Annotated[SuccessSection | None, checked(optional(SuccessSection.model_validate))] = Field(
         default=None, description="When an estimate counts as converged"
+    )
+    tracks: Annotated[TracksSection | None, checked(optional(TracksSection.model_validate))] = Field(
+        default=None, description="What is stored of the frequencies of a signal over time; nothing by default"
     )
 
     _warnings: tuple[str, ...] = PrivateAttr(default=())
@@ -240,6 +265,24 @@ class Spec(Section):
             Key path, and message.
         """
         present = {name for name in cls.model_fields if raw.get(name) is not None}
+        if "signal" in present:
+            for name in _OF_SYSTEMS:
+                if name in present:
+                    other = "; what is added to a signal is its disturbance" if name == "noise" else ""
+                    message = (
+                        f"belongs to the identification of a system, and 'signal' is none; keep one of the two{other}"
+                    )
+                    yield (name,), message
+            for name, example in (
+                ("sampling", "{kind: regular, interval: 0.001, duration: 60}"),
+                ("monte_carlo", "{runs: 10, seed: 1}"),
+            ):
+                if name not in present:
+                    yield (name,), f"is missing; a signal needs it, for example {example}"
+            return
+        for name in ("disturbance", "tracks"):
+            if name in present:
+                yield (name,), "belongs to a signal, and there is none; add signal, or leave it out"
         loop = raw.get("loop")
         has_reference = isinstance(loop, Mapping) and loop.get("reference") is not None
         if "data" in present:
@@ -270,7 +313,13 @@ class Spec(Section):
             name for name in _SIMULATED if name not in present and not (name == "excitation" and "loop" in present)
         ]
         if len(missing) == len(_SIMULATED):
-            yield (), "there are no data: give system, excitation and sampling to simulate them, or data for a record"
+            yield (
+                (),
+                (
+                    "there are no data: give system, excitation and sampling to simulate them, data for a record, or "
+                    "signal and sampling to estimate frequencies"
+                ),
+            )
             return
         for name in missing:
             yield (name,), "is missing; data are simulated with system, excitation (or loop) and sampling"
@@ -459,6 +508,7 @@ def json_schema() -> dict[str, Any]:
         {"required": ["data"]},
         {"required": ["system", "excitation", "sampling", "monte_carlo"]},
         {"required": ["system", "loop", "sampling", "monte_carlo"]},
+        {"required": ["signal", "sampling", "monte_carlo"]},
     ]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "ctid experiment"}
 

@@ -32,6 +32,7 @@ from ctid_cli.experiment.manifest import (
     Slot,
     assemble,
     is_additive,
+    is_of_signal,
     slots,
     swept_names,
     true_delay,
@@ -58,6 +59,12 @@ _COLUMNS = (
     *("id", "experiment", "estimator", "kind", "cell", "replicate", "start", "initial_delay", "start_delay", "status"),
     *("message", "delay", "numerator", "denominator", "parameters", "standard_errors", "cost", "fit_percent"),
     *("validation_fit_percent", "iterations", "condition_number", "seconds"),
+)
+
+
+#: Columns of an experiment on a signal.
+_SIGNAL_COLUMNS = (
+    *("id", "experiment", "estimator", "kind", "cell", "replicate", "status", "message", "measures", "seconds"),
 )
 
 
@@ -292,6 +299,39 @@ def read_stored(folder: Path) -> Stored:
     return _read_sealed(folder)
 
 
+def read_tracks(folder: Path) -> dict[str, dict[str, Any]]:
+    """The stored frequencies over time of an experiment on a signal.
+
+    Parameters
+    ----------
+    folder : Path
+        The experiment's folder.
+
+    Returns
+    -------
+    dict
+        By id of the estimate, arrays by name: ``t`` [s], shape (N,); ``omega`` and ``uncertainty`` [rad/s], shape
+        (N, n); ``flags``, bit fields of `ctid_cli.frequency.Flag`, shape (N,).
+
+    Raises
+    ------
+    UsageError
+        If there are no results.
+    RefusedError
+        If a newer ctid wrote them, or a run goes on and nothing was sealed before.
+    StorageError
+        If they are damaged.
+    """
+    from ctid_cli.experiment.frequency_measures import unpack_track
+    from ctid_cli.experiment.sealed import read_sealed_tracks
+
+    stored = read_stored(folder)
+    packed = {key.id: result["track"] for key, result in stored.results.items() if result.get("track") is not None}
+    if packed:
+        return {name: unpack_track(track) for name, track in packed.items()}
+    return read_sealed_tracks(folder / SEALED) if (folder / SEALED).exists() else {}
+
+
 def _read_sealed(folder: Path) -> Stored:
     from ctid_cli.experiment.sealed import read_sealed
 
@@ -329,7 +369,8 @@ def load_estimates(folder: Path) -> pd.DataFrame:
         One row per estimate in the order of the specification (estimator, data cell, replicate, start), with the
         columns of `ctid_cli.experiment.manifest` (``parameters`` only where the system or an estimator is a sum of
         submodels), then ``converged`` (missing where no success rule applies) and
-        ``true_delay`` [s]. ``attrs["mixed"]`` tells whether other code or arithmetic computed some of them.
+        ``true_delay`` [s]; of an experiment on a signal ``measures`` in place of all that belongs to models.
+        ``attrs["mixed"]`` tells whether other code or arithmetic computed some of them.
 
     Raises
     ------
@@ -346,7 +387,10 @@ def load_estimates(folder: Path) -> pd.DataFrame:
     rows = stored.rows()
     frame = pd.DataFrame(index=pd.RangeIndex(len(rows)))
     own = [name for name in _COLUMNS if name != "parameters" or is_additive(stored.manifest)]
-    for name in (*own, *swept_names(stored.manifest), "converged", "true_delay"):
+    last = ["converged", "true_delay"]
+    if is_of_signal(stored.manifest):
+        own, last = list(_SIGNAL_COLUMNS), ["converged"]
+    for name in (*own, *swept_names(stored.manifest), *last):
         frame[name] = _column(name, [row.get(name) for row in rows])
     frame.attrs["mixed"] = len(stored.origins) > 1
     return frame
@@ -365,7 +409,7 @@ def _column(name: str, values: list[Any]) -> pd.Series[Any]:
         return pd.Series(values, dtype="float64")
     if name in _TEXT_COLUMNS:
         return pd.Series(values, dtype="str")
-    if name in _COLUMNS:
+    if name in _COLUMNS or name == "measures":
         return pd.Series(values, dtype="object")
     return pd.Series(values)
 

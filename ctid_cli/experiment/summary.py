@@ -4,7 +4,9 @@ An estimate has *converged* if it satisfies every condition of the specification
 
 - ``delay_relative_error``: the estimated delay differs from the true one by at most this fraction of it;
 - ``fit_percent``: the fit on the record it was estimated from is at least this [%];
-- ``parameter_relative_error``: every parameter of the submodels differs from the true one by at most this fraction.
+- ``parameter_relative_error``: every parameter of the submodels differs from the true one by at most this fraction;
+- ``band`` [rad/s] and ``by`` [s]: every frequency of a signal came into the band around the true one to stay there,
+  counted from the start, and after its last step from that.
 
 Its status does not matter: an estimate that stopped at the iteration limit with the right delay has converged, one that
 settled elsewhere has not. An estimate without a result (``FAILED``, ``CRASHED``, ``TIMEOUT``) has not converged and
@@ -18,6 +20,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
+from ctid_cli.experiment.frequency_measures import is_settled, measure_names
 from ctid_cli.experiment.manifest import FAILURES
 
 if TYPE_CHECKING:
@@ -55,6 +58,8 @@ def is_converged(
     if rule.get("parameter_relative_error") is not None and true_parameters is not None:
         found, tolerance = row.get("parameters") or {}, rule["parameter_relative_error"]
         conditions.append(all(_near(found.get(name), true, tolerance) for name, true in true_parameters.items()))
+    if rule.get("band") is not None:
+        conditions.append(is_settled(row.get("measures"), rule["band"], rule.get("by")))
     if rule.get("fit_percent") is not None:
         conditions.append(row["fit_percent"] is not None and row["fit_percent"] >= rule["fit_percent"])
     if not conditions:
@@ -173,10 +178,12 @@ def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:
     DataFrame
         The same rows and columns, but coefficients as ``b0, b1, …`` and ``a1, a2, …`` (descending powers, the leading 1
         of the denominator left out), parameters of submodels, where there are such, as ``g1_a1, …, g1_b0, …``, and
-        standard errors as ``se_b0, …, se_a1, …, se_g1_a1, …, se_delay``.
+        standard errors as ``se_b0, …, se_a1, …, se_g1_a1, …, se_delay``. Measures of frequencies are ``omega_1, …``.
     """
     import pandas as pd
 
+    if "measures" in estimates:
+        return _flat_measures(estimates)
     numerators, denominators = estimates["numerator"].tolist(), estimates["denominator"].tolist()
     errors = estimates["standard_errors"].tolist()
     flat: dict[str, list[Any]] = {}
@@ -197,6 +204,21 @@ def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:
             columns |= {key: pd.Series(values, dtype="float64", index=estimates.index) for key, values in flat.items()}
         elif name not in ("denominator", "parameters", "standard_errors"):
             columns[name] = estimates[name]
+    return pd.DataFrame(columns)
+
+
+def _flat_measures(estimates: pd.DataFrame) -> pd.DataFrame:
+    import pandas as pd
+
+    rows = estimates["measures"].tolist()
+    columns: dict[str, Any] = {}
+    for name in estimates.columns:
+        if name != "measures":
+            columns[name] = estimates[name]
+            continue
+        for measure in measure_names(rows):
+            values = [(row or {}).get(measure) for row in rows]
+            columns[measure] = pd.Series(values, dtype="float64", index=estimates.index)
     return pd.DataFrame(columns)
 
 

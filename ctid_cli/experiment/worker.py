@@ -25,6 +25,7 @@ from ctid_cli.experiment.manifest import RESULT_FIELDS, Key
 
 if TYPE_CHECKING:
     from ctid_cli.experiment.dataset import DataSet
+    from ctid_cli.experiment.frequency_runs import SignalDataSet
     from ctid_cli.experiment.plan import DataCell, EstimatorCell
     from ctid_cli.experiment.start_points import AnyStart
     from ctid_cli.models import Term
@@ -188,9 +189,15 @@ def failed(message: str, status: str) -> dict[str, Any]:
     return dict.fromkeys(RESULT_FIELDS) | {"status": status, "message": message}
 
 
-def _result(fit: Any, data: DataSet, start_delay: float | None, terms: tuple[Term, ...] | None) -> dict[str, Any]:
+def _result(
+    fit: Any, data: DataSet | SignalDataSet, start_delay: float | None, terms: tuple[Term, ...] | None
+) -> dict[str, Any]:
     from ctid_cli.experiment.additive_parameters import additive_parameters
+    from ctid_cli.experiment.frequency_runs import FrequencyFit, SignalDataSet
 
+    if isinstance(fit, FrequencyFit) and isinstance(data, SignalDataSet):
+        return dict.fromkeys(RESULT_FIELDS) | fit.result(data)
+    assert not isinstance(data, SignalDataSet)  # only estimators of frequencies take one
     model = fit.model
     parameters, errors = additive_parameters(fit, terms)
     result = {

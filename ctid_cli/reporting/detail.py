@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ctid_cli.errors import MismatchError
+from ctid_cli.experiment.frequency_measures import MEASURE_UNITS, base_name, measure_names
+from ctid_cli.experiment.frequency_runs import FrequencyFit, SignalDataSet
 from ctid_cli.experiment.plan import build_plan
 from ctid_cli.experiment.spec import spec_from_canonical
 from ctid_cli.experiment.store import FoundEstimate, read_stored, spec_folder
@@ -112,6 +114,8 @@ def detail_text(found: FoundEstimate, again: Repeated | None, out: Path) -> str:
     ]
     if row.get("converged") is not None:
         lines.append("It meets the success rule." if row["converged"] else "It does not meet the success rule.")
+    if "measures" in row:
+        return "\n".join([*lines, *_measured(found), "", *_origin_of(found), *_repeated(found, again, out)])
     shown = parameters_of(found)
     if shown:
         lines += ["", parameter_table(shown), *_conventions(shown)]
@@ -130,20 +134,38 @@ def detail_text(found: FoundEstimate, again: Repeated | None, out: Path) -> str:
         f"condition number {number(row['condition_number'], 3)}",
         f"time             {seconds(row['seconds'])}",
         "",
+        *_origin_of(found),
+    ]
+    return "\n".join([*lines, *_repeated(found, again, out)])
+
+
+def _measured(found: FoundEstimate) -> list[str]:
+    """What was measured of the frequencies of a signal."""
+    measures = found.row["measures"] or {}
+    body = [
+        [name, number(measures[name], 8 if name.startswith("omega") else 4), MEASURE_UNITS[base_name(name)[0]]]
+        for name in measure_names([measures])
+    ]
+    table = ["", text_table(["measure", "value", "unit"], body, "lrl")] if body else []
+    return [*table, "", f"time             {seconds(found.row['seconds'])}"]
+
+
+def _origin_of(found: FoundEstimate) -> list[str]:
+    row = found.row
+    return [
         f"Data (cell {row['cell']}, seed {found.seed}, data set {row['replicate']}):",
         *_settings(found.data),
         "Estimator:",
         *_settings(found.estimator),
         "",
     ]
-    if again is None:
-        lines += [
-            "To make this data set and this estimate again and see every iteration:",
-            f"  {redo_command(found, out)}",
-        ]
-    else:
-        lines += [_verdict(again), "", _history(again)]
-    return "\n".join(lines)
+
+
+def _repeated(found: FoundEstimate, again: Repeated | None, out: Path) -> list[str]:
+    if again is not None:
+        return [_verdict(again), *(["", _history(again)] if again.history else [])]
+    every = "" if "measures" in found.row else " and see every iteration"
+    return [f"To make this data set and this estimate again{every}:", f"  {redo_command(found, out)}"]
 
 
 def redo_command(found: FoundEstimate, out: Path) -> str:
@@ -189,6 +211,8 @@ def repeat(found: FoundEstimate) -> Repeated:
                 data = cell.dataset(task.replicate)
                 drawn = start.draw(found.seed, task.replicate, data.true_model)
                 fit = estimator.estimator.prepare(data.record).fit(drawn)
+                if isinstance(fit, FrequencyFit) and isinstance(data, SignalDataSet):
+                    return Repeated([], _moved(row.get("measures") or {}, fit.result(data)["measures"]))
                 model = {
                     "numerator": plain(fit.model.numerator),
                     "denominator": plain(fit.model.denominator),
@@ -209,6 +233,16 @@ def _difference(stored: Mapping[str, Any], model: Mapping[str, Any]) -> float | 
         for a, b in zip(then, now, strict=True):
             if a is not None and b is not None and a != b:
                 worst = max(worst, abs(a - b) / max(abs(a), abs(b)))
+    return worst
+
+
+def _moved(stored: Mapping[str, float | None], now: Mapping[str, float | None]) -> float | None:
+    """Largest relative difference between frequencies."""
+    worst = None
+    for name, then in stored.items():
+        value = now.get(name)
+        if name.startswith("omega") and then is not None and value is not None:
+            worst = max(worst or 0.0, abs(value - then) / max(abs(then), abs(value)))
     return worst
 
 

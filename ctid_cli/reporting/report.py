@@ -11,11 +11,12 @@ from typing import Any
 
 from ctid_cli.errors import UsageError
 from ctid_cli.experiment.folder import InUseError
+from ctid_cli.experiment.manifest import is_of_signal
 from ctid_cli.experiment.spec import load_spec
 from ctid_cli.reporting.results import Results, differences, experiments_in, find_results, out_option, shown_path
 from ctid_cli.reporting.rows import Row, experiment_rows, study_rows
 from ctid_cli.reporting.study import DEFAULT_STUDY, Study, data_folder, load_study
-from ctid_cli.reporting.tables import csv_text, experiment_table, record_table, study_table
+from ctid_cli.reporting.tables import csv_text, experiment_table, frequency_table, record_table, study_table
 
 #: What a measured record's rows carry besides the keys of every table.
 _RECORD_KEYS = (
@@ -136,6 +137,9 @@ def success_sentence(settings: Mapping[str, Any]) -> str:
         parts.append(f"delay estimate lies within {100 * rule['delay_relative_error']:g} % of the true delay")
     if rule.get("parameter_relative_error") is not None:
         parts.append(f"parameters all lie within {100 * rule['parameter_relative_error']:g} % of the true ones")
+    if rule.get("band") is not None:
+        soon = "" if rule.get("by") is None else f" within {rule['by']:g} s"
+        parts.append(f"frequencies all come to lie within {rule['band']:g} rad/s of the true ones{soon}, to stay there")
     if rule.get("fit_percent") is not None:
         parts.append(f"model fits to at least {rule['fit_percent']:g} %")
     if not parts:
@@ -184,7 +188,8 @@ def _study(study: Study, number: int, out: Path) -> Table:
 def _experiment(results: Results, out: Path) -> Table:
     rows: list[Row] = experiment_rows(results, results.experiment)
     success = success_sentence(results.settings)
-    text, markdown = (experiment_table(results.experiment, rows, success, style) for style in ("text", "md"))
+    draw = frequency_table if is_of_signal(results.manifest) else experiment_table
+    text, markdown = (draw(results.experiment, rows, success, style) for style in ("text", "md"))
     return Table([row.as_dict() for row in rows], text, markdown, _notes(results, out))
 
 

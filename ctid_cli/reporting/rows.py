@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from statistics import median
 from typing import Any
 
+from ctid_cli.experiment.frequency_measures import base_name, measure_names
+from ctid_cli.experiment.manifest import is_of_signal
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.reporting.study import InitialDelay, Study, StudyTable
 
@@ -45,6 +49,10 @@ class Row:
         Median time of one estimate [s].
     estimator_settings : tuple of str
         The fields of ``settings`` that belong to the estimator: they label columns, the others label rows.
+    measures : mapping, optional
+        Of frequencies of a signal: ``median_settling_time`` and ``median_settling_after_step`` of the slowest tone [s],
+        None where half of the data sets or more never settled; ``median_rms_1 …`` [rad/s]; ``false_alarms`` of all data
+        sets together.
     """
 
     table: int | str
@@ -62,6 +70,7 @@ class Row:
     published_percent: float | None = None
     median_seconds: float | None = None
     estimator_settings: tuple[str, ...] = field(default=(), compare=False)
+    measures: Mapping[str, float | None] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """The row of ``ctid table --format json``: swept fields are keys of their own."""
@@ -80,6 +89,7 @@ class Row:
             "high": self.high,
             "published_percent": self.published_percent,
             "median_seconds": self.median_seconds,
+            **(self.measures or {}),
         }
 
 
@@ -102,10 +112,12 @@ def experiment_rows(results: Results, table: int | str, fields: Mapping[str, str
     """
     manifest = results.manifest
     down, across = _swept(manifest["data_cells"]), _swept(manifest["estimators"])
-    constant = {name: lookup(results.settings, path) for name, path in (fields or ALWAYS).items()}
+    always = {} if is_of_signal(manifest) else ALWAYS
+    constant = {name: lookup(results.settings, path) for name, path in (fields or always).items()}
     # Several sets of initial parameters are told apart by their names, as initial delays are by their values.
     given = {label for label, delay in manifest["starts"].items() if delay is None and label != "none"}
     groups = results.summaries(["cell", "estimator", *across, "start"])
+    measured = _measured(results, ["cell", "estimator", *across, "start"])
     counted = {tuple(group[name] for name in ("cell", "estimator", *across, "start")): group for group in groups}
     rows = []
     for cell in manifest["data_cells"]:
@@ -113,7 +125,8 @@ def experiment_rows(results: Results, table: int | str, fields: Mapping[str, str
             own = {name: estimator["swept"].get(name) for name in across}
             for start in estimator["starts"]:
                 named = {"start": start if start in given else None} if len(given) > 1 else {}
-                group = counted.get((cell["hash"], estimator["name"], *own.values(), start), {})
+                place = (cell["hash"], estimator["name"], *own.values(), start)
+                group = counted.get(place, {})
                 rows.append(
                     Row(
                         table=table,
@@ -130,6 +143,7 @@ def experiment_rows(results: Results, table: int | str, fields: Mapping[str, str
                         high=group.get("high"),
                         median_seconds=group.get("median_seconds"),
                         estimator_settings=across,
+                        measures=measured.get(place),
                     )
                 )
     return rows
@@ -292,6 +306,43 @@ def _ordered(study: Study, table: StudyTable, rows: list[Row]) -> list[Row]:
         return experiments.index(row.experiment), settings.index(setting(row.settings)), methods.index(row.method)
 
     return sorted(rows, key=place)
+
+
+def _measured(results: Results, by: Sequence[str]) -> dict[tuple[Any, ...], dict[str, float | None]]:
+    """What the estimates of a group measured together, where they are frequencies of a signal."""
+    groups: dict[tuple[Any, ...], list[Mapping[str, float | None]]] = {}
+    for row in results.rows:
+        if "measures" in row:
+            groups.setdefault(tuple(row.get(name) for name in by), []).append(row["measures"] or {})
+    # Every row of a table carries the same keys.
+    names = measure_names(one for group in groups.values() for one in group)
+    return {place: _together(group, names) for place, group in groups.items()}
+
+
+def _together(group: Sequence[Mapping[str, float | None]], names: Sequence[str]) -> dict[str, float | None]:
+    found: dict[str, float | None] = {}
+    for base in ("settling_time", "settling_after_step"):
+        own = [name for name in names if base_name(name)[0] == base]
+        if own:
+            found[f"median_{base}"] = _median([_slowest([one.get(name) for name in own]) for one in group])
+    for name in names:
+        if base_name(name)[0] == "rms":
+            values = [one.get(name) for one in group]
+            found[f"median_{name}"] = _median([math.inf if value is None else value for value in values])
+    alarms = [one["false_alarms"] for one in group if one.get("false_alarms") is not None]
+    if "false_alarms" in names:
+        found["false_alarms"] = sum(alarm for alarm in alarms if alarm is not None) if alarms else None
+    return found
+
+
+def _slowest(times: Sequence[float | None]) -> float:
+    return max(math.inf if time is None else time for time in times)
+
+
+def _median(values: Sequence[float]) -> float | None:
+    """Median of values of which some are infinite, because they do not exist."""
+    middle = median(values)
+    return middle if math.isfinite(middle) else None
 
 
 def _swept(parts: list[dict[str, Any]]) -> tuple[str, ...]:

@@ -29,6 +29,9 @@ TIME = "Time: median of one estimate."
 GROUPS_PER_BLOCK = 2
 ESTIMATES_PER_BLOCK = 3
 
+#: Titles of the columns of measured frequencies.
+MEASURE_TITLES = {"median_settling_time": "settling", "median_settling_after_step": "after step"}
+
 _SHORT = {"snr_db": ("SNR", " dB")}
 
 
@@ -203,6 +206,46 @@ def experiment_table(name: str, rows: Sequence[Row], success: str, style: str = 
     if style == "md":
         return "\n\n".join([f"### {heading[0]}", heading[1], *blocks, foot])
     return "\n".join([*heading, "", "\n\n".join(blocks), "", *_wrap(foot)])
+
+
+def frequency_table(name: str, rows: Sequence[Row], success: str, style: str = "text") -> str:
+    """Frequencies of a signal: swept fields and estimators down, percentages and measures across.
+
+    Parameters
+    ----------
+    name : str
+        Name of the experiment.
+    rows : sequence of Row
+        Its cells, with measures.
+    success : str
+        What its percentages count.
+    style : {"text", "md"}, default "text"
+        Kind of table.
+
+    Returns
+    -------
+    str
+        Heading, table and footnote.
+    """
+    keys = list(dict.fromkeys(key for row in rows for key in row.settings))
+    measures = list(dict.fromkeys(key for row in rows for key in row.measures or {}))
+    header = [*(setting_title(key) for key in keys), "estimator", "settled %", "95 %", "n"]
+    header += [MEASURE_TITLES.get(key, key.removeprefix("median_").replace("_", " ")) for key in measures]
+    body = []
+    for row in rows:
+        found = row.measures or {}
+        texts = [setting_text(key, row.settings.get(key)) for key in keys] + [row.method]
+        texts += [_percent(row), _interval(row) if row.n else "", str(row.n)]
+        body.append([*texts, *(number(found.get(key), 3) for key in measures), _time(row)])
+    header.append("time")
+    align = "l" * (len(keys) + 1) + "r" * (len(measures) + 4)
+    foot = f"{RULE} settling: median over the data sets of the time until the slowest tone is in the band to stay [s], "
+    foot += "from the start and after the last step of a frequency; - is never, or unknown. rms: median over the data "
+    foot += f"sets of the root-mean-square error of each tone over the window [rad/s]. {TIME}"
+    if style == "md":
+        table = markdown_table(header, body, align)
+        return "\n\n".join([f"### {name}", f"Counted: {success}.", table, foot])
+    return "\n".join([name, f"Counted: {success}.", "", text_table(header, body, align), "", *_wrap(foot)])
 
 
 def record_table(

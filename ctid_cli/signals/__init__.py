@@ -1,4 +1,4 @@
-"""Records, held signals, excitations, sampling schemes and noise."""
+"""Records, held signals, excitations, sums of sinusoids, sampling schemes and noise."""
 
 from ctid_cli.signals.arma_noise import ArmaNoise
 from ctid_cli.signals.csv_file import read_held_signal, read_record
@@ -15,6 +15,16 @@ from ctid_cli.signals.excitation import (
 )
 from ctid_cli.signals.held import COINCIDENCE, HeldSignal, Hold
 from ctid_cli.signals.measurement import Measurement, read_measurement
+from ctid_cli.signals.multi_sine import (
+    DISTURBANCES,
+    Disturbance,
+    MultiSine,
+    Piece,
+    SineDisturbance,
+    Tone,
+    UniformDisturbance,
+    disturb,
+)
 from ctid_cli.signals.noise import NOISES, Noise, WhiteNoise
 from ctid_cli.signals.record import Controller, Enters, Loop, Record, regular_interval
 from ctid_cli.signals.sampling import (
@@ -29,6 +39,7 @@ from ctid_cli.signals.streams import ROLES, Role, stream
 
 __all__ = [
     "COINCIDENCE",
+    "DISTURBANCES",
     "EXCITATIONS",
     "NOISES",
     "ROLES",
@@ -36,6 +47,7 @@ __all__ = [
     "TAPS",
     "ArmaNoise",
     "Controller",
+    "Disturbance",
     "Enters",
     "Excitation",
     "Gaussian",
@@ -45,16 +57,22 @@ __all__ = [
     "InputRecord",
     "Loop",
     "Measurement",
+    "MultiSine",
     "Multisine",
     "Noise",
+    "Piece",
     "Prbs",
     "Record",
     "RegularSampling",
     "Role",
     "Sampling",
+    "SineDisturbance",
     "Step",
+    "Tone",
+    "UniformDisturbance",
     "UniformIntervals",
     "WhiteNoise",
+    "disturb",
     "geometric_sizes",
     "maximal_length_sequence",
     "read_held_signal",

@@ -1,0 +1,182 @@
+"""``ctid track``."""
+
+from __future__ import annotations
+
+import sys
+import time as clock
+from enum import StrEnum
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Annotated, Self
+
+import typer
+
+from ctid_cli.cli._common import Json, guarded
+from ctid_cli.cli._progress import LINE_EVERY
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+    from ctid_cli.signals.sampled_signal import SampledSignal
+
+#: Seconds before a bar appears: most records are done sooner.
+BAR_AFTER = 1.0
+
+
+class MethodOption(StrEnum):
+    """Estimators by their names."""
+
+    automatic = "automatic"
+    drem_gradient = "drem_gradient"
+    drem_finite_time = "drem_finite_time"
+    drem_window = "drem_window"
+    restarting_least_squares = "restarting_least_squares"
+    adaptive_observer = "adaptive_observer"
+    filter_regression = "filter_regression"
+    esprit = "esprit"
+    nonlinear_least_squares = "nonlinear_least_squares"
+
+
+@guarded
+def track(
+    file: Annotated[Path, typer.Argument(metavar="SIGNAL", help="Recorded signal (.csv, .mat, .wav).")],
+    tones: Annotated[int, typer.Option("--tones", help="Number of sinusoids, 1 to 8: the strongest ones.")],
+    method: Annotated[
+        MethodOption, typer.Option("--method", help="How the frequencies are estimated.")
+    ] = MethodOption.automatic,
+    time: Annotated[str | None, typer.Option("--time", metavar="NAME", help="Column of the times.")] = None,
+    signal: Annotated[
+        str | None, typer.Option("--signal", metavar="NAME", help="Column or channel of the signal.")
+    ] = None,
+    interval: Annotated[
+        float | None, typer.Option("--interval", metavar="SECONDS", help="Sampling interval, for files without times.")
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option("--rate", metavar="HERTZ", help="Sampling rate, in place of the interval.")
+    ] = None,
+    start: Annotated[
+        float | None, typer.Option("--from", metavar="TIME", help="First instant to use, in the file's unit of time.")
+    ] = None,
+    stop: Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")] = None,
+    every: Annotated[
+        float | None,
+        typer.Option("--every", metavar="SECONDS", help="One row every so often; about 1000 if not given."),
+    ] = None,
+    window: Annotated[
+        float | None, typer.Option("--window", metavar="SECONDS", help="Length of the windows, in place of automatic.")
+    ] = None,
+    as_json: Json = False,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE", help="Where the track goes (.csv, .h5); the figure lies beside it.")
+    ] = Path("track.csv"),
+) -> None:
+    """Follow the frequencies of a recorded signal that is a sum of sinusoids.
+
+    Prints the frequency of each tone, how far it moves, and for how much of the time it can be trusted; writes the
+    frequencies and amplitudes over time to track.csv and track.svg. All the rest is chosen from the record, and said.
+    """
+    import json
+
+    from ctid_cli.errors import UsageError
+    from ctid_cli.frequency.automatic import choose_settings
+    from ctid_cli.frequency.record_track import track_record
+    from ctid_cli.reporting.track_plot import track_svg
+    from ctid_cli.reporting.track_report import track_bytes, track_object, track_table, track_text, write_files
+    from ctid_cli.signals.sampled_signal import read_sampled_signal
+
+    extension = out.suffix.lower()
+    if extension not in (".csv", ".h5"):
+        raise UsageError(f"--out must end in .csv or .h5, not {out.name!r}")
+    given = _interval(interval, rate)
+    for name, value in (("--every", every), ("--window", window)):
+        if value is not None and not 0 < value < float("inf"):
+            raise UsageError(f"{name} must be a positive number of seconds, not {value:g}")
+    record = _in_seconds(read_sampled_signal(file, time=time, signal=signal, interval=given, start=start, stop=stop))
+    kind = None if method is MethodOption.automatic else method.value
+    try:
+        settings = choose_settings(record.samples, record.interval, tones, method=kind, window=window)
+        with _Progress(file.name) as tell:
+            found = track_record(record.samples, record.interval, settings, every=every, on_progress=tell)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    figure = out.with_suffix(".svg")
+    title = f"{file.name}: {settings.estimator.kind}"
+    write_files(
+        {
+            out: track_bytes(track_table(found, record.start), extension),
+            figure: track_svg(found, record.start, record.unit, title),
+        }
+    )
+    if as_json:
+        typer.echo(json.dumps(track_object(record, settings, found, [out, figure]), allow_nan=False))
+    else:
+        typer.echo(track_text(record, settings, found))
+        typer.echo(f"\nWritten: {out}, {figure}")
+
+
+def _interval(interval: float | None, rate: float | None) -> float | None:
+    from ctid_cli.errors import UsageError
+
+    if interval is not None and rate is not None:
+        raise UsageError("--interval and --rate say the same; give one of them")
+    for name, value in (("--interval", interval), ("--rate", rate)):
+        if value is not None and not 0 < value < float("inf"):
+            raise UsageError(f"{name} must be a positive number, not {value:g}")
+    return interval if rate is None else 1.0 / rate
+
+
+def _in_seconds(record: SampledSignal) -> SampledSignal:
+    from ctid_cli.errors import UsageError
+    from ctid_cli.reporting.estimate import SECONDS
+
+    unit = record.time_unit or "s"
+    if unit not in SECONDS:
+        raise UsageError(
+            f"{record.file}: the unit of time, {unit!r}, is not known, so there is no frequency in Hz; give the clock "
+            "with --interval SECONDS or --rate HERTZ"
+        )
+    return record.rescaled(SECONDS[unit], "s")
+
+
+class _Progress:
+    """A bar for people, a line now and then for log files; nothing for a record that is done at once."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._began = self._last = clock.monotonic()
+        self._bar: Progress | None = None
+        self._task: TaskID | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __call__(self, done: int, total: int) -> None:
+        now = clock.monotonic()
+        if sys.stderr.isatty():
+            if self._bar is None and now - self._began > BAR_AFTER:
+                self._start()
+            if self._bar is not None and self._task is not None:
+                self._bar.update(self._task, completed=done, total=total)
+        elif now - self._last >= LINE_EVERY:
+            self._last = now
+            typer.echo(f"{self._name}: {100 * done / total:.0f} % of the record", err=True)
+
+    def _start(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=20),
+            TaskProgressColumn(),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+        )
+        self._task = self._bar.add_task(self._name, total=None)
+        self._bar.start()

@@ -1,0 +1,343 @@
+"""What is measured of frequencies over time against the true ones, and how tracks are stored.
+
+Names of the measures, each with the number of the tone behind it where it is one number per tone, by rising frequency:
+
+- ``omega_1``: last estimate [rad/s];
+- ``valid_from``: first instant of a valid estimate [s];
+- ``settling_time_1``: when the error came into the band to stay there to the end, or to the first step of a frequency
+  [s]; ``settling_after_step_1``: the same from the last step of a frequency to the end, counted from the step [s].
+  They have no value if that never happened. Flags do not matter; an estimate that begins at the truth has settled at 0;
+- ``rms_1``, ``bias_1``: root mean square and mean of the error over the window [rad/s];
+- ``false_alarms``: alarms with no step of a frequency or an amplitude shortly before, of trackers that raise any;
+- ``valid_share``: share of the record with a valid estimate [%].
+
+An estimate of a whole record has ``omega``, ``rms`` and ``bias`` of this one error, and ``valid_share`` 0 or 100.
+"""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.signals import Disturbance, MultiSine, SineDisturbance
+
+if TYPE_CHECKING:
+    from ctid_cli.frequency import FrequencyEstimate, FrequencyTrack
+
+Array = NDArray[np.float64]
+
+#: Units of the measures, in the order of columns.
+MEASURE_UNITS = {
+    "omega": "rad/s",
+    "valid_from": "s",
+    "settling_time": "s",
+    "settling_after_step": "s",
+    "rms": "rad/s",
+    "bias": "rad/s",
+    "false_alarms": "-",
+    "valid_share": "%",
+}
+#: An alarm so soon after a step [s] answers to it.
+ALARM_GRACE = 5.0
+#: Length of the window of rms and bias, before the end of the record, if none is given [s].
+USUAL_WINDOW = 10.0
+#: Kinds of trackers that raise alarms.
+_ALARMING = ("restarting_least_squares",)
+
+
+@dataclass(frozen=True)
+class Measuring:
+    """What is measured of every estimate, and which tracks are stored.
+
+    Parameters
+    ----------
+    band : float, optional
+        Largest error of a settled frequency [rad/s]; without it no settling times are measured.
+    window : tuple of float, optional
+        First and last instant of the window of rms and bias [s]; the last 10 s if not given.
+    interval : float, optional
+        Time from one row of a stored track to the next [s]; None stores none.
+    runs : int, default 0
+        The tracks of so many data sets are stored.
+    """
+
+    band: float | None = None
+    window: tuple[float, float] | None = None
+    interval: float | None = None
+    runs: int = 0
+
+
+def true_frequencies(signal: MultiSine, disturbance: Disturbance | None, tones: int, times: Array) -> Array:
+    """The frequencies that an estimator of so many tones should find.
+
+    Parameters
+    ----------
+    signal : MultiSine
+        The signal.
+    disturbance : Disturbance or None
+        A sinusoid counts as one more tone for an estimator that has one more than the signal.
+    tones : int
+        Tones of the estimator.
+    times : ndarray, shape (N,)
+        Instants [s].
+
+    Returns
+    -------
+    ndarray, shape (N, tones)
+        Frequencies [rad/s], ascending in each row.
+
+    Raises
+    ------
+    ValueError
+        If there are not so many.
+    """
+    true = signal.frequencies_at(times)
+    if tones == true.shape[1] + 1 and isinstance(disturbance, SineDisturbance):
+        true = np.sort(np.column_stack((true, np.full(true.shape[0], disturbance.frequency))), axis=1)
+    if tones != true.shape[1]:
+        raise ValueError(f"tones must be {true.shape[1]}, as many as the signal has, not {tones}.")
+    return true
+
+
+def measure_track(
+    track: FrequencyTrack, true: Array, signal: MultiSine, measuring: Measuring, options: Any
+) -> dict[str, float | None]:
+    """Measure the estimates of an online estimator.
+
+    Parameters
+    ----------
+    track : FrequencyTrack
+        The estimates, one for every sample from 0 s.
+    true : ndarray, shape (N, n)
+        True frequencies [rad/s].
+    signal : MultiSine
+        The signal, for the instants of its steps.
+    measuring : Measuring
+        What to measure.
+    options : Any
+        The estimator.
+
+    Returns
+    -------
+    dict
+        Value by name, see the top of this module; None for a value that does not exist.
+    """
+    t, errors, valid = track.t, track.omega - true, track.valid
+    count = errors.shape[1]
+    found: dict[str, float | None] = _numbered("omega", track.omega[-1])
+    found["valid_from"] = float(t[np.argmax(valid)]) if valid.any() else None
+    if measuring.band is not None:
+        steps = [float(step) for step in signal.frequency_steps]
+        # The first sample of a piece may come before the instant of the step by a rounding error.
+        places = [0, *(int(np.searchsorted(t, step * (1.0 - 1e-9))) for step in steps), t.size]
+        inside = np.abs(errors) <= measuring.band
+        for k in range(count):
+            found[f"settling_time_{k + 1}"] = _settling(inside[:, k], t, 0, places[1], 0.0)
+            if steps:
+                after = _settling(inside[:, k], t, places[-2], places[-1], steps[-1])
+                found[f"settling_after_step_{k + 1}"] = after
+    chosen = errors[_in_window(t, measuring.window)]
+    found |= _numbered("rms", np.sqrt(np.mean(chosen**2, axis=0)))
+    found |= _numbered("bias", np.mean(chosen, axis=0))
+    if options.kind in _ALARMING:
+        found["false_alarms"] = float(_false_alarms(track, signal.steps))
+    found["valid_share"] = 100.0 * float(np.mean(valid))
+    return {name: found[name] for name in measure_names([found])}
+
+
+def measure_estimate(estimate: FrequencyEstimate, true: Array, window: tuple[float, float] | None, times: Array) -> Any:
+    """Measure the estimate of a whole record.
+
+    Parameters
+    ----------
+    estimate : FrequencyEstimate
+        The estimate.
+    true : ndarray, shape (N, n)
+        True frequencies [rad/s].
+    window : tuple of float or None
+        The estimate is compared with the mean frequencies over this window [s].
+    times : ndarray, shape (N,)
+        Instants of the true frequencies [s].
+
+    Returns
+    -------
+    dict
+        Value by name, see the top of this module.
+    """
+    error = estimate.omega - true[_in_window(times, window)].mean(axis=0)
+    found: dict[str, float | None] = _numbered("omega", estimate.omega)
+    found |= _numbered("rms", np.abs(error)) | _numbered("bias", error)
+    return found | {"valid_share": 100.0 if estimate.valid else 0.0}
+
+
+def measure_names(rows: Iterable[Mapping[str, Any] | None]) -> list[str]:
+    """Names of the measures that any estimate has, in the order of columns.
+
+    Parameters
+    ----------
+    rows : iterable of mapping or None
+        Measures of each estimate by name.
+
+    Returns
+    -------
+    list of str
+        By measure, then by tone.
+
+    Examples
+    --------
+    >>> measure_names([{"rms_2": 0.1, "rms_1": 0.1}, None, {"omega_1": 2.0}])
+    ['omega_1', 'rms_1', 'rms_2']
+    """
+    order = list(MEASURE_UNITS)
+
+    def place(name: str) -> tuple[int, int]:
+        base, tone = base_name(name)
+        return order.index(base), tone
+
+    return sorted({name for row in rows if row for name in row}, key=place)
+
+
+def base_name(name: str) -> tuple[str, int]:
+    """A measure without the number of its tone, and that number.
+
+    Parameters
+    ----------
+    name : str
+        Name of a measure.
+
+    Returns
+    -------
+    (str, int)
+        Key of `MEASURE_UNITS`, and the number of the tone; 0 if the measure is not one of a tone.
+
+    Examples
+    --------
+    >>> base_name("settling_time_2"), base_name("valid_share")
+    (('settling_time', 2), ('valid_share', 0))
+    """
+    base, _, tone = name.rpartition("_")
+    return (base, int(tone)) if tone.isdigit() else (name, 0)
+
+
+def is_settled(measures: Mapping[str, float | None] | None, band: float, by: float | None) -> bool:
+    """Whether all frequencies came into the band in time and stayed there.
+
+    Parameters
+    ----------
+    measures : mapping or None
+        Measures of an estimate by name.
+    band : float
+        Largest error [rad/s], the one that settling times were measured with.
+    by : float or None
+        Latest settling time, from the start and after the last step of a frequency [s]; None for any.
+
+    Returns
+    -------
+    bool
+        Of an estimate of a whole record: whether its errors lie in the band.
+    """
+    if not measures:
+        return False
+    times = [value for name, value in measures.items() if name.startswith("settling_")]
+    if times:
+        return all(time is not None and (by is None or time <= by) for time in times)
+    errors = [value for name, value in measures.items() if base_name(name)[0] == "rms"]
+    return all(error is not None and error <= band for error in errors)
+
+
+def thinned(track: FrequencyTrack, interval: float, sampling_interval: float) -> FrequencyTrack:
+    """Every so many rows of a track.
+
+    Parameters
+    ----------
+    track : FrequencyTrack
+        One row for every sample.
+    interval : float
+        Time from one kept row to the next [s], rounded to whole sampling intervals.
+    sampling_interval : float
+        Sampling interval [s].
+
+    Returns
+    -------
+    FrequencyTrack
+        From the first row on.
+    """
+    every = max(1, round(interval / sampling_interval))
+    return type(track)(track.t[::every], track.omega[::every], track.flags[::every], track.uncertainty[::every])
+
+
+def pack_track(track: FrequencyTrack) -> dict[str, Any]:
+    """A track as plain data.
+
+    Parameters
+    ----------
+    track : FrequencyTrack
+        The track.
+
+    Returns
+    -------
+    dict
+        Compressed columns by name. Frequencies keep all their digits, since the errors of an exact estimator are far
+        below those of short numbers; uncertainties do not need them.
+    """
+    columns = {"t": track.t, "omega": track.omega, "flags": track.flags, "uncertainty": track.uncertainty}
+    kinds = {"t": "<f8", "omega": "<f8", "flags": "<u2", "uncertainty": "<f4"}
+    packed = {}
+    for name, values in columns.items():
+        array = np.ascontiguousarray(values, dtype=kinds[name])
+        data = base64.b64encode(zlib.compress(array.tobytes())).decode("ascii")
+        packed[name] = {"kind": kinds[name], "shape": list(array.shape), "data": data}
+    return packed
+
+
+def unpack_track(packed: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """The columns of a packed track.
+
+    Parameters
+    ----------
+    packed : mapping
+        What `pack_track` gave.
+
+    Returns
+    -------
+    dict of ndarray
+        ``t``, ``omega``, ``flags`` and ``uncertainty``.
+    """
+    return {
+        name: np.frombuffer(zlib.decompress(base64.b64decode(part["data"])), part["kind"]).reshape(part["shape"])
+        for name, part in packed.items()
+    }
+
+
+def _numbered(name: str, values: Array) -> dict[str, float | None]:
+    return {f"{name}_{k + 1}": float(value) if np.isfinite(value) else None for k, value in enumerate(values)}
+
+
+def _settling(inside: NDArray[np.bool_], t: Array, first: int, last: int, since: float) -> float | None:
+    outside = np.flatnonzero(~inside[first:last])
+    if not outside.size:
+        place = first
+    else:
+        place = first + int(outside[-1]) + 1
+    # A difference of instants, without the last digits of either.
+    return None if place == last else max(0.0, round(float(t[place] - since), 9))
+
+
+def _in_window(t: Array, window: tuple[float, float] | None) -> NDArray[np.bool_]:
+    low, high = (t[-1] - USUAL_WINDOW, t[-1]) if window is None else window
+    slack = 1e-9 * max(1.0, abs(high))
+    return np.asarray((t >= low - slack) & (t <= high + slack))
+
+
+def _false_alarms(track: FrequencyTrack, steps: tuple[float, ...]) -> int:
+    from ctid_cli.frequency import Flag
+
+    alarm = (track.flags & int(Flag.CHANGED)) != 0
+    begins = track.t[np.flatnonzero(alarm & ~np.concatenate(([False], alarm[:-1])))]
+    return sum(not any(0.0 <= begin - step + 1e-9 <= ALARM_GRACE for step in steps) for begin in begins)

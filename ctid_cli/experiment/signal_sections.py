@@ -1,0 +1,120 @@
+"""Sections of experiments on the frequencies of a signal: the signal, its disturbance, and what is stored of tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from ctid_cli.experiment.option_sections import SamplingSection, check_of
+from ctid_cli.experiment.sections import (
+    Complaint,
+    Section,
+    by_kind,
+    checked,
+    choice,
+    list_of,
+    number,
+    optional,
+    section_for,
+    several_wrong,
+    swept,
+    whole,
+)
+from ctid_cli.signals import DISTURBANCES, MultiSine, RegularSampling
+
+_SECONDS = swept(number("s", above=0.0))
+
+if TYPE_CHECKING:
+    SignalSection = Section
+    DisturbanceSection = Section
+else:
+    SignalSection = section_for(MultiSine)
+    DisturbanceSection = by_kind({kind: section_for(target, kind=kind) for kind, target in DISTURBANCES.items()})
+
+
+class RegularDurationSection(Section):
+    """Samples at equal intervals, from 0 s, as many as fit into a time."""
+
+    target: ClassVar[type | None] = RegularSampling
+    sweepable: ClassVar[frozenset[str]] = frozenset({"interval", "duration"})
+
+    kind: Annotated[Literal["regular"], checked(choice("regular"))] = Field(description="Which one it is")
+    interval: Annotated[float | list[float], checked(_SECONDS)] = Field(description="Sampling interval [s]")
+    duration: Annotated[float | list[float], checked(_SECONDS)] = Field(
+        description="Length of the record, in place of the number of samples [s]"
+    )
+
+    def build(self, values: Mapping[str, Any]) -> RegularSampling:
+        """The sampling scheme.
+
+        Parameters
+        ----------
+        values : mapping
+            The section as plain data, with one value per swept field.
+
+        Returns
+        -------
+        RegularSampling
+            With ``duration / interval`` samples, rounded.
+        """
+        # Beyond the largest whole number of samples any number of them is refused as too many.
+        return RegularSampling(values["interval"], int(min(round(values["duration"] / values["interval"]), 2**62)))
+
+
+def sampling_section(value: Any) -> Section:
+    """Check of the sampling scheme, with a number of samples or a duration.
+
+    Parameters
+    ----------
+    value : Any
+        The section as it was read.
+
+    Returns
+    -------
+    Section
+        The section of the kind that it names.
+    """
+    if isinstance(value, RegularDurationSection):
+        return value
+    if not isinstance(value, Mapping) or value.get("kind") != "regular" or "duration" not in value:
+        section: Section = _sampling(value)
+        return section
+    if "samples" in value:
+        message = "gives the length a second time, 'duration' has it already; keep one of the two"
+        raise several_wrong("sampling", [(("samples",), message, True)])
+    return RegularDurationSection.model_validate(value)
+
+
+_sampling = check_of(SamplingSection)
+if TYPE_CHECKING:
+    AnySamplingSection = Section
+else:
+    AnySamplingSection = SamplingSection | RegularDurationSection
+
+
+class TracksSection(Section):
+    """What is stored of the frequencies over time, and where their errors are measured."""
+
+    interval: Annotated[float, checked(number("s", above=0.0))] = Field(
+        default=0.05, description="Time from one stored estimate to the next [s]"
+    )
+    window: Annotated[
+        list[float] | None,
+        checked(optional(list_of(number("s", at_least=0.0), "a list of 2 numbers [s]", length=2))),
+    ] = Field(default=None, description="First and last instant of the window of rms and bias [s]; the last 10 s")
+    runs: Annotated[int, checked(whole(at_least=0, at_most=1_000_000))] = Field(
+        default=1, description="Store the tracks of so many data sets of every data cell"
+    )
+
+    def complaints(self) -> Iterator[Complaint]:
+        """Say that the window is empty.
+
+        Yields
+        ------
+        tuple
+            Key path inside the section, and message.
+        """
+        if self.window is not None and not self.window[0] < self.window[1]:
+            yield ("window",), f"must begin before it ends; it runs from {self.window[0]:g} to {self.window[1]:g} s"

@@ -1,0 +1,256 @@
+"""Amplitudes, phases and bias by linear regression, once the frequencies are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.frequency.regression import MOST_TONES
+from ctid_cli.signals.checks import require_positive
+
+Array = NDArray[np.float64]
+
+#: Below this ratio of the singular values the sinusoids cannot be told apart.
+SINGULAR = 1e-10
+#: A residual below this fraction of the signal (root mean squares) is rounding, and may as well be this large.
+ROUNDING = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class Sinusoids:
+    """A sum of sinusoids and a bias.
+
+    Parameters
+    ----------
+    omega : ndarray, shape (n,)
+        Frequencies [rad/s].
+    amplitudes : ndarray, shape (n,)
+        Amplitudes, not negative [signal unit].
+    phases : ndarray, shape (n,)
+        Phases at the first sample, ``sin(w t + phase)``, within -pi and pi [rad].
+    bias : float
+        Constant part [signal unit].
+    residual_rms : float
+        Root mean square of what is left of the samples [signal unit]; NaN if nothing was fitted.
+    """
+
+    omega: Array
+    amplitudes: Array
+    phases: Array
+    bias: float = 0.0
+    residual_rms: float = np.nan
+
+    def at(self, t: ArrayLike) -> Array:
+        """Value at given instants.
+
+        Parameters
+        ----------
+        t : array_like, shape (N,)
+            Time since the first sample [s].
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Signal [signal unit].
+        """
+        angles = np.asarray(t, dtype=float)[:, None] * self.omega + self.phases
+        return np.asarray(np.sin(angles) @ self.amplitudes + self.bias)
+
+
+def fit_sinusoids(samples: ArrayLike, interval: float, omega: ArrayLike, *, bias: bool = True) -> Sinusoids:
+    """Amplitudes, phases and bias of sinusoids of known frequencies, by least squares.
+
+    Parameters
+    ----------
+    samples : array_like, shape (N,)
+        Signal on a regular clock [signal unit]; NaN where missing.
+    interval : float
+        Sampling interval [s].
+    omega : array_like, shape (n,)
+        Frequencies [rad/s], positive and different.
+    bias : bool, default True
+        Whether a constant part is estimated too.
+
+    Returns
+    -------
+    Sinusoids
+        The fit.
+
+    Raises
+    ------
+    DataError
+        If the samples are too few or too short to tell the sinusoids apart.
+    ValueError
+        If a frequency is not positive.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> t = 0.01 * np.arange(1000)
+    >>> fit = fit_sinusoids(3 * np.sin(2 * t + 0.5) + np.cos(3 * t) - 1, 0.01, [2.0, 3.0])
+    >>> fit.amplitudes.round(6), fit.phases.round(6), round(fit.bias, 6)
+    (array([3., 1.]), array([0.5     , 1.570796]), -1.0)
+    """
+    y, t = present_samples(samples, interval)
+    frequencies = np.asarray(omega, dtype=float)
+    if frequencies.ndim != 1 or not 1 <= frequencies.size <= MOST_TONES:
+        raise ValueError(f"omega must hold 1 to {MOST_TONES} frequencies, not {omega!r}.")
+    for frequency in frequencies:
+        require_positive("omega", float(frequency), "rad/s")
+    # The middle of the record as origin of time: sines and cosines are then as different as the record allows.
+    middle = 0.5 * (t[0] + t[-1])
+    design = harmonic_design(t - middle, frequencies, bias=bias)
+    coefficients = solve_design(design, y)
+    n = frequencies.size
+    residual = y - design @ coefficients
+    phases = np.arctan2(coefficients[n : 2 * n], coefficients[:n]) - frequencies * middle
+    return Sinusoids(
+        frequencies,
+        np.hypot(coefficients[:n], coefficients[n : 2 * n]),
+        np.pi - np.mod(np.pi - phases, 2.0 * np.pi),
+        float(coefficients[2 * n]) if bias else 0.0,
+        float(np.sqrt(np.mean(residual**2))),
+    )
+
+
+def present_samples(samples: ArrayLike, interval: float) -> tuple[Array, Array]:
+    """Samples that are there, with their instants.
+
+    Parameters
+    ----------
+    samples : array_like, shape (N,)
+        Signal [signal unit]; NaN where missing.
+    interval : float
+        Sampling interval [s].
+
+    Returns
+    -------
+    values, t : ndarray, shape (M,)
+        Samples [signal unit] and their time since the first of all [s].
+
+    Raises
+    ------
+    DataError
+        If the samples are not a series of real numbers, or none is there.
+    """
+    require_positive("interval", interval, "s")
+    values = np.asarray(samples)
+    if values.ndim != 1 or values.dtype.kind not in "fiu":
+        raise DataError(
+            f"the samples must be one series of real numbers, not an array of shape {values.shape} "
+            f"and type {values.dtype}."
+        )
+    values = values.astype(np.float64)
+    places = np.flatnonzero(np.isfinite(values))
+    if not places.size:
+        raise DataError("the record holds no finite sample.")
+    return values[places], interval * places.astype(np.float64)
+
+
+def harmonic_design(t: Array, omega: Array, *, bias: bool) -> Array:
+    """Sines, cosines and, if asked for, a constant.
+
+    Parameters
+    ----------
+    t : ndarray, shape (N,)
+        Instants [s].
+    omega : ndarray, shape (n,)
+        Frequencies [rad/s].
+    bias : bool
+        Whether there is a constant column.
+
+    Returns
+    -------
+    ndarray, shape (N, 2 n) or (N, 2 n + 1)
+        Columns.
+    """
+    angles = t[:, None] * omega
+    columns = [np.sin(angles), np.cos(angles)]
+    if bias:
+        columns.append(np.ones((t.size, 1)))
+    return np.hstack(columns)
+
+
+def solve_design(design: Array, y: Array) -> Array:
+    """Least squares that refuses what the samples do not determine.
+
+    Parameters
+    ----------
+    design : ndarray, shape (N, p)
+        Columns.
+    y : ndarray, shape (N,)
+        Samples.
+
+    Returns
+    -------
+    ndarray, shape (p,)
+        Coefficients.
+
+    Raises
+    ------
+    DataError
+        If they are not determined.
+    """
+    count, unknowns = design.shape
+    if count < unknowns:
+        raise DataError(f"{count} samples cannot determine {unknowns} amplitudes; use a longer record.")
+    coefficients, _, _, singular_values = np.linalg.lstsq(design, y, rcond=None)
+    if singular_values[-1] < SINGULAR * singular_values[0]:
+        raise DataError(
+            "the samples cannot tell the sinusoids apart: two frequencies are too close to each other, "
+            "or one of them to zero or to a multiple of the sampling frequency, for so short a record."
+        )
+    return np.asarray(coefficients)
+
+
+def frequency_errors(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[Array, Array, float]:
+    r"""Gauss-Newton step of the frequencies, and the error that the residual could make.
+
+    Parameters
+    ----------
+    y : ndarray, shape (N,)
+        Samples.
+    t : ndarray, shape (N,)
+        Their instants [s].
+    omega : ndarray, shape (n,)
+        Frequencies [rad/s].
+    bias : bool
+        Whether there is a constant.
+
+    Returns
+    -------
+    step : ndarray, shape (n,)
+        Correction of the frequencies by least squares [rad/s].
+    uncertainty : ndarray, shape (n,)
+        ``sqrt([(J'J)^-1]_ii e'e)`` [rad/s], J the derivatives with respect to all unknowns, e the residual: the error
+        if all of the residual lay in the worst direction. Rounding counts as residual.
+    misfit : float
+        ``e'e`` at the frequencies as given [signal unit^2].
+
+    Raises
+    ------
+    DataError
+        If the sinusoids cannot be told apart.
+    """
+    n = omega.size
+    time = t - 0.5 * (t[0] + t[-1])
+    design = harmonic_design(time, omega, bias=bias)
+    coefficients = solve_design(design, y)
+    residual = y - design @ coefficients
+    slopes = time[:, None] * (design[:, n : 2 * n] * coefficients[:n] - design[:, :n] * coefficients[n : 2 * n])
+    # What of the slopes the amplitudes cannot follow.
+    orthogonal, _ = np.linalg.qr(design)
+    slopes -= orthogonal @ (orthogonal.T @ slopes)
+    misfit, floor = float(residual @ residual), ROUNDING**2 * float(y @ y)
+    scales = np.linalg.norm(slopes, axis=0)
+    if not (scales > 0).all():
+        return np.zeros(n), np.full(n, np.inf), misfit
+    q, r = np.linalg.qr(slopes / scales)
+    if np.abs(np.diag(r)).min() < SINGULAR:
+        return np.zeros(n), np.full(n, np.inf), misfit
+    inverse = np.linalg.inv(r)
+    step = inverse @ (q.T @ residual) / scales
+    return step, np.linalg.norm(inverse, axis=1) / scales * np.sqrt(misfit + floor), misfit

@@ -1,0 +1,473 @@
+"""Settings for the frequencies of a recorded signal, chosen from the record alone, with the reasons."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.frequency import (
+    FREQUENCY_ESTIMATORS,
+    AdaptiveObserver,
+    DremFiniteTime,
+    DremGradient,
+    DremWindow,
+    Esprit,
+    FilterRegression,
+    NonlinearLeastSquares,
+    RestartingLeastSquares,
+)
+from ctid_cli.frequency.decimation import Decimation, low_pass, without_low
+from ctid_cli.frequency.regression import MOST_TONES
+from ctid_cli.frequency.spectrum import Peaks, find_peaks
+from ctid_cli.frequency.windows import estimate_window
+from ctid_cli.signals.checks import require_choice, require_integer, require_positive
+
+Array = NDArray[np.float64]
+
+#: Samples in a period of the highest tone, for estimators that take windows, that delay, and that integrate.
+WINDOW_SAMPLES = 4
+DELAY_SAMPLES = 12
+INTEGRATION_SAMPLES = 60
+#: Fewest samples for each tone.
+SAMPLES_PER_TONE = 8
+#: A signal that varies by less than this fraction of itself is constant.
+CONSTANT = 1e-12
+#: Tones of the record of less than this fraction of the weakest wanted one (amplitudes) disturb nobody.
+HARMLESS = 0.2
+#: A constant part of less than this fraction disturbs nobody either.
+HARMLESS_OFFSET = 0.02
+#: The low-pass keeps so much more than the highest tone, and stops another tone if that is so many times higher.
+PASS = 1.1
+STOP = 1.25
+#: A high-pass, with these edges as fractions of the lowest tone, is used if there is enough of the record.
+LOW_STOP = 0.4
+LOW_PASS = 0.8
+HIGH_PASS_SHARE = 0.1
+#: What the filters leave in their stop bands [dB].
+STOP_BAND = 60.0
+LOW_STOP_BAND = 40.0
+#: Gaps shorter than this fraction of the shortest period are bridged. A filter would widen the others, so nonlinear
+#: least squares go without one if no more than so many samples could be thinned to one.
+BRIDGED = 0.05
+MOST_UNTHINNED = 10
+#: A window begins with so many beats of its two closest tones, and doubles until so large a share of so many windows is
+#: certain; it never exceeds this fraction of the record, unless the record is shorter than those beats.
+BEATS = 3.0
+DOUBLINGS = 4
+CERTAIN_SHARE = 0.9
+TRIALS = 8
+LARGEST_SHARE = 1.0 / 3.0
+#: Samples of a window for each tone that is estimated.
+WINDOW_SAMPLES_PER_TONE = 8
+#: Delay of the regression times the highest frequency, and the prefilter in delays.
+DELAY_ANGLE = 2.2
+PREFILTER_DELAYS = 1.5
+#: Tones that share the band: so many at most for estimators that delay, and for those that integrate.
+DELAY_SPARES = 2
+INTEGRATION_SPARES = 0
+#: Share of the Nyquist frequency above which a tone may be the image of one that the sampling has folded.
+SUSPICIOUS = 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class Settings:
+    """What to do with a record to find the frequencies of its tones.
+
+    Parameters
+    ----------
+    estimator : Any
+        Estimator with its options, one of :data:`~ctid_cli.frequency.FREQUENCY_ESTIMATORS`.
+    tones : int
+        Number of wanted tones; the estimator may have more, which only share their band.
+    expected : ndarray, shape (m,)
+        Where the spectrum shows the tones of the estimator [rad/s], the wanted ones first.
+    offset : float
+        Constant that is subtracted first [signal unit].
+    decimation : Decimation
+        Filter and thinning before the estimator.
+    interval : float
+        Sampling interval of what the estimator gets [s].
+    window : int
+        Samples, of those, in a window of a batch estimator, and in the stretch from which amplitudes are found.
+    reasons : tuple of str
+        What was chosen and why, one sentence each.
+    warnings : tuple of str
+        What may be wrong, one sentence each.
+    """
+
+    estimator: Any
+    tones: int
+    expected: Array
+    offset: float
+    decimation: Decimation
+    interval: float
+    window: int
+    reasons: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def wanted(self) -> Array:
+        """Where the spectrum shows the wanted tones [rad/s], ascending."""
+        return np.sort(self.expected[: self.tones])
+
+    @property
+    def window_seconds(self) -> float:
+        """Length of a window [s]."""
+        return self.window * self.interval
+
+    @property
+    def lag(self) -> float:
+        """Time by which the middle of the filter lies behind its newest sample, in samples of the record."""
+        return 0.5 * (self.decimation.weights.size - 1)
+
+
+@dataclass(frozen=True)
+class _Band:
+    """Which tones the estimator gets, and how the others are kept away."""
+
+    expected: Array
+    amplitudes: Array
+    decimation: Decimation
+    sentences: tuple[str, ...]
+    resolution: float
+
+
+def choose_settings(
+    samples: Array, interval: float, tones: int, *, method: str | None = None, window: float | None = None
+) -> Settings:
+    """Choose an estimator and everything that it needs.
+
+    Parameters
+    ----------
+    samples : ndarray, shape (N,)
+        Signal on a regular clock [signal unit]; NaN where missing.
+    interval : float
+        Sampling interval [s].
+    tones : int
+        Number of tones wanted, 1 to 8: those that are strongest for most of the record.
+    method : str, optional
+        Kind of the estimator; by default ESPRIT over windows, or nonlinear least squares if samples are missing.
+    window : float, optional
+        Length of the windows [s]; by default as short as gives certain estimates.
+
+    Returns
+    -------
+    Settings
+        With sentences that say what was chosen.
+
+    Raises
+    ------
+    DataError
+        If no tone can be found in the record: it is constant, too short, or shows no peak.
+    ValueError
+        If an option is out of range.
+
+    Notes
+    -----
+    The tones are the strongest peaks of the median spectrum of the record's segments. A low-pass whose stop band begins
+    before what would fold onto them, and before the next strong tone, allows to keep only some samples in each period
+    of the highest tone. Tones that no filter can keep away are estimated too. The delay h of the regressions is near
+    ``2.2/w_max`` (pi/w_max is where frequencies become ambiguous), with a prefilter of 1.5 h. Windows begin with four
+    beats of the closest tones and are doubled until nearly all estimates are certain.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> t = 0.001 * np.arange(5000)
+    >>> settings = choose_settings(np.sin(300 * t) + np.sin(450 * t), 0.001, 2)
+    >>> settings.estimator.kind, settings.wanted.round()
+    ('esprit', array([300., 450.]))
+    """
+    require_integer("tones", tones, 1, MOST_TONES)
+    require_positive("interval", interval, "s")
+    if method is not None:
+        require_choice("method", method, tuple(FREQUENCY_ESTIMATORS))
+    if window is not None:
+        require_positive("window", window, "s")
+    _refuse_unusable(samples, tones)
+    peaks = find_peaks(samples, interval, tones)
+    if peaks.omega.size == 0:
+        raise DataError(
+            f"no tone stands out of the spectrum of {samples.size * interval:.4g} s: the signal is noise, its tones "
+            "move too fast, or the record is shorter than two periods; use a longer record, or another part of it"
+        )
+    warnings = list(_doubts(peaks, tones, interval))
+    offset = _offset(samples, float(peaks.amplitudes[:tones][-1]))
+    bridge = int(BRIDGED * 2.0 * np.pi / (peaks.omega[:tones].max() * interval))
+    gaps = bool((~np.isfinite(samples)).any())
+    chosen = method
+    if chosen is None:
+        chosen = NonlinearLeastSquares.kind if gaps else Esprit.kind
+    batch = chosen in (Esprit.kind, NonlinearLeastSquares.kind)
+    band = _choose_band(samples, interval, tones, peaks, chosen, bridge, gaps)
+    thinned = band.decimation.apply(samples - offset)
+    thin = interval * band.decimation.factor
+    if method is None and gaps and np.isfinite(thinned).all():
+        chosen = Esprit.kind
+    if np.isfinite(thinned).sum() < SAMPLES_PER_TONE * tones:
+        raise DataError(
+            f"the record is too short or has too many gaps: {samples.size * interval:.4g} s are hardly more than "
+            f"the {band.decimation.weights.size * interval:.4g} s of the filter before the estimator; use a longer one"
+        )
+    reasons = [_tones_sentence(peaks, tones), *_preparation(offset, bridge if gaps else 0, interval), *band.sentences]
+    length, sentence = _choose_window(thinned, thin, tones, band, peaks, chosen if batch else Esprit.kind, window)
+    estimator, how = _estimator(chosen, band, thin, length)
+    if method is None:
+        why = (
+            "nonlinear least squares, since samples are missing"
+            if chosen == NonlinearLeastSquares.kind
+            else "ESPRIT, the most exact one for a whole record without gaps"
+        )
+        reasons.append(f"Method: {chosen}: {why}.")
+    reasons += [how] if how else []
+    reasons.append(sentence if batch else f"Amplitudes are found from the last {length * thin:.4g} s before each row.")
+    return Settings(
+        estimator, tones, band.expected, offset, band.decimation, thin, length, tuple(reasons), tuple(warnings)
+    )
+
+
+def _refuse_unusable(samples: Array, tones: int) -> None:
+    present = samples[np.isfinite(samples)]
+    if present.size < SAMPLES_PER_TONE * tones:
+        raise DataError(
+            f"{present.size} samples are too few for {tones} tones; at least {SAMPLES_PER_TONE * tones} are needed"
+        )
+    low, high = float(present.min()), float(present.max())
+    if high - low <= CONSTANT * max(abs(low), abs(high)):
+        what = "zero" if high == low == 0.0 else f"constant ({low:.6g})"
+        raise DataError(f"the signal is {what} throughout: it has no tones")
+
+
+def _doubts(peaks: Peaks, tones: int, interval: float) -> list[str]:
+    found = []
+    if peaks.omega.size < tones:
+        found.append(
+            f"Only {peaks.omega.size} of {tones} tones stand out of the spectrum; the others may be noise, or tones "
+            f"closer than {peaks.resolution / (2 * np.pi):.4g} Hz: use fewer tones or a longer record."
+        )
+    highest = float(peaks.omega[:tones].max())
+    if highest > SUSPICIOUS * np.pi / interval:
+        found.append(
+            f"The tone at {highest / (2 * np.pi):.6g} Hz is close to the Nyquist frequency, {0.5 / interval:.6g} Hz: "
+            "it may be the image of a tone above it. A record with a shorter sampling interval would tell."
+        )
+    return found
+
+
+def _offset(samples: Array, weakest: float) -> float:
+    """Constant part, if it matters; a Hann window keeps the tones out of the mean."""
+    present = np.isfinite(samples)
+    window = np.where(present, np.sin(np.pi * (np.arange(samples.size) + 0.5) / samples.size) ** 2, 0.0)
+    mean = float(window @ np.where(present, samples, 0.0) / window.sum())
+    return mean if abs(mean) > HARMLESS_OFFSET * weakest else 0.0
+
+
+def _tones_sentence(peaks: Peaks, tones: int) -> str:
+    shown = np.sort(peaks.omega[:tones]) / (2.0 * np.pi)
+    names = ", ".join(f"{frequency:.5g}" for frequency in shown)
+    which = "The strongest tone" if shown.size == 1 else f"The {shown.size} strongest tones"
+    return f"{which} for most of the record: {names} Hz (median spectrum of segments of {peaks.segment:.4g} s)."
+
+
+def _preparation(offset: float, bridge: int, interval: float) -> list[str]:
+    found = []
+    if offset:
+        found.append(f"The mean, {offset:.4g}, is subtracted.")
+    if bridge:
+        found.append(f"Gaps of up to {bridge * interval:.3g} s are bridged by straight lines.")
+    return found
+
+
+def _choose_band(
+    samples: Array, interval: float, tones: int, peaks: Peaks, kind: str, bridge: int, gaps: bool
+) -> _Band:
+    wanted = peaks.omega[:tones]
+    low, top = float(wanted.min()), float(wanted.max())
+    weakest = float(peaks.amplitudes[:tones][-1])
+    if wanted.size < tones:
+        top += peaks.resolution
+    top = min(top, np.pi / interval / PASS)
+    loud = peaks.amplitudes[tones:] > HARMLESS * weakest
+    others, loudness = peaks.omega[tones:][loud], peaks.amplitudes[tones:][loud]
+
+    if kind in (Esprit.kind, NonlinearLeastSquares.kind):
+        per_period, most = WINDOW_SAMPLES, MOST_TONES
+    elif kind in (AdaptiveObserver.kind, FilterRegression.kind):
+        per_period, most = INTEGRATION_SAMPLES, tones + INTEGRATION_SPARES
+    else:
+        per_period, most = DELAY_SAMPLES, tones + DELAY_SPARES
+    factor = max(1, int(2.0 * np.pi / (per_period * top * interval)))
+    pass_edge = PASS * top
+    stop_edge = min(2.0 * np.pi / (factor * interval) - pass_edge, np.pi / interval)
+    above = others[others >= STOP * top]
+    if above.size:
+        stop_edge = min(stop_edge, float(above.min()))
+    sentences = []
+    weights = np.ones(1)
+    unfiltered = gaps and kind == NonlinearLeastSquares.kind and factor <= MOST_UNTHINNED
+    if unfiltered:
+        factor = 1
+    elif (factor > 1 or above.size) and stop_edge > pass_edge:
+        weights = low_pass(pass_edge, stop_edge, STOP_BAND, interval)
+        hertz = 2.0 * np.pi
+        text = (
+            f"A low-pass keeps what is below {pass_edge / hertz:.4g} Hz and stops what is above "
+            f"{stop_edge / hertz:.4g} Hz; it is {weights.size * interval:.3g} s long."
+        )
+        if factor > 1:
+            text += f" One of {factor} samples is kept, every {factor * interval:.4g} s."
+        sentences.append(text)
+        others, loudness = others[others < STOP * top], loudness[others < STOP * top]
+    high_pass = 2.0 * np.pi * (LOW_STOP_BAND - 7.95) / (2.285 * 2.0 * np.pi * (LOW_PASS - LOW_STOP) * low)
+    below = others <= LOW_PASS * low
+    if not unfiltered and below.any() and high_pass < HIGH_PASS_SHARE * samples.size * interval:
+        weights = without_low(weights, LOW_STOP * low, LOW_PASS * low, LOW_STOP_BAND, interval)
+        sentences.append(
+            f"A high-pass keeps away what is below {LOW_STOP * low / (2.0 * np.pi):.4g} Hz; "
+            f"it is {high_pass:.3g} s long."
+        )
+        reached = others <= LOW_STOP * low
+        others, loudness = others[~reached], loudness[~reached]
+    spares = others[: max(0, min(most, MOST_TONES) - tones)]
+    if spares.size:
+        names = ", ".join(f"{frequency:.5g}" for frequency in np.sort(spares) / (2.0 * np.pi))
+        sentences.append(f"Estimated too, since they disturb, but not shown: tones at {names} Hz.")
+    missing = tones - wanted.size
+    # Tones that the spectrum does not tell apart are somewhere beside the strongest one.
+    guessed = peaks.omega[0] + peaks.resolution / (missing + 1.0) * np.arange(1, missing + 1)
+    return _Band(
+        np.concatenate((wanted, guessed, spares)),
+        np.concatenate((peaks.amplitudes[:tones], np.full(missing, weakest), loudness[: spares.size])),
+        Decimation(weights, factor, bridge),
+        tuple(sentences),
+        peaks.resolution,
+    )
+
+
+def _choose_window(
+    thinned: Array, thin: float, tones: int, band: _Band, peaks: Peaks, kind: str, window: float | None
+) -> tuple[int, str]:
+    """Samples in a window, and why."""
+    count = band.expected.size
+    duration = thinned.size * thin
+    least = WINDOW_SAMPLES_PER_TONE * count
+    if window is not None:
+        length = round(window / thin)
+        if not least <= length <= thinned.size:
+            raise ValueError(
+                f"window must be between {least * thin:.4g} s, for {count} tones, and the {duration:.4g} s that the "
+                f"filters leave of the record, not {window:g}."
+            )
+        return length, f"Windows of {length * thin:.4g} s, as asked for."
+    closest = _closest(band.expected, tones)
+    lowest = closest >= float(band.expected[:tones].min()) * (1.0 - 1e-12)
+    of_what = "periods of the lowest tone" if lowest else "beats of the closest tones"
+    length = max(least, int(np.ceil(BEATS * 2.0 * np.pi / (closest * thin))))
+    if length >= LARGEST_SHARE * thinned.size:
+        length = thinned.size if length >= thinned.size else length
+        return length, (
+            f"Windows of {length * thin:.4g} s, "
+            + ("the whole record" if length == thinned.size else f"{BEATS:g} {of_what}")
+            + ": there is no room for longer ones."
+        )
+    estimator = _batch(kind, count)
+    best, best_share = length, -1.0
+    for _ in range(DOUBLINGS + 1):
+        if length > LARGEST_SHARE * thinned.size:
+            break
+        firsts = np.linspace(0, thinned.size - length, TRIALS).astype(int)
+        valid = [
+            estimate_window(estimator, thinned[k : k + length], thin, band.expected, tones).flags == 0 for k in firsts
+        ]
+        share = float(np.mean(valid))
+        if share > best_share:
+            best, best_share = length, share
+        if share >= CERTAIN_SHARE:
+            break
+        length *= 2
+    periods = best * thin * float(band.expected[:tones].min()) / (2.0 * np.pi)
+    if best_share >= CERTAIN_SHARE:
+        why = "the shortest tried in which the frequencies are certain"
+    else:
+        why = f"the best tried, though the frequencies are certain in only {100 * best_share:.0f} % of them"
+    return best, f"Windows of {best * thin:.4g} s, {periods:.3g} periods of the lowest tone: {why}."
+
+
+def _closest(expected: Array, tones: int) -> float:
+    """Smallest distance of a wanted tone from any other, and from zero [rad/s]."""
+    marks = np.concatenate(([0.0], expected))
+    distance = np.abs(expected[:tones, None] - marks)
+    distance[np.arange(tones), 1 + np.arange(tones)] = np.inf
+    return float(distance.min())
+
+
+def _batch(kind: str, tones: int) -> Any:
+    return NonlinearLeastSquares(tones=tones) if kind == NonlinearLeastSquares.kind else Esprit(tones=tones)
+
+
+def _estimator(kind: str, band: _Band, thin: float, length: int) -> tuple[Any, str]:
+    """The estimator, and a sentence about its options."""
+    tones = band.expected.size
+    if kind in (Esprit.kind, NonlinearLeastSquares.kind):
+        return _batch(kind, tones), ""
+    expected = np.sort(band.expected)
+    low, top = float(expected[0]), float(expected[-1])
+    window = length * thin
+    if kind == AdaptiveObserver.kind:
+        gap = 0.3 * float(np.diff(np.concatenate(([0.0], expected))).min())
+        ratio = min(1.2, (0.5 / (low * thin)) ** (1.0 / max(1, 2 * tones - 1)))
+        rate = min(0.1 * low, 3.0 / window)
+        return AdaptiveObserver(
+            tones=tones,
+            initial_frequencies=tuple(expected),
+            pole=low,
+            ratio=max(1.0, ratio),
+            rate=rate,
+            hold=2.0 * np.pi / low,
+            smallest_gap=gap,
+            lowest_frequency=0.1 * low,
+            highest_frequency=2.0 * top,
+        ), f"Slowest pole {low:.4g} rad/s, adaptation rate {rate:.4g} 1/s; it starts from the spectrum's frequencies."
+    if kind == FilterRegression.kind:
+        pole = float(np.sqrt(low * top))
+        return FilterRegression(
+            tones=tones, pole=pole, forgetting=2.0 / window, initial_frequencies=tuple(expected), hold=0.5 * window
+        ), f"Filter pole {pole:.4g} rad/s, the middle of the tones; data older than {0.5 * window:.4g} s are forgotten."
+    lag = max(1, round(DELAY_ANGLE / (top * thin)))
+    if lag * thin * top >= np.pi:
+        lag -= 1
+    h = max(1, lag) * thin
+    common: dict[str, Any] = {"tones": tones, "h": h, "prefilter": PREFILTER_DELAYS * h}
+    told = f"Delay h = {h:.4g} s ({h * top:.3g} rad of the highest tone), prefilter {PREFILTER_DELAYS * h:.4g} s"
+    if kind == RestartingLeastSquares.kind:
+        return RestartingLeastSquares(**common, memory=window), f"{told}, memory {window:.4g} s."
+    spacing, square = _best_spacing(band.expected, band.amplitudes, h, thin)
+    told += f", rows d = {spacing:.4g} s apart"
+    if kind == DremWindow.kind:
+        return DremWindow(**common, d=spacing, memory=window, first_row=0), f"{told}, window {window:.4g} s."
+    rate = 5.0 / window
+    options = {**common, "d": spacing, "epsilon": float(square**-0.5), "gamma": rate, "first_row": 0}
+    options["initial_frequencies"] = tuple(expected)
+    told += f", gain for a rate of {rate:.4g} 1/s."
+    return (DremGradient if kind == DremGradient.kind else DremFiniteTime)(**options), told
+
+
+def _best_spacing(omega: Array, amplitudes: Array, h: float, thin: float) -> tuple[float, float]:
+    """Distance of the stacked rows for which their determinant is largest, and its mean square."""
+    n = omega.size
+    c = np.cos(omega * h)
+    factor = 2.0 ** (n * n) * np.prod([c[i] - c[j] for i in range(n) for j in range(i + 1, n)])
+    # Phases spread evenly over all their combinations.
+    phases = 2.0 * np.pi * np.mod(np.outer(np.arange(1, 401), np.sqrt([2, 3, 5, 7, 11, 13, 17, 19][:n])), 1.0)
+    best = (thin, 0.0)
+    for spacing in np.unique(np.maximum(1, np.round(np.linspace(0.3, 2.0, 18) * h / thin))) * thin:
+        rows = np.arange(n)[:, None] * spacing * omega
+        parts = amplitudes * np.sin(phases[:, None, :] - rows)
+        square = float(np.mean((factor * np.linalg.det(parts)) ** 2))
+        if square > best[1]:
+            best = (float(spacing), square)
+    return best

@@ -1,0 +1,391 @@
+r"""From the parameters of the delay regression to frequencies, and how far an error of the one moves the other.
+
+``prod(c - c_i) = c^n + theta_1 c^(n-1) + ... + theta_n`` has the roots ``c_i = cos(w_i h)``, real and within [-1, 1] if
+theta belongs to sinusoids at all. Noise can move a pair of roots off the real axis, or a root out of the interval.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from ctid_cli.filtering.sections import polynomial_roots, time_scale
+from ctid_cli.frequency.flags import CERTAIN_FRACTION, COMPLEX_ROOTS, OUT_OF_BOUNDS, UNCERTAIN, Flag
+
+Array = NDArray[np.float64]
+
+#: A root must settle within this many Newton steps; simple roots need fewer than ten.
+NEWTON_STEPS = 60
+#: Keeps a division from overflowing.
+TINY = 1e-30
+
+
+@njit(cache=True, nogil=True)
+def real_roots(coefficients: Array, work: Array, roots: Array) -> bool:
+    """Roots of a monic polynomial whose roots are all real, largest first.
+
+    Parameters
+    ----------
+    coefficients : ndarray, shape (n + 1,)
+        Monic, descending powers.
+    work : ndarray, shape (n + 1,)
+        Work space.
+    roots : ndarray, shape (n,)
+        Receives the roots.
+
+    Returns
+    -------
+    bool
+        Whether n real roots were found; if not, `roots` holds nothing of use.
+
+    Notes
+    -----
+    Right of its largest root a polynomial with only real roots is convex and increasing, so Newton's iteration from the
+    Samuelson bound falls monotonically on the largest root. It is divided out, the last two roots come from the
+    quadratic formula, and each root is polished on the undivided polynomial. A step that rises shows complex roots.
+    """
+    n = roots.size
+    for k in range(n + 1):
+        work[k] = coefficients[k]
+    degree = n
+    found = 0
+    while degree > 2:
+        spread = (degree - 1.0) ** 2 * work[1] * work[1] - 2.0 * degree * (degree - 1.0) * work[2]
+        if not spread >= 0.0:
+            return False
+        x = (-work[1] + np.sqrt(spread)) / degree
+        settled = False
+        for _ in range(NEWTON_STEPS):
+            value, slope = 1.0, 0.0
+            for k in range(1, degree + 1):
+                slope = slope * x + value
+                value = value * x + work[k]
+            if value == 0.0:
+                settled = True
+                break
+            if not slope > 0.0:
+                return False
+            change = value / slope
+            if abs(change) <= 1e-13 * (abs(x) + 1e-3):
+                x -= change
+                settled = True
+                break
+            if change < 0.0:
+                # Rounding may carry the iteration just beyond a root, but no further.
+                settled = abs(change) <= 1e-6 * (abs(x) + 1e-3)
+                x -= change
+                break
+            x -= change
+        if not settled:
+            return False
+        roots[found] = x
+        found += 1
+        for k in range(1, degree):
+            work[k] += x * work[k - 1]
+        degree -= 1
+    if degree == 1:
+        roots[found] = -work[1]
+        return True
+    half = -0.5 * work[1]
+    discriminant = half * half - work[2]
+    if not discriminant >= 0.0:
+        return False
+    large = half - np.sqrt(discriminant) if half < 0.0 else half + np.sqrt(discriminant)
+    other = work[2] / large if large != 0.0 else 0.0
+    roots[found] = max(large, other)
+    roots[found + 1] = min(large, other)
+    if n > 2:
+        for i in range(n):
+            gap = np.inf
+            if i > 0:
+                gap = abs(roots[i - 1] - roots[i])
+            if i < n - 1:
+                gap = min(gap, abs(roots[i] - roots[i + 1]))
+            for _ in range(2):
+                value, slope = 1.0, 0.0
+                for k in range(1, n + 1):
+                    slope = slope * roots[i] + value
+                    value = value * roots[i] + coefficients[k]
+                if not abs(value) < 1e-3 * gap * abs(slope):
+                    break
+                roots[i] -= value / slope
+    return True
+
+
+@njit(cache=True, nogil=True)
+def root_real_parts(coefficients: Array, work: Array, roots: Array) -> bool:
+    """Real parts of the roots of any monic polynomial, largest first.
+
+    Parameters
+    ----------
+    coefficients : ndarray, shape (n + 1,)
+        Monic, descending powers.
+    work : ndarray, shape (n + 1,)
+        Work space.
+    roots : ndarray, shape (n,)
+        Receives the real parts.
+
+    Returns
+    -------
+    bool
+        Whether all roots are real.
+    """
+    n = roots.size
+    if real_roots(coefficients, work, roots):
+        return True
+    if n == 2:
+        roots[0] = roots[1] = -0.5 * coefficients[1]
+        return False
+    scale = time_scale(coefficients)
+    factor = 1.0
+    for k in range(n + 1):
+        work[k] = coefficients[k] * factor
+        factor /= scale
+    raw = polynomial_roots(work)
+    all_real = True
+    for i in range(n):
+        value = raw[i].real * scale
+        all_real = all_real and raw[i].imag == 0.0
+        place = i
+        while place > 0 and roots[place - 1] < value:
+            roots[place] = roots[place - 1]
+            place -= 1
+        roots[place] = value
+    return all_real
+
+
+@njit(cache=True, nogil=True)
+def decode(
+    theta: Array, delay: float, top: float, bottom: float, polynomial: Array, work: Array, roots: Array, omega: Array
+) -> int:
+    """Frequencies that belong to the parameters of the delay regression, ascending.
+
+    Parameters
+    ----------
+    theta : ndarray, shape (n,)
+        Parameters [-].
+    delay : float
+        Delay h that the regression really used [s].
+    top, bottom : float
+        Cosines of the lowest and of the highest frequency times the delay.
+    polynomial, work : ndarray, shape (n + 1,)
+        Work space.
+    roots : ndarray, shape (n,)
+        Receives the cosines within the bounds, descending.
+    omega : ndarray, shape (n,)
+        Receives the frequencies [rad/s], ascending.
+
+    Returns
+    -------
+    int
+        Flags: complex roots (their real parts were used), frequencies put on a bound.
+    """
+    n = theta.size
+    polynomial[0] = 1.0
+    for k in range(n):
+        if not np.isfinite(theta[k]):
+            for i in range(n):
+                roots[i] = omega[i] = np.nan
+            return COMPLEX_ROOTS
+        polynomial[k + 1] = theta[k]
+    flags = 0 if root_real_parts(polynomial, work, roots) else COMPLEX_ROOTS
+    for i in range(n):
+        if roots[i] > top:
+            roots[i] = top
+            flags |= OUT_OF_BOUNDS
+        elif roots[i] < bottom:
+            roots[i] = bottom
+            flags |= OUT_OF_BOUNDS
+        omega[i] = np.arccos(roots[i]) / delay
+    return flags
+
+
+@njit(cache=True, nogil=True)
+def root_sensitivities(roots: Array, slopes: Array, out: Array) -> None:
+    """Derivatives of the frequencies with respect to the coefficients of their polynomial.
+
+    Parameters
+    ----------
+    roots : ndarray, shape (n,)
+        Roots of ``x^n + theta_1 x^(n-1) + ... + theta_n``.
+    slopes : ndarray, shape (n,)
+        Derivative of each frequency with respect to its root.
+    out : ndarray, shape (n, n)
+        Receives ``d omega_i/d theta_k``: a coefficient moves a root by ``-x^(n-k)/P'(x)``. Infinite for a double root.
+    """
+    n = roots.size
+    for i in range(n):
+        slope = 1.0
+        for j in range(n):
+            if j != i:
+                slope *= roots[i] - roots[j]
+        factor = -slopes[i] / slope if slope != 0.0 else np.inf
+        for k in range(n - 1, -1, -1):
+            out[i, k] = factor
+            factor *= roots[i]
+
+
+@njit(cache=True, nogil=True)
+def cosine_sensitivities(roots: Array, delay: float, slopes: Array, out: Array) -> None:
+    """Derivatives of the frequencies with respect to the parameters of the delay regression.
+
+    Parameters
+    ----------
+    roots : ndarray, shape (n,)
+        Cosines.
+    delay : float
+        Delay h [s].
+    slopes : ndarray, shape (n,)
+        Work space.
+    out : ndarray, shape (n, n)
+        Receives ``d omega_i/d theta_k`` [rad/s].
+    """
+    for i in range(roots.size):
+        square = 1.0 - roots[i] * roots[i]
+        slopes[i] = -1.0 / (delay * np.sqrt(square)) if square > 0.0 else -np.inf
+    root_sensitivities(roots, slopes, out)
+
+
+@njit(cache=True, nogil=True)
+def room_of(omega: Array, place: int) -> float:
+    """How far a frequency can be wrong before it is another one.
+
+    Parameters
+    ----------
+    omega : ndarray, shape (n,)
+        Frequencies [rad/s], ascending.
+    place : int
+        Which of them.
+
+    Returns
+    -------
+    float
+        The frequency itself or the distance to a neighbour, whichever is least [rad/s].
+    """
+    room = omega[place]
+    if place > 0:
+        room = min(room, omega[place] - omega[place - 1])
+    if place + 1 < omega.size:
+        room = min(room, omega[place + 1] - omega[place])
+    return float(room)
+
+
+@njit(cache=True, nogil=True)
+def propagate(sensitivities: Array, errors: Array, out: Array) -> None:
+    """Largest errors of the frequencies that given errors of the parameters can make.
+
+    Parameters
+    ----------
+    sensitivities : ndarray, shape (n, n)
+        ``d omega_i/d theta_k`` [rad/s].
+    errors : ndarray, shape (n,)
+        Absolute errors of the parameters.
+    out : ndarray, shape (n,)
+        Receives ``sum_k |d omega_i/d theta_k| errors_k`` [rad/s].
+    """
+    for i in range(out.size):
+        total = 0.0
+        for k in range(errors.size):
+            total += abs(sensitivities[i, k]) * errors[k]
+        out[i] = total
+
+
+@njit(cache=True, nogil=True)
+def still_doubtful(omega: Array, quiet: float) -> bool:
+    """Whether an estimate was uncertain less than a period, or a beat, ago.
+
+    Parameters
+    ----------
+    omega : ndarray, shape (n,)
+        Frequencies [rad/s], ascending.
+    quiet : float
+        Time since it was uncertain [s].
+
+    Returns
+    -------
+    bool
+        True if so: the misfit of other signals vanishes for a while in every beat.
+    """
+    least = np.inf
+    for i in range(omega.size):
+        least = min(least, room_of(omega, i))
+    return bool(not quiet * least >= 2.0 * np.pi)
+
+
+@njit(cache=True, nogil=True)
+def flag_uncertain(omega: Array, uncertainty: Array, rounding: Array, span: float) -> int:
+    """Compare what may be wrong with a frequency with the frequency itself and with the distance to its neighbours.
+
+    Parameters
+    ----------
+    omega : ndarray, shape (n,)
+        Frequencies [rad/s], ascending.
+    uncertainty : ndarray, shape (n,)
+        Possible errors as the misfit shows them [rad/s]; in place enlarged if the data are short, and by rounding.
+    rounding : ndarray, shape (n,)
+        Possible errors by rounding [rad/s].
+    span : float
+        Time from the first to the last sample that the estimate rests on [s].
+
+    Returns
+    -------
+    int
+        The flag, or 0.
+
+    Notes
+    -----
+    Within a part of a period, or of the beat of two neighbours, a bias, a drift or another tone hardly differs from a
+    change of the frequencies, and hardly shows as a misfit. Measured errors grow like the fifth power of the missing
+    part: the possible error is multiplied by ``(period/span)^5``.
+    """
+    flag = 0
+    for i in range(omega.size):
+        room = room_of(omega, i)
+        if room * span < 2.0 * np.pi:
+            short = 2.0 * np.pi / max(room * span, TINY)
+            uncertainty[i] *= short * short * short * short * short
+        uncertainty[i] += rounding[i]
+        if not uncertainty[i] <= CERTAIN_FRACTION * room:
+            flag = UNCERTAIN
+    return flag
+
+
+def frequencies_of(
+    theta: ArrayLike, delay: float, *, lowest: float = 0.0, highest: float | None = None
+) -> tuple[Array, Flag]:
+    """Frequencies that belong to the parameters of the delay regression.
+
+    Parameters
+    ----------
+    theta : array_like, shape (n,)
+        Parameters [-].
+    delay : float
+        Delay h [s].
+    lowest : float, default 0.0
+        Lower bound of the frequencies [rad/s].
+    highest : float, optional
+        Upper bound [rad/s]; by default pi/h, beyond which frequencies cannot be told apart.
+
+    Returns
+    -------
+    omega : ndarray, shape (n,)
+        Frequencies [rad/s], ascending.
+    flags : Flag
+        What is wrong with them.
+
+    Examples
+    --------
+    >>> omega, flags = frequencies_of([0.3349, -0.0858], 0.7)
+    >>> omega.round(3), flags == 0
+    (array([2., 3.]), True)
+    >>> frequencies_of([0.0, 0.5], 0.7)[1].sentences
+    ('The estimated parameters belong to no set of real frequencies.',)
+    """
+    values = np.ascontiguousarray(theta, dtype=float)
+    n = values.size
+    omega, roots = np.empty(n), np.empty(n)
+    top = float(np.cos(lowest * delay))
+    bottom = -1.0 if highest is None else float(np.cos(highest * delay))
+    flags = decode(values, float(delay), top, bottom, np.empty(n + 1), np.empty(n + 1), roots, omega)
+    return omega, Flag(flags)

@@ -1,0 +1,156 @@
+"""Options that all estimators on the delay regression share, and what they mean at a sampling interval."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.frequency.consistency import second_lag
+from ctid_cli.frequency.prefilter import impulse_response
+from ctid_cli.frequency.regression import MOST_TONES, delay_table, whole_delay
+from ctid_cli.frequency.tracking import OnlineEstimator
+from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
+
+Array = NDArray[np.float64]
+
+#: A delay that rounding to whole sampling intervals changes by a larger fraction is worth a note.
+NOTEWORTHY_ROUNDING = 0.01
+
+
+@dataclass(frozen=True)
+class DelayClock:
+    """The delay regression at a sampling interval.
+
+    Parameters
+    ----------
+    lag, second_lag : int
+        Delay h, and the delay of the check against aliases, in sampling intervals.
+    delay, second_delay : float
+        The same [s].
+    top, bottom : float
+        Cosines of the lowest and of the highest frequency times h [-].
+    table : ndarray, shape (n + 1, 2 n + 1)
+        Coefficients of the regression.
+    weights : ndarray, shape (L + 1,)
+        Impulse response of the prefilter.
+    notes : tuple of str
+        Sentences about rounding.
+    """
+
+    lag: int
+    second_lag: int
+    delay: float
+    second_delay: float
+    top: float
+    bottom: float
+    table: Array
+    weights: Array
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DelayRegression(OnlineEstimator):
+    """Options of an estimator on the delay regression.
+
+    Parameters
+    ----------
+    tones : int
+        Number of sinusoids n, 1 to 8.
+    h : float
+        Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals.
+    prefilter : float, default 0.0
+        Length of a Hann low-pass in front of the regression [s]; 0 for none.
+    difference : float, default 0.0
+        If positive, the signal this much earlier is subtracted [s], which removes a constant bias.
+    lowest_frequency : float, default 0.0
+        Lower bound of the frequencies [rad/s].
+    highest_frequency : float, optional
+        Upper bound of the frequencies [rad/s]; by default pi/h, beyond which they cannot be told apart.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+    """
+
+    tones: int = field(metadata={"doc": "Number of sinusoids, 1 to 8"})
+    h: float = field(metadata={"doc": "Delay of the regression, below pi over the highest frequency", "unit": "s"})
+    prefilter: float = field(
+        default=0.0, metadata={"doc": "Length of a Hann low-pass in front of the regression, 0 for none", "unit": "s"}
+    )
+    difference: float = field(
+        default=0.0, metadata={"doc": "Subtract the signal this much earlier, against a bias; 0 for not", "unit": "s"}
+    )
+    lowest_frequency: float = field(default=0.0, metadata={"doc": "Lower bound of the frequencies", "unit": "rad/s"})
+    highest_frequency: float | None = field(
+        default=None, metadata={"doc": "Upper bound of the frequencies; pi/h if not given", "unit": "rad/s"}
+    )
+
+    def __post_init__(self) -> None:
+        require_integer("tones", self.tones, 1, MOST_TONES)
+        require_positive("h", self.h, "s")
+        require_not_negative("prefilter", self.prefilter, "s")
+        require_not_negative("difference", self.difference, "s")
+        require_not_negative("lowest_frequency", self.lowest_frequency, "rad/s")
+        if self.highest_frequency is not None:
+            require_positive("highest_frequency", self.highest_frequency, "rad/s")
+        self._check_bounds(self.h)
+
+    def clock(self, interval: float) -> DelayClock:
+        """The regression at a sampling interval.
+
+        Parameters
+        ----------
+        interval : float
+            Sampling interval [s].
+
+        Returns
+        -------
+        DelayClock
+            Delays in whole intervals, bounds and tables.
+
+        Raises
+        ------
+        ValueError
+            If a delay is too short or too long at this interval.
+        """
+        lag = whole_delay("h", self.h, interval)
+        delay = lag * interval
+        highest = self._check_bounds(delay)
+        notes = []
+        if abs(delay - self.h) > NOTEWORTHY_ROUNDING * self.h:
+            notes.append(
+                f"h = {self.h:g} s is no whole number of sampling intervals of {interval:g} s; {delay:g} s is used."
+            )
+        if self.difference > 0:
+            whole_delay("difference", self.difference, interval)
+        second = second_lag(lag)
+        return DelayClock(
+            lag,
+            second,
+            delay,
+            second * interval,
+            float(np.cos(self.lowest_frequency * delay)),
+            float(np.cos(highest * delay)),
+            delay_table(self.tones).astype(float),
+            impulse_response(self.prefilter, self.difference, interval),
+            tuple(notes),
+        )
+
+    def _check_bounds(self, delay: float) -> float:
+        """Upper bound of the frequencies at a delay [s], if the bounds make sense."""
+        unique = np.pi / delay
+        highest = unique if self.highest_frequency is None else float(self.highest_frequency)
+        if highest > unique * (1.0 + 1e-12):
+            raise ValueError(
+                f"with h = {delay:g} s, frequencies above pi/h = {unique:g} rad/s are seen as lower ones, but "
+                f"highest_frequency is {highest:g} rad/s; use an h below {np.pi / highest:g} s."
+            )
+        if self.lowest_frequency >= highest:
+            raise ValueError(
+                f"lowest_frequency ({self.lowest_frequency:g} rad/s) must be below highest_frequency "
+                f"({highest:g} rad/s)."
+            )
+        return min(highest, unique)

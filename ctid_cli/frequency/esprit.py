@@ -1,0 +1,153 @@
+"""Frequencies of a whole record by ESPRIT: estimation of signal parameters via rotational invariance techniques."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.frequency.amplitudes import frequency_errors, present_samples
+from ctid_cli.frequency.decoding import flag_uncertain
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.regression import MOST_TONES
+from ctid_cli.frequency.tracking import FrequencyEstimate
+from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
+
+Array = NDArray[np.float64]
+
+#: Rows of the Hankel matrix as a fraction of the samples, and the largest number of them.
+ROWS_FRACTION = 0.4
+MOST_ROWS = 400
+#: Singular values below this fraction of the largest are rounding.
+RANK_TOLERANCE = 1e-11
+
+
+@dataclass(frozen=True, kw_only=True)
+class Esprit:
+    r"""Frequencies of a whole record by ESPRIT, a reference for the online estimators.
+
+    Parameters
+    ----------
+    tones : int
+        Number of sinusoids n, 1 to 8.
+    averaging : float, default 0.0
+        Blocks of this length are averaged first [s], so that some hundred samples are left; 0 for none. Frequencies
+        must lie below pi over this time.
+    lowest_frequency : float, default 0.0
+        Lower bound of the frequencies [rad/s].
+    highest_frequency : float, optional
+        Upper bound of the frequencies [rad/s]; by default pi over the interval of the averages.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+
+    Notes
+    -----
+    The Hankel matrix of a sum of n sinusoids has rank 2 n, and its column space U satisfies ``U_down = U_up F``, where
+    F has the eigenvalues ``exp(+-j w_i T)``. F is found by least squares from the leading left singular vectors.
+
+    References
+    ----------
+    R. Roy and T. Kailath, "ESPRIT - estimation of signal parameters via rotational invariance techniques", *IEEE Trans.
+    Acoustics, Speech, and Signal Processing* 37 (1989) 984-995. doi:10.1109/29.32276
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli.frequency import Esprit
+    >>> t = 0.01 * np.arange(1000)
+    >>> estimate = Esprit(tones=2, averaging=0.05).estimate(np.sin(2 * t) + np.cos(3 * t), 0.01)
+    >>> estimate.omega.round(9), estimate.valid
+    (array([2., 3.]), True)
+    """
+
+    kind: ClassVar[str] = "esprit"
+    online: ClassVar[bool] = False
+
+    tones: int = field(metadata={"doc": "Number of sinusoids, 1 to 8"})
+    averaging: float = field(default=0.0, metadata={"doc": "Blocks that are averaged first, 0 for none", "unit": "s"})
+    lowest_frequency: float = field(default=0.0, metadata={"doc": "Lower bound of the frequencies", "unit": "rad/s"})
+    highest_frequency: float | None = field(
+        default=None, metadata={"doc": "Upper bound of the frequencies", "unit": "rad/s"}
+    )
+
+    def __post_init__(self) -> None:
+        require_integer("tones", self.tones, 1, MOST_TONES)
+        require_not_negative("averaging", self.averaging, "s")
+        require_not_negative("lowest_frequency", self.lowest_frequency, "rad/s")
+        if self.highest_frequency is not None:
+            require_positive("highest_frequency", self.highest_frequency, "rad/s")
+
+    def estimate(self, samples: ArrayLike, interval: float) -> FrequencyEstimate:
+        """Estimate the frequencies of a record.
+
+        Parameters
+        ----------
+        samples : array_like, shape (N,)
+            Signal on a regular clock, without gaps [signal unit].
+        interval : float
+            Sampling interval [s].
+
+        Returns
+        -------
+        FrequencyEstimate
+            The frequencies.
+
+        Raises
+        ------
+        DataError
+            If samples are missing, or too few are there.
+        ValueError
+            If the bounds do not fit to the averaging.
+        """
+        y, t = present_samples(samples, interval)
+        if y.size < np.asarray(samples).size:
+            raise DataError(
+                "ESPRIT needs a record without missing samples; nonlinear_least_squares takes one with gaps."
+            )
+        n = self.tones
+        block = max(1, round(self.averaging / interval))
+        highest = np.pi / (block * interval)
+        if self.highest_frequency is not None:
+            if self.highest_frequency > highest * (1.0 + 1e-12):
+                raise ValueError(
+                    f"averages over {block * interval:g} s show frequencies up to {highest:g} rad/s, but "
+                    f"highest_frequency is {self.highest_frequency:g} rad/s; use an averaging below "
+                    f"{np.pi / self.highest_frequency:g} s."
+                )
+            highest = self.highest_frequency
+        averages = y[: y.size // block * block].reshape(-1, block).mean(axis=1)
+        rows = min(int(ROWS_FRACTION * averages.size), MOST_ROWS)
+        if rows < 2 * n + 1:
+            raise DataError(
+                f"{averages.size} samples, after the averaging, are too few for {n} tones; use a longer record or a "
+                "shorter averaging."
+            )
+        hankel = np.lib.stride_tricks.sliding_window_view(averages, averages.size - rows + 1)
+        vectors, singular_values, _ = np.linalg.svd(hankel, full_matrices=False)
+        flags = Flag(0)
+        if not singular_values[2 * n - 1] > RANK_TOLERANCE * singular_values[0]:
+            flags |= Flag.UNDETERMINED
+        basis = vectors[:, : 2 * n]
+        rotations = np.linalg.eigvals(np.linalg.lstsq(basis[:-1], basis[1:], rcond=None)[0])
+        angles = np.sort(np.angle(rotations[np.imag(rotations) > 0]))
+        if angles.size < n:
+            # Real eigenvalues: a constant, an alternating or a vanishing part instead of a sinusoid.
+            flags |= Flag.COMPLEX_ROOTS
+            angles = np.sort(np.abs(np.angle(rotations)))[::2]
+        omega = angles / (block * interval)
+        bounded = np.clip(omega, self.lowest_frequency, highest)
+        if (bounded != omega).any():
+            flags |= Flag.OUT_OF_BOUNDS
+        try:
+            uncertainty = frequency_errors(y, t, bounded, bias=False)[1]
+        except DataError:
+            uncertainty = np.full(n, np.nan)
+            flags |= Flag.UNDETERMINED
+        flags |= Flag(flag_uncertain(bounded, uncertainty, np.zeros(n), float(t[-1] - t[0])))
+        return FrequencyEstimate(bounded, flags, uncertainty)

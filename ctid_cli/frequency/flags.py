@@ -1,0 +1,73 @@
+"""Why an estimate must not be trusted, one bit for each reason."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+
+#: Frequencies are called certain while the error that the misfit of the equations can make stays below this fraction of
+#: the frequency itself and of the distance to its neighbours.
+CERTAIN_FRACTION = 0.1
+
+
+class Flag(IntFlag):
+    """Reasons for which an estimate is marked invalid; an estimate is valid exactly if it has none.
+
+    Notes
+    -----
+    Tracks store the flags as unsigned 16-bit integers; ``track.flags & Flag.GAP`` selects one reason.
+    """
+
+    STARTING = 1
+    GAP = 2
+    CHANGED = 4
+    UNDETERMINED = 8
+    UNCERTAIN = 16
+    COMPLEX_ROOTS = 32
+    OUT_OF_BOUNDS = 64
+    INCONSISTENT = 128
+    NOT_CONVERGED = 256
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """One sentence for each flag that is set: what happened, and what to change."""
+        return tuple(MEANINGS[flag] for flag in Flag if flag in self)
+
+
+#: What each flag tells the user.
+MEANINGS: dict[Flag, str] = {
+    Flag.STARTING: "Too few samples have arrived since the start or since the last restart.",
+    Flag.GAP: "A sample that the estimate needs at this instant is missing or not finite.",
+    Flag.CHANGED: (
+        "The signal changed: the estimate is held until every sample from before the change has left the delays."
+    ),
+    Flag.UNDETERMINED: (
+        "The samples do not determine as many frequencies as asked for: "
+        "the signal is zero, constant or has fewer tones, or two of its tones look alike at this delay; "
+        "use fewer tones."
+    ),
+    Flag.UNCERTAIN: (
+        "The equations hold so badly or determine so little that a frequency may be wrong by a tenth of itself or of "
+        "the distance to the next one; the signal has noise, a bias or more tones than the model: "
+        "use a prefilter, more tones or a longer record."
+    ),
+    Flag.COMPLEX_ROOTS: "The estimated parameters belong to no set of real frequencies.",
+    Flag.OUT_OF_BOUNDS: (
+        "A frequency lies outside the bounds lowest_frequency and highest_frequency and was put on the bound."
+    ),
+    Flag.INCONSISTENT: (
+        "The frequencies do not explain the signal at a second delay: a tone above pi/h is seen as another one "
+        "(use a smaller h), or the estimate is still inexact or lags behind a change."
+    ),
+    Flag.NOT_CONVERGED: "The iterations did not converge; start closer, or use a longer record.",
+}
+
+# The bits as plain integers, as compiled code wants them.
+STARTING = int(Flag.STARTING)
+GAP = int(Flag.GAP)
+CHANGED = int(Flag.CHANGED)
+UNDETERMINED = int(Flag.UNDETERMINED)
+UNCERTAIN = int(Flag.UNCERTAIN)
+COMPLEX_ROOTS = int(Flag.COMPLEX_ROOTS)
+OUT_OF_BOUNDS = int(Flag.OUT_OF_BOUNDS)
+INCONSISTENT = int(Flag.INCONSISTENT)
+NOT_CONVERGED = int(Flag.NOT_CONVERGED)

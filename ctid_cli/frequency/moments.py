@@ -1,0 +1,198 @@
+"""Least squares from accumulated second moments, and how certain its result is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Second moments summed over many samples carry relative errors of about this size.
+ROUNDING = 4e-15
+
+
+@njit(cache=True, nogil=True)
+def accumulate_row(row: Array, gram: Array, keep: float) -> None:
+    """Add a row to the lower triangle of second moments that forget.
+
+    Parameters
+    ----------
+    row : ndarray, shape (q,)
+        Row.
+    gram : ndarray, shape (q, q)
+        Second moments; only the lower triangle is kept.
+    keep : float
+        Factor on what was there before.
+    """
+    for i in range(row.size):
+        for j in range(i + 1):
+            gram[i, j] = keep * gram[i, j] + row[i] * row[j]
+
+
+@njit(cache=True, nogil=True)
+def squared_residual(gram: Array, theta: Array) -> float:
+    """Sum of the squared residuals ``psi - phi' theta``.
+
+    Parameters
+    ----------
+    gram : ndarray, shape (n + 1, n + 1)
+        Second moments of ``[phi psi]``, lower triangle.
+    theta : ndarray, shape (n,)
+        Parameters.
+
+    Returns
+    -------
+    float
+        Not negative.
+    """
+    n = theta.size
+    total = gram[n, n]
+    for i in range(n):
+        total -= 2.0 * theta[i] * gram[n, i]
+        for j in range(i):
+            total += 2.0 * theta[i] * theta[j] * gram[i, j]
+        total += theta[i] * theta[i] * gram[i, i]
+    return float(max(total, 0.0))
+
+
+@njit(cache=True, nogil=True)
+def factorise(gram: Array, ridge: float, factor: Array, scales: Array) -> bool:
+    """Cholesky factor of the regressors' second moments, scaled to a unit diagonal.
+
+    Parameters
+    ----------
+    gram : ndarray, shape (n + 1, n + 1)
+        Second moments of ``[phi psi]``, lower triangle.
+    ridge : float
+        Added to the unit diagonal.
+    factor : ndarray, shape (n, n)
+        Receives the lower factor.
+    scales : ndarray, shape (n,)
+        Receives the square roots of the diagonal.
+
+    Returns
+    -------
+    bool
+        Whether the moments are positive definite beyond rounding.
+    """
+    n = scales.size
+    for i in range(n):
+        scales[i] = np.sqrt(gram[i, i])
+        if not (np.isfinite(scales[i]) and scales[i] > 0.0):
+            return False
+    for i in range(n):
+        for j in range(i + 1):
+            total = gram[i, j] / (scales[i] * scales[j])
+            if i == j:
+                total += ridge
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i == j:
+                if not total > 4e-16 * n:
+                    return False
+                factor[i, i] = np.sqrt(total)
+            else:
+                factor[i, j] = total / factor[j, j]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def substitute(factor: Array, values: Array) -> None:
+    """Solve ``L L' x = b`` in place.
+
+    Parameters
+    ----------
+    factor : ndarray, shape (n, n)
+        Lower factor L.
+    values : ndarray, shape (n,)
+        b, replaced by x.
+    """
+    n = values.size
+    for i in range(n):
+        total = values[i]
+        for k in range(i):
+            total -= factor[i, k] * values[k]
+        values[i] = total / factor[i, i]
+    for i in range(n - 1, -1, -1):
+        total = values[i]
+        for k in range(i + 1, n):
+            total -= factor[k, i] * values[k]
+        values[i] = total / factor[i, i]
+
+
+@njit(cache=True, nogil=True)
+def least_squares(gram: Array, factor: Array, scales: Array, theta: Array) -> None:
+    """Least-squares parameters from second moments and their factor.
+
+    Parameters
+    ----------
+    gram : ndarray, shape (n + 1, n + 1)
+        Second moments of ``[phi psi]``, lower triangle.
+    factor : ndarray, shape (n, n)
+        From :func:`factorise`.
+    scales : ndarray, shape (n,)
+        From :func:`factorise`.
+    theta : ndarray, shape (n,)
+        Receives the parameters.
+    """
+    n = theta.size
+    for i in range(n):
+        theta[i] = gram[n, i] / scales[i]
+    substitute(factor, theta)
+    for i in range(n):
+        theta[i] /= scales[i]
+
+
+@njit(cache=True, nogil=True)
+def moment_uncertainty(
+    gram: Array,
+    factor: Array,
+    scales: Array,
+    misfit: float,
+    theta: Array,
+    sensitivities: Array,
+    uncertainty: Array,
+    rounding: Array,
+) -> None:
+    r"""Error that the misfit of the equations would make if all of it lay in the worst direction.
+
+    Parameters
+    ----------
+    gram : ndarray, shape (n + 1, n + 1)
+        Second moments of ``[phi psi]``, lower triangle.
+    factor, scales : ndarray, shapes (n, n), (n,)
+        From :func:`factorise`.
+    misfit : float
+        Sum of squared residuals that may move the estimate.
+    theta : ndarray, shape (n,)
+        Parameters.
+    sensitivities : ndarray, shape (n, n)
+        ``g_ik = d omega_i/d theta_k`` [rad/s].
+    uncertainty : ndarray, shape (n,)
+        Receives the possible error of each frequency by the misfit [rad/s].
+    rounding : ndarray, shape (n,)
+        Receives that by rounding [rad/s].
+
+    Notes
+    -----
+    Residuals e at the true parameters move the estimate by ``G^-1 Phi' e`` and a frequency by at most
+    ``sqrt(g' G^-1 g e'e)`` (Cauchy-Schwarz), whatever the e: noise, a bias, another tone. The residual left by
+    the fit stands for ``e'e``; as a difference of moments it is known up to rounding only, and taken for no less. Rounding
+    of G moves a frequency by up to ``|G^-1 g|`` times the rounding errors.
+    """
+    n = theta.size
+    size = np.sqrt(gram[n, n])
+    for k in range(n):
+        size += abs(theta[k]) * scales[k]
+    direction = np.empty(n)
+    for i in range(n):
+        for k in range(n):
+            direction[k] = sensitivities[i, k] / scales[k]
+        substitute(factor, direction)
+        square, length = 0.0, 0.0
+        for k in range(n):
+            square += direction[k] * sensitivities[i, k] / scales[k]
+            length += abs(direction[k])
+        uncertainty[i] = np.sqrt(max(square, 0.0) * max(misfit, ROUNDING * size * size))
+        rounding[i] = ROUNDING * size * length

@@ -1,0 +1,167 @@
+"""The tones that stand out of a record's spectrum: where to look before anything is estimated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Points of the spectrum for each bin of an unpadded one.
+PADDING = 4
+#: Samples in the shortest segment, and in the longest one; samples in all segments of one length.
+SHORTEST_SEGMENT = 64
+LONGEST_SEGMENT = 2**18
+MOST_SAMPLES = 2**21
+#: A segment with a larger fraction of missing samples is left out.
+MOST_MISSING = 0.1
+#: A peak must stand so many times (in amplitude) above the median of the bins around it, so many on each side, and
+#: above what leaks from larger ones; two peaks are so many bins apart, and so is the lowest one from zero.
+ABOVE_FLOOR = 5.0
+FLOOR_BINS = 12
+ABOVE_LEAKAGE = 2.0
+CLOSEST = 1.5
+#: Peaks below this fraction of the largest are rounding of the transform.
+ROUNDING = 1e-9
+#: The longest segments are taken whose weakest wanted peak comes this close to the largest such peak of any length, if
+#: possible no more than this fraction of the record: a median needs some of them.
+NEARLY = 0.8
+LONGEST_FRACTION = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Peaks:
+    """Peaks of a spectrum.
+
+    Parameters
+    ----------
+    omega : ndarray, shape (m,)
+        Frequencies [rad/s], the largest peak first.
+    amplitudes : ndarray, shape (m,)
+        Amplitudes, median over the record [signal unit], descending.
+    segment : float
+        Length of the segments [s]; tones closer than ``4 pi/segment`` make one peak.
+    """
+
+    omega: Array
+    amplitudes: Array
+    segment: float
+
+    @property
+    def resolution(self) -> float:
+        """Frequencies closer than this make one peak [rad/s]."""
+        return 4.0 * np.pi / self.segment
+
+
+def find_peaks(samples: Array, interval: float, tones: int) -> Peaks:
+    """Peaks of the median spectrum of a record's segments, of a length that shows as many strong ones as wanted.
+
+    Parameters
+    ----------
+    samples : ndarray, shape (N,)
+        Signal [signal unit]; NaN where missing.
+    interval : float
+        Sampling interval [s].
+    tones : int
+        Number of tones wanted.
+
+    Returns
+    -------
+    Peaks
+        All peaks that stand out, perhaps fewer than wanted.
+
+    Notes
+    -----
+    The median over segments shows what is there most of the time, not what is loud for a moment. Long segments tell
+    close tones apart and short ones stand it if a tone moves: of the lengths N, N/2, N/4, ... the longest is taken that
+    shows the weakest of the wanted peaks (nearly) as large as any length does.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> t = 0.1 * np.arange(1000)
+    >>> peaks = find_peaks(np.sin(2 * t) + 0.5 * np.sin(3 * t), 0.1, 2)
+    >>> peaks.omega.round(1), peaks.amplitudes.round(1)
+    (array([2., 3.]), array([1. , 0.5]))
+    """
+    missing = ~np.isfinite(samples)
+    values = np.asarray(samples, dtype=float)
+    if missing.any():
+        places = np.arange(values.size)
+        values = np.interp(places, places[~missing], values[~missing])
+    found = []
+    size = min(values.size, LONGEST_SEGMENT)
+    while size >= min(SHORTEST_SEGMENT, values.size):
+        spectrum = median_spectrum(values, missing, size)
+        if spectrum is not None:
+            bins, amplitudes = _significant(spectrum)
+            found.append(Peaks(2.0 * np.pi * bins / (size * interval), amplitudes, size * interval))
+        size //= 2
+    if not found:
+        return Peaks(np.empty(0), np.empty(0), values.size * interval)
+    most = max(min(peaks.omega.size, tones) for peaks in found)
+    enough = [peaks for peaks in found if peaks.omega.size >= most]
+    if most == 0:
+        return enough[0]
+    largest = max(peaks.amplitudes[most - 1] for peaks in enough)
+    good = [peaks for peaks in enough if peaks.amplitudes[most - 1] >= NEARLY * largest]
+    return next((peaks for peaks in good if peaks.segment <= LONGEST_FRACTION * values.size * interval), good[-1])
+
+
+def median_spectrum(values: Array, missing: NDArray[np.bool_], size: int) -> Array | None:
+    """Median over segments of the amplitude spectrum, with a Hann window.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        Signal, gaps bridged [signal unit].
+    missing : ndarray of bool, shape (N,)
+        Which samples were.
+    size : int
+        Samples in a segment, at most N; segments overlap by half, if they need not be fewer.
+
+    Returns
+    -------
+    ndarray, shape (PADDING size // 2 + 1,), or None
+        Amplitudes [signal unit], ``PADDING`` for each bin; None if every segment has too many gaps.
+    """
+    count = max(1, min(2 * values.size // size - 1, MOST_SAMPLES // size))
+    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(size) + 0.5) / size)
+    window /= window.sum()
+    spectra = []
+    for first in np.linspace(0, values.size - size, count).astype(int):
+        if missing[first : first + size].mean() > MOST_MISSING:
+            continue
+        part = values[first : first + size]
+        spectra.append(2.0 * np.abs(np.fft.rfft((part - window @ part) * window, PADDING * size)))
+    return np.asarray(np.median(spectra, axis=0)) if spectra else None
+
+
+def _significant(spectrum: Array) -> tuple[Array, Array]:
+    """Places [bins] and amplitudes of the peaks that are neither noise nor leakage, the largest first."""
+    coarse = spectrum[::PADDING]
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(coarse, FLOOR_BINS, mode="reflect"), 2 * FLOOR_BINS + 1)
+    floor = np.repeat(np.median(around, axis=1), PADDING)
+    inner = spectrum[1:-1]
+    places = 1 + np.flatnonzero((inner > spectrum[:-2]) & (inner >= spectrum[2:]))
+    places = places[(places >= CLOSEST * PADDING) & (spectrum[places] > ABOVE_FLOOR * floor[places])]
+    if places.size:
+        places = places[spectrum[places] > ROUNDING * spectrum.max()]
+    bins: list[float] = []
+    amplitudes: list[float] = []
+    for place in places[np.argsort(-spectrum[places])]:
+        # The top of a parabola. (That through the logarithms would be far off beside a zero of the spectrum.)
+        left, top, right = spectrum[place - 1 : place + 2]
+        shift = 0.5 * (left - right) / (left - 2.0 * top + right)
+        bin_, amplitude = float(place + shift) / PADDING, float(top - 0.25 * (left - right) * shift)
+        distance = np.abs(np.array(bins) - bin_)
+        if bins and distance.min() < CLOSEST:
+            continue
+        # Envelope of the side lobes of the Hann window.
+        leakage = np.array(amplitudes) / (np.pi * distance * (distance**2 - 1.0))
+        if amplitude > ABOVE_LEAKAGE * leakage.sum():
+            bins.append(bin_)
+            amplitudes.append(amplitude)
+    return np.array(bins), np.array(amplitudes)

@@ -1,0 +1,339 @@
+"""What all online estimators share: one object that takes samples one by one or by the million, and can be saved."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from numbers import Real
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.prefilter import convolve, fast_convolve
+from ctid_cli.signals.checks import require_positive
+
+Array = NDArray[np.float64]
+
+#: A sample larger than this counts as missing: its powers would overflow.
+LARGEST_SAMPLE = 1e30
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyEstimate:
+    """Frequencies at one instant.
+
+    Parameters
+    ----------
+    omega : ndarray, shape (n,)
+        Frequencies [rad/s], ascending.
+    flags : Flag
+        Why they must not be trusted; no flag if they may.
+    uncertainty : ndarray, shape (n,)
+        Error that the misfit of the equations could make in its worst direction [rad/s]; NaN if unknown. Random noise
+        makes far smaller errors.
+    """
+
+    omega: Array
+    flags: Flag
+    uncertainty: Array
+
+    @property
+    def valid(self) -> bool:
+        """Whether no flag is set."""
+        return not self.flags
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """One sentence for each flag."""
+        return self.flags.sentences
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyTrack:
+    """Frequencies over time.
+
+    Parameters
+    ----------
+    t : ndarray, shape (N,)
+        Instants since the first sample that the tracker ever saw [s].
+    omega : ndarray, shape (N, n)
+        Frequencies [rad/s], ascending in each row.
+    flags : ndarray of uint16, shape (N,)
+        Bit field of :class:`~ctid_cli.frequency.flags.Flag`.
+    uncertainty : ndarray, shape (N, n)
+        Error that the misfit of the equations could make in its worst direction [rad/s]; NaN if unknown.
+    """
+
+    t: Array
+    omega: Array
+    flags: NDArray[np.uint16]
+    uncertainty: Array
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Samples without any flag, shape (N,)."""
+        return np.asarray(self.flags == 0)
+
+    @property
+    def final(self) -> FrequencyEstimate:
+        """The last estimate."""
+        return FrequencyEstimate(self.omega[-1].copy(), Flag(int(self.flags[-1])), self.uncertainty[-1].copy())
+
+
+@dataclass(frozen=True, eq=False)
+class Recursion:
+    """A compiled recursion with everything it needs.
+
+    Parameters
+    ----------
+    advance : callable
+        ``advance(samples, omega, uncertainty, flags, *constants, *state.values())`` takes the samples in order, changes
+        the state in place and writes one row of results for each sample.
+    constants : tuple
+        Arguments that never change.
+    state : dict of ndarray
+        Everything that does, by name.
+    weights : ndarray, shape (L + 1,)
+        Impulse response of the prefilter, newest sample first; one weight for none.
+    past : float
+        What the prefilter takes for the samples before the first one: NaN or 0.
+    notes : tuple of str
+        Sentences about options that could not be met exactly.
+    """
+
+    advance: Callable[..., None]
+    constants: tuple[Any, ...]
+    state: dict[str, NDArray[Any]]
+    weights: Array = field(default_factory=lambda: np.ones(1))
+    past: float = np.nan
+    notes: tuple[str, ...] = ()
+
+
+class OnlineEstimator:
+    """Base of the options of all online estimators."""
+
+    kind: ClassVar[str]
+    online: ClassVar[bool] = True
+    tones: int
+
+    def recursion(self, interval: float) -> Recursion:
+        """The compiled recursion for a sampling interval.
+
+        Parameters
+        ----------
+        interval : float
+            Sampling interval [s].
+
+        Returns
+        -------
+        Recursion
+            With the state before the first sample.
+
+        Raises
+        ------
+        ValueError
+            If the options make no sense at this sampling interval.
+        """
+        raise NotImplementedError
+
+    def start(self, interval: float) -> Tracker:
+        """Begin before the first sample.
+
+        Parameters
+        ----------
+        interval : float
+            Sampling interval [s].
+
+        Returns
+        -------
+        Tracker
+            Takes the samples.
+
+        Raises
+        ------
+        ValueError
+            If the options make no sense at this sampling interval.
+        """
+        return Tracker(self, interval)
+
+    def restore(self, interval: float, state: Mapping[str, ArrayLike]) -> Tracker:
+        """Go on where another tracker stopped.
+
+        Parameters
+        ----------
+        interval : float
+            Sampling interval [s], the same as before.
+        state : mapping of str to array_like
+            What :meth:`Tracker.state` returned.
+
+        Returns
+        -------
+        Tracker
+            Gives the same numbers, bit for bit, as the one whose state it is.
+
+        Raises
+        ------
+        DataError
+            If the state is not one of this estimator with these options and this sampling interval.
+        """
+        tracker = Tracker(self, interval)
+        tracker.load(state)
+        return tracker
+
+
+class Tracker:
+    """An estimator at work: takes samples of a regular clock and keeps what it needs of them.
+
+    Parameters
+    ----------
+    options : OnlineEstimator
+        Estimator with its options.
+    interval : float
+        Sampling interval [s].
+
+    Raises
+    ------
+    ValueError
+        If the options make no sense at this sampling interval.
+
+    Notes
+    -----
+    One sample and many pass through the same compiled recursion: however a record is cut into pieces, the numbers are
+    the same, bit for bit.
+    """
+
+    def __init__(self, options: OnlineEstimator, interval: float) -> None:
+        require_positive("interval", interval, "s")
+        self.options = options
+        self.interval = float(interval)
+        self._recursion = options.recursion(self.interval)
+        weights = np.ascontiguousarray(self._recursion.weights)
+        self._weights = weights
+        self._reversed_weights = np.ascontiguousarray(weights[::-1])
+        self._state: dict[str, NDArray[Any]] = {
+            "fingerprint": np.frombuffer(_fingerprint(options, self.interval), np.uint8).copy(),
+            "count": np.zeros(1, np.int64),
+            "unfiltered": np.full(weights.size - 1, self._recursion.past),
+            **self._recursion.state,
+        }
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences about options that could not be met exactly, such as a delay between two samples."""
+        return self._recursion.notes
+
+    def update(self, sample: float) -> FrequencyEstimate:
+        """Take the next sample.
+
+        Parameters
+        ----------
+        sample : float
+            Signal one sampling interval after the last one [signal unit]; NaN if it is missing.
+
+        Returns
+        -------
+        FrequencyEstimate
+            Frequencies at this instant.
+        """
+        omega, uncertainty, flags = self._advance(np.array([sample], dtype=float), fft=False)
+        return FrequencyEstimate(omega[0], Flag(int(flags[0])), uncertainty[0])
+
+    def run(self, samples: ArrayLike, *, fft: bool = False) -> FrequencyTrack:
+        """Take many samples.
+
+        Parameters
+        ----------
+        samples : array_like, shape (N,)
+            Signal at the next N instants [signal unit]; NaN where missing.
+        fft : bool, default False
+            Whether the prefilter is computed by fast Fourier transforms: faster, and equal to the direct sum only up to
+            rounding (1e-12 of the largest sample).
+
+        Returns
+        -------
+        FrequencyTrack
+            Frequencies at these instants.
+
+        Raises
+        ------
+        DataError
+            If the samples are not a series of real numbers.
+        """
+        values = np.asarray(samples)
+        if values.ndim != 1 or values.dtype.kind not in "fiu":
+            raise DataError(
+                f"the samples must be one series of real numbers, not an array of shape {values.shape} "
+                f"and type {values.dtype}."
+            )
+        first = int(self._state["count"][0])
+        omega, uncertainty, flags = self._advance(np.asarray(values, dtype=float), fft=fft)
+        t = self.interval * np.arange(first, first + values.size, dtype=np.float64)
+        return FrequencyTrack(t, omega, flags, uncertainty)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Everything that later estimates depend on.
+
+        Returns
+        -------
+        dict of ndarray
+            Copies of the arrays; for :meth:`OnlineEstimator.restore`.
+        """
+        return {name: array.copy() for name, array in self._state.items()}
+
+    def load(self, state: Mapping[str, ArrayLike]) -> None:
+        """Take over a saved state.
+
+        Parameters
+        ----------
+        state : mapping of str to array_like
+            What :meth:`state` returned.
+
+        Raises
+        ------
+        DataError
+            If the state is not one of this estimator with these options and this sampling interval.
+        """
+        arrays = {name: np.asarray(array) for name, array in state.items()}
+        same = arrays.keys() == self._state.keys() and all(
+            (arrays[name].shape, arrays[name].dtype) == (own.shape, own.dtype) for name, own in self._state.items()
+        )
+        if not same or not np.array_equal(arrays["fingerprint"], self._state["fingerprint"]):
+            raise DataError(
+                f"this is not the state of {self.options!r} at a sampling interval of {self.interval:g} s; "
+                "restore it with the options and the interval that it was saved with."
+            )
+        for name, own in self._state.items():
+            own[...] = arrays[name]
+
+    def _advance(self, samples: Array, *, fft: bool) -> tuple[Array, Array, NDArray[np.uint16]]:
+        state = self._state
+        count, tones = samples.size, self.options.tones
+        with np.errstate(invalid="ignore"):
+            samples = np.where(np.abs(samples) <= LARGEST_SAMPLE, samples, np.nan)
+        if self._weights.size > 1:
+            everything = np.concatenate((state["unfiltered"], samples))
+            state["unfiltered"][...] = everything[count:]
+            if fft and count:
+                samples = fast_convolve(everything, self._weights)
+            else:
+                convolve(everything, self._reversed_weights, samples)
+        omega, uncertainty = np.empty((count, tones)), np.empty((count, tones))
+        flags = np.empty(count, np.uint16)
+        inner = [state[name] for name in self._recursion.state]
+        self._recursion.advance(samples, omega, uncertainty, flags, *self._recursion.constants, *inner)
+        state["count"][0] += count
+        return omega, uncertainty, flags
+
+
+def _fingerprint(options: OnlineEstimator, interval: float) -> bytes:
+    """Digest of everything that gives a state its meaning."""
+    values = []
+    for item in fields(options):  # type: ignore[arg-type]
+        value = getattr(options, item.name)
+        # The same number may come as an integer or as a float.
+        values.append((item.name, float(value) if isinstance(value, Real) else value))
+    return hashlib.sha256(repr((options.kind, values, interval.hex())).encode()).digest()

@@ -1,0 +1,150 @@
+"""The figure of ``ctid track``: frequencies over time, and amplitudes below."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.frequency.record_track import RecordTrack
+from ctid_cli.reporting.figures.style import BAND, ramp, spread, svg
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+#: Up to so many tones get a panel each, which shows how far they move; more share one.
+MOST_PANELS = 5
+#: The axis of a panel shows the central part of the valid rows, and so much more on both sides.
+SHOWN_PERCENT = 98.0
+MARGIN = 0.35
+#: Amplitudes that differ by more than this factor are drawn on a logarithmic axis.
+LOGARITHMIC = 10.0
+
+
+def track_svg(track: RecordTrack, start: float, unit: str | None, title: str) -> bytes:
+    """Figure of a track; the same track always gives the same bytes.
+
+    Parameters
+    ----------
+    track : RecordTrack
+        The track.
+    start : float
+        Instant of the record's first sample [s].
+    unit : str or None
+        Unit of the signal.
+    title : str
+        Title of the figure.
+
+    Returns
+    -------
+    bytes
+        An SVG file: the frequency of each tone [Hz], stretches that are not valid shaded, and the amplitudes below.
+    """
+    tones = track.omega.shape[1]
+    panels = tones if tones <= MOST_PANELS else 1
+    height = 1.1 + (1.15 * panels if panels > 1 else 2.6) + 1.7
+
+    def draw(figure: Figure) -> None:
+        _draw(figure, track, start, unit, title, panels)
+
+    return svg(7.2, height, draw)
+
+
+def _draw(figure: Figure, track: RecordTrack, start: float, unit: str | None, title: str, panels: int) -> None:
+    tones = track.omega.shape[1]
+    t, valid = start + track.t, track.valid
+    frequencies = track.omega / (2.0 * np.pi)
+    ratios = [1.0] * panels + [1.5] if panels > 1 else [2.2, 1.4]
+    grid = figure.add_gridspec(panels + 1, 1, height_ratios=ratios)
+    styles = ramp(tones)
+    first: Any = None
+    for row in range(panels):
+        # The highest tone on top, as on a sheet of music.
+        mine = [tones - 1 - row] if panels > 1 or tones == 1 else list(range(tones))
+        axes = figure.add_subplot(grid[row], sharex=first)
+        first = first or axes
+        for k in mine:
+            shown = np.where(valid, frequencies[:, k], np.nan)
+            axes.plot(t, np.where(valid, np.nan, frequencies[:, k]), color=styles[k]["color"], linewidth=0.4, alpha=0.6)
+            _line(axes, t, shown, {**styles[k], "linestyle": "-"})
+        _limit(axes, frequencies[:, mine], valid)
+        axes.tick_params(labelbottom=False)
+        axes.ticklabel_format(axis="y", useOffset=False)
+        if panels > 1:
+            axes.annotate(
+                f"tone {tones - row}", (0.995, 0.92), xycoords="axes fraction", ha="right", va="top", fontsize=8
+            )
+        _shade(axes, t, valid)
+        if row == 0:
+            axes.set_title(title, loc="left")
+        axes.set_ylabel("[Hz]" if panels > 1 else "frequency [Hz]")
+    if panels > 1:
+        figure.supylabel("frequency [Hz]", fontsize=9)
+        for axes in figure.axes:
+            axes.set_ylabel("")
+    below = figure.add_subplot(grid[-1], sharex=first)
+    ends = []
+    for k in range(tones):
+        values = np.where(valid, track.amplitudes[:, k], np.nan)
+        _line(below, t, values, styles[k])
+        finite = values[np.isfinite(values)]
+        ends.append(float(finite[-1]) if finite.size else np.nan)
+    seen = track.amplitudes[valid]
+    seen = seen[np.isfinite(seen) & (seen > 0)]
+    if seen.size and np.percentile(seen, 95) > LOGARITHMIC * np.percentile(seen, 5):
+        below.set_yscale("log")
+    elif seen.size:
+        below.set_ylim(bottom=0.0)
+    below.set_ylabel(f"amplitude [{unit}]" if unit else "amplitude")
+    below.set_xlabel("t [s]")
+    below.margins(x=0.0)
+    if t.size > 1:
+        below.set_xlim(t[0], t[-1])
+    _shade(below, t, valid)
+    if tones > 1:
+        _label_ends(below, np.array(ends))
+
+
+def _line(axes: Any, t: Array, values: Array, style: dict[str, Any]) -> None:
+    # A valid row between two that are not would be no line.
+    lonely = np.isfinite(values) & ~np.isfinite(np.roll(values, 1)) & ~np.isfinite(np.roll(values, -1))
+    axes.plot(t, values, linewidth=1.2, **style)
+    axes.plot(t[lonely], values[lonely], ".", color=style["color"], markersize=3)
+
+
+def _limit(axes: Any, frequencies: Array, valid: NDArray[np.bool_]) -> None:
+    """Show the valid rows; what strays elsewhere may leave the axes."""
+    shown = frequencies[valid] if valid.any() else frequencies
+    shown = shown[np.isfinite(shown)]
+    if not shown.size:
+        return
+    rest = 0.5 * (100.0 - SHOWN_PERCENT)
+    low, high = np.percentile(shown, [rest, 100.0 - rest])
+    room = max(MARGIN * (high - low), 1e-4 * high, 1e-12)
+    axes.set_ylim(low - room, high + room)
+
+
+def _shade(axes: Any, t: Array, valid: NDArray[np.bool_]) -> None:
+    """Grey bands where no row is valid."""
+    if t.size < 2 or valid.all():
+        return
+    half = 0.5 * float(t[1] - t[0])
+    steps = np.diff(np.concatenate(([0], (~valid).astype(np.int8), [0])))
+    for a, b in zip(np.flatnonzero(steps == 1), np.flatnonzero(steps == -1), strict=True):
+        axes.axvspan(t[a] - half, t[b - 1] + half, color=BAND, linewidth=0.0, zorder=0)
+
+
+def _label_ends(axes: Any, ends: Array) -> None:
+    """Numbers of the tones beside the ends of their lines."""
+    low, high = axes.get_ylim()
+    log = axes.get_yscale() == "log"
+    scale = np.log if log else np.asarray
+    known = np.flatnonzero(np.isfinite(ends) & (ends > 0))
+    if not known.size:
+        return
+    places = (scale(ends[known]) - scale(low)) / (scale(high) - scale(low))
+    for k, place in zip(known, spread(places, 0.1), strict=True):
+        axes.annotate(str(k + 1), (1.008, float(place)), xycoords="axes fraction", ha="left", va="center", fontsize=8)

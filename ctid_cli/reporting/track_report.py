@@ -1,0 +1,359 @@
+"""What ``ctid track`` answers: frequencies of a recorded signal as text, as an object for JSON, and as a file."""
+
+from __future__ import annotations
+
+import io
+import math
+import textwrap
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import StorageError
+from ctid_cli.frequency.automatic import Settings
+from ctid_cli.frequency.flags import MEANINGS, Flag
+from ctid_cli.frequency.record_track import RecordTrack
+from ctid_cli.reporting.layout import count, number, text_table
+from ctid_cli.signals.sampled_signal import SampledSignal
+
+Array = NDArray[np.float64]
+
+#: Width of paragraphs.
+WIDTH = 100
+#: A smaller share of valid time is worth a warning.
+MOSTLY_VALID = 0.9
+#: Most frequent reasons for invalid rows that are named.
+MOST_REASONS = 3
+
+
+@dataclass(frozen=True)
+class ToneSummary:
+    """One tone over the valid rows of a track; None where there are none.
+
+    Parameters
+    ----------
+    tone : int
+        Number, from 1 by rising frequency.
+    frequency_hz, omega : float or None
+        Median frequency [Hz], [rad/s].
+    spread_hz : float or None
+        Half the width of the central 68 % [Hz].
+    amplitude : float or None
+        Median amplitude [signal unit].
+    valid_percent : float
+        Share of the rows that are valid [%].
+    """
+
+    tone: int
+    frequency_hz: float | None
+    omega: float | None
+    spread_hz: float | None
+    amplitude: float | None
+    valid_percent: float
+
+
+def summarise(track: RecordTrack) -> list[ToneSummary]:
+    """One line for each tone.
+
+    Parameters
+    ----------
+    track : RecordTrack
+        The track.
+
+    Returns
+    -------
+    list of ToneSummary
+        By rising frequency.
+    """
+    valid = track.valid
+    share = 100.0 * float(valid.mean()) if valid.size else 0.0
+    found = []
+    for k in range(track.omega.shape[1]):
+        omega = track.omega[valid, k]
+        amplitudes = track.amplitudes[valid, k]
+        amplitudes = amplitudes[np.isfinite(amplitudes)]
+        amplitude = float(np.median(amplitudes)) if amplitudes.size else None
+        if omega.size:
+            middle = float(np.median(omega))
+            low, high = np.percentile(omega, [16.0, 84.0]) / (2.0 * np.pi)
+            summary = ToneSummary(k + 1, middle / (2.0 * np.pi), middle, float(high - low) / 2.0, amplitude, share)
+        else:
+            summary = ToneSummary(k + 1, None, None, None, None, share)
+        found.append(summary)
+    return found
+
+
+def track_warnings(track: RecordTrack, settings: Settings) -> list[str]:
+    """What a reader must know before believing the numbers.
+
+    Parameters
+    ----------
+    track : RecordTrack
+        The track.
+    settings : Settings
+        How it was found.
+
+    Returns
+    -------
+    list of str
+        Sentences.
+    """
+    found = list(settings.warnings)
+    share = float(track.valid.mean()) if track.valid.size else 0.0
+    if share < MOSTLY_VALID:
+        found.append(
+            f"{100 * (1 - share):.3g} % of the rows are not valid."
+            if share > 0
+            else "No row is valid: there are no frequencies to report."
+        )
+        shares = {flag: float(np.mean((track.flags & int(flag)) != 0)) for flag in Flag}
+        reasons = sorted((flag for flag in Flag if shares[flag] > 0), key=lambda flag: -shares[flag])
+        found += [f"{100 * shares[flag]:.3g} %: {MEANINGS[flag]}" for flag in reasons[:MOST_REASONS]]
+    return found
+
+
+def track_object(signal: SampledSignal, settings: Settings, track: RecordTrack, files: list[Path]) -> dict[str, Any]:
+    """A track for ``ctid track --json``.
+
+    Parameters
+    ----------
+    signal : SampledSignal
+        The record, times in seconds.
+    settings : Settings
+        How the frequencies were found.
+    track : RecordTrack
+        The track.
+    files : list of Path
+        What was written.
+
+    Returns
+    -------
+    dict
+        The documented keys; None for numbers that are not there.
+    """
+    kind = settings.estimator.kind
+    content = {
+        "file": signal.file,
+        "signal": signal.column,
+        "unit": signal.unit,
+        "samples": int(signal.samples.size),
+        "missing": signal.missing,
+        "interval": signal.interval,
+        "start": signal.start,
+        "method": kind,
+        "tones": [asdict(tone) for tone in summarise(track)],
+        "rows": int(track.t.size),
+        "every": track.every,
+        "warnings": track_warnings(track, settings),
+        "notes": list(signal.notes),
+        "chosen": list(settings.reasons),
+        "settings": {
+            "estimator": asdict(settings.estimator),
+            "interval": settings.interval,
+            "kept_one_of": settings.decimation.factor,
+            "filter_seconds": (settings.decimation.weights.size - 1) * signal.interval,
+            "window_seconds": settings.window_seconds,
+            "offset": settings.offset,
+            "expected_hz": (settings.expected / (2.0 * np.pi)).tolist(),
+        },
+        "written": [str(file) for file in files],
+    }
+    cleaned: dict[str, Any] = _plain(content)
+    return cleaned
+
+
+def track_text(signal: SampledSignal, settings: Settings, track: RecordTrack) -> str:
+    """A track for people, within 100 columns.
+
+    Parameters
+    ----------
+    signal : SampledSignal
+        The record, times in seconds.
+    settings : Settings
+        How the frequencies were found.
+    track : RecordTrack
+        The track.
+
+    Returns
+    -------
+    str
+        The record, what was chosen, one line for each tone, warnings.
+    """
+    end = signal.start + (signal.samples.size - 1) * signal.interval
+    gaps = f", {count(signal.missing, 'sample')} missing" if signal.missing else ""
+    lines = _wrapped(
+        f"{signal.file}: {count(signal.samples.size, 'sample')} of {signal.column!r} from {signal.start:.6g} to "
+        f"{end:.6g} s, every {signal.interval:.6g} s ({1.0 / signal.interval:.6g} Hz){gaps}"
+    )
+    for note in signal.notes:
+        lines += _wrapped(note, "  ")
+    for reason in settings.reasons:
+        lines += _wrapped(f"- {reason}", "", 2)
+    unit = f"amplitude [{signal.unit}]" if signal.unit else "amplitude"
+    cells = [
+        [
+            str(tone.tone),
+            _to_spread(tone.frequency_hz, tone.spread_hz),
+            number(tone.spread_hz, 2),
+            number(tone.omega, 8),
+            number(tone.amplitude, 4),
+            f"{tone.valid_percent:.4g} %",
+        ]
+        for tone in summarise(track)
+    ]
+    header = ["tone", "frequency [Hz]", "spread [Hz]", "[rad/s]", unit, "valid"]
+    lines += [
+        "",
+        text_table(header, cells, "rrrrrr"),
+        *_wrapped(
+            f"Medians over the valid ones of {count(track.t.size, 'row')}, one every {track.every:.4g} s; the spread "
+            "is half the width of the central 68 %."
+        ),
+    ]
+    warnings = track_warnings(track, settings)
+    if warnings:
+        lines += ["", "Warnings:"]
+        lines += [line for warning in warnings for line in _wrapped(f"- {warning}", "", 2)]
+    return "\n".join(lines)
+
+
+def flag_words(flags: int) -> str:
+    """Names of flags.
+
+    Parameters
+    ----------
+    flags : int
+        Bit field.
+
+    Returns
+    -------
+    str
+        In lower case, separated by blanks; empty for none.
+
+    Examples
+    --------
+    >>> flag_words(0), flag_words(18)
+    ('', 'gap uncertain')
+    """
+    return " ".join(str(flag.name).lower() for flag in Flag if flags & flag)
+
+
+def track_table(track: RecordTrack, start: float) -> dict[str, NDArray[Any]]:
+    """Columns of the file of a track.
+
+    Parameters
+    ----------
+    track : RecordTrack
+        The track.
+    start : float
+        Instant of the record's first sample [s].
+
+    Returns
+    -------
+    dict of ndarray
+        ``t`` [s], ``omega_1`` ... [rad/s], ``frequency_1_hz`` ..., ``amplitude_1`` ..., ``valid``, ``flags``.
+    """
+    tones = range(track.omega.shape[1])
+    return {
+        "t": start + track.t,
+        **{f"omega_{k + 1}": track.omega[:, k] for k in tones},
+        **{f"frequency_{k + 1}_hz": track.omega[:, k] / (2.0 * np.pi) for k in tones},
+        **{f"amplitude_{k + 1}": track.amplitudes[:, k] for k in tones},
+        "valid": track.valid,
+        "flags": np.array([flag_words(int(flags)) for flags in track.flags], dtype=object),
+    }
+
+
+def track_bytes(table: dict[str, NDArray[Any]], extension: str) -> bytes:
+    """The file of a track.
+
+    Parameters
+    ----------
+    table : dict of ndarray
+        What :func:`track_table` returns.
+    extension : {".csv", ".h5"}
+        Kind of the file. An HDF5 file has one data set for each column.
+
+    Returns
+    -------
+    bytes
+        Its content.
+    """
+    if extension == ".csv":
+        lines = [",".join(table)]
+        for row in zip(*table.values(), strict=True):
+            lines.append(",".join(_cell(value) for value in row))
+        return ("\n".join(lines) + "\n").encode()
+    import h5py
+
+    file = io.BytesIO()
+    with h5py.File(file, "w", track_order=True) as store:
+        for name, values in table.items():
+            if values.dtype == object:
+                store.create_dataset(name, data=[str(value) for value in values], dtype=h5py.string_dtype())
+            else:
+                store.create_dataset(name, data=values)
+    return file.getvalue()
+
+
+def write_files(files: dict[Path, bytes]) -> None:
+    """Write files, and the folders that they need.
+
+    Parameters
+    ----------
+    files : dict of Path to bytes
+        Content by name.
+
+    Raises
+    ------
+    StorageError
+        If one cannot be written.
+    """
+    for path, content in files.items():
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        except OSError as error:
+            raise StorageError(f"{error.filename or path} cannot be written: {error.strerror or error}") from error
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, bool | np.bool_):
+        return "1" if value else "0"
+    if isinstance(value, str):
+        return value
+    return f"{value:.12g}" if math.isfinite(value) else ""
+
+
+def _to_spread(value: float | None, spread: float | None) -> str:
+    """A frequency with two digits of its spread, at least six in all and no more than rounding allows."""
+    if value is None or spread is None:
+        return "-"
+    digits = 6
+    if 0.0 < spread < value:
+        digits = max(6, 2 + math.floor(math.log10(value)) - math.floor(math.log10(spread)))
+    return f"{value:#.{min(digits, 10)}g}"
+
+
+def _wrapped(text: str, indent: str = "", hanging: int = 0) -> list[str]:
+    return textwrap.wrap(
+        text,
+        WIDTH,
+        initial_indent=indent,
+        subsequent_indent=indent + " " * hanging,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    return value

@@ -1,0 +1,349 @@
+"""Sums of sinusoids whose frequencies and amplitudes may step, and what disturbs them."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctid_cli.signals.arma_noise import ArmaNoise
+from ctid_cli.signals.checks import require_choice, require_finite, require_positive
+from ctid_cli.signals.held import COINCIDENCE
+from ctid_cli.signals.noise import WhiteNoise
+
+Array = NDArray[np.float64]
+PhaseAtSteps = Literal["jump", "continuous"]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A constant value up to an instant.
+
+    Parameters
+    ----------
+    value : float
+        Value, in the unit of what it belongs to.
+    until : float, optional
+        Instant at which the next piece begins [s]; the last piece has none.
+    """
+
+    value: float = field(metadata={"doc": "value, in the unit of what it belongs to"})
+    until: float | None = field(
+        default=None, metadata={"doc": "instant at which the next piece begins; none for the last one", "unit": "s"}
+    )
+
+
+@dataclass(frozen=True)
+class Tone:
+    """One sinusoid.
+
+    Parameters
+    ----------
+    frequency : float or tuple of Piece
+        Frequency [rad/s], positive.
+    amplitude : float or tuple of Piece, default 1.0
+        Amplitude [signal unit], positive.
+    phase : float, default 0.0
+        Phase at time 0 [rad].
+
+    Raises
+    ------
+    ValueError
+        If a value is not positive, or the pieces do not follow one another.
+    """
+
+    frequency: float | tuple[Piece, ...] = field(metadata={"doc": "frequency", "unit": "rad/s"})
+    amplitude: float | tuple[Piece, ...] = field(default=1.0, metadata={"doc": "amplitude", "unit": "signal unit"})
+    phase: float = field(default=0.0, metadata={"doc": "phase at time 0", "unit": "rad"})
+
+    def __post_init__(self) -> None:
+        for name, unit in (("frequency", "rad/s"), ("amplitude", "signal unit")):
+            _check_course(name, getattr(self, name), unit)
+        require_finite("phase", self.phase, "rad")
+
+
+@dataclass(frozen=True)
+class MultiSine:
+    r"""A sum of sinusoids and a constant.
+
+    Parameters
+    ----------
+    tones : tuple of Tone
+        The sinusoids.
+    bias : float, default 0.0
+        The constant [signal unit].
+    phase_at_steps : {"continuous", "jump"}, default "continuous"
+        What a step of a frequency does to the phase.
+
+    Raises
+    ------
+    ValueError
+        If there is no tone, or two of them have the same frequency at the same time.
+
+    Notes
+    -----
+    Each tone is ``A(t) sin(int_0^t w + phase)``; with ``jump`` it is ``A(t) sin(w(t) t + phase)``, whose phase jumps
+    when the frequency w steps. A piece begins at the very instant that the one before it names.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli.signals import MultiSine, Piece, Tone
+    >>> signal = MultiSine((Tone(3.0), Tone((Piece(1.0, until=5.0), Piece(2.0)))))
+    >>> signal.frequencies_at([0.0, 5.0])
+    array([[1., 3.],
+           [2., 3.]])
+    >>> signal.frequency_steps
+    (5.0,)
+    """
+
+    tones: tuple[Tone, ...] = field(metadata={"doc": "the sinusoids"})
+    bias: float = field(default=0.0, metadata={"doc": "constant that is added", "unit": "signal unit"})
+    phase_at_steps: PhaseAtSteps = field(
+        default="continuous", metadata={"doc": "jump: sin(w(t) t + phase); continuous: the phase is the integral of w"}
+    )
+
+    def __post_init__(self) -> None:
+        if not self.tones:
+            raise ValueError("tones must hold at least one sinusoid.")
+        require_finite("bias", self.bias, "signal unit")
+        require_choice("phase_at_steps", self.phase_at_steps, get_args(PhaseAtSteps))
+        instants = [0.0, *self.frequency_steps]
+        for instant, row in zip(instants, self.frequencies_at(instants), strict=True):
+            if (np.diff(row) == 0.0).any():
+                raise ValueError(
+                    f"two tones have the same frequency from {instant:g} s on; they are one sinusoid, so leave one out."
+                )
+
+    @property
+    def frequency_steps(self) -> tuple[float, ...]:
+        """Instants at which a frequency steps [s], ascending."""
+        return _steps([tone.frequency for tone in self.tones])
+
+    @property
+    def steps(self) -> tuple[float, ...]:
+        """Instants at which a frequency or an amplitude steps [s], ascending."""
+        return _steps([course for tone in self.tones for course in (tone.frequency, tone.amplitude)])
+
+    @property
+    def highest_frequency(self) -> float:
+        """The highest frequency that any tone ever has [rad/s]."""
+        return float(max(_values(tone.frequency).max() for tone in self.tones))
+
+    def frequencies_at(self, times: ArrayLike) -> Array:
+        """Frequencies at some instants.
+
+        Parameters
+        ----------
+        times : array_like, shape (N,)
+            Instants [s].
+
+        Returns
+        -------
+        ndarray, shape (N, n)
+            Frequencies [rad/s], ascending in each row.
+        """
+        t = np.asarray(times, dtype=float)
+        return np.sort(np.column_stack([_course_at(tone.frequency, t) for tone in self.tones]), axis=1)
+
+    def generate(self, times: ArrayLike) -> Array:
+        """The signal.
+
+        Parameters
+        ----------
+        times : array_like, shape (N,)
+            Instants [s].
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Signal [signal unit].
+        """
+        t = np.asarray(times, dtype=float)
+        total = np.full(t.size, float(self.bias))
+        for tone in self.tones:
+            if self.phase_at_steps == "jump":
+                angle = _course_at(tone.frequency, t) * t
+            else:
+                angle = _integral(tone.frequency, t)
+            total += _course_at(tone.amplitude, t) * np.sin(angle + tone.phase)
+        return total
+
+
+@dataclass(frozen=True)
+class UniformDisturbance:
+    """Independent samples, uniform between two bounds of one size.
+
+    Parameters
+    ----------
+    half_width : float
+        Largest size of a sample [signal unit].
+
+    Raises
+    ------
+    ValueError
+        If the size is not positive.
+    """
+
+    kind: ClassVar[str] = "uniform"
+
+    half_width: float = field(metadata={"doc": "largest size of a sample", "unit": "signal unit"})
+
+    def __post_init__(self) -> None:
+        require_positive("half_width", self.half_width, "signal unit")
+
+    def generate(self, undisturbed: Array, rng: np.random.Generator) -> Array:
+        """Disturbance of one record.
+
+        Parameters
+        ----------
+        undisturbed : ndarray, shape (N,)
+            The signal without it [signal unit]; only its length matters.
+        rng : numpy.random.Generator
+            Source of the samples.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Disturbance [signal unit].
+        """
+        return self.half_width * rng.uniform(-1.0, 1.0, undisturbed.size)
+
+
+@dataclass(frozen=True)
+class SineDisturbance:
+    """One more sinusoid, which is not asked for.
+
+    Parameters
+    ----------
+    amplitude : float
+        Amplitude [signal unit].
+    frequency : float
+        Frequency [rad/s].
+    phase : float, default 0.0
+        Phase at time 0 [rad].
+
+    Raises
+    ------
+    ValueError
+        If amplitude or frequency is not positive.
+    """
+
+    kind: ClassVar[str] = "sine"
+
+    amplitude: float = field(metadata={"doc": "amplitude", "unit": "signal unit"})
+    frequency: float = field(metadata={"doc": "frequency", "unit": "rad/s"})
+    phase: float = field(default=0.0, metadata={"doc": "phase at time 0", "unit": "rad"})
+
+    def __post_init__(self) -> None:
+        require_positive("amplitude", self.amplitude, "signal unit")
+        require_positive("frequency", self.frequency, "rad/s")
+        require_finite("phase", self.phase, "rad")
+
+    def at(self, times: ArrayLike) -> Array:
+        """The disturbance.
+
+        Parameters
+        ----------
+        times : array_like, shape (N,)
+            Instants [s].
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Disturbance [signal unit].
+        """
+        return self.amplitude * np.sin(self.frequency * np.asarray(times, dtype=float) + self.phase)
+
+
+Disturbance = UniformDisturbance | SineDisturbance | WhiteNoise | ArmaNoise
+
+#: Disturbances of a signal by the word that selects them in a specification.
+DISTURBANCES: dict[str, type[Disturbance]] = {
+    disturbance.kind: disturbance for disturbance in (UniformDisturbance, SineDisturbance, WhiteNoise, ArmaNoise)
+}
+
+
+def disturb(signal: Array, times: Array, disturbance: Disturbance | None, rng: np.random.Generator) -> Array:
+    """Add a disturbance to a signal.
+
+    Parameters
+    ----------
+    signal : ndarray, shape (N,)
+        The signal [signal unit].
+    times : ndarray, shape (N,)
+        Its instants [s].
+    disturbance : Disturbance or None
+        What is added; None for nothing.
+    rng : numpy.random.Generator
+        Source of the random ones.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        Disturbed signal [signal unit].
+
+    Raises
+    ------
+    DataError
+        If a signal-to-noise ratio is asked for and the signal is zero throughout.
+    """
+    if disturbance is None:
+        return signal
+    if isinstance(disturbance, SineDisturbance):
+        return signal + disturbance.at(times)
+    return signal + disturbance.generate(signal, rng)
+
+
+def _check_course(name: str, course: float | tuple[Piece, ...], unit: str) -> None:
+    if not isinstance(course, tuple):
+        require_positive(name, course, unit)
+        return
+    if not course:
+        raise ValueError(f"{name} must hold at least one piece.")
+    for piece in course:
+        require_positive(f"the value of a piece of {name}", piece.value, unit)
+    if course[-1].until is not None or any(piece.until is None for piece in course[:-1]):
+        raise ValueError(f"every piece of {name} but the last needs 'until' [s], and the last has none.")
+    ends = [piece.until for piece in course[:-1] if piece.until is not None]
+    for end in ends:
+        require_positive(f"'until' of a piece of {name}", end, "s")
+    if any(later <= earlier for earlier, later in itertools.pairwise(ends)):
+        raise ValueError(f"the pieces of {name} must follow one another; their ends are {ends} s.")
+
+
+def _values(course: float | tuple[Piece, ...]) -> Array:
+    return np.array([piece.value for piece in course] if isinstance(course, tuple) else [course], dtype=float)
+
+
+def _ends(course: float | tuple[Piece, ...]) -> Array:
+    pieces = course if isinstance(course, tuple) else ()
+    return np.array([piece.until for piece in pieces if piece.until is not None], dtype=float)
+
+
+def _steps(courses: list[float | tuple[Piece, ...]]) -> tuple[float, ...]:
+    steps: set[float] = set()
+    for course in courses:
+        changing = np.diff(_values(course)) != 0.0
+        steps.update(_ends(course)[changing].tolist())
+    return tuple(sorted(steps))
+
+
+def _place(course: float | tuple[Piece, ...], t: Array) -> NDArray[np.intp]:
+    """Number of the piece at each instant; 3 k 0.1 and k 0.3 are one instant, whatever their last bits."""
+    ends = _ends(course)
+    return np.searchsorted(ends * (1.0 - COINCIDENCE), t, side="right")
+
+
+def _course_at(course: float | tuple[Piece, ...], t: Array) -> Array:
+    return np.asarray(_values(course)[_place(course, t)])
+
+
+def _integral(course: float | tuple[Piece, ...], t: Array) -> Array:
+    values, ends = _values(course), np.concatenate(([0.0], _ends(course)))
+    before = np.concatenate(([0.0], np.cumsum(values[:-1] * np.diff(ends))))
+    place = _place(course, t)
+    return np.asarray(before[place] + values[place] * (t - ends[place]))

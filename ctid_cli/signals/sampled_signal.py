@@ -1,0 +1,313 @@
+"""One signal on a regular clock, from a text, MATLAB or sound file."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.signals.checks import require_positive
+from ctid_cli.signals.csv_file import read_csv_table, require_file
+from ctid_cli.signals.mat_file import read_mat_table
+from ctid_cli.signals.measurement import TEXT_EXTENSIONS, USUAL_NAMES, split_header
+from ctid_cli.signals.table import Table, listing, refuse_missing, refuse_nameless, wrong_separator
+
+Array = NDArray[np.float64]
+
+#: Names by which the signal is recognised when nobody says which column it is, the most telling first.
+SIGNAL_NAMES = (
+    "y",
+    "signal",
+    "output",
+    "value",
+    "values",
+    "x",
+    "amplitude",
+    "data",
+    "audio",
+    "sound",
+    "wave",
+    "voltage",
+)
+#: How the names of sound files end.
+SOUND_EXTENSIONS = (".wav", ".wave")
+#: An instant may lie so many sampling intervals beside the grid.
+CLOCK_TOLERANCE = 0.01
+#: A record with more samples missing between its lines than this many times those it has is not on one grid.
+MOST_FILLED = 20
+
+
+@dataclass(frozen=True, eq=False)
+class SampledSignal:
+    """A signal on a regular clock and what is known of the file that it comes from.
+
+    Parameters
+    ----------
+    samples : ndarray, shape (N,)
+        Signal [signal unit]; NaN where a sample is missing.
+    interval : float
+        Sampling interval [time unit].
+    start : float
+        Instant of the first sample [time unit].
+    file : str
+        Name of the file.
+    column : str
+        Column of the signal.
+    time : str or None
+        Column of the times; None if they were not used.
+    time_unit, unit : str or None
+        Units as labels; None where the file names none.
+    notes : tuple of str
+        What was assumed, one sentence each.
+    """
+
+    samples: Array
+    interval: float
+    start: float
+    file: str
+    column: str
+    time: str | None
+    time_unit: str | None
+    unit: str | None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def missing(self) -> int:
+        """Number of missing samples."""
+        return int(np.count_nonzero(~np.isfinite(self.samples)))
+
+    def rescaled(self, factor: float, unit: str) -> SampledSignal:
+        """The same signal in another unit of time.
+
+        Parameters
+        ----------
+        factor : float
+            New units in an old one.
+        unit : str
+            Label of the new unit.
+
+        Returns
+        -------
+        SampledSignal
+            With times in the new unit.
+        """
+        return replace(self, interval=factor * self.interval, start=factor * self.start, time_unit=unit)
+
+
+def read_sampled_signal(
+    path: str | os.PathLike[str],
+    *,
+    time: str | None = None,
+    signal: str | None = None,
+    interval: float | None = None,
+    start: float | None = None,
+    stop: float | None = None,
+) -> SampledSignal:
+    """Signal from a comma-separated, MATLAB or sound file.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A text file (``.csv``, ``.txt``, ``.dat``) whose first line names its comma-separated columns, a ``.mat`` file
+        with vectors, or a ``.wav`` file.
+    time, signal : str, optional
+        Columns; one that is not given is recognised by its usual name, and the signal as the only other column. The
+        channels of a sound file are called ``channel 1``, ``channel 2`` ...
+    interval : float, optional
+        Sampling interval [s] in place of the times of the file.
+    start, stop : float, optional
+        First and last instant that is used [time unit].
+
+    Returns
+    -------
+    SampledSignal
+        The signal; instants that the file leaves out are missing samples.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be used, or its clock is not regular; the message says what to do.
+    ValueError
+        If the interval is not positive.
+    """
+    if interval is not None:
+        require_positive("interval", interval, "s")
+    extension = Path(path).suffix.lower()
+    notes: list[str] = []
+    if extension in SOUND_EXTENSIONS:
+        table, rate, note = _read_sound(path)
+        interval = 1.0 / rate if interval is None else interval
+        notes.append(note)
+    elif extension == ".mat":
+        table = read_mat_table(path)
+    elif extension in TEXT_EXTENSIONS:
+        table = read_csv_table(path)
+    else:
+        raise DataError(
+            f"{os.fspath(path)}: files ending in {extension} are not read; a signal is read from comma-separated text "
+            "(.csv), MATLAB vectors (.mat) or sound (.wav)"
+        )
+    times, column, more = _columns(table, time, signal, interval is not None)
+    notes += more
+    name, unit = split_header(column)[0], split_header(column)[1]
+    values = table.numbers(column)
+    values = np.where(np.isfinite(values), values, np.nan)
+    time_unit: str | None = "s"
+    if interval is None and times is not None:
+        time_unit = split_header(times)[1]
+        clock = table.numbers(times)
+        if clock.size == 1 and values.size > 1:
+            interval, first, time_unit = float(clock[0]), 0.0, time_unit or "s"
+            if not (np.isfinite(interval) and interval > 0):
+                raise DataError(f"{table.file}: {times!r} is {interval:g}; a sampling interval must be positive")
+            notes.append(f"{times!r} is one number and was taken as the sampling interval.")
+        else:
+            if clock.size != values.size:
+                raise DataError(
+                    f"{table.file}: {times!r} has {clock.size} values and {column!r} has {values.size}; they must be "
+                    "equally many"
+                )
+            values, interval, note = _on_grid(table, times, clock, values, time_unit or "s")
+            first = float(clock[0])
+            notes += [note] if note else []
+    else:
+        first = 0.0
+        if times is not None:
+            notes.append(f"The times {times!r} are not used, since the sampling interval was given.")
+            times = None
+    assert interval is not None  # every way above has set it
+    low, high = _window(table, first, interval, values.size, start, stop, time_unit or "s")
+    values = values[low:high]
+    if not np.isfinite(values).any():
+        raise DataError(f"{table.file}: no sample of {column!r} is a finite number")
+    return SampledSignal(
+        values, interval, first + low * interval, table.file, name, times, time_unit, unit, tuple(notes)
+    )
+
+
+def _columns(table: Table, time: str | None, signal: str | None, clocked: bool) -> tuple[str | None, str, list[str]]:
+    """Columns of the times and of the signal, and what was assumed."""
+    refuse_nameless(table)
+    if separated := wrong_separator(table):
+        raise DataError(f"{table.head}: the file has one column. {separated}")
+    times = _named(table, time) if time is not None else _usual(table, USUAL_NAMES["time"], signal)
+    if times is None and not clocked:
+        raise DataError(
+            f"{table.head}: no {table.noun} is called 't' or 'time'; {listing(table)}. Say which one holds the times "
+            "(--time), or give the clock (--interval SECONDS or --rate HERTZ)"
+        )
+    column = _named(table, signal) if signal is not None else _usual(table, SIGNAL_NAMES, times)
+    left = [name for name in table.names if name != times]
+    notes = []
+    if column is None:
+        if len(left) != 1 and table.noun != "channel":
+            raise DataError(
+                f"{table.head}: no {table.noun} is called 'y' or 'signal'; {listing(table)}. Say which one is the "
+                "signal (--signal)"
+            )
+        column = left[0]
+    if column == times:
+        raise DataError(f"{table.head}: {column!r} cannot be both the time and the signal")
+    unused = [name for name in left if name != column]
+    if unused and table.lines is not None:
+        notes.append(f"Not used: {', '.join(map(repr, unused))}.")
+    return times, column, notes
+
+
+def _named(table: Table, wanted: str) -> str:
+    matching = [name for name in table.names if name == wanted or split_header(name)[0] == wanted]
+    if wanted in table.names:
+        return wanted
+    if len(matching) != 1:
+        refuse_missing(table, wanted)
+    return matching[0]
+
+
+def _usual(table: Table, usual: tuple[str, ...], taken: str | None) -> str | None:
+    for word in usual:
+        for name in table.names:
+            leaf = split_header(name)[0] if table.lines is not None else name.rpartition(".")[2]
+            if leaf.lower() == word and taken not in (name, leaf):
+                return name
+    return None
+
+
+def _on_grid(table: Table, name: str, t: Array, values: Array, unit: str) -> tuple[Array, float, str]:
+    """Samples at all instants of the grid that the times lie on, its interval, and a note on what is missing."""
+    table.check_times(name, t, unit)
+    if t.size < 2:
+        raise DataError(f"{table.file}: one sample has no frequency")
+    steps = np.diff(t)
+    counts = np.maximum(1.0, np.round(steps / np.median(steps)))
+    places = np.concatenate(([0.0], np.cumsum(counts)))
+    # The grid that fits all instants best in the sense of its two ends.
+    interval = float((t[-1] - t[0]) / places[-1])
+    stray = np.abs(t - (t[0] + places * interval))
+    worst = int(np.argmax(stray))
+    rounding = 4 * np.finfo(float).eps * float(np.abs(t).max())
+    if stray[worst] > CLOCK_TOLERANCE * interval + rounding or places[-1] > MOST_FILLED * t.size:
+        raise DataError(
+            f"{table.place(worst)}: the clock is not regular: the intervals run from {steps.min():.6g} to "
+            f"{steps.max():.6g} {unit}, and {t[worst]:.9g} {unit} lies {stray[worst]:.3g} {unit} beside a grid of "
+            f"{interval:.6g} {unit}; the estimators compare samples at fixed delays, so they need a regular clock. "
+            "Resample the record, or give its clock (--interval or --rate) if the times in the file are only rounded"
+        )
+    if places[-1] + 1 == t.size:
+        return values, interval, ""
+    filled = np.full(int(places[-1]) + 1, np.nan)
+    filled[places.astype(np.int64)] = values
+    return filled, interval, f"The times leave out {filled.size - t.size} instants of the clock; they count as missing."
+
+
+def _window(
+    table: Table, first: float, interval: float, count: int, start: float | None, stop: float | None, unit: str
+) -> tuple[int, int]:
+    low = 0 if start is None else max(0, int(np.ceil((start - first) / interval - 1e-6)))
+    high = count if stop is None else min(count, int(np.floor((stop - first) / interval + 1e-6)) + 1)
+    if low >= high:
+        last = first + (count - 1) * interval
+        raise DataError(
+            f"{table.file}: no sample lies in the window that was asked for; the record runs from {first:.9g} to "
+            f"{last:.9g} {unit}"
+        )
+    return low, high
+
+
+def _read_sound(path: str | os.PathLike[str]) -> tuple[Table, float, str]:
+    from scipy.io import wavfile
+
+    file = require_file(path)
+    try:
+        with warnings.catch_warnings():
+            # Chunks with titles and the like are no concern of the samples.
+            warnings.simplefilter("ignore", wavfile.WavFileWarning)
+            rate, data = wavfile.read(path)
+    except OSError as error:
+        raise DataError(f"{file}: cannot be read: {error.strerror or error}") from None
+    except Exception:  # the reader meets damaged files with whatever its parser stumbles over
+        raise DataError(f"{file}: this is not a WAV file of plain samples, or a damaged one") from None
+    channels = np.asarray(data).reshape(len(data), -1)
+    if channels.size == 0 or rate <= 0:
+        raise DataError(f"{file}: the file holds no samples")
+    # Whole numbers become fractions of full scale; those of eight bits are not signed.
+    kind = channels.dtype
+    scaled = channels.astype(np.float64)
+    if kind == np.uint8:
+        scaled = (scaled - 128.0) / 128.0
+    elif kind.kind == "i":
+        scaled /= float(np.iinfo(kind).max) + 1.0
+    names = tuple(f"channel {k + 1}" for k in range(channels.shape[1]))
+
+    def convert(name: str) -> Array:
+        return scaled[:, names.index(name)]
+
+    note = f"Sound of {rate} Hz; amplitudes are fractions of full scale."
+    if len(names) > 1:
+        note += f" The first of {len(names)} channels is used unless --signal names another."
+    table = Table(file, names, convert, None, "channel")
+    return table, float(rate), note

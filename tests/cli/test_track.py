@@ -1,0 +1,128 @@
+"""``ctid track``: from a file to frequencies, or to one sentence."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.io import wavfile
+
+from ctid_cli.cli.track import MethodOption
+from ctid_cli.frequency import FREQUENCY_ESTIMATORS
+
+T = 0.002 * np.arange(3000)
+
+
+def signal(seed=0):
+    rng = np.random.default_rng(seed)
+    y = 1.5 * np.sin(2 * np.pi * 12.0 * T) + np.sin(2 * np.pi * 19.0 * T + 1.0)
+    return y + 0.05 * rng.standard_normal(T.size)
+
+
+def write(file, t, y, header="t,y"):
+    lines = [header, *(f"{a:.9g},{b:.9g}" for a, b in zip(t, y, strict=True))]
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def record(tmp_path):
+    return write(tmp_path / "record.csv", T, signal())
+
+
+def test_names_of_the_methods():
+    assert [method.value for method in MethodOption] == ["automatic", *FREQUENCY_ESTIMATORS]
+
+
+def test_table_track_and_figure(ctid, record, tmp_path):
+    out = tmp_path / "new" / "track.csv"
+    text = ctid("track", record, "--tones", 2, "--out", out).stdout
+    for part in ("record.csv: 3000 samples", "frequency [Hz]", "strongest tones", "Windows of", "track.svg"):
+        assert part in text
+    frame = pd.read_csv(out)
+    valid = frame[frame["valid"] == 1]
+    assert valid["frequency_1_hz"].median() == pytest.approx(12.0, abs=0.02)
+    assert valid["omega_2"].median() == pytest.approx(2 * np.pi * 19.0, rel=1e-3)
+    assert valid["amplitude_1"].median() == pytest.approx(1.5, rel=0.02)
+    assert (out.parent / "track.svg").read_bytes().startswith(b"<?xml")
+
+
+def test_json_and_hdf5(ctid, record, tmp_path):
+    out = tmp_path / "track.h5"
+    options = ("--tones", 2, "--method", "restarting_least_squares", "--every", 0.05, "--json", "--out", out)
+    done = ctid("track", record, *options)
+    content = json.loads(done.stdout)
+    assert content["method"] == "restarting_least_squares"
+    assert [tone["frequency_hz"] for tone in content["tones"]] == pytest.approx([12.0, 19.0], abs=0.05)
+    assert content["every"] == pytest.approx(0.05, rel=0.1)
+    assert content["written"] == [str(out), str(out.with_suffix(".svg"))]
+    assert out.is_file()
+    assert json.loads(ctid("track", record, *options).stdout) == content
+
+
+def test_units_windows_and_rates(ctid, tmp_path):
+    common = ("--tones", 2, "--json", "--out", tmp_path / "a.csv")
+    expected = pytest.approx([12.0, 19.0], abs=0.05)
+
+    def found(*arguments):
+        content = json.loads(ctid("track", *arguments, *common).stdout)
+        return content, [tone["frequency_hz"] for tone in content["tones"]]
+
+    content, hertz = found(write(tmp_path / "ms.csv", 1e3 * T, signal(), "t [ms],y"), "--from", 1000, "--to", 5000)
+    assert hertz == expected
+    assert (content["start"], content["samples"]) == (pytest.approx(1.0), 2001)
+    wavfile.write(tmp_path / "a.wav", 500, (8000 * signal()).astype(np.int16))
+    assert found(tmp_path / "a.wav")[1] == expected
+    assert found(write(tmp_path / "b.csv", np.arange(3000), signal(), "number,y"), "--rate", 500)[1] == expected
+    assert found(tmp_path / "b.csv", "--interval", 0.002, "--window", 1.0)[0]["settings"]["window_seconds"] == (
+        pytest.approx(1.0, rel=0.05)
+    )
+
+
+def test_missing_samples_are_flagged(ctid, tmp_path):
+    y = signal()
+    y[1000:1400] = np.nan
+    keep = np.isfinite(y)
+    content = json.loads(
+        ctid(
+            *("track", write(tmp_path / "gap.csv", T[keep], y[keep]), "--tones", 2, "--json"),
+            *("--out", tmp_path / "t.csv"),
+        ).stdout
+    )
+    assert content["missing"] == 400
+    frame = pd.read_csv(tmp_path / "t.csv")
+    inside = frame[(frame["t"] > T[1100]) & (frame["t"] < T[1300])]
+    assert len(inside)
+    assert (inside["valid"] == 0).all()
+    assert inside["flags"].str.contains("gap").all()
+
+
+@pytest.mark.parametrize(
+    ("t", "y", "options", "message"),
+    [
+        (T, np.zeros(T.size), (), "is zero"),
+        (T, np.full(T.size, 4.0), (), "constant"),
+        (T[:5], signal()[:5], (), "too few"),
+        (T, np.random.default_rng(1).standard_normal(T.size), (), "no tone stands out"),
+        (T**1.1, signal(), (), "clock is not regular"),
+        (T, signal(), ("--tones", 9), "tones must be an integer from 1 to 8"),
+        (T, signal(), ("--every", -1), "--every"),
+        (T, signal(), ("--window", 1000), "window must be between"),
+        (T, signal(), ("--rate", 0), "--rate"),
+        (T, signal(), ("--rate", 5, "--interval", 2), "one of them"),
+        (T, signal(), ("--out", "track.txt"), ".csv or .h5"),
+        (T, signal(), ("--signal", "z"), "'z'"),
+        (T, signal(), ("--from", 100), "no sample lies"),
+    ],
+)
+def test_mistakes_are_one_sentence(ctid, tmp_path, t, y, options, message):
+    file = write(tmp_path / "bad.csv", t, y)
+    done = ctid("track", file, "--tones", 2, "--out", tmp_path / "t.csv", *options, code=2)
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "t.csv").exists()
+
+
+def test_an_unknown_unit_of_time(ctid, tmp_path):
+    file = write(tmp_path / "a.csv", T, signal(), "t [fortnights],y")
+    assert "fortnights" in ctid("track", file, "--tones", 1, code=2).stderr

@@ -1,0 +1,173 @@
+"""Experiments on the frequencies of a signal: specification, measures, storage."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from ctid_cli.errors import SpecError
+from ctid_cli.experiment.engine import run_experiment
+from ctid_cli.experiment.frequency_measures import (
+    Measuring,
+    is_settled,
+    measure_track,
+    pack_track,
+    thinned,
+    unpack_track,
+)
+from ctid_cli.experiment.plan import build_plan
+from ctid_cli.experiment.spec import load_spec, spec_from_canonical
+from ctid_cli.experiment.store import load_estimates, read_stored, read_tracks
+from ctid_cli.experiment.summary import export_rows
+from ctid_cli.experiment.worker import Job, run_job
+from ctid_cli.frequency import Flag, FrequencyTrack, RestartingLeastSquares
+from ctid_cli.signals import MultiSine, Piece, Tone
+
+SPEC = """\
+experiment: frequencies
+signal:
+  tones: [{frequency: [{until: 15, value: 1.8}, {value: 2.0}]}, {frequency: 3.0, phase: 1.5}]
+  phase_at_steps: jump
+disturbance: {kind: uniform, half_width: 0.01}
+sampling: {kind: regular, interval: 0.01, duration: 30}
+estimators:
+  restarting: {kind: restarting_least_squares, tones: 2, h: 0.7, prefilter: 0.5}
+  esprit: {kind: esprit, tones: 2, averaging: 0.05}
+success: {band: 0.05, by: 8}
+tracks: {interval: 0.05, window: [25, 30]}
+monte_carlo: {runs: 2, seed: 1}
+"""
+SYSTEM = "system: {numerator: [1], denominator: [1, 1]}\nexcitation: {kind: gaussian}\n"
+
+
+def load(tmp_path, text=SPEC, *overrides):
+    file = tmp_path / "spec.yaml"
+    file.write_text(text, encoding="utf-8")
+    return load_spec(file, overrides)
+
+
+def problems(tmp_path, text, *overrides):
+    with pytest.raises(SpecError) as error:
+        load(tmp_path, text, *overrides)
+    return error.value.problems
+
+
+#: (what is replaced, by what, line, key, part of the message); the only problem of the specification.
+BROKEN = {
+    "both worlds": ("experiment: frequencies\n", "experiment: frequencies\nnoise: {kind: white, variance: 1}\n", 2,
+                    "noise", "disturbance"),
+    "estimator of systems": ("{kind: esprit, tones: 2, averaging: 0.05}", "{kind: svf, poles: 2, zeros: 0}", 9,
+                             "estimators.esprit.kind", "allowed: drem_gradient"),
+    "too many tones": ("esprit, tones: 2", "esprit, tones: 3", 9, "estimators.esprit.tones", "must be 2"),
+    "too slow a clock": ("{frequency: 3.0,", "{frequency: 400.0,", 6, "sampling.interval", "below 314.2 rad/s"),
+    "late step": ("until: 15", "until: 31", 3, "signal.tones", "a step at 31 s comes after the last sample"),
+    "no last piece": ("{value: 2.0}", "{value: 2.0, until: 20}", 3, "signal.tones[0].frequency", "the last has none"),
+    "text for pieces": ("3.0, phase", "fast, phase", 3, "signal.tones[1].frequency", "a list is allowed too"),
+    "length twice": ("duration: 30}", "duration: 30, samples: 7}", 6, "sampling.samples", "keep one of the two"),
+    "window": ("[25, 30]", "[25, 31]", 11, "tracks.window", "ends at 30 s"),
+    "track interval": ("tracks: {interval: 0.05", "tracks: {interval: 0.001", 11, "tracks.interval", "0.01 s"),
+    "rule of systems": ("{band: 0.05, by: 8}", "{delay_relative_error: 1}", 10, "success.delay_relative_error", "band"),
+    "no band": ("{band: 0.05, by: 8}", "{by: 8}", 10, "success.by", "add band"),
+    "h too long": ("h: 0.7", "h: 8", 8, "estimators.restarting.h", "delays are filled after 32.5 s"),
+    "no such word": ("jump", "leap", 4, "signal.phase_at_steps", "'jump', 'continuous'"),
+    "no clock": ("sampling: {kind: regular, interval: 0.01, duration: 30}\n", "", 1, "sampling", "for example"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BROKEN.values(), ids=BROKEN)
+def test_mistakes_are_named_with_their_place(tmp_path, case):
+    old, new, line, key, message = case
+    assert SPEC.count(old) == 1
+    (problem,) = problems(tmp_path, SPEC.replace(old, new))
+    assert (problem.line, problem.key) == (line, key)
+    assert message in problem.message
+
+
+def test_a_system_has_no_estimator_of_frequencies(tmp_path):
+    text = SYSTEM + "\n".join(SPEC.splitlines()[5:7]) + "\n  one: {kind: esprit, tones: 2}\n"
+    (problem,) = problems(tmp_path, f"experiment: one\n{text}monte_carlo: {{runs: 1, seed: 1}}\n")
+    assert problem.key == "estimators.one.kind"
+    assert "give signal" in problem.message
+
+
+def test_a_duration_is_a_number_of_samples(tmp_path):
+    spec = load(tmp_path, SPEC, "sampling.interval=[0.01, 0.02]")
+    assert [cell.source.sampling.samples for cell in build_plan(spec).data_cells] == [3000, 1500]
+    again = spec_from_canonical(json.loads(json.dumps(spec.canonical())))
+    assert build_plan(again).spec_hash == build_plan(spec).spec_hash
+
+
+def test_what_is_measured_belongs_to_the_identity_and_the_time_limit_does_not(tmp_path):
+    (cell,) = build_plan(load(tmp_path)).data_cells
+    for override, same in (("success.by=9", True), ("success.band=0.02", False), ("tracks.window=[20, 30]", False)):
+        (other,) = build_plan(load(tmp_path, SPEC, override)).data_cells
+        assert (other.hash == cell.hash) is same
+        assert np.array_equal(other.dataset(1).record.samples, cell.dataset(1).record.samples)
+
+
+def made(t, first, flags=None):
+    omega = np.column_stack((first, np.full(t.size, 3.0)))
+    return FrequencyTrack(t, omega, np.zeros(t.size, np.uint16) if flags is None else flags, np.zeros(omega.shape))
+
+
+def test_measures_of_a_made_up_track():
+    signal = MultiSine((Tone((Piece(1.8, until=6.0), Piece(2.0))), Tone(3.0)))
+    t = 0.5 * np.arange(24)
+    first = np.where(t < 2.0, 5.0, 1.8)  # wrong until 2 s, right until the step, late by 1.5 s after it
+    first[t >= 7.5] = 2.01
+    flags = np.where(t < 3.0, int(Flag.STARTING), 0).astype(np.uint16)
+    flags[(t == 4.0) | (t == 7.0) | (t == 7.5) | (t == 11.5)] = int(Flag.CHANGED)
+    options = RestartingLeastSquares(tones=2, h=0.7)
+    true = signal.frequencies_at(t)
+    found = measure_track(made(t, first, flags), true, signal, Measuring(0.05, (9.0, 12.0)), options)
+    assert found == {
+        "omega_1": 2.01, "omega_2": 3.0, "valid_from": 3.0, "settling_time_1": 2.0, "settling_time_2": 0.0,
+        "settling_after_step_1": 1.5, "settling_after_step_2": 0.0, "rms_1": pytest.approx(0.01), "rms_2": 0.0,
+        "bias_1": pytest.approx(0.01), "bias_2": 0.0, "false_alarms": 2.0, "valid_share": pytest.approx(100 * 14 / 24),
+    }  # fmt: skip
+    assert is_settled(found, 0.05, 2.0)
+    assert not is_settled(found, 0.05, 1.9)
+    first[-1] = 2.2
+    never = measure_track(made(t, first), true, signal, Measuring(0.05), options)
+    assert (never["settling_time_1"], never["settling_after_step_1"]) == (2.0, None)
+    assert not is_settled(never, 0.05, None)
+
+
+def test_a_packed_track_is_the_track():
+    t = 0.01 * np.arange(1001)
+    track = thinned(made(t, np.sin(t) + 2), 0.05, 0.01)
+    assert track.t.tolist() == t[::5].tolist()
+    packed = json.loads(json.dumps(pack_track(track)))
+    for name, values in unpack_track(packed).items():
+        assert np.array_equal(values, getattr(track, name))
+
+
+def test_results_are_sealed_and_read_back(tmp_path):
+    plan = build_plan(load(tmp_path))
+    folder = tmp_path / "out"
+    summary = run_experiment(plan, folder, jobs=1)
+    assert (summary.computed, summary.failed) == (4, 0)
+    stored = read_stored(folder)
+    (cell,) = plan.data_cells
+    wanted = tuple(plan.keys(plan.tasks()[0]))
+    outcomes = run_job(Job(cell, 0, 1, wanted))
+    assert {outcome.key for outcome in outcomes} < stored.results.keys()
+    for outcome in outcomes:
+        assert stored.results[outcome.key]["measures"] == outcome.result["measures"]
+    tracks = read_tracks(folder)
+    (online,) = [outcome for outcome in outcomes if "track" in outcome.result]
+    assert list(tracks) == [online.key.id], "of one data set, and none of an estimate of the whole record"
+    for name, values in unpack_track(online.result["track"]).items():
+        assert np.array_equal(tracks[online.key.id][name], values, equal_nan=True)
+    with h5py.File(folder / "runs.h5") as file:
+        assert file[f"tracks/{online.key.id}/omega"].attrs["unit"] == "rad/s"
+    flat = export_rows(load_estimates(folder))
+    assert {"omega_1", "settling_after_step_2", "rms_2", "false_alarms", "converged"} <= set(flat)
+    assert not {"numerator", "delay", "b0", "measures"} & set(flat)
+    restarting = flat[flat["estimator"] == "restarting"]
+    assert restarting["converged"].all()
+    assert (restarting["settling_after_step_1"] < 8).all()
+    assert not flat[flat["estimator"] == "esprit"]["converged"].any(), "a step lies in the record"
+    again = run_experiment(plan, folder, jobs=1)
+    assert (again.computed, again.reused) == (0, 4)

@@ -1,0 +1,122 @@
+"""Settings from the record alone: good enough that the tones are found, and refusals in words."""
+
+import numpy as np
+import pytest
+
+from ctid_cli.errors import DataError
+from ctid_cli.frequency import FREQUENCY_ESTIMATORS
+from ctid_cli.frequency.automatic import choose_settings
+from ctid_cli.frequency.record_track import track_record
+
+
+def plucked(rate=8000.0, seconds=1.5, hum=0.003, noise=0.0005, seed=0):
+    """A string that decays: inharmonic partials, two loud high ones for a moment, hum, noise and a constant."""
+    t = np.arange(int(rate * seconds)) / rate
+    rng = np.random.default_rng(seed)
+    y = 0.002 + hum * np.sin(2 * np.pi * 100.0 * t) + noise * rng.standard_normal(t.size)
+    for frequency, amplitude, decay in (*PARTIALS, (1320.7, 0.02, 6.0), (1467.9, 0.02, 6.0)):
+        y += amplitude * np.exp(-decay * t) * np.sin(2 * np.pi * frequency * t + frequency)
+    return y
+
+
+PARTIALS = ((146.3, 0.15, 0.4), (292.9, 0.03, 0.4), (439.9, 0.03, 1.1), (587.4, 0.015, 1.3))
+
+
+def medians(y, interval, tones, **options):
+    settings = choose_settings(y, interval, tones, **options)
+    track = track_record(y, interval, settings)
+    return settings, track, np.median(track.omega[track.valid], axis=0) / (2 * np.pi)
+
+
+def test_partials_of_a_decaying_string():
+    settings, track, found = medians(plucked(), 1 / 8000.0, 4)
+    assert found == pytest.approx([146.3, 292.9, 439.9, 587.4], abs=0.15)
+    assert track.valid.mean() > 0.9
+    assert settings.estimator.kind == "esprit"
+    assert settings.decimation.factor > 1
+    assert np.abs(settings.expected[4:] / (2 * np.pi) - 100.0).min() < 0.5
+    text = " ".join(settings.reasons)
+    for part in ("low-pass", "One of 3 samples", "not shown", "Windows of", "esprit"):
+        assert part in text
+
+
+def test_the_online_tracker_finds_the_string_too():
+    track, found = medians(plucked(), 1 / 8000.0, 4, method="restarting_least_squares")[1:]
+    assert found == pytest.approx([146.3, 292.9, 439.9, 587.4], abs=0.3)
+    assert track.valid.mean() > 0.7
+
+
+@pytest.mark.parametrize("method", list(FREQUENCY_ESTIMATORS))
+def test_every_method_finds_two_tones_far_from_one_radian_per_second(method):
+    t = 2e-6 * np.arange(30_000)
+    rng = np.random.default_rng(2)
+    y = np.sin(4000.0 * t) + 0.8 * np.sin(6500.0 * t + 1.0) + 0.01 * rng.standard_normal(t.size)
+    settings = choose_settings(y, 2e-6, 2, method=method)
+    track = track_record(y, 2e-6, settings)
+    assert settings.estimator.kind == method
+    assert track.omega[-1] == pytest.approx([4000.0, 6500.0], rel=0.02)
+    assert track.amplitudes[-1] == pytest.approx([1.0, 0.8], rel=0.05)
+    assert track.valid[-1]
+
+
+def test_units_of_time_only_scale():
+    y = plucked(seconds=0.6)
+    one, other = (choose_settings(y, interval, 4) for interval in (1 / 8000.0, 1.0))
+    assert other.expected * 8000.0 == pytest.approx(one.expected, rel=1e-9)
+    assert (other.window, other.decimation.factor) == (one.window, one.decimation.factor)
+    assert other.decimation.weights == pytest.approx(one.decimation.weights, abs=1e-12)
+
+
+def test_delay_of_the_regression_follows_the_highest_tone():
+    t = 0.001 * np.arange(20_000)
+    settings = choose_settings(np.sin(30.0 * t) + np.sin(50.0 * t), 0.001, 2, method="restarting_least_squares")
+    assert 1.8 < settings.estimator.h * 50.0 < 2.6
+    assert settings.estimator.prefilter == pytest.approx(1.5 * settings.estimator.h)
+
+
+def test_noise_makes_windows_longer():
+    t = 0.01 * np.arange(6000)
+    noise = np.random.default_rng(3).standard_normal(t.size)
+    clean, noisy = (choose_settings(np.sin(20.0 * t) + level * noise, 0.01, 1) for level in (0.01, 2.0))
+    assert noisy.window_seconds > 1.5 * clean.window_seconds
+
+
+def test_gaps_ask_for_a_method_that_stands_them():
+    t = 0.01 * np.arange(3000)
+    y = np.sin(20.0 * t) + 0.5 * np.sin(45.0 * t)
+    y[np.random.default_rng(4).random(t.size) < 0.05] = np.nan
+    settings, track, found = medians(y, 0.01, 2)
+    assert settings.estimator.kind == "nonlinear_least_squares"
+    assert found * 2 * np.pi == pytest.approx([20.0, 45.0], rel=1e-3)
+    assert track.valid.mean() > 0.9
+
+
+def test_doubts_are_told():
+    t = 0.01 * np.arange(3000)
+    assert "Nyquist" in choose_settings(np.sin(305.0 * t), 0.01, 1).warnings[0]
+    noise = 0.01 * np.random.default_rng(5).standard_normal(t.size)
+    assert "Only 1 of 2" in choose_settings(np.sin(30.0 * t) + noise, 0.01, 2).warnings[0]
+    assert choose_settings(np.sin(30.0 * t) + noise, 0.01, 1).warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("y", "message"),
+    [
+        (np.zeros(100), "is zero"),
+        (np.full(100, 3.3), "constant"),
+        (np.sin(np.arange(5.0)), "too few"),
+        (np.full(100, np.nan), "too few"),
+        (np.random.default_rng(6).standard_normal(500), "no tone stands out"),
+        (np.arange(100.0), "no tone stands out|too short"),
+    ],
+)
+def test_refusals(y, message):
+    with pytest.raises(DataError, match=message):
+        choose_settings(y, 0.01, 1)
+
+
+def test_options_out_of_range():
+    y = np.sin(0.3 * np.arange(300))
+    for options in ({"tones": 0}, {"tones": 9}, {"method": "fft"}, {"window": -1.0}, {"window": 1e6}):
+        with pytest.raises(ValueError, match=next(iter(options))):
+            choose_settings(y, 0.01, **{"tones": 1, **options})

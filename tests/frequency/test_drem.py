@@ -1,0 +1,236 @@
+"""Gradient, finite time and sliding window against plain numpy twins, exactness, and what scaling must not change."""
+
+import numpy as np
+import pytest
+
+from ctid_cli.frequency import DremFiniteTime, DremGradient, DremWindow, Flag
+from ctid_cli.frequency.decoding import frequencies_of
+from ctid_cli.frequency.drem_window import slide
+from ctid_cli.frequency.regression import regression_rows, theta_of
+from tests.frequency.signals import INTERVAL, OMEGA, tones
+
+H, D = 0.4, 0.3
+LAG, SPACING = 40, 30
+COUNT = 2500
+
+
+def mixed_regressions(y, n, first_row, lag=LAG, spacing=SPACING):
+    """Psi (N, n) and Delta (N,) from numpy's determinants; NaN where a row is missing."""
+    psi, phi = regression_rows(y, n, lag)
+    right, delta = np.full((y.size, n), np.nan), np.full(y.size, np.nan)
+    for k in range(2 * n * lag + (first_row + n - 1) * spacing, y.size):
+        places = k - (first_row + np.arange(n)) * spacing
+        matrix = phi[places]
+        delta[k] = np.linalg.det(matrix)
+        for i in range(n):
+            replaced = matrix.copy()
+            replaced[:, i] = psi[places]
+            right[k, i] = np.linalg.det(replaced)
+    return right, delta
+
+
+def noisy(n, count=COUNT, noise=0.01):
+    return tones(n, count).sum(axis=1) + noise * np.random.default_rng(n).standard_normal(count)
+
+
+def decoded(theta, h=H):
+    return np.array([frequencies_of(row, h)[0] for row in theta])
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("first_row", [0, 1])
+def test_gradient_and_finite_time_are_the_published_recursions(n, first_row):
+    # theta' = gamma Delta (Psi - Delta theta) solved over each interval, W' = -gamma Delta^2 W, and the finite-time
+    # estimate (theta - theta(0) W)/(1 - W): literally, from numpy's determinants.
+    y = noisy(n)
+    epsilon, gamma = 0.3, np.array([3.0, 1.0, 2.0])[:n]
+    initial = tuple(1.2 * OMEGA[n])
+    right, delta = mixed_regressions(y, n, first_row)
+    theta, W = np.array([theta_of(initial, H)] * (y.size + 1)), np.ones((y.size + 1, n))
+    for k in range(y.size):
+        theta[k + 1], W[k + 1] = theta[k], W[k]
+        if np.isfinite(delta[k]):
+            x = gamma * (epsilon * delta[k]) ** 2 * INTERVAL
+            theta[k + 1] = right[k] / delta[k] + (theta[k] - right[k] / delta[k]) * np.exp(-x)
+            W[k + 1] = W[k] * np.exp(-x)
+    options = {
+        "tones": n,
+        "h": H,
+        "d": D,
+        "epsilon": epsilon,
+        "gamma": tuple(gamma),
+        "first_row": first_row,
+        "initial_frequencies": initial,
+    }
+    gradient = DremGradient(**options).start(INTERVAL).run(y).omega
+    np.testing.assert_allclose(gradient, decoded(theta[1:]), atol=1e-8)
+    finite = DremFiniteTime(**options).start(INTERVAL).run(y).omega
+    begun = W[1:].max(axis=1) < 0.99
+    assert begun.sum() > 1000
+    literal = (theta[1:] - theta[0] * W[1:]) / np.where(W[1:] < 1, 1 - W[1:], np.nan)
+    np.testing.assert_allclose(finite[begun], decoded(literal[begun]), atol=1e-7)
+    # The initial frequencies are shown until the first mixed row.
+    assert np.array_equal(np.unique(finite[: np.flatnonzero(np.isfinite(delta))[0]], axis=0), finite[:1])
+    np.testing.assert_allclose(finite[0], initial, rtol=1e-9)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("memory", [0.5, 3.0, 100.0])
+def test_window_is_least_squares_on_the_mixed_regressions_of_the_window(n, memory):
+    y = noisy(n)
+    right, delta = np.nan_to_num(mixed_regressions(y, n, 1)[0]), np.nan_to_num(mixed_regressions(y, n, 1)[1])
+    length = round(memory / INTERVAL)
+    track = DremWindow(tones=n, h=H, d=D, memory=memory).start(INTERVAL).run(y)
+    first = 2 * n * LAG + n * SPACING
+    assert np.isnan(track.omega[:first]).all()
+    for k in (first, first + 20, first + 150, 1234, COUNT - 1):
+        part = slice(max(0, k + 1 - length), k + 1)
+        theta = (delta[part] @ right[part]) / (delta[part] @ delta[part])
+        np.testing.assert_allclose(track.omega[k], frequencies_of(theta, H)[0], atol=1e-8)
+
+
+def test_sliding_sums_hold_the_window_and_nothing_else():
+    rng = np.random.default_rng(0)
+    values = rng.standard_normal((100, 2)) * 10.0 ** rng.uniform(-8, 8, (100, 1))
+    window, newer, sums, place = np.zeros((7, 2)), np.zeros(2), np.empty(2), 0
+    for k, value in enumerate(values):
+        window[place] = value
+        place = slide(window, newer, place, sums)
+        part = values[max(0, k - 6) : k + 1]
+        # No more rounding than that of the sum itself, although much larger numbers have passed.
+        np.testing.assert_allclose(sums, part.sum(axis=0), rtol=0, atol=1e-15 * np.abs(part).sum(axis=0).max())
+
+
+@pytest.mark.parametrize("n", range(1, 6))
+@pytest.mark.parametrize("first_row", [0, 1])
+def test_finite_time_is_exact_from_its_first_row_on(n, first_row):
+    y = tones(n, 3000).sum(axis=1)
+    first = 2 * n * LAG + (first_row + n - 1) * SPACING
+    for options in (
+        DremFiniteTime(tones=n, h=H, d=D, epsilon=0.3, first_row=first_row),
+        DremWindow(tones=n, h=H, d=D, memory=5.0, first_row=first_row),
+    ):
+        track = options.start(INTERVAL).run(y)
+        error = np.abs(track.omega - OMEGA[n]).max(axis=1)
+        assert error[first + 1 :].max() < (1e-9 if n < 5 else 1e-4)
+        assert error[-1] < 1e-8
+        assert not track.valid[:first].any()
+        # Valid once n h/4 of rows have agreed, and from then on.
+        assert track.valid[first + n * LAG // 4 :].all()
+        assert (track.uncertainty[track.valid] < 0.05).all()
+        assert np.array_equal(np.flatnonzero(track.valid), np.arange(first - 1 + n * LAG // 4, y.size))
+
+
+def test_gradient_converges_at_the_rate_of_the_excitation():
+    # ln of the error falls by gamma <Delta^2> in a unit of time.
+    y = tones(2, 6000).sum(axis=1)
+    delta = mixed_regressions(y, 2, 1)[1]
+    gamma = 0.3 / np.nanmean(delta**2)
+    options = DremGradient(tones=2, h=H, d=D, gamma=gamma, initial_frequencies=tuple(OMEGA[2] + 0.1))
+    error = np.abs(options.start(INTERVAL).run(y).omega - OMEGA[2]).max(axis=1)
+    # Over a whole number of beats, 2 pi/(w2 - w1).
+    beats = round(6 * np.pi / INTERVAL)
+    assert np.log(error[2000] / error[2000 + beats]) == pytest.approx(0.3 * beats * INTERVAL, rel=0.02)
+
+
+def test_gains_of_any_size_are_stable():
+    # The explicit step would diverge beyond gamma Delta^2 Ts = 2.
+    for gamma in (1e-12, 1e6, 1e12):
+        y = tones(2, 3000).sum(axis=1)
+        track = DremFiniteTime(tones=2, h=H, d=D, gamma=gamma).start(INTERVAL).run(y)
+        np.testing.assert_allclose(track.omega[-1], OMEGA[2], atol=1e-9)
+        track = DremGradient(tones=2, h=H, d=D, gamma=gamma).start(INTERVAL).run(y)
+        assert np.isfinite(track.omega).all()
+
+
+def test_normalisation_is_a_gain():
+    y = noisy(2)
+    base = DremFiniteTime(tones=2, h=H, d=D, epsilon=0.5, gamma=(2.0, 3.0)).start(INTERVAL).run(y)
+    other = DremFiniteTime(tones=2, h=H, d=D, epsilon=0.05, gamma=(200.0, 300.0)).start(INTERVAL).run(y)
+    np.testing.assert_allclose(other.omega, base.omega, atol=1e-9)
+    literal = DremFiniteTime(tones=2, h=H, d=D, epsilon=0.5, power="literal").start(INTERVAL).run(y)
+    squared = DremFiniteTime(tones=2, h=H, d=D, epsilon=0.5, power=2).start(INTERVAL).run(y)
+    once = DremFiniteTime(tones=2, h=H, d=D, epsilon=0.25).start(INTERVAL).run(y)
+    assert np.array_equal(literal.omega, squared.omega)
+    assert np.array_equal(literal.omega, once.omega)
+
+
+def test_amplitude_is_a_gain_and_time_is_relative():
+    y = noisy(2)
+    base = DremFiniteTime(tones=2, h=H, d=D, gamma=1.0, first_row=0).start(INTERVAL).run(y)
+    louder = DremFiniteTime(tones=2, h=H, d=D, gamma=10.0**-12, first_row=0).start(INTERVAL).run(1000.0 * y)
+    np.testing.assert_allclose(louder.omega, base.omega, atol=1e-9)
+    assert np.array_equal(louder.flags, base.flags)
+    slower = DremFiniteTime(tones=2, h=8 * H, d=8 * D, gamma=0.125, first_row=0).start(8 * INTERVAL).run(y)
+    np.testing.assert_allclose(8.0 * slower.omega, base.omega, rtol=1e-12)
+    np.testing.assert_allclose(8.0 * slower.uncertainty, base.uncertainty, rtol=1e-9)
+    assert np.array_equal(slower.flags, base.flags)
+
+
+def test_zero_filled_delays_enter_the_estimate():
+    y = tones(2, 3000).sum(axis=1)
+    gated = DremFiniteTime(tones=2, h=H, d=D).start(INTERVAL).run(y)
+    filled = DremFiniteTime(tones=2, h=H, d=D, gated=False).start(INTERVAL).run(y)
+    padded = DremFiniteTime(tones=2, h=H, d=D).start(INTERVAL).run(np.concatenate((np.zeros(300), y)))
+    # Zero-filled delays are the same as a signal that has been zero for ever, from the first complete row on.
+    np.testing.assert_allclose(filled.omega[:], padded.omega[300:], atol=1e-9)
+    error = np.abs(filled.omega - OMEGA[2]).max(axis=1)
+    assert error[2 * 2 * LAG + 2 * SPACING] > 1e-3
+    assert np.abs(gated.omega[2 * 2 * LAG + 2 * SPACING] - OMEGA[2]).max() < 1e-9
+
+
+def test_rounded_delays_cost_nothing():
+    # h = 0.1 s is no multiple of 3 ms: 0.099 s is used, in the arc cosine too.
+    t = 0.003 * np.arange(1000)
+    y = np.sin(2 * t) + np.cos(3 * t)
+    tracker = DremFiniteTime(tones=2, h=0.1, d=0.13, epsilon=100.0, gamma=0.005).start(0.003)
+    assert tracker.notes[0].endswith("0.099 s is used.")
+    np.testing.assert_allclose(tracker.run(y).omega[-1], [2.0, 3.0], atol=1e-9)
+
+
+def test_a_missing_sample_is_a_gap_until_it_leaves_the_delays():
+    y = tones(2, 1500).sum(axis=1)
+    y[900] = np.nan
+    track = DremFiniteTime(tones=2, h=H, d=D).start(INTERVAL).run(y)
+    gaps = np.flatnonzero(track.flags & Flag.GAP)
+    lags = np.add.outer(np.arange(5) * LAG, np.array([1, 2]) * SPACING)
+    assert np.array_equal(gaps, np.unique(900 + lags))
+    assert not track.valid[gaps].any()
+    assert np.abs(track.omega[300:] - OMEGA[2]).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tones": 0}, "tones must be an integer from 1 to 8, not 0"),
+        ({"h": 0.0}, r"h must be a positive number \[s\], not 0.0"),
+        ({"d": -1.0}, r"d must be a positive number \[s\], not -1.0"),
+        ({"epsilon": 0}, "epsilon must be a positive number"),
+        ({"gamma": (1.0, 2.0, 3.0)}, r"gamma must hold one number for each of the 2 tones, not \(1.0, 2.0, 3.0\)"),
+        ({"gamma": (1.0, 0.0)}, "gamma must be a positive number"),
+        ({"gamma": -1.0}, "gamma must be a positive number"),
+        ({"initial_frequencies": (1.0,)}, "initial_frequencies must hold one number for each of the 2 tones"),
+        ({"first_row": -1}, "first_row must be an integer from 0"),
+        ({"power": 0}, "power must be an integer of at least 1"),
+        ({"prefilter": -0.1}, "prefilter must be zero or a positive number"),
+        ({"lowest_frequency": 9.0}, r"lowest_frequency \(9 rad/s\) must be below highest_frequency \(7.85398 rad/s\)"),
+        (
+            {"highest_frequency": 8.0},
+            r"with h = 0.4 s, frequencies above pi/h = 7.85398 rad/s are seen as lower ones, but highest_frequency is 8 "
+            r"rad/s; use an h below 0.392699 s",
+        ),
+    ],
+)
+@pytest.mark.parametrize("estimator", [DremFiniteTime, DremGradient])
+def test_impossible_options_are_refused(estimator, options, message):
+    with pytest.raises(ValueError, match=message):
+        estimator(**{"tones": 2, "h": H, "d": D, **options})
+
+
+def test_delays_that_the_clock_cannot_show_are_refused():
+    with pytest.raises(ValueError, match=r"d = 0.1 s is shorter than half a sampling interval of 0.5 s"):
+        DremFiniteTime(tones=2, h=H, d=0.1).start(0.5)
+    with pytest.raises(ValueError, match=r"with h = 0.5 s, frequencies above pi/h = 6.28319 rad/s .* is 7 rad/s"):
+        DremFiniteTime(tones=2, h=H, d=0.5, highest_frequency=7.0).start(0.5)
+    with pytest.raises(ValueError, match=r"memory = 0.05 s holds 5 samples of 0.01 s, fewer than the 8"):
+        DremWindow(tones=2, h=H, d=D, memory=0.05).start(INTERVAL)

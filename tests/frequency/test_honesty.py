@@ -1,0 +1,133 @@
+"""Signals that do not have the tones asked for: no estimator calls a wrong number valid."""
+
+import numpy as np
+import pytest
+
+from ctid_cli.frequency import (
+    DremFiniteTime,
+    DremGradient,
+    DremWindow,
+    Esprit,
+    FilterRegression,
+    Flag,
+    NonlinearLeastSquares,
+    RestartingLeastSquares,
+)
+
+INTERVAL = 0.01
+T = INTERVAL * np.arange(4000)
+TRUTH = np.array([2.0, 3.0])
+CLEAN = np.sin(2 * T) + np.cos(3 * T)
+NOISE = np.random.default_rng(0).standard_normal(T.size)
+
+#: Two tones are asked for, and there is no right answer.
+NO_TWO_TONES = {
+    "zero": 0 * T,
+    "constant": 0 * T + 2.5,
+    "a ramp": 0.3 * T,
+    "one tone": np.sin(2 * T),
+    "one tone twice": np.sin(2 * T) + 0.7 * np.cos(2 * T + 1),
+    "one tone and noise": np.sin(2 * T) + 0.05 * NOISE,
+    "noise": NOISE,
+    "an alias": np.sin(2 * T) + np.sin(7 * T),
+    "a weak alias": np.sin(2 * T) + 0.2 * np.sin(7 * T + 1),
+    "an alias and noise": np.sin(2 * T) + np.sin(7 * T) + 0.05 * NOISE,
+    "three tones": CLEAN + np.sin(4 * T),
+    "a bias": CLEAN + 0.5,
+    "a large bias": CLEAN + 3.0,
+    "a square wave": np.sign(np.sin(2 * T)),
+}
+ONLINE = [
+    DremGradient(tones=2, h=0.7, d=0.4, epsilon=0.3),
+    DremFiniteTime(tones=2, h=0.7, d=0.4, epsilon=0.3),
+    DremFiniteTime(tones=2, h=0.7, d=0.4, epsilon=0.3, prefilter=1.0, first_row=0),
+    DremWindow(tones=2, h=0.7, d=0.4, memory=4.0),
+    RestartingLeastSquares(tones=2, h=0.7),
+    RestartingLeastSquares(tones=2, h=0.7, prefilter=1.0),
+    RestartingLeastSquares(tones=2, h=0.7, solution="total_least_squares"),
+    FilterRegression(tones=2, pole=4.0),
+]
+BATCH = [Esprit(tones=2, averaging=0.05), NonlinearLeastSquares(tones=2, averaging=0.05)]
+#: What an estimator may do with a signal: tell the tones that are there.
+TOLD_APART = {"an alias", "a weak alias", "an alias and noise"}
+
+
+@pytest.mark.parametrize("name", NO_TWO_TONES)
+@pytest.mark.parametrize("options", ONLINE, ids=lambda options: options.kind)
+def test_no_estimate_is_valid_where_there_are_no_two_tones(options, name):
+    if isinstance(options, FilterRegression) and name in TOLD_APART:
+        return  # it has no delay that could alias
+    track = options.start(INTERVAL).run(NO_TWO_TONES[name])
+    assert not track.valid.any()
+
+
+@pytest.mark.parametrize("name", [name for name in NO_TWO_TONES if name not in TOLD_APART | {"a bias"}])
+@pytest.mark.parametrize("options", BATCH, ids=lambda options: options.kind)
+def test_no_record_is_called_valid_that_has_no_two_tones(options, name):
+    assert not options.estimate(NO_TWO_TONES[name], INTERVAL).valid
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-6, 1e-3, 0.05, 0.3])
+@pytest.mark.parametrize("options", ONLINE + BATCH, ids=lambda options: options.kind)
+def test_valid_estimates_are_right(options, noise):
+    y = CLEAN + noise * NOISE
+    if options.online:
+        track = options.start(INTERVAL).run(y)
+        error = np.abs(track.omega - TRUTH)
+        valid = track.valid
+        assert (error[valid] < 0.1).all()  # what certain means here: a tenth of the distance
+        assert (np.abs(track.omega[-1] - TRUTH) <= track.uncertainty[-1] + 1e-6).all()
+        if noise <= 1e-3:
+            assert valid[-500:].all()
+            assert error[-500:].max() < 1e-2
+    else:
+        estimate = options.estimate(y, INTERVAL)
+        assert estimate.valid
+        assert (np.abs(estimate.omega - TRUTH) <= estimate.uncertainty).all()
+
+
+@pytest.mark.parametrize("options", ONLINE, ids=lambda options: options.kind)
+def test_flags_say_what_is_wrong(options):
+    def flags(name):
+        return Flag(int(options.start(INTERVAL).run(NO_TWO_TONES[name]).flags[-1]))
+
+    assert flags("zero") & Flag.UNDETERMINED
+    assert flags("noise") & Flag.UNCERTAIN
+    assert flags("a large bias") & (Flag.UNCERTAIN | Flag.COMPLEX_ROOTS | Flag.OUT_OF_BOUNDS)
+    if not isinstance(options, FilterRegression):
+        assert flags("an alias") & Flag.INCONSISTENT
+
+
+@pytest.mark.parametrize("omega", [3.2, 4.0, 6.0, 7.0, 8.5, 11.0, 20.0, 60.0])
+def test_every_alias_of_one_tone_is_noticed(omega):
+    # pi/h is 3.14 rad/s here; all of these are seen as something below it.
+    track = RestartingLeastSquares(tones=1, h=1.0).start(INTERVAL).run(np.sin(omega * T + 0.3))
+    assert (track.omega[-1] < np.pi).all()
+    assert not track.valid.any()
+
+
+def test_tones_that_look_alike_at_the_delay_are_one():
+    # cos(w h) is the same for 2 and 2 pi/0.7 - 2 rad/s; at another delay they are two.
+    y = np.sin(2 * T) + np.sin((2 * np.pi / 0.7 - 2) * T)
+    assert not RestartingLeastSquares(tones=2, h=0.7).start(INTERVAL).run(y).valid.any()
+    track = RestartingLeastSquares(tones=2, h=0.4).start(INTERVAL).run(y)
+    assert track.valid[-1000:].all()
+
+
+def test_five_tones_are_valid_only_once_they_are_known():
+    omega = np.array([1.0, 2.0, 3.0, 4.2, 5.5])
+    y = np.sin(np.outer(T, omega) + np.arange(5)).sum(axis=1)
+    track = RestartingLeastSquares(tones=5, h=0.4).start(INTERVAL).run(y)
+    error = np.abs(track.omega - omega).max(axis=1)
+    assert (error > 0.1)[400:430].any()  # right after the delays are filled
+    assert error[track.valid].max() < 1e-4
+    assert track.valid[-2000:].all()
+
+
+@pytest.mark.parametrize("scale", [1e-25, 1e25])
+@pytest.mark.parametrize("options", ONLINE, ids=lambda options: options.kind)
+def test_extreme_amplitudes_give_no_wrong_number(options, scale):
+    with np.errstate(all="raise"):
+        track = options.start(INTERVAL).run(scale * CLEAN)
+    if track.valid.any():
+        assert np.abs(track.omega[track.valid] - TRUTH).max() < 0.1
