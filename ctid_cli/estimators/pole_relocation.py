@@ -15,8 +15,8 @@ squared output error, as in refined instrumental variables.
 
 References
 ----------
-B. Gustavsen and A. Semlyen, "Rational approximation of frequency domain responses by vector fitting", *IEEE Trans. Power
-Delivery* 14 (1999) 1052-1061. doi:10.1109/61.772353
+B. Gustavsen and A. Semlyen, "Rational approximation of frequency domain responses by vector fitting", *IEEE Trans.
+Power Delivery* 14 (1999) 1052-1061. doi:10.1109/61.772353
 """
 
 from __future__ import annotations
