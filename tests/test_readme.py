@@ -23,16 +23,19 @@ def test_the_python_example_prints_what_is_shown():
     assert len(example.strip().splitlines()) <= 12
 
 
-def test_the_specification_is_valid(tmp_path):
+def test_the_specifications_are_valid(tmp_path):
     from ctid_cli.experiment.plan import build_plan
     from ctid_cli.experiment.spec import load_spec
 
-    (text,) = block("yaml")
+    first, second = block("yaml")
     file = tmp_path / "my-first.yaml"
-    file.write_text(text, encoding="utf-8")
+    file.write_text(first, encoding="utf-8")
     plan = build_plan(load_spec(file))
     assert plan.experiment == "my-first"
     assert len(plan.tasks()) == 40
+    file.write_text("experiment: sum\nmonte_carlo: {runs: 300, seed: 1}\n" + second, encoding="utf-8")
+    plan = build_plan(load_spec(file))
+    assert (len(plan.tasks()), len(plan.estimators)) == (15_000, 2)
 
 
 def test_linked_files_exist():

@@ -119,12 +119,12 @@ def automatic_start(record: Record, terms: Sequence[Term], delay: float = 0.0) -
     >>> import numpy as np
     >>> from ctid_cli.filtering import simulate_additive
     >>> from ctid_cli.signals import HeldSignal
-    >>> system = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
+    >>> system = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.04, 0.02, 1.0])])
     >>> t = 0.05 * np.arange(1000)
     >>> u = HeldSignal(t, np.random.default_rng(1).standard_normal(1000))
     >>> start = automatic_start(Record(t, simulate_additive(system, u, t), u), system.terms)
     >>> start.model.theta.round(2)
-    array([0.25 , 0.25 , 3.   , 0.01 , 0.02, 1.   ])
+    array([0.25, 0.25, 3.  , 0.02, 0.04, 1.  ])
     """
     structure = tuple(terms)
     if not structure:

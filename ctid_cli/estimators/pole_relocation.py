@@ -12,6 +12,11 @@ For given poles this is linear. Poles are moved as in vector fitting: with ``\si
 is linear in r, t and c, and the zeros of sigma are better poles. Least squares would be biased by the noise in
 ``sigma Y``; with the fitted output in the place of Y as instrument, a fixed point (c = 0) is a stationary point of the
 squared output error, as in refined instrumental variables.
+
+References
+----------
+B. Gustavsen and A. Semlyen, "Rational approximation of frequency domain responses by vector fitting", *IEEE Trans.
+Power Delivery* 14 (1999) 1052-1061. doi:10.1109/61.772353
 """
 
 from __future__ import annotations
@@ -38,7 +43,8 @@ LOCAL_LINES = 12
 LOCAL_DEGREE = 2
 #: A band of that many lines counts as excited by the input from this ratio of explained to noise power on.
 CLEARLY_EXPLAINED = 10.0
-#: Lines are kept up to the highest clearly explained frequency times this: weaker modes may lie beyond it.
+#: Lines are kept up to the highest clearly explained frequency times this: weaker modes may lie beyond it. Of a
+#: short record no fewer than this many are kept.
 HEADROOM = 2.5
 FEWEST_LINES = 128
 #: Moves of all poles after each new mode, and after the last.
@@ -69,9 +75,9 @@ class Lines:
     frequencies : ndarray, shape (K,)
         Equidistant frequencies [rad/s], without zero.
     inputs, outputs : ndarray, shape (K,)
-        Spectra of delayed input and output, divided by the noise level.
+        Spectra of delayed input and output times the weights.
     weights : ndarray, shape (K,)
-        What they were multiplied with: the spectrum of a transient.
+        Reciprocal noise levels; also what the weights make of a transient.
     direct : ndarray, shape (K,) or (0,)
         Spectrum of what a direct feed-through adds to the output, weighted likewise; empty where there is none.
     integrators : int

@@ -243,7 +243,9 @@ def parameter_estimates(results: Results) -> list[ParameterEstimates]:
             f"{results.experiment}: errors of parameters need their true values, and the data are not simulated from "
             "a sum of submodels (system: additive)"
         )
-    hashes = {(part["name"], *_items(part["swept"])): part["hash"] for part in manifest["estimators"]}
+    # By place, not by hash: a later version may write the same specification with more defaults.
+    cell_places = {cell["hash"]: k for k, cell in enumerate(manifest["data_cells"])}
+    places = {(part["name"], *_items(part["swept"])): k for k, part in enumerate(manifest["estimators"])}
     across = list(dict.fromkeys(name for part in manifest["estimators"] for name in part["swept"]))
     variances = long_record_variances(build_plan(spec_from_canonical(results.settings)))
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
@@ -256,7 +258,7 @@ def parameter_estimates(results: Results) -> list[ParameterEstimates]:
         cell, truth = cells[cell_hash], truths[cell_hash]
         assert truth is not None
         names = tuple(truth)
-        theory = variances.get((cell_hash, hashes[estimator, *_items(own)]))
+        theory = variances.get((cell_places[cell_hash], places[estimator, *_items(own)]))
         samples = lookup(cell["content"], "sampling.samples")
         failed = sum(row["status"] in FAILURES for row in rows)
         found.append(

@@ -14,7 +14,7 @@ from ctid_cli.reporting.expected_accuracy import LONG, expected_accuracy
 from ctid_cli.signals import RegularSampling
 
 
-def long_record_variances(plan: Plan) -> dict[tuple[str, str], dict[str, float]]:
+def long_record_variances(plan: Plan) -> dict[tuple[int, int], dict[str, float]]:
     """Variances of the parameters of submodels that estimates approach on long records.
 
     Parameters
@@ -25,24 +25,24 @@ def long_record_variances(plan: Plan) -> dict[tuple[str, str], dict[str, float]]
     Returns
     -------
     dict
-        By hash of the data cell and hash of the estimator: N times the variance by parameter name, for N samples.
-        A pair is missing where `ctid_cli.reporting.expected_accuracy.expected_accuracy` knows no limit.
+        By places of the data cell and of the estimator in the plan: N times the variance by parameter name, for N
+        samples. A pair is missing where `ctid_cli.reporting.expected_accuracy.expected_accuracy` knows no limit.
 
     Notes
     -----
     The limit is taken whatever the number of samples of the cell: short records do not reach it.
     """
-    found: dict[tuple[str, str], dict[str, float]] = {}
+    found: dict[tuple[int, int], dict[str, float]] = {}
     # Cells that differ in the number of samples have the same limit.
     known: dict[str, dict[str, float] | None] = {}
-    for cell in plan.data_cells:
-        for part in plan.estimators:
+    for k, cell in enumerate(plan.data_cells):
+        for j, part in enumerate(plan.estimators):
             same = content_hash([_without_length(cell.content), part.content])
             if same not in known:
                 known[same] = _variances(cell.source, part.estimator, plan)
             variances = known[same]
             if variances is not None:
-                found[cell.hash, part.hash] = variances
+                found[k, j] = variances
     return found
 
 

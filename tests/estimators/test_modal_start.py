@@ -10,8 +10,8 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimators import modal_start
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc
 from ctid_cli.estimators.common import Start
-from ctid_cli.estimators.modal_start import _arrangements, _criterion, automatic_start
-from ctid_cli.filtering import simulate_additive
+from ctid_cli.estimators.modal_start import _arrangements, _criterion, _NumeratorFit, automatic_start
+from ctid_cli.filtering import filter_data, simulate_additive
 from ctid_cli.models import AdditiveModel, Submodel, Term
 from ctid_cli.signals import HeldSignal, Record
 from tests.estimators.additive_records import (
@@ -237,6 +237,17 @@ def test_pairs_and_real_poles_are_shared_out():
     # The wrong number of poles fits no term.
     assert list(_arrangements([pair, slow], (MODE,))) == []
     assert list(_arrangements([pair], (MODE, Term(1, 0)))) == []
+
+
+@pytest.mark.parametrize("others", [[], [Submodel([0.5], [1.0], 2)], [Submodel([0.7], [1.0])]])
+def test_spare_poles_are_those_that_explain_least(others):
+    system = AdditiveModel([MODE_1, MODE_2, *others])
+    record = open_record(system, 1000, 0.01, 15)
+    fitter = _NumeratorFit(filter_data(record), system.terms, 0.0)
+    first, second = (complex(mode.poles[0].real, abs(mode.poles[0].imag)) for mode in (MODE_1, MODE_2))
+    assert fitter.reduced([-0.5 + 4j, first, -3 + 0j, second], 4) == [first, second]
+    # Of two pairs for three poles the better damped one, here the first, becomes a real pole.
+    assert fitter.reduced([first, second], 3) == [complex(-abs(first)), second]
 
 
 def test_different_structures_are_tried_in_every_order():

@@ -77,12 +77,12 @@ def ideal_results(plan, folder, *, bias=None, width=None, seed=1):
     truth = true_parameters(build_manifest(plan)["data_cells"][0])
     rng = np.random.default_rng(seed)
     found = {}
-    for cell in plan.data_cells:
+    for k, cell in enumerate(plan.data_cells):
         samples = cell.source.sampling.samples
         common = rng.standard_normal((plan.runs, len(truth)))
-        for part in plan.estimators:
+        for j, part in enumerate(plan.estimators):
             # Where there is no theory: one per cent at so many samples.
-            theory = variances.get((cell.hash, part.hash)) or {n: 1e-4 * v**2 * samples for n, v in truth.items()}
+            theory = variances.get((k, j)) or {n: 1e-4 * v**2 * samples for n, v in truth.items()}
             deviation = np.array([np.sqrt(theory[name] / samples) for name in truth])
             own = 0.95 * common + np.sqrt(1 - 0.95**2) * rng.standard_normal(common.shape)
             shift = np.array([(bias or {}).get(part.name, {}).get(name, 0.0) for name in truth])

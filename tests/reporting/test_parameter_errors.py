@@ -1,5 +1,9 @@
 """Errors of parameters: every number against another route, and who counts and who does not."""
 
+import json
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -34,8 +38,8 @@ def published(name):
 
 def variances_of(plan, cell=0):
     found = long_record_variances(plan)
-    hashes = {part.name: found.get((plan.data_cells[cell].hash, part.hash)) for part in plan.estimators}
-    return {name: variances for name, variances in hashes.items() if variances is not None}
+    of_cell = {part.name: found.get((cell, k)) for k, part in enumerate(plan.estimators)}
+    return {name: variances for name, variances in of_cell.items() if variances is not None}
 
 
 def test_groups_follow_the_specification(plan, tmp_path):
@@ -213,6 +217,20 @@ def test_results_on_disk_give_the_same_errors(plan, tmp_path):
     again = read_results(tmp_path, "two-modes")
     assert isinstance(again, Results)
     assert parameter_errors(parameter_estimates(again)) == parameter_errors(parameter_estimates(results))
+
+
+def test_theory_is_found_for_results_of_an_earlier_version(plan, tmp_path):
+    results = ideal_results(plan, tmp_path)
+    before = parameter_errors(parameter_estimates(results))
+    # Hashes that no specification has today.
+    manifest = json.loads(re.sub(r'"hash": "(\w+)"', r'"hash": "old \1"', json.dumps(results.manifest)))
+    stored = {
+        key._replace(data_hash=f"old {key.data_hash}", estimator_hash=f"old {key.estimator_hash}"): value
+        for key, value in results.stored.results.items()
+    }
+    older = Results(tmp_path, replace(results.stored, manifest=manifest, results=stored, seconds={}))
+    assert parameter_errors(parameter_estimates(older)) == before
+    assert all(row.theory is not None for row in before)
 
 
 def test_theory_is_that_of_each_estimators_own_form(plan):
