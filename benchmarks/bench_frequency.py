@@ -1,0 +1,112 @@
+"""Samples per second of the frequency estimators: whole records, one sample at a time, and plain numpy for comparison."""
+
+import time
+
+import numpy as np
+
+from ctid_cli.frequency import (
+    AdaptiveObserver,
+    DremFiniteTime,
+    DremGradient,
+    DremWindow,
+    Esprit,
+    FilterRegression,
+    NonlinearLeastSquares,
+    RestartingLeastSquares,
+)
+from ctid_cli.frequency.regression import delay_table
+
+INTERVAL = 0.001
+SAMPLES = 200_000
+REPEATS = 7
+OMEGA = {2: np.array([2.0, 3.0]), 5: np.array([1.0, 2.0, 3.0, 4.2, 5.5])}
+#: Required samples per second.
+TARGETS = {"drem": {2: 1e6, 5: 3e5}, "tracker, prefilter by FFT": {2: 2e6}}
+
+
+def signal(n, count=SAMPLES):
+    t = INTERVAL * np.arange(count)
+    return np.sin(np.outer(t, OMEGA[n]) + np.arange(n)).sum(axis=1)
+
+
+def estimators(n):
+    h, d = (0.7, 0.4) if n == 2 else (0.4, 0.3)
+    epsilon = 1.0 if n == 2 else 1e-2
+    start = tuple(OMEGA[n] + 0.2)
+    return (
+        ("drem_gradient", DremGradient(tones=n, h=h, d=d, epsilon=epsilon), False),
+        ("drem_finite_time", DremFiniteTime(tones=n, h=h, d=d, epsilon=epsilon), False),
+        ("drem_window", DremWindow(tones=n, h=h, d=d, memory=4.0), False),
+        ("tracker, no prefilter", RestartingLeastSquares(tones=n, h=h), False),
+        ("tracker, prefilter by sums", RestartingLeastSquares(tones=n, h=h, prefilter=1.0), False),
+        ("tracker, prefilter by FFT", RestartingLeastSquares(tones=n, h=h, prefilter=1.0), True),
+        ("total least squares", RestartingLeastSquares(tones=n, h=h, solution="total_least_squares"), False),
+        ("adaptive_observer", AdaptiveObserver(tones=n, initial_frequencies=start), False),
+        ("filter_regression", FilterRegression(tones=n, pole=4.0, initial_frequencies=start), False),
+    )
+
+
+def fastest(function, repeats=REPEATS):
+    """Shortest processor time of some calls [s], which neighbours on the same cores disturb least."""
+    times = []
+    for _ in range(repeats):
+        begin = time.thread_time()
+        function()
+        times.append(time.thread_time() - begin)
+    return min(times)
+
+
+def numpy_finite_time(y, n, h, d, gain):
+    """The finite-time recursion for n tones, sample by sample with numpy, frequencies included."""
+    table, lag, spacing = delay_table(n).astype(float), round(h / INTERVAL), round(d / INTERVAL)
+    lags, stack = lag * np.arange(2 * n + 1), spacing * np.arange(1, n + 1)
+    rows = np.full((y.size, n + 1), np.nan)
+    z, q, omega = np.zeros(n), np.zeros(n), np.full((y.size, n), np.nan)
+    for k in range(2 * n * lag, y.size):
+        rows[k] = table @ y[k - lags]
+        matrix = rows[k - stack]
+        delta = np.linalg.det(matrix[:, :n])
+        if np.isfinite(delta) and delta != 0.0:
+            ratio = np.linalg.solve(matrix[:, :n], matrix[:, n])
+            m = -np.expm1(-gain * INTERVAL * delta**2)
+            z += m * (ratio - z)
+            q += m * (1.0 - q)
+            roots = np.roots(np.concatenate(([1.0], z / q)))
+            omega[k] = np.sort(np.arccos(np.clip(roots.real, -1.0, 1.0)) / h)
+    return omega
+
+
+def main():
+    print(f"{'estimator':28}{'n':>3}{'samples/s':>12}{'target':>10}{'one by one':>13}{'error':>10}")
+    for n in (2, 5):
+        y = signal(n)
+        for name, options, fft in estimators(n):
+            options.start(INTERVAL).run(y[:5000], fft=fft)
+            seconds = fastest(lambda options=options, fft=fft: options.start(INTERVAL).run(y, fft=fft))
+            error = np.abs(options.start(INTERVAL).run(y, fft=fft).omega[-1] - OMEGA[n]).max()
+            single = ""
+            if not fft:
+                tracker = options.start(INTERVAL)
+                tracker.run(y[:10_000])
+                each = fastest(lambda tracker=tracker: [tracker.update(sample) for sample in y[:1000]], 3) / 1000
+                single = f"{1e6 * each:.1f} us"
+            target = TARGETS.get(name, TARGETS["drem"] if name in ("drem_gradient", "drem_finite_time") else {}).get(n)
+            print(
+                f"{name:28}{n:3d}{SAMPLES / seconds:12.3g}{f'{target:.0e}' if target else '-':>10}{single:>13}{error:10.1e}"
+            )
+        begin = time.thread_time()
+        count = 20_000
+        h, d = (0.7, 0.4) if n == 2 else (0.4, 0.3)
+        numpy_finite_time(y[:count], n, h, d, 1.0)
+        print(f"{'finite time, numpy':28}{n:3d}{count / (time.thread_time() - begin):12.3g}")
+    y = signal(2, 20_000) + 0.1 * np.random.default_rng(0).standard_normal(20_000)
+    print(f"\n{'20 s, 20,000 samples, n = 2':34}{'ms':>8}")
+    for name, options in (
+        ("ESPRIT on averages of 0.05 s", Esprit(tones=2, averaging=0.05)),
+        ("nonlinear least squares", NonlinearLeastSquares(tones=2, averaging=0.05)),
+    ):
+        print(f"{name:34}{1e3 * fastest(lambda options=options: options.estimate(y, INTERVAL)):8.1f}")
+
+
+if __name__ == "__main__":
+    main()
