@@ -338,8 +338,9 @@ def advance_observer(
                 uncertainty[k, p] = np.sqrt(max(unit[p], 0.0) / scales[p] * moments[n, n]) / (2.0 * omega[k, p])
         if determined:
             # The effective length of an exponential window, and the delay of the observer.
-            span = min(counters[0] * interval, 2.0 / rate + 1.0 / poles[0])
-            flag |= flag_uncertain(omega[k], uncertainty[k], no_rounding, span)
+            elapsed = counters[0] * interval
+            span = min(elapsed, 2.0 / rate + 1.0 / poles[0])
+            flag |= flag_uncertain(omega[k], uncertainty[k], no_rounding, span, elapsed)
         elif counters[0] > hold:
             flag |= UNDETERMINED
         flags[k] = flag

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.errors import DataError
+from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.regression import MOST_TONES
 from ctid_cli.signals.checks import require_positive
 
@@ -17,6 +18,8 @@ Array = NDArray[np.float64]
 SINGULAR = 1e-10
 #: A residual below this fraction of the signal (root mean squares) is rounding, and may as well be this large.
 ROUNDING = 1e-13
+#: Probability with which white noise alone has a tone that is called one.
+FALSE_TONE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,3 +257,41 @@ def frequency_errors(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[A
     inverse = np.linalg.inv(r)
     step = inverse @ (q.T @ residual) / scales
     return step, np.linalg.norm(inverse, axis=1) / scales * np.sqrt(misfit + floor), misfit
+
+
+def flag_insignificant(y: Array, t: Array, omega: Array, *, bias: bool) -> Flag:
+    r"""Compare the weakest tone with the strongest that white noise of the residual's size would seem to have.
+
+    Parameters
+    ----------
+    y : ndarray, shape (N,)
+        Samples.
+    t : ndarray, shape (N,)
+        Their instants [s].
+    omega : ndarray, shape (n,)
+        Frequencies [rad/s].
+    bias : bool
+        Whether there is a constant.
+
+    Returns
+    -------
+    Flag
+        ``UNDETERMINED`` if a tone is no stronger than noise, or the tones cannot be told apart.
+
+    Notes
+    -----
+    Each of the N/2 ordinates of the periodogram of white noise of variance s^2 exceeds ``N A^2/4 = g s^2`` with the
+    probability ``exp(-g)``, the largest with ``N/2 exp(-g)`` (R. A. Fisher, "Tests of significance in harmonic
+    analysis", *Proc. Royal Society A* 125 (1929) 54-59, for many samples).
+    """
+    try:
+        design = harmonic_design(t - 0.5 * (t[0] + t[-1]), omega, bias=bias)
+        coefficients = solve_design(design, y)
+    except DataError:
+        return Flag.UNDETERMINED
+    n = omega.size
+    residual = y - design @ coefficients
+    variance = float(residual @ residual) / max(y.size - design.shape[1] - n, 1)
+    weakest = float((coefficients[:n] ** 2 + coefficients[n : 2 * n] ** 2).min())
+    strongest_of_noise = 4.0 * variance / y.size * np.log(0.5 * y.size / FALSE_TONE)
+    return Flag(0) if weakest > strongest_of_noise else Flag.UNDETERMINED

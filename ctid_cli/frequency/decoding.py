@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 
 #: A root must settle within this many Newton steps; simple roots need fewer than ten.
 NEWTON_STEPS = 60
+#: An estimation younger than so many periods, or beats of neighbours, is less certain than its misfit shows.
+FIRST_PERIODS = 2.0
 #: Keeps a division from overflowing.
 TINY = 1e-30
 
@@ -314,7 +316,7 @@ def still_doubtful(omega: Array, quiet: float) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def flag_uncertain(omega: Array, uncertainty: Array, rounding: Array, span: float) -> int:
+def flag_uncertain(omega: Array, uncertainty: Array, rounding: Array, span: float, elapsed: float) -> int:
     """Compare what may be wrong with a frequency with the frequency itself and with the distance to its neighbours.
 
     Parameters
@@ -327,6 +329,8 @@ def flag_uncertain(omega: Array, uncertainty: Array, rounding: Array, span: floa
         Possible errors by rounding [rad/s].
     span : float
         Time from the first to the last sample that the estimate rests on [s].
+    elapsed : float
+        Time since the first sample of all, or since the restart [s].
 
     Returns
     -------
@@ -337,13 +341,15 @@ def flag_uncertain(omega: Array, uncertainty: Array, rounding: Array, span: floa
     -----
     Within a part of a period, or of the beat of two neighbours, a bias, a drift or another tone hardly differs from a
     change of the frequencies, and hardly shows as a misfit. Measured errors grow like the fifth power of the missing
-    part: the possible error is multiplied by ``(period/span)^5``.
+    part: the possible error is multiplied by ``(period/span)^5``. The same holds for the first two periods: later a
+    misfit has shown itself, even if the estimate itself rests on fewer samples.
     """
     flag = 0
+    enough = min(span, elapsed / FIRST_PERIODS)
     for i in range(omega.size):
         room = room_of(omega, i)
-        if room * span < 2.0 * np.pi:
-            short = 2.0 * np.pi / max(room * span, TINY)
+        if room * enough < 2.0 * np.pi:
+            short = 2.0 * np.pi / max(room * enough, TINY)
             uncertainty[i] *= short * short * short * short * short
         uncertainty[i] += rounding[i]
         if not uncertainty[i] <= CERTAIN_FRACTION * room:

@@ -288,7 +288,8 @@ def advance_window(
                 errors[i] = (1.0 + abs(theta[i])) * relative
             propagate(sensitivities, errors, rounding)
             span = (rows.shape[0] + 2 * n * lag + sums[2 * n + 2]) * interval
-            if flag_uncertain(omega[k], uncertainty[k], rounding, span):
+            elapsed = (rows.shape[0] + 2 * n * lag + counters[3]) * interval
+            if flag_uncertain(omega[k], uncertainty[k], rounding, span, elapsed):
                 flag |= UNCERTAIN
                 if sums[2 * n + 2] >= enough:
                     counters[6] = 0

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.errors import DataError
-from ctid_cli.frequency.amplitudes import frequency_errors, present_samples
+from ctid_cli.frequency.amplitudes import flag_insignificant, frequency_errors, present_samples
 from ctid_cli.frequency.decoding import flag_uncertain
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.regression import MOST_TONES
@@ -149,5 +149,7 @@ class Esprit:
         except DataError:
             uncertainty = np.full(n, np.nan)
             flags |= Flag.UNDETERMINED
-        flags |= Flag(flag_uncertain(bounded, uncertainty, np.zeros(n), float(t[-1] - t[0])))
+        length = float(t[-1] - t[0])
+        flags |= Flag(flag_uncertain(bounded, uncertainty, np.zeros(n), length, length))
+        flags |= flag_insignificant(y, t, bounded, bias=False)
         return FrequencyEstimate(bounded, flags, uncertainty)

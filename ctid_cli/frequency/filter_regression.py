@@ -356,8 +356,9 @@ def advance_filter(
                 moment_uncertainty(
                     moments, factor, scales, misfit, coefficients, sensitivities, possible_errors, rounding
                 )
-                span = min(float(counters[0]), memory) * interval
-                counters[3] = verdict | flag_uncertain(frequencies, possible_errors, rounding, span)
+                elapsed = counters[0] * interval
+                span = min(elapsed, memory * interval)
+                counters[3] = verdict | flag_uncertain(frequencies, possible_errors, rounding, span, elapsed)
             else:
                 counters[3] = UNDETERMINED
         for i in range(n):

@@ -178,8 +178,8 @@ def moment_uncertainty(
     -----
     Residuals e at the true parameters move the estimate by ``G^-1 Phi' e`` and a frequency by at most
     ``sqrt(g' G^-1 g e'e)`` (Cauchy-Schwarz), whatever the e: noise, a bias, another tone. The residual left by
-    the fit stands for ``e'e``; as a difference of moments it is known up to rounding only, and taken for no less. Rounding
-    of G moves a frequency by up to ``|G^-1 g|`` times the rounding errors.
+    the fit stands for ``e'e``; as a difference of moments it is known up to rounding only, and taken for no less.
+    Rounding of G moves a frequency by up to ``|G^-1 g|`` times the rounding errors.
     """
     n = theta.size
     size = np.sqrt(gram[n, n])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.errors import DataError
-from ctid_cli.frequency.amplitudes import frequency_errors, present_samples
+from ctid_cli.frequency.amplitudes import flag_insignificant, frequency_errors, present_samples
 from ctid_cli.frequency.checks import one_for_each
 from ctid_cli.frequency.decoding import flag_uncertain
 from ctid_cli.frequency.esprit import Esprit
@@ -142,5 +142,6 @@ class NonlinearLeastSquares:
             flags |= Flag.UNDETERMINED
         order = np.argsort(omega)
         omega, uncertainty = omega[order], uncertainty[order]
-        flags |= Flag(flag_uncertain(omega, uncertainty, np.zeros(n), float(length)))
+        flags |= Flag(flag_uncertain(omega, uncertainty, np.zeros(n), float(length), float(length)))
+        flags |= flag_insignificant(y, t, omega, bias=self.bias)
         return FrequencyEstimate(omega, flags, uncertainty)

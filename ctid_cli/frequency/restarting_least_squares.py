@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ctid_cli.frequency.consistency import check_consistency, observe_second_delay
-from ctid_cli.frequency.decoding import cosine_sensitivities, decode, flag_uncertain
+from ctid_cli.frequency.decoding import FIRST_PERIODS, cosine_sensitivities, decode, flag_uncertain, still_doubtful
 from ctid_cli.frequency.delay_options import DelayRegression
 from ctid_cli.frequency.flags import CHANGED, GAP, STARTING, UNDETERMINED
 from ctid_cli.frequency.moments import (
@@ -47,6 +47,8 @@ ROUNDING_FLOOR = 1e-18
 #: checked after so many lengths of the prefilter.
 MIXED_RATIO = 6.0
 MIXED_PREFILTERS = 8
+#: A fit that leaves no larger fraction of the regressand's second moment is exact, however short its data are.
+EXACT = 1e-13
 #: Memory if none is given, in units of h.
 DEFAULT_MEMORY = 100.0
 #: Fraction of the regressand's second moment that the frequencies may leave at the second delay.
@@ -170,11 +172,8 @@ class RestartingLeastSquares(DelayRegression):
             np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(covariance))),
             self.solution == "total_least_squares",
             float(interval),
-            clock.delay,
-            clock.top,
-            clock.bottom,
+            np.array([clock.delay, clock.top, clock.bottom, clock.second_delay]),
             clock.second_lag,
-            clock.second_delay,
         )
         state = {
             "samples": np.full(2 * n * clock.lag + 1, np.nan),
@@ -183,7 +182,7 @@ class RestartingLeastSquares(DelayRegression):
             "check": np.zeros((n + 1, n + 1)),
             "estimate": np.full((3, n), np.nan),
             "levels": np.zeros(4),
-            "counters": np.zeros(5, np.int64),
+            "counters": np.zeros(6, np.int64),
         }
         return Recursion(advance_restarting, constants, state, clock.weights, np.nan, clock.notes)
 
@@ -248,6 +247,54 @@ def total_least_squares(gram: Array, whitener: Array, theta: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
+def judge(
+    gram: Array,
+    factor: Array,
+    scales: Array,
+    theta: Array,
+    clock: Array,
+    span: float,
+    elapsed: float,
+    frequencies: Array,
+    possible_errors: Array,
+) -> tuple[int, bool]:
+    """Frequencies that belong to fitted parameters, and how far they can be trusted.
+
+    Parameters
+    ----------
+    gram : ndarray, shape (n + 1, n + 1)
+        Second moments of ``[phi psi]``, lower triangle.
+    factor, scales : ndarray, shapes (n, n), (n,)
+        From :func:`~ctid_cli.frequency.moments.factorise`.
+    theta : ndarray, shape (n,)
+        Parameters.
+    clock : ndarray, shape (4,)
+        Delay h [s], cosines of the lowest and of the highest frequency times h, second delay [s].
+    span, elapsed : float
+        Time that the moments rest on, and since the restart [s].
+    frequencies, possible_errors : ndarray, shape (n,)
+        Receive the estimates [rad/s].
+
+    Returns
+    -------
+    flags : int
+        What is wrong with them.
+    judges : bool
+        Whether the fit is good enough to judge other samples by. Rows of the first periods are so much alike that a fit
+        to noise leaves next to no residual.
+    """
+    n = theta.size
+    roots, slopes, rounding = np.empty(n), np.empty(n), np.empty(n)
+    sensitivities = np.empty((n, n))
+    flags = decode(theta, clock[0], clock[1], clock[2], np.empty(n + 1), np.empty(n + 1), roots, frequencies)
+    cosine_sensitivities(roots, clock[0], slopes, sensitivities)
+    misfit = squared_residual(gram, theta)
+    moment_uncertainty(gram, factor, scales, misfit, theta, sensitivities, possible_errors, rounding)
+    uncertain = flag_uncertain(frequencies, possible_errors, rounding, span, elapsed)
+    return flags | uncertain, uncertain == 0 or not still_doubtful(frequencies, elapsed / FIRST_PERIODS)
+
+
+@njit(cache=True, nogil=True)
 def advance_restarting(
     samples: Array,
     omega: Array,
@@ -260,11 +307,8 @@ def advance_restarting(
     whitener: Array,
     total: bool,
     interval: float,
-    delay: float,
-    top: float,
-    bottom: float,
+    clock: Array,
     check_lag: int,
-    check_delay: float,
     history: Array,
     older: Array,
     newer: Array,
@@ -296,14 +340,12 @@ def advance_restarting(
         Inverse of the Cholesky factor of the rows' noise covariance, for total least squares.
     total : bool
         Whether that is used.
-    interval, delay : float
-        Sampling interval and delay h [s].
-    top, bottom : float
-        Cosines of the bounds of the frequencies.
+    interval : float
+        Sampling interval [s].
+    clock : ndarray, shape (4,)
+        Delay h [s], cosines of the lowest and of the highest frequency times h, second delay [s].
     check_lag : int
         Second delay in sampling intervals.
-    check_delay : float
-        The same [s].
     history : ndarray
         Ring of samples.
     older, newer : ndarray, shape (n + 1, n + 1)
@@ -314,15 +356,14 @@ def advance_restarting(
         theta, frequencies and their uncertainty.
     levels : ndarray, shape (4,)
         Weight of the older and of the newer moments, recent mean squared residual, threshold of the alarm.
-    counters : ndarray of int, shape (5,)
+    counters : ndarray of int, shape (6,)
         Place of the newest sample, rows since the restart, rows at the next comparison, samples still to flush, flags
-        of the last estimate.
+        of the last estimate, and whether it is good enough to judge new samples by.
     """
     n = omega.shape[1]
     row, check_row = np.empty(n + 1), np.empty(n + 1)
-    roots, slopes, scales, rounding = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    polynomial, work = np.empty(n + 1), np.empty(n + 1)
-    factor, sensitivities, gram = np.empty((n, n)), np.empty((n, n)), np.empty((n + 1, n + 1))
+    scales, trial, trial_omega, trial_errors = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    factor, gram = np.empty((n, n)), np.empty((n + 1, n + 1))
     theta, frequencies, possible_errors = estimate[0], estimate[1], estimate[2]
     smoothing = 1.0 / settings[0]
     for k in range(samples.size):
@@ -350,7 +391,7 @@ def advance_restarting(
                 levels[2] += smoothing * (residual * residual - levels[2])
             counters[1] += 1
             keep = 1.0
-            if levels[0] + levels[1] >= memory:
+            if levels[0] + levels[1] > memory - 0.5:
                 keep = 1.0 - 1.0 / memory
                 levels[0] *= keep
                 for i in range(n + 1):
@@ -363,15 +404,18 @@ def advance_restarting(
             if counters[1] >= counters[2]:
                 # Does the newer half fit much better than the whole?
                 if factorise(newer, 0.0, factor, scales):
-                    least_squares(newer, factor, scales, slopes)
-                    alone = squared_residual(newer, slopes) / levels[1]
+                    least_squares(newer, factor, scales, trial)
+                    alone = squared_residual(newer, trial) / levels[1]
+                    span = (2 * n * lag + levels[1]) * interval
+                    _, judges = judge(newer, factor, scales, trial, clock, span, span, trial_omega, trial_errors)
+                    judges = judges or alone * levels[1] <= EXACT * newer[n, n]
                     for i in range(n + 1):
                         for j in range(i + 1):
                             gram[i, j] = older[i, j] + newer[i, j]
-                    if levels[0] > 0.0 and factorise(gram, 0.0, factor, scales):
-                        least_squares(gram, factor, scales, slopes)
+                    if judges and levels[0] > 0.0 and factorise(gram, 0.0, factor, scales):
+                        least_squares(gram, factor, scales, trial)
                         weight = levels[0] + levels[1]
-                        together = squared_residual(gram, slopes) / weight
+                        together = squared_residual(gram, trial) / weight
                         mixed = together > MIXED_RATIO * alone + 1e-14 * gram[n, n] / weight
                 if mixed:
                     counters[1] = int(levels[1])
@@ -397,17 +441,17 @@ def advance_restarting(
                         total_least_squares(gram, whitener, theta)
                     else:
                         least_squares(gram, factor, scales, theta)
-                    misfit = squared_residual(gram, theta)
-                    levels[3] = (ALARM_RATIO * misfit + ROUNDING_FLOOR * gram[n, n]) / weight
-                    verdict = decode(theta, delay, top, bottom, polynomial, work, roots, frequencies)
-                    cosine_sensitivities(roots, delay, slopes, sensitivities)
-                    moment_uncertainty(gram, factor, scales, misfit, theta, sensitivities, possible_errors, rounding)
-                    verdict |= flag_uncertain(frequencies, possible_errors, rounding, (2 * n * lag + weight) * interval)
-                    verdict |= check_consistency(check, frequencies, check_delay, NEGLIGIBLE)
+                    levels[3] = (ALARM_RATIO * squared_residual(gram, theta) + ROUNDING_FLOOR * gram[n, n]) / weight
+                    span, elapsed = (2 * n * lag + weight) * interval, (2 * n * lag + counters[1]) * interval
+                    verdict, judges = judge(
+                        gram, factor, scales, theta, clock, span, elapsed, frequencies, possible_errors
+                    )
+                    counters[5] = 1 if judges else 0
+                    verdict |= check_consistency(check, frequencies, clock[3], NEGLIGIBLE)
                 counters[4] = verdict
             if counters[1] < settings[4]:
                 flag = STARTING
-            elif counters[1] >= settings[1] and levels[2] > levels[3]:
+            elif counters[1] >= settings[1] and counters[5] > 0 and levels[2] > levels[3]:
                 counters[3] = settings[3]
                 counters[1] = 0
                 flag = CHANGED

@@ -342,7 +342,8 @@ def advance_scalars(
             # Rows that carry weight: (sum w)^2/sum w^2.
             remembered = q[fastest] * q[fastest] / recent[n + 2] if recent[n + 2] > 0.0 else 0.0
             span = (rows.shape[0] + 2 * n * lag + remembered) * interval
-            if flag_uncertain(omega[k], uncertainty[k], rounding, span):
+            elapsed = (rows.shape[0] + 2 * n * lag + counters[2]) * interval
+            if flag_uncertain(omega[k], uncertainty[k], rounding, span, elapsed):
                 flag |= UNCERTAIN
                 if counters[2] >= enough:
                     counters[5] = 0

@@ -120,23 +120,26 @@ NONE = np.zeros(2)
     ],
 )
 def test_certain_means_a_tenth_of_the_distance_to_the_next(uncertainty, certain):
-    assert (flag_uncertain(np.array([2.0, 3.0]), np.array(uncertainty), NONE, LONG) == 0) == certain
+    assert (flag_uncertain(np.array([2.0, 3.0]), np.array(uncertainty), NONE, LONG, LONG) == 0) == certain
     # By the misfit, by rounding, or by both.
-    assert (flag_uncertain(np.array([2.0, 3.0]), np.zeros(2), np.array(uncertainty), LONG) == 0) == certain
+    assert (flag_uncertain(np.array([2.0, 3.0]), np.zeros(2), np.array(uncertainty), LONG, LONG) == 0) == certain
     half = 0.5 * np.array(uncertainty)
-    assert (flag_uncertain(np.array([2.0, 3.0]), half.copy(), half, LONG) == 0) == certain
+    assert (flag_uncertain(np.array([2.0, 3.0]), half.copy(), half, LONG, LONG) == 0) == certain
 
 
 def test_a_frequency_near_zero_must_be_certain_too():
-    assert flag_uncertain(np.array([0.5, 3.0]), np.array([0.06, 0.0]), NONE, LONG) == Flag.UNCERTAIN
-    assert flag_uncertain(np.array([0.5, 3.0]), np.array([0.04, 0.0]), NONE, LONG) == 0
+    assert flag_uncertain(np.array([0.5, 3.0]), np.array([0.06, 0.0]), NONE, LONG, LONG) == Flag.UNCERTAIN
+    assert flag_uncertain(np.array([0.5, 3.0]), np.array([0.04, 0.0]), NONE, LONG, LONG) == 0
 
 
 def test_short_data_make_a_misfit_weigh_more_but_not_rounding():
     omega = np.array([2.0, 6.0])  # a period of the first takes pi seconds
-    for span, factor in ((4.0, 1.0), (np.pi, 1.0), (np.pi / 2, 32.0), (np.pi / 4, 1024.0)):
+    # Either the estimate rests on less than a period, or less than two have passed.
+    cases = ((4.0, LONG, 1.0), (np.pi, LONG, 1.0), (np.pi / 2, LONG, 32.0), (np.pi / 4, LONG, 1024.0))
+    cases += ((np.pi, 2 * np.pi, 1.0), (np.pi, np.pi, 32.0), (np.pi / 2, 2 * np.pi, 32.0))
+    for span, elapsed, factor in cases:
         uncertainty = np.array([1e-3, 0.0])
-        flag_uncertain(omega, uncertainty, np.array([1e-4, 2e-4]), span)
+        flag_uncertain(omega, uncertainty, np.array([1e-4, 2e-4]), span, elapsed)
         np.testing.assert_allclose(uncertainty, [1e-3 * factor + 1e-4, 2e-4], rtol=1e-12)
 
 

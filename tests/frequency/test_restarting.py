@@ -13,8 +13,8 @@ from tests.frequency.signals import INTERVAL, OMEGA, tones
 H, LAG = 0.4, 40
 
 
-def tracker(n=2, **options):
-    return RestartingLeastSquares(tones=n, h=H, **options).start(INTERVAL)
+def tracker(n=2, h=H, **options):
+    return RestartingLeastSquares(tones=n, h=h, **options).start(INTERVAL)
 
 
 def rows_of(y, n):
@@ -111,9 +111,9 @@ def test_noise_raises_no_alarm_but_a_step_does():
     rng = np.random.default_rng(0)
     y = tones(2, 20_000).sum(axis=1) + 0.1 * rng.standard_normal(20_000)
     for prefilter in (0.0, 0.6):
-        assert not alarms(tracker(prefilter=prefilter).run(y)).size
+        assert not alarms(tracker(h=1.0, prefilter=prefilter).run(y)).size
     y[10_000:] = tones(2, 10_000, omega=[1.3, 2.5]).sum(axis=1) + 0.1 * rng.standard_normal(10_000)
-    track = tracker(prefilter=0.6).run(y)
+    track = tracker(h=1.0, prefilter=0.6).run(y)
     (alarm,) = alarms(track)
     assert 10_000 < alarm < 10_300
     np.testing.assert_allclose(track.omega[[9990, -1]], [OMEGA[2], [1.3, 2.5]], atol=5e-3)
@@ -146,12 +146,29 @@ def test_a_slow_drift_is_followed_within_the_memory():
     np.testing.assert_allclose(np.array(lags) / 0.002, [22.0, 12.0, 7.0], atol=2.5)
 
 
-def test_forgetting_keeps_old_errors_out():
-    y = tones(2, 6000).sum(axis=1)
-    y[1000:1100] += 0.3 * np.random.default_rng(0).standard_normal(100)  # rows are bad until 1100 + 4 h
-    short, long = tracker(memory=2.0).run(y), tracker(memory=1e4).run(y)
-    assert np.abs(short.omega[-1] - OMEGA[2]).max() < 1e-4
-    assert short.uncertainty[-1].max() < 0.01 * long.uncertainty[-1].max()
+@pytest.mark.parametrize("memory", [2.0, 3.5])
+def test_older_rows_are_forgotten_exponentially(memory):
+    y = noisy(2, 1560)
+    track = tracker(memory=memory).run(y)
+    assert not alarms(track).size
+    rows = rows_of(y, 2)
+    most = round(memory / INTERVAL)
+    # All rows weigh the same until there are as many as remembered; every further one makes the others weigh less.
+    weights = (1.0 - 1.0 / most) ** np.clip(np.arange(len(rows))[::-1], 0, len(rows) - most)
+    root = np.sqrt(weights)[:, None]
+    theta = np.linalg.lstsq(root * rows[:, :2], root[:, 0] * rows[:, 2], rcond=None)[0]
+    np.testing.assert_allclose(track.omega[-1], frequencies_of(theta, H)[0], atol=1e-9)
+    without = np.linalg.lstsq(rows[:, :2], rows[:, 2], rcond=None)[0]
+    assert np.abs(track.omega[-1] - frequencies_of(without, H)[0]).max() > 1e-3
+
+
+@pytest.mark.parametrize("n", [3, 4, 5])
+def test_noise_that_a_short_record_hides_raises_no_alarm(n):
+    # Rows of the first periods are so much alike that the fit leaves a hundred times less than the noise.
+    y = noisy(n, 6000)
+    track = tracker(n).run(y)
+    assert not alarms(track).size
+    assert not (np.diff(np.flatnonzero(track.flags & Flag.STARTING)) > 1).any()  # nor was anything dropped
 
 
 def test_time_is_relative():
@@ -165,10 +182,10 @@ def test_time_is_relative():
 def test_amplitude_is_relative():
     y = noisy(2, noise=0.05)
     y[900:] = 0.7 * y[:600]
-    base = tracker(prefilter=0.5).run(y)
+    base = tracker(h=1.0, prefilter=0.5).run(y)
     assert alarms(base).size == 1
     for scale in (2.0**60, 2.0**-80):
-        scaled = tracker(prefilter=0.5).run(scale * y)
+        scaled = tracker(h=1.0, prefilter=0.5).run(scale * y)
         assert np.array_equal(base.flags, scaled.flags)
         np.testing.assert_allclose(scaled.omega, base.omega, rtol=1e-12)
 
@@ -183,8 +200,8 @@ def test_a_difference_removes_a_bias():
 
 def test_least_squares_is_biased_by_noise_and_says_so():
     y = tones(2, 6000).sum(axis=1) + 0.3 * np.random.default_rng(0).standard_normal(6000)
-    plain, filtered = tracker().run(y), tracker(prefilter=0.6).run(y)
-    total = tracker(solution="total_least_squares").run(y)
+    plain, filtered = tracker(h=0.8).run(y), tracker(h=0.8, prefilter=1.5).run(y)
+    total = tracker(h=0.8, solution="total_least_squares").run(y)
     errors = [np.abs(track.omega[-1] - OMEGA[2]).max() for track in (plain, filtered, total)]
     assert errors[0] > 0.05
     assert max(errors[1:]) < 0.02

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.figures import additive, useful_redundancy
+from ctid_cli.reporting.figures import additive, finite_time_frequency, useful_redundancy
 from ctid_cli.reporting.figures.from_results import FromResults, not_run
 from ctid_cli.reporting.study import DEFAULT_STUDY
 
@@ -16,6 +16,7 @@ from ctid_cli.reporting.study import DEFAULT_STUDY
 STUDIES: Mapping[str, Mapping[str, Callable[[], bytes] | FromResults]] = {
     "useful-redundancy": useful_redundancy.FIGURES,
     "additive": additive.FIGURES,
+    "finite-time-frequency": finite_time_frequency.FIGURES,
 }
 
 

@@ -1,0 +1,194 @@
+"""Drawings of estimated frequencies over time, and of their errors on a logarithmic axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, svg
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+Array = NDArray[np.float64]
+
+#: Looks of up to three estimators of a group, told apart by colour, lightness and dashes.
+LOOKS: tuple[dict[str, Any], ...] = (
+    {"color": DARK, "linestyle": "-"},
+    {"color": MARK, "linestyle": (0, (3.2, 1.4))},
+    {"color": MIDDLE, "linestyle": (0, (1, 1))},
+)
+#: What an estimate looks like that its estimator calls valid, and one that it calls invalid.
+FIRM: dict[str, Any] = {"linewidth": 1.5}
+FAINT: dict[str, Any] = {"alpha": 0.6, "linewidth": 0.7}
+#: What the truth, and the error of an estimate from the whole record look like.
+TRUTH: dict[str, Any] = {"color": LIGHT, "linewidth": 3.2, "alpha": 0.6, "solid_capstyle": "butt"}
+WHOLE: dict[str, Any] = {"color": MIDDLE, "linewidth": 0.8}
+#: Smaller errors than this are rounding, and drawn here [rad/s].
+ROUNDING = 1e-16
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Frequencies as one estimator found them.
+
+    Parameters
+    ----------
+    label : str
+        What the estimator is called.
+    t : ndarray, shape (N,)
+        Instants [s].
+    omega, true : ndarray, shape (N, n)
+        Estimated and true frequencies [rad/s].
+    valid : ndarray of bool, shape (N,)
+        Whether the estimator itself calls them valid.
+    """
+
+    label: str
+    t: Array
+    omega: Array
+    true: Array
+    valid: NDArray[np.bool_]
+
+    @property
+    def error(self) -> Array:
+        """Larger one of the errors of all tones, no smaller than rounding [rad/s], shape (N,)."""
+        return np.asarray(np.maximum(np.abs(self.omega - self.true).max(axis=1), ROUNDING))
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Estimators that share a column.
+
+    Parameters
+    ----------
+    title : str
+        What they have in common.
+    curves : sequence of Curve
+        Up to three of them, in every row of panels the same.
+    """
+
+    title: str
+    curves: Sequence[Curve]
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """The same experiment seen by all groups: a row of panels with frequencies, and one with errors.
+
+    Parameters
+    ----------
+    title : str
+        What was observed; empty if there is only one.
+    groups : sequence of Group
+        The columns.
+    duration : float
+        Length of the record [s].
+    exact_from : float
+        From here on a finite-time estimator can be exact [s].
+    reference : float or None
+        Error of an estimate from the whole record [rad/s]; None draws none.
+    """
+
+    title: str
+    groups: Sequence[Group]
+    duration: float
+    exact_from: float
+    reference: float | None = None
+
+
+def errors_svg(rows: Sequence[Row], frequencies: tuple[float, float], errors: tuple[float, float], title: str) -> bytes:
+    """Frequencies and errors over time.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        What was observed, each a row of frequencies and one of errors.
+    frequencies, errors : tuple of float
+        Range of the axes of frequencies and of errors [rad/s].
+    title : str
+        What is shown.
+
+    Returns
+    -------
+    bytes
+        An SVG file: lines are thin where the estimator itself calls its estimate invalid.
+    """
+
+    def draw(figure: Figure) -> None:
+        from matplotlib.ticker import MaxNLocator
+
+        columns = len(rows[0].groups)
+        panels = figure.subplots(
+            2 * len(rows), columns, sharex=True, sharey="row", squeeze=False, height_ratios=[1.0, 1.15] * len(rows)
+        )
+        for k, row in enumerate(rows):
+            for above, below, group in zip(panels[2 * k], panels[2 * k + 1], row.groups, strict=True):
+                _draw_frequencies(above, group.curves)
+                _draw_errors(below, group.curves, row)
+                above.set_ylim(*frequencies)
+                below.set_yscale("log")
+                below.set_ylim(*errors)
+            panels[2 * k, 0].set_ylabel(f"{row.title}\nfrequency [rad/s]".strip())
+            panels[2 * k + 1, 0].set_ylabel(f"{row.title}\nlarger error [rad/s]".strip())
+        for axes, group in zip(panels[0], rows[0].groups, strict=True):
+            axes.set_title(group.title, loc="left", fontsize=8)
+        for axes, group in zip(panels[-1], rows[0].groups, strict=True):
+            axes.set_xlabel("time [s]")
+            axes.set_xlim(0.0, rows[0].duration)
+            axes.xaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 1.5, 2, 3, 5, 10]))
+            axes.legend(
+                handles=_handles(group.curves), loc="upper left", bbox_to_anchor=(-0.03, -0.27), frameon=False,
+                handlelength=2.8, borderpad=0.0, labelspacing=0.35,
+            )  # fmt: skip
+        figure.legend(handles=_common_handles(rows), loc="outside lower center", ncols=2, frameon=False)
+        figure.suptitle(title)
+
+    return svg(7.8, 2.1 + 2.9 * len(rows), draw)
+
+
+def _draw_frequencies(axes: Any, curves: Sequence[Curve]) -> None:
+    for true in curves[0].true.T:
+        axes.plot(curves[0].t, true, **TRUTH, zorder=1)
+    for curve, look in zip(curves, LOOKS, strict=False):
+        for omega in curve.omega.T:
+            _draw_line(axes, curve, omega, look)
+
+
+def _draw_errors(axes: Any, curves: Sequence[Curve], row: Row) -> None:
+    axes.axvspan(0.0, row.exact_from, color=BAND, linewidth=0.0, zorder=0)
+    if row.reference is not None:
+        axes.axhline(row.reference, **WHOLE, zorder=1)
+    for curve, look in zip(curves, LOOKS, strict=False):
+        _draw_line(axes, curve, curve.error, look)
+
+
+def _draw_line(axes: Any, curve: Curve, values: Array, look: dict[str, Any]) -> None:
+    axes.plot(curve.t, values, **look | FAINT)
+    axes.plot(curve.t, np.where(curve.valid, values, np.nan), **look | FIRM)
+
+
+def _handles(curves: Sequence[Curve]) -> list[Line2D]:
+    from matplotlib.lines import Line2D
+
+    return [Line2D([], [], **look | FIRM, label=curve.label) for curve, look in zip(curves, LOOKS, strict=False)]
+
+
+def _common_handles(rows: Sequence[Row]) -> list[Line2D | Patch]:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], **TRUTH, label="true frequencies"),
+        Line2D([], [], color=DARK, **FAINT, label="thin: called invalid by the estimator itself"),
+        Patch(color=BAND, label="before the first instant at which finite time is exact, $n(2h + d)$"),
+    ]
+    if any(row.reference is not None for row in rows):
+        handles.append(Line2D([], [], **WHOLE, label="nonlinear least squares, whole record"))
+    return handles

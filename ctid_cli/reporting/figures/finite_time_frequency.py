@@ -1,0 +1,171 @@
+"""Figures of the study of finite-time frequency estimation: 1 to 4 of the paper, with errors and with more estimators.
+
+Signals and tuning are those of Vediakova, Vedyakov, Pyrkin, Bobtsov and Gromov, "Frequency estimation of
+multi-sinusoidal signals in finite-time" (2020). Two of its four estimators are not available in print: what stands in
+their place is derived, and every figure says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from ctid_cli.errors import UsageError
+from ctid_cli.experiment.frequency_runs import SignalSource
+from ctid_cli.experiment.plan import build_plan
+from ctid_cli.experiment.spec import spec_from_canonical
+from ctid_cli.experiment.store import read_tracks
+from ctid_cli.reporting.figures.error_plot import Curve, Group, Row, errors_svg
+from ctid_cli.reporting.figures.from_results import FromResults
+from ctid_cli.reporting.results import Results
+
+#: Experiments of the study and their specifications.
+CONFIGS: Mapping[str, str] = {
+    f"finite-time-frequency/{name.replace('_', '-')}": f"finite_time_frequency/{name}.yaml"
+    for name in ("two_tones", "harmonic", "random", "step", "recovery", "recovery_in_noise", "efficiency")
+}
+#: What estimators are called that the paper compares with, but that are not theirs.
+DERIVED = "derived, not the published algorithm"
+#: Columns of every figure: what the estimators have in common, and their labels by name in the specification.
+GROUPS: Mapping[str, Mapping[str, str]] = {
+    "the paper's estimators": {"finite_time": "finite time", "gradient": "gradient"},
+    "finite time after every change": {
+        "window": "finite time, sliding window",
+        "restarting": "restarting least squares",
+        "restarting_prefiltered": "the same with a prefilter",
+    },
+    DERIVED: {
+        "observer": "adaptive observer",
+        "filter": "filter regression",
+        "filter_gradient": "the same, gradient",
+    },
+}
+#: Rows of the drawn tracks are so far apart [s], finer than a line is wide.
+DRAWN_INTERVAL = 0.1
+
+
+def figure_1(results: Results) -> bytes:
+    """Two tones without noise.
+
+    Parameters
+    ----------
+    results : Results
+        The experiment.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    title = r"Section VI-A: $\sin 2t + \cos 3t$, no noise"
+    return errors_svg([_row(results)], (1.0, 5.5), (1e-17, 20.0), title)
+
+
+def figure_2(results: Results) -> bytes:
+    """Two tones and a third one that the estimators do not know of.
+
+    Parameters
+    ----------
+    results : Results
+        The experiment.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    title = r"Section VI-B: $\sin 2t + \sin 3t$ disturbed by $0.25 \sin 15t$"
+    return errors_svg([_row(results, reference=True)], (0.5, 5.5), (5e-8, 20.0), title)
+
+
+def figure_3(results: Results) -> bytes:
+    """Two tones in random noise.
+
+    Parameters
+    ----------
+    results : Results
+        The experiment; its first data set is drawn.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    title = r"Section VI-B: $\sin 2t + \sin 3t$, noise uniform in $\pm 0.2$, first data set"
+    return errors_svg([_row(results, reference=True)], (0.5, 5.5), (2e-6, 20.0), title)
+
+
+def figure_4(results: Results) -> bytes:
+    """A step of both frequencies, with the phase as printed, and with one that goes on.
+
+    Parameters
+    ----------
+    results : Results
+        The experiment.
+
+    Returns
+    -------
+    bytes
+        An SVG file.
+    """
+    rows = [
+        _row(results, "phase jumps", phase_at_steps="jump"),
+        _row(results, "phase goes on", phase_at_steps="continuous"),
+    ]
+    title = r"Section VI-C: both frequencies step at 30 s, no noise"
+    return errors_svg(rows, (1.4, 4.2), (1e-17, 20.0), title)
+
+
+def _row(results: Results, title: str = "", *, reference: bool = False, **swept: str) -> Row:
+    """Stored tracks of the first data set, with the truth."""
+    plan = build_plan(spec_from_canonical(dict(results.settings)))
+    cell = next(cell for cell in plan.data_cells if cell.swept.items() >= swept.items())
+    rows = {row["estimator"]: row for row in results.rows if row["replicate"] == 0 and row["cell"] == cell.hash}
+    source = cell.source
+    assert isinstance(source, SignalSource)
+    tracks = read_tracks(results.folder)
+    groups = []
+    for name, members in GROUPS.items():
+        curves = []
+        for estimator, label in members.items():
+            if estimator not in rows:
+                continue
+            track = tracks.get(rows[estimator]["id"])
+            if track is None:
+                raise UsageError(
+                    f"the results of {results.experiment} hold no frequencies over time of {estimator!r}; run "
+                    "its specification with tracks.runs of 1 or more"
+                )
+            every = max(1, round(DRAWN_INTERVAL / float(track["t"][1] - track["t"][0])))
+            t = np.asarray(track["t"][::every])
+            true = source.signal.frequencies_at(t)
+            curves.append(Curve(label, t, track["omega"][::every], true, track["flags"][::every] == 0))
+        groups.append(Group(name, curves))
+    options = next(part.estimator.options for part in plan.estimators if part.name == "finite_time")
+    return Row(
+        title,
+        groups,
+        source.sampling.samples * source.sampling.interval,
+        options.tones * (2 * options.h + options.d),
+        _whole_record_error(results, options.tones) if reference else None,
+    )
+
+
+def _whole_record_error(results: Results, tones: int) -> float:
+    """Root-mean-square error of nonlinear least squares over all data sets, of the worse tone [rad/s]."""
+    found = [row["measures"] for row in results.rows if row["estimator"] == "nonlinear_least_squares"]
+    errors = np.array([[measures[f"rms_{k + 1}"] for k in range(tones)] for measures in found])
+    return float(np.sqrt(np.mean(errors**2, axis=0)).max())
+
+
+def _of_results(draw: Callable[..., bytes], experiment: str) -> FromResults:
+    return FromResults({experiment: CONFIGS[experiment]}, draw)
+
+
+FIGURES: Mapping[str, FromResults] = {
+    "1": _of_results(figure_1, "finite-time-frequency/two-tones"),
+    "2": _of_results(figure_2, "finite-time-frequency/harmonic"),
+    "3": _of_results(figure_3, "finite-time-frequency/random"),
+    "4": _of_results(figure_4, "finite-time-frequency/step"),
+}
