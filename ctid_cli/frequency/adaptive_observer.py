@@ -142,6 +142,7 @@ class AdaptiveObserver(OnlineEstimator):
             "observer": np.zeros((n + 1, 2 * n)),
             "moments": np.zeros((n + 1, n + 1)),
             "last": np.full(1, np.nan),
+            "average": np.asarray(self.initial_frequencies, dtype=float).copy(),
             "counters": np.zeros(1, np.int64),
         }
         return Recursion(advance_observer, constants, state)
@@ -219,6 +220,7 @@ def advance_observer(
     observer: Array,
     moments: Array,
     last: Array,
+    average: Array,
     counters: IntArray,
 ) -> None:
     """Observer, sensitivities and recursive Gauss-Newton steps.
@@ -249,6 +251,8 @@ def advance_observer(
         Mean products of the sensitivities of the prediction and of the error, lower triangle.
     last : ndarray, shape (1,)
         Last sample.
+    average : ndarray, shape (n,)
+        Recent mean of the frequencies [rad/s].
     counters : ndarray of int, shape (1,)
         Samples so far.
     """
@@ -329,13 +333,16 @@ def advance_observer(
         determined = factorise(moments, 0.0, factor, scales)
         for p in range(n):
             omega[k, p] = np.sqrt(squares[p])
+            average[p] += min(smoothing, 1.0) * (omega[k, p] - average[p])
             uncertainty[k, p] = np.nan
             if determined:
                 for j in range(n):
                     unit[j] = 0.0
                 unit[p] = 1.0 / scales[p]
                 substitute(factor, unit)
-                uncertainty[k, p] = np.sqrt(max(unit[p], 0.0) / scales[p] * moments[n, n]) / (2.0 * omega[k, p])
+                misfit = np.sqrt(max(unit[p], 0.0) / scales[p] * moments[n, n]) / (2.0 * omega[k, p])
+                # An estimate that still moves is not where it will be.
+                uncertainty[k, p] = misfit + abs(omega[k, p] - average[p])
         if determined:
             # The effective length of an exponential window, and the delay of the observer.
             elapsed = counters[0] * interval

@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 
 #: A window with a larger fraction of missing samples has no estimate.
 MOST_MISSING = 0.5
+#: An estimate within this fraction of an expected frequency is probably the one of that tone.
+NEAR = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +77,7 @@ def estimate_window(estimator: Any, samples: Array, interval: float, expected: A
             found = fewer.estimate(samples, interval)
         except DataError:
             continue
-        result = wanted_tones(found, expected[:count], wanted)
+        result = wanted_tones(found, expected, wanted)
         if not result.flags & Flag.UNDETERMINED:
             break
     return result
@@ -88,8 +90,8 @@ def wanted_tones(found: FrequencyEstimate, expected: Array, wanted: int) -> Wind
     ----------
     found : FrequencyEstimate
         Estimate of m tones.
-    expected : ndarray, shape (m,)
-        Frequencies that the spectrum shows [rad/s], those of the wanted tones first.
+    expected : ndarray, shape (M,)
+        Frequencies that the spectrum shows [rad/s], those of the wanted tones first; no fewer than were estimated.
     wanted : int
         Number n of wanted tones, at most m.
 
@@ -101,7 +103,7 @@ def wanted_tones(found: FrequencyEstimate, expected: Array, wanted: int) -> Wind
     omega, uncertainty = found.omega, found.uncertainty
     if omega.size == wanted or not np.isfinite(omega).all():
         return WindowEstimate(omega[:wanted], uncertainty[:wanted], found.flags, omega)
-    kept = np.sort(belonging(omega, expected)[:wanted])
+    kept = np.sort(belonging(omega, expected, wanted))
     flags = found.flags & ~(Flag.UNCERTAIN | Flag.COMPLEX_ROOTS | Flag.OUT_OF_BOUNDS)
     # The room of a wanted tone is that between the wanted ones.
     apart = np.diff(np.concatenate(([0.0], omega[kept])))
@@ -111,30 +113,44 @@ def wanted_tones(found: FrequencyEstimate, expected: Array, wanted: int) -> Wind
     return WindowEstimate(omega[kept], uncertainty[kept], flags, omega)
 
 
-def belonging(found: Array, expected: Array) -> NDArray[np.intp]:
-    """Which of the estimated frequencies belong to which of the expected ones.
+def belonging(found: Array, expected: Array, wanted: int) -> NDArray[np.intp]:
+    """Which of the estimated frequencies belong to the wanted tones.
 
     Parameters
     ----------
-    found, expected : ndarray, shape (m,)
-        Frequencies [rad/s].
+    found : ndarray, shape (m,)
+        Estimated frequencies [rad/s].
+    expected : ndarray, shape (M,)
+        Frequencies that the spectrum shows [rad/s], those of the wanted tones first, M at least m.
+    wanted : int
+        Number n of wanted tones, at most m.
 
     Returns
     -------
-    ndarray of int, shape (m,)
-        For each expected frequency the place of its estimate; the sum of the distances of the logarithms is least.
+    ndarray of int, shape (n,)
+        For each wanted tone the place of its estimate. Every estimate belongs to one of the expected tones; of those
+        that only share the band some may have none.
+
+    Notes
+    -----
+    The sum over all pairs of ``x/(x + NEAR)`` is least, with x the distance of the logarithms: one pair that fits is
+    worth more than several that nearly do, and a tone that strayed far is as good as any other that did.
 
     Examples
     --------
-    >>> belonging(np.array([0.1, 2.1, 3.2]), np.array([3.0, 2.0, 9.0]))
+    >>> belonging(np.array([0.1, 2.1, 3.2]), np.array([3.0, 2.0, 9.0]), 3)
     array([2, 1, 0])
+    >>> belonging(np.array([1.0, 1.1, 1.5, 3.0]), np.array([1.5, 3.0, 1.1, 1.7, 1.0]), 2)
+    array([2, 3])
     """
     from scipy.optimize import linear_sum_assignment
 
     tiny = 1e-3 * float(expected.min())
     distance = np.abs(np.log(np.maximum(found, tiny)) - np.log(expected)[:, None])
-    # A tone that strayed far is as good as any other that did.
-    return np.asarray(linear_sum_assignment(np.minimum(distance, 0.5))[1])
+    absent = np.zeros((expected.size, expected.size - found.size))
+    absent[:wanted] = expected.size  # more than all others together: wanted tones are always there
+    cost = np.hstack((distance / (distance + NEAR), absent))
+    return np.asarray(linear_sum_assignment(cost)[1][:wanted])
 
 
 def amplitudes_of(samples: Array, interval: float, omega: Array, everything: Array) -> Array:
