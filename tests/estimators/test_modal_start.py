@@ -270,3 +270,16 @@ def test_criterion_is_a_likelihood_with_a_level_for_each_band():
     np.testing.assert_allclose(_criterion(error), expected, rtol=1e-12)
     np.testing.assert_allclose(_criterion(10 * error) - _criterion(error), 4 * power.size * np.log(10), rtol=1e-12)
     assert np.isfinite(_criterion(np.zeros(50)))
+
+
+@pytest.mark.parametrize("shift", [-3.0, 1e4])
+@pytest.mark.parametrize("initial_state", ["rest", "estimated"])
+def test_when_the_clock_began_does_not_matter(shift, initial_state):
+    record = coloured_record(1)
+    later = Record(record.t + shift, record.y, HeldSignal(record.input.t + shift, record.input.values))
+    options = AdditiveSrivc(terms=FOUR_MODES.terms, initial_state=initial_state)
+    fits = []
+    for one in (record, later):
+        start = automatic_start(one, FOUR_MODES.terms, 0.0)
+        fits.append(options.prepare(one).fit(Start(model=start.model)).additive.theta)
+    np.testing.assert_allclose(fits[1], fits[0], rtol=1e-7)
