@@ -5,6 +5,8 @@
 # make reproduce-additive
 #                 the study of additive models in open and closed loop, with as many data sets as its specifications say;
 #                 with RUNS=20 fewer, which publishes nothing
+# make reproduce-frequency
+#                 the same for the study of frequency estimation in finite time
 # make bench      speed, measured against other tools
 # make clean      remove what the other targets built (never results)
 
@@ -18,10 +20,11 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 STUDY := $(sort $(wildcard configs/useful_redundancy/*.yaml))
 ADDITIVE := open_loop closed_loop closed_loop_coloured coverage_open_loop coverage_closed_loop flexible_beam
+FREQUENCY := two_tones harmonic random step recovery recovery_in_noise efficiency
 # The number of data sets, where it was asked for: not the default of above.
 FEWER := $(if $(filter file,$(origin RUNS)),,--runs $(RUNS))
 
-.PHONY: demo test reproduce reproduce-additive bench clean
+.PHONY: demo test reproduce reproduce-additive reproduce-frequency bench clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -51,6 +54,12 @@ reproduce-additive: $(VENV)/.installed
 	$(BIN)/ctid figure additive --out "$(OUT)"
 	@if [ -z "$(FEWER)" ]; then set -e; $(BIN)/python -m experiments.additive.publish --results "$(OUT)"; \
 	  $(BIN)/python -m experiments.additive.acceptance --results "$(OUT)"; fi
+
+reproduce-frequency: $(VENV)/.installed
+	set -e; for name in $(FREQUENCY); do \
+	  $(BIN)/ctid run configs/finite_time_frequency/$$name.yaml $(FEWER) --jobs $(JOBS) --out "$(OUT)"; done
+	$(BIN)/ctid figure finite-time-frequency --out "$(OUT)"
+	@if [ -z "$(FEWER)" ]; then $(BIN)/python -m experiments.finite_time_frequency.publish --results "$(OUT)"; fi
 
 bench: $(VENV)/.test-installed
 	set -e; for benchmark in benchmarks/bench_*.py; do $(BIN)/python "$$benchmark"; done

@@ -8,7 +8,8 @@ Names of the measures, each with the number of the tone behind it where it is on
   [s]; ``settling_after_step_1``: the same from the last step of a frequency to the end, counted from the step [s].
   They have no value if that never happened. Flags do not matter; an estimate that begins at the truth has settled at 0;
 - ``rms_1``, ``bias_1``: root mean square and mean of the error over the window [rad/s];
-- ``false_alarms``: alarms with no step of a frequency or an amplitude shortly before, of trackers that raise any;
+- ``false_alarms``: alarms with no step of a frequency or an amplitude in the two periods of the lowest frequency before,
+  of trackers that raise any;
 - ``valid_share``: share of the record with a valid estimate [%].
 
 An estimate of a whole record has ``omega``, ``rms`` and ``bias`` of this one error, and ``valid_share`` 0 or 100.
@@ -43,8 +44,8 @@ MEASURE_UNITS = {
     "false_alarms": "-",
     "valid_share": "%",
 }
-#: An alarm so soon after a step [s] answers to it.
-ALARM_GRACE = 5.0
+#: An alarm within so many periods of the lowest frequency after a step answers to it.
+ALARM_PERIODS = 2.0
 #: Length of the window of rms and bias, before the end of the record, if none is given [s].
 USUAL_WINDOW = 10.0
 #: Kinds of trackers that raise alarms.
@@ -146,7 +147,7 @@ def measure_track(
     found |= _numbered("rms", np.sqrt(np.mean(chosen**2, axis=0)))
     found |= _numbered("bias", np.mean(chosen, axis=0))
     if options.kind in _ALARMING:
-        found["false_alarms"] = float(_false_alarms(track, signal.steps))
+        found["false_alarms"] = float(_false_alarms(track, signal))
     found["valid_share"] = 100.0 * float(np.mean(valid))
     return {name: found[name] for name in measure_names([found])}
 
@@ -335,9 +336,11 @@ def _in_window(t: Array, window: tuple[float, float] | None) -> NDArray[np.bool_
     return np.asarray((t >= low - slack) & (t <= high + slack))
 
 
-def _false_alarms(track: FrequencyTrack, steps: tuple[float, ...]) -> int:
+def _false_alarms(track: FrequencyTrack, signal: MultiSine) -> int:
     from ctid_cli.frequency import Flag
 
     alarm = (track.flags & int(Flag.CHANGED)) != 0
     begins = track.t[np.flatnonzero(alarm & ~np.concatenate(([False], alarm[:-1])))]
-    return sum(not any(0.0 <= begin - step + 1e-9 <= ALARM_GRACE for step in steps) for begin in begins)
+    steps = np.array(signal.steps)
+    graces = ALARM_PERIODS * 2.0 * np.pi / signal.frequencies_at(steps)[:, 0]
+    return sum(not ((steps <= begin + 1e-9) & (begin <= steps + graces)).any() for begin in begins)

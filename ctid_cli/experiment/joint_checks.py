@@ -66,8 +66,8 @@ def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool
     """
     yield from world_complaints(spec, broken)
     if spec.signal is not None:
-        yield from too_long_complaints(variants(spec.sampling) if spec.sampling is not None else [])
-        yield from signal_complaints(spec)
+        too_long = list(too_long_complaints(variants(spec.sampling) if spec.sampling is not None else []))
+        yield from too_long or signal_complaints(spec)
         return
     extents = _extents(spec) if files_are_good else []
     estimators = {

@@ -12,7 +12,7 @@ import numpy as np
 from ctid_cli.experiment.frequency_measures import true_frequencies
 from ctid_cli.experiment.sections import Complaint, Variant, field_in, grouped, variants
 from ctid_cli.experiment.yaml_source import KeyPath
-from ctid_cli.frequency import FREQUENCY_ESTIMATORS
+from ctid_cli.frequency import FREQUENCY_ESTIMATORS, DremWindow
 from ctid_cli.signals import RegularSampling, SineDisturbance
 
 if TYPE_CHECKING:
@@ -165,16 +165,23 @@ def _of_clock(spec: Spec, signal: Variant, clock: Variant) -> Iterator[Failure]:
 def _of_estimator(options: Any, clock: RegularSampling) -> Iterator[str]:
     if not options.online:
         return
-    try:
-        tracker = options.start(clock.interval)
-    except ValueError as error:
-        yield str(error)
-        return
-    del tracker
-    filled = 2 * options.tones * getattr(options, "h", 0.0) + getattr(options, "prefilter", 0.0)
     duration = clock.interval * clock.samples
+    # First of all, since the estimator would keep all the samples of such a time.
+    for name in ("prefilter", "difference", "d", *(("memory",) if options.kind == DremWindow.kind else ())):
+        value = getattr(options, name, 0.0)
+        if value > duration:
+            yield f"{name} = {value:g} s is longer than the record, {duration:g} s"
+            return
+    rows = options.first_row + options.tones - 1 if hasattr(options, "d") else 0
+    filled = 2 * options.tones * getattr(options, "h", 0.0) + rows * getattr(options, "d", 0.0)
+    filled += getattr(options, "prefilter", 0.0) + getattr(options, "difference", 0.0)
     if filled >= duration:
         yield f"its delays are filled after {filled:g} s, and the record ends at {duration:g} s; take a smaller h"
+        return
+    try:
+        options.start(clock.interval)
+    except ValueError as error:
+        yield str(error)
 
 
 def _fits(options: Any, signal: Any, disturbances: list[Any]) -> bool:

@@ -63,9 +63,8 @@ TRIALS = 8
 LARGEST_SHARE = 1.0 / 3.0
 #: Samples of a window for each tone that is estimated.
 WINDOW_SAMPLES_PER_TONE = 8
-#: Delay of the regression times the highest frequency, and the prefilter in delays.
-DELAY_ANGLE = 2.2
-PREFILTER_DELAYS = 1.5
+#: Length of the prefilter in delays.
+PREFILTER_DELAYS = 2.0
 #: Tones that share the band: so many at most for estimators that delay, and for those that integrate.
 DELAY_SPARES = 2
 INTEGRATION_SPARES = 0
@@ -170,9 +169,10 @@ def choose_settings(
     -----
     The tones are the strongest peaks of the median spectrum of the record's segments. A low-pass whose stop band begins
     before what would fold onto them, and before the next strong tone, allows to keep only some samples in each period
-    of the highest tone. Tones that no filter can keep away are estimated too. The delay h of the regressions is near
-    ``2.2/w_max`` (pi/w_max is where frequencies become ambiguous), with a prefilter of 1.5 h. Windows begin with four
-    beats of the closest tones and are doubled until nearly all estimates are certain.
+    of the highest tone. Tones that no filter can keep away are estimated too. The delay h of the regressions is the one
+    at which noise moves the wanted tones least, below ``pi/(1.1 w_max)`` (frequencies become ambiguous at pi/w_max),
+    with a prefilter of 2 h. Windows begin with three beats of the closest tones and are doubled until nearly all
+    estimates are certain.
 
     Examples
     --------
@@ -215,7 +215,7 @@ def choose_settings(
         )
     reasons = [_tones_sentence(peaks, tones), *_preparation(offset, bridge if gaps else 0, interval), *band.sentences]
     length, sentence = _choose_window(thinned, thin, tones, band, peaks, chosen if batch else Esprit.kind, window)
-    estimator, how = _estimator(chosen, band, thin, length)
+    estimator, how = _estimator(chosen, band, tones, thin, length)
     if method is None:
         why = (
             "nonlinear least squares, since samples are missing"
@@ -409,7 +409,7 @@ def _batch(kind: str, tones: int) -> Any:
     return NonlinearLeastSquares(tones=tones) if kind == NonlinearLeastSquares.kind else Esprit(tones=tones)
 
 
-def _estimator(kind: str, band: _Band, thin: float, length: int) -> tuple[Any, str]:
+def _estimator(kind: str, band: _Band, wanted: int, thin: float, length: int) -> tuple[Any, str]:
     """The estimator, and a sentence about its options."""
     tones = band.expected.size
     if kind in (Esprit.kind, NonlinearLeastSquares.kind):
@@ -437,10 +437,7 @@ def _estimator(kind: str, band: _Band, thin: float, length: int) -> tuple[Any, s
         return FilterRegression(
             tones=tones, pole=pole, forgetting=2.0 / window, initial_frequencies=tuple(expected), hold=0.5 * window
         ), f"Filter pole {pole:.4g} rad/s, the middle of the tones; data older than {0.5 * window:.4g} s are forgotten."
-    lag = max(1, round(DELAY_ANGLE / (top * thin)))
-    if lag * thin * top >= np.pi:
-        lag -= 1
-    h = max(1, lag) * thin
+    h = _best_delay(band.expected, band.amplitudes, wanted, thin)
     common: dict[str, Any] = {"tones": tones, "h": h, "prefilter": PREFILTER_DELAYS * h}
     told = f"Delay h = {h:.4g} s ({h * top:.3g} rad of the highest tone), prefilter {PREFILTER_DELAYS * h:.4g} s"
     if kind == RestartingLeastSquares.kind:
@@ -454,6 +451,22 @@ def _estimator(kind: str, band: _Band, thin: float, length: int) -> tuple[Any, s
     options["initial_frequencies"] = tuple(expected)
     told += f", gain for a rate of {rate:.4g} 1/s."
     return (DremGradient if kind == DremGradient.kind else DremFiniteTime)(**options), told
+
+
+def _best_delay(omega: Array, amplitudes: Array, wanted: int, thin: float) -> float:
+    """Delay of the regression at which the same noise moves the worst of the wanted tones least, against its room."""
+    longest = max(1, int(np.pi / (PASS * float(omega.max()) * thin)))
+    others = ~np.eye(omega.size, dtype=bool)
+    apart = np.where(others, np.abs(omega[:, None] - omega), omega)
+    best, largest = thin, -1.0
+    for h in thin * np.arange(1, longest + 1):
+        cosines = np.cos(omega * h)
+        # Slope of prod_j (c - c_j) over w_i, at w_i.
+        slopes = h * np.sin(omega * h) * np.prod(np.where(others, 2.0 * np.abs(cosines[:, None] - cosines), 1.0), axis=1)
+        worst = float((amplitudes * slopes * apart.min(axis=1))[:wanted].min())
+        if worst > largest:
+            best, largest = float(h), worst
+    return best
 
 
 def _best_spacing(omega: Array, amplitudes: Array, h: float, thin: float) -> tuple[float, float]:

@@ -9,19 +9,18 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ctid_cli.frequency.consistency import check_consistency, observe_second_delay
-from ctid_cli.frequency.decoding import cosine_sensitivities, decode, flag_uncertain, propagate, still_doubtful
+from ctid_cli.frequency.consistency import observe_second_delay
+from ctid_cli.frequency.decoding import decode
 from ctid_cli.frequency.delay_options import DelayRegression
-from ctid_cli.frequency.flags import GAP, STARTING, UNCERTAIN, UNDETERMINED
+from ctid_cli.frequency.flags import GAP, STARTING, UNDETERMINED
 from ctid_cli.frequency.regression import form_row, minor_plan, mix_rows, whole_delay
 from ctid_cli.frequency.scalar_regressions import (
-    CHECK_EVERY,
     CHECK_SPANS,
     LONG_AGO,
     MIXING_ROUNDING,
-    NEGLIGIBLE,
     ROWS_PER_TONE,
     check_mixing,
+    judge_mixed,
     rows_before_valid,
 )
 from ctid_cli.frequency.tracking import Recursion
@@ -136,7 +135,8 @@ class DremWindow(DelayRegression):
             "window": np.zeros((length, 2 * n + 3)),
             "newer": np.zeros(2 * n + 3),
             "check": np.zeros((n + 1, n + 1)),
-            "counters": np.array([0, 0, 0, 0, 0, 0, LONG_AGO], np.int64),
+            "counters": np.zeros(4, np.int64),
+            "doubts": np.array([0, 0, LONG_AGO], np.int64),
         }
         return Recursion(advance_window, constants, state, clock.weights, np.nan, clock.notes)
 
@@ -202,6 +202,7 @@ def advance_window(
     newer: Array,
     check: Array,
     counters: IntArray,
+    doubts: IntArray,
 ) -> None:
     """Least squares on every mixed regression over a sliding window.
 
@@ -236,9 +237,10 @@ def advance_window(
         Sums over the newer part of the window.
     check : ndarray, shape (n + 1, n + 1)
         Second moments at the second delay.
-    counters : ndarray of int, shape (7,)
-        Place of the newest sample, of the newest row and of the next entry of the window, mixed rows so far, samples
-        since the last verdict at the second delay, that verdict, and samples since the estimate was uncertain.
+    counters : ndarray of int, shape (4,)
+        Place of the newest sample, of the newest row and of the next entry of the window, and mixed rows so far.
+    doubts : ndarray of int, shape (3,)
+        See :func:`~ctid_cli.frequency.scalar_regressions.judge_mixed`.
     """
     n = omega.shape[1]
     row, check_row = np.empty(n + 1), np.empty(n + 1)
@@ -282,26 +284,31 @@ def advance_window(
                 scatter = square - theta[i] * theta[i]
                 errors[i] = np.sqrt(scatter) if scatter > SCATTER_ROUNDING * square else 0.0
             flag |= decode(theta, delay, top, bottom, polynomial, work, roots, omega[k])
-            cosine_sensitivities(roots, delay, slopes, sensitivities)
-            propagate(sensitivities, errors, uncertainty[k])
-            for i in range(n):
-                errors[i] = (1.0 + abs(theta[i])) * relative
-            propagate(sensitivities, errors, rounding)
             span = (rows.shape[0] + 2 * n * lag + sums[2 * n + 2]) * interval
             elapsed = (rows.shape[0] + 2 * n * lag + counters[3]) * interval
-            if flag_uncertain(omega[k], uncertainty[k], rounding, span, elapsed):
-                flag |= UNCERTAIN
-                if sums[2 * n + 2] >= enough:
-                    counters[6] = 0
-            elif still_doubtful(omega[k], counters[6] * interval):
-                flag |= UNCERTAIN
-            counters[6] += 1
-            if counters[4] == 0:
-                counters[5] = check_consistency(check, omega[k], check_delay, NEGLIGIBLE)
-            counters[4] = (counters[4] + 1) % CHECK_EVERY
+            started = sums[2 * n + 2] >= enough
+            flag |= judge_mixed(
+                theta,
+                roots,
+                errors,
+                relative,
+                delay,
+                span,
+                elapsed,
+                interval,
+                started,
+                check,
+                check_delay,
+                doubts,
+                sensitivities,
+                slopes,
+                rounding,
+                omega[k],
+                uncertainty[k],
+            )
         else:
             for i in range(n):
                 omega[k, i] = uncertainty[k, i] = np.nan
             if counters[3] > 0:
                 flag |= UNDETERMINED
-        flags[k] = flag | counters[5]
+        flags[k] = flag | doubts[1]

@@ -201,9 +201,86 @@ def scalar_recursion(options: DremOptions, interval: float, *, finite_time: bool
         "sums": np.zeros((2, n)),
         "recent": np.zeros(n + 3),
         "check": np.zeros((n + 1, n + 1)),
-        "counters": np.array([0, 0, 0, 0, 0, LONG_AGO], np.int64),
+        "counters": np.zeros(3, np.int64),
+        "doubts": np.array([0, 0, LONG_AGO], np.int64),
     }
     return Recursion(advance_scalars, constants, state, clock.weights, past, clock.notes)
+
+
+@njit(cache=True, nogil=True)
+def judge_mixed(
+    theta: Array,
+    roots: Array,
+    errors: Array,
+    relative: float,
+    delay: float,
+    span: float,
+    elapsed: float,
+    interval: float,
+    started: bool,
+    check: Array,
+    check_delay: float,
+    doubts: IntArray,
+    sensitivities: Array,
+    slopes: Array,
+    rounding: Array,
+    omega: Array,
+    uncertainty: Array,
+) -> int:
+    """What may be wrong with frequencies from mixed regressions.
+
+    Parameters
+    ----------
+    theta, roots : ndarray, shape (n,)
+        Parameters and cosines.
+    errors : ndarray, shape (n,)
+        Errors of the parameters that the misfit shows.
+    relative : float
+        Relative error of the mixed regressions by rounding.
+    delay : float
+        Delay h [s].
+    span, elapsed : float
+        Time that the estimate rests on, and since the first sample [s].
+    interval : float
+        Sampling interval [s].
+    started : bool
+        Whether there are enough rows for a verdict that lasts.
+    check : ndarray, shape (n + 1, n + 1)
+        Second moments at the second delay.
+    check_delay : float
+        The same [s].
+    doubts : ndarray of int, shape (3,)
+        Samples since the last verdict at the second delay, that verdict, and samples since the estimate was uncertain.
+    sensitivities, slopes, rounding : ndarray, shapes (n, n), (n,), (n,)
+        Work space.
+    omega : ndarray, shape (n,)
+        Frequencies [rad/s].
+    uncertainty : ndarray, shape (n,)
+        Receives what may be wrong with them [rad/s].
+
+    Returns
+    -------
+    int
+        UNCERTAIN or 0; the verdict at the second delay is left in `doubts`.
+    """
+    n = theta.size
+    cosine_sensitivities(roots, delay, slopes, sensitivities)
+    propagate(sensitivities, errors, uncertainty)
+    for i in range(n):
+        slopes[i] = (1.0 + abs(theta[i])) * relative
+    propagate(sensitivities, slopes, rounding)
+    flag = 0
+    if flag_uncertain(omega, uncertainty, rounding, span, elapsed):
+        flag = UNCERTAIN
+        if started:
+            doubts[2] = 0
+    elif still_doubtful(omega, doubts[2] * interval):
+        flag = UNCERTAIN
+    doubts[2] += 1
+    if doubts[0] == 0:
+        doubts[1] = check_consistency(check, omega, check_delay, NEGLIGIBLE)
+    doubts[0] = (doubts[0] + 1) % CHECK_EVERY
+    return flag
 
 
 @njit(cache=True, nogil=True)
@@ -235,6 +312,7 @@ def advance_scalars(
     recent: Array,
     check: Array,
     counters: IntArray,
+    doubts: IntArray,
 ) -> None:
     """Gradient and finite-time estimate of every mixed regression.
 
@@ -280,15 +358,17 @@ def advance_scalars(
         in the fastest estimate.
     check : ndarray, shape (n + 1, n + 1)
         Second moments at the second delay.
-    counters : ndarray of int, shape (6,)
-        Place of the newest sample and of the newest row, mixed rows so far, samples since the last verdict at the
-        second delay, that verdict, and samples since the estimate was uncertain.
+    counters : ndarray of int, shape (3,)
+        Place of the newest sample and of the newest row, and mixed rows so far.
+    doubts : ndarray of int, shape (3,)
+        See :func:`judge_mixed`.
     """
     n = gains.size
     row, check_row = np.empty(n + 1), np.empty(n + 1)
     matrix, minors, mixed = np.empty((n, n + 1)), np.empty(2 ** (n + 1)), np.empty(n + 1)
-    errors, rounding, roots, slopes = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    polynomial, work, sensitivities = np.empty(n + 1), np.empty(n + 1), np.empty((n, n))
+    errors, roots, slopes, rounding = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    sensitivities = np.empty((n, n))
+    polynomial, work = np.empty(n + 1), np.empty(n + 1)
     keep = 1.0 - 1.0 / (CHECK_SPANS * n * lag)
     remember = 1.0 - 1.0 / (RECENT_SPANS * n * lag)
     z, q = sums[0], sums[1]
@@ -332,30 +412,36 @@ def advance_scalars(
             flag |= STARTING
         flag |= decode(theta, delay, top, bottom, polynomial, work, roots, omega[k])
         if recent[n] > 0.0:
-            cosine_sensitivities(roots, delay, slopes, sensitivities)
             relative = np.sqrt(recent[n + 1] / recent[n])
             for i in range(n):
                 errors[i] = np.sqrt(recent[i] / recent[n])
-                slopes[i] = (1.0 + abs(theta[i])) * relative
-            propagate(sensitivities, errors, uncertainty[k])
-            propagate(sensitivities, slopes, rounding)
             # Rows that carry weight: (sum w)^2/sum w^2.
             remembered = q[fastest] * q[fastest] / recent[n + 2] if recent[n + 2] > 0.0 else 0.0
             span = (rows.shape[0] + 2 * n * lag + remembered) * interval
             elapsed = (rows.shape[0] + 2 * n * lag + counters[2]) * interval
-            if flag_uncertain(omega[k], uncertainty[k], rounding, span, elapsed):
-                flag |= UNCERTAIN
-                if counters[2] >= enough:
-                    counters[5] = 0
-            elif still_doubtful(omega[k], counters[5] * interval):
-                flag |= UNCERTAIN
-            counters[5] += 1
-            if counters[3] == 0:
-                counters[4] = check_consistency(check, omega[k], check_delay, NEGLIGIBLE)
-            counters[3] = (counters[3] + 1) % CHECK_EVERY
+            started = counters[2] >= enough
+            flag |= judge_mixed(
+                theta,
+                roots,
+                errors,
+                relative,
+                delay,
+                span,
+                elapsed,
+                interval,
+                started,
+                check,
+                check_delay,
+                doubts,
+                sensitivities,
+                slopes,
+                rounding,
+                omega[k],
+                uncertainty[k],
+            )
         else:
             for i in range(n):
                 uncertainty[k, i] = np.nan
             if counters[2] > 0:
                 flag |= UNDETERMINED
-        flags[k] = flag | counters[4]
+        flags[k] = flag | doubts[1]

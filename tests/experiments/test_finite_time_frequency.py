@@ -1,9 +1,18 @@
-"""The acceptance numbers of the frequency estimators; those that need many data sets with few of them."""
+"""The study of finite-time frequency estimation: its acceptance numbers, with few data sets, and what it publishes."""
 
+import csv
+import json
+
+import numpy as np
 import pytest
 
-from experiments.finite_time_frequency import acceptance
+from ctid_cli.experiment.plan import build_plan
+from ctid_cli.experiment.spec import load_spec
+from ctid_cli.reporting.figures.finite_time_frequency import CONFIGS, DERIVED
+from ctid_cli.reporting.study import data_folder
+from experiments.finite_time_frequency import acceptance, as_printed, measured, publish
 from experiments.finite_time_frequency.acceptance import Check
+from tests.reporting.frequency_results import config, run_here
 
 SHORT = {
     "exact": acceptance.exact,
@@ -42,3 +51,230 @@ def test_the_bound_is_that_of_a_single_tone_where_tones_are_far_apart():
     # 24 sigma^2/(A^2 T^2 N) for a long record.
     bound = acceptance.cramer_rao(200.0, 0.01, 0.1)
     assert bound == pytest.approx([(24 * 0.01 / (200.0**2 * 20_000)) ** 0.5] * 2, rel=0.02)
+
+
+# Specifications ------------------------------------------------------------------------------------------
+
+
+def test_the_folder_holds_the_specifications_of_the_study():
+    there = {
+        f"finite_time_frequency/{file.name}" for file in (data_folder("configs") / "finite_time_frequency").glob("*")
+    }
+    assert there == set(CONFIGS.values())
+    for file in CONFIGS.values():
+        assert load_spec(data_folder("configs") / file).warnings == ()
+
+
+@pytest.mark.parametrize(("name", "signal"), [("two-tones", "A"), ("harmonic", "B"), ("step", "D"), ("recovery", "D")])
+def test_signals_are_those_of_the_acceptance_numbers(name, signal):
+    for cell, jump in zip(build_plan(load_spec(config(name))).data_cells, (True, False), strict=False):
+        assert cell.swept == ({"phase_at_steps": "jump" if jump else "continuous"} if signal == "D" else {})
+        samples = cell.dataset(0).record.samples
+        expected = acceptance.signal(signal, 0.001, 0.001 * samples.size, jump=jump)
+        assert samples == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["random", "efficiency", "recovery-in-noise"])
+def test_noise_has_the_printed_variance(name):
+    (cell, *_) = build_plan(load_spec(config(name))).data_cells
+    clean = cell.source.signal.generate(cell.source.sampling.times(np.random.default_rng(0)))
+    noise = cell.dataset(0).record.samples - clean
+    assert np.std(noise) == pytest.approx(acceptance.SIGMA, rel=0.02)
+    assert np.abs(noise).max() <= 0.2 or name == "recovery-in-noise"
+
+
+@pytest.mark.parametrize(("name", "tuning"), [("two-tones", "A"), ("harmonic", "B"), ("random", "C"), ("step", "D")])
+def test_the_delay_estimators_have_the_printed_tuning(name, tuning):
+    parts = {part.name: part.estimator.options for part in build_plan(load_spec(config(name))).estimators}
+    for kind in ("finite_time", "gradient"):
+        options = parts[kind]
+        assert {key: getattr(options, key) for key in acceptance.TUNING[tuning]} == acceptance.TUNING[tuning]
+        assert (options.initial_frequencies, options.first_row, options.power, options.gated) == ((2, 5), 1, 1, True)
+
+
+def test_experiments_with_noise_have_data_sets_of_their_own():
+    seeds = [load_spec(config(name)).monte_carlo.seed for name in ("random", "efficiency", "recovery-in-noise")]
+    assert len(set(seeds)) == 3
+
+
+# What the runs say ---------------------------------------------------------------------------------------
+
+COARSE = ("sampling.interval=0.01",)
+#: Longer averages for the estimators of whole records, which are fast then.
+BLOCKS = ("estimators.esprit.averaging=0.2", "estimators.nonlinear_least_squares.averaging=0.2")
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("results")
+    for name in ("two-tones", "harmonic"):
+        run_here(name, folder, [*COARSE, *BLOCKS])
+    run_here("step", folder, COARSE)
+    run_here("random", folder, [*COARSE, *BLOCKS, "monte_carlo.runs=3", "tracks.runs=3"])
+    finer = "sampling.interval=0.005"
+    run_here("recovery", folder, [finer])
+    # As much noise in every second as with the published clock.
+    run_here("recovery-in-noise", folder, [finer, "monte_carlo.runs=2", "disturbance.variance=0.0026667"])
+    run_here("efficiency", folder, [finer, "monte_carlo.runs=8"])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def study(out):
+    return measured.read_study(out)
+
+
+def one(rows, **wanted):
+    (row,) = (row for row in rows if row.items() >= wanted.items())
+    return row
+
+
+def test_settling_times_are_those_of_a_direct_simulation(study):
+    rows = list(measured.settling(study["two-tones"]))
+    y = acceptance.signal("A", 0.01, 60.0)
+    for name, kind in (("finite_time", acceptance.DremFiniteTime), ("gradient", acceptance.DremGradient)):
+        track = acceptance.drem(kind, "A").start(0.01).run(y)
+        row = one(rows, estimator=name)
+        for band in measured.BANDS:
+            assert row[f"within_{band:g}"] == pytest.approx(acceptance.settle(track, acceptance.TRUTH, band))
+    assert one(rows, estimator="finite_time")["within_0.001"] == pytest.approx(0.66)
+    assert {row["estimator"] for row in rows if row["derived"] == "yes"} == {"observer", "filter", "filter_gradient"}
+    assert not {"esprit", "nonlinear_least_squares"} & {row["estimator"] for row in rows}
+
+
+def test_a_step_is_measured_piece_by_piece_and_invalid_silence_is_told_from_validity(study):
+    rows = list(measured.settling(study["step"]))
+    assert {row["piece"] for row in rows} == {"from 0 s", "from 30 s"}
+    for reading, longest in (("jump", 2.9), ("continuous", 2.9)):
+        row = one(rows, estimator="restarting", piece="from 30 s", reading=reading)
+        assert 2.8 <= row["within_0.001"] <= longest
+        assert row["valid_but_off_by_0.05"] < 0.1
+        slow = one(rows, estimator="finite_time", piece="from 30 s", reading=reading)
+        assert slow["within_0.001"] > 13
+        assert slow["valid_but_off_by_0.05"] > 0.1
+
+
+def test_medians_over_data_sets(study):
+    errors = list(measured.residuals(study["random"]))
+    row = one(errors, estimator="finite_time", tone=2)
+    raw = [r["measures"] for r in study["random"].rows if r["estimator"] == "finite_time"]
+    assert row["data_sets"] == 3
+    assert row["rms"] == np.median([m["rms_2"] for m in raw])
+    assert row["bias"] == pytest.approx(np.mean([m["bias_2"] for m in raw]))
+    times = one(list(measured.settling(study["random"])), estimator="restarting_prefiltered")
+    assert times["within_0.05"] <= times["longest_0.05"] < 6
+
+
+def test_recovery(study):
+    rows = list(measured.recovery(study["recovery"]))
+    assert one(rows, estimator="window", reading="jump")["longest"] == pytest.approx(7.595, abs=0.01)
+    assert one(rows, estimator="finite_time", reading="jump")["median"] == pytest.approx(31.3, abs=0.1)
+    never = one(rows, estimator="observer", reading="jump")
+    assert (never["median"], never["longest"], never["never"]) == (None, None, 1)
+    alarmed = one(measured.recovery(study["recovery-in-noise"]), estimator="restarting_prefiltered", reading="jump")
+    assert alarmed["false_alarms"] == 0
+    assert alarmed["band"] == 0.02
+
+
+def test_efficiency_is_the_error_of_the_last_estimate_over_the_bound(study):
+    row = one(measured.efficiency(study["efficiency"]), estimator="esprit", tone=1)
+    last = np.array([r["measures"]["omega_1"] for r in study["efficiency"].rows if r["estimator"] == "esprit"])
+    bound = acceptance.cramer_rao(20.0, 0.005, 0.2 / np.sqrt(3))[0]
+    assert row["ratio"] == pytest.approx(np.sqrt(np.mean((last - 2.0) ** 2)) / bound)
+    assert row["rmse"] ** 2 == pytest.approx(row["bias"] ** 2 + row["deviation"] ** 2 * 7 / 8)
+    biased = one(measured.efficiency(study["efficiency"]), estimator="finite_time", tone=2)
+    assert biased["bias"] > 5 * biased["bias_error"]
+
+
+def test_the_monte_carlo_error_is_that_of_normal_errors():
+    rng = np.random.default_rng(1)
+    assert measured.monte_carlo_error(rng.standard_normal(100_000)) == pytest.approx(1 / np.sqrt(2e5), rel=0.05)
+    # A bias that is large and known adds none.
+    assert measured.monte_carlo_error(100 + rng.standard_normal(10_000)) == pytest.approx(0.01, rel=0.05)
+
+
+def test_runs_are_checked_against_the_acceptance_numbers(study):
+    checks = list(measured.run_checks(study))
+    assert len([check for check in checks if check.item == "runs: recovery in noise"]) == 6
+    assert all(check.met for check in checks if check.item.startswith("runs: recovery"))
+    names = [check.name for check in checks if check.item == "runs: efficiency"]
+    assert len(names) == len(measured.EFFICIENT) + 1
+    spoilt = [row for row in study["recovery"].rows if row["estimator"] == "window"]
+    for row in spoilt:
+        row["measures"]["settling_after_step_1"] = None
+    missed = [check for check in measured.run_checks(study) if not check.met and "recovery" in check.item]
+    assert len(missed) == 2
+    assert all(check.value == np.inf for check in missed)
+
+
+# What is published ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def published(out, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("published")
+    (out / "finite_time_frequency_figures").mkdir()
+    (out / "finite_time_frequency_figures" / "figure_1.svg").write_text("drawn")
+    patch = pytest.MonkeyPatch()
+    patch.setattr(as_printed, "INTERVAL", 0.01)
+    patch.setitem(acceptance.ITEMS, "exact", lambda: acceptance.exact(0.01, slack=2))
+    patch.setitem(measured.EFFICIENT, "esprit", 1e-3)
+    with pytest.raises(SystemExit):
+        publish.main(["--results", str(out), "--out", str(folder), "--items", "exact"])
+    patch.undo()
+    return folder
+
+
+def test_everything_is_written(published):
+    names = {file.name for file in published.iterdir()}
+    assert names == {
+        "settling.csv", "residuals.csv", "recovery.csv", "efficiency.csv", "tables.md", "acceptance.md",
+        "environment.json", "figures",
+    }  # fmt: skip
+    assert (published / "figures" / "figure_1.svg").read_text() == "drawn"
+    assert json.loads((published / "environment.json").read_text()) == {}
+    rows = list(csv.DictReader((published / "recovery.csv").read_text().splitlines()))
+    assert {row["reading"] for row in rows} == {"jump", "continuous"}
+    assert len(rows) == 2 * (8 + 11)
+
+
+def test_tables_say_what_is_derived_and_what_is_biased(published):
+    text = (published / "tables.md").read_text()
+    lines = [line for line in text.splitlines() if line.startswith(("| `observer`", "| `filter"))]
+    assert len(lines) == 3 * 5 + 2 * 3
+    assert all(DERIVED in line for line in lines)
+    for figure in "1234":
+        assert f"(figure {figure})" in text
+    (biased,) = (line for line in text.split("Cramer-Rao")[1].splitlines() if line.startswith("| `finite_time` "))
+    assert "| 0.026 ±" in biased
+    assert "| `finite_time` | 0.66 | 0.66 | 0.66 |" in text
+
+
+def test_a_missed_number_is_published_as_missed(published):
+    text = (published / "acceptance.md").read_text()
+    (line,) = (line for line in text.splitlines() if "| esprit" in line.replace("efficiency ", ""))
+    assert line.endswith("at most 0.001 | NO |")
+    assert "| NO |" not in text.split("runs: recovery |")[0]
+    assert "Checked elsewhere" in text
+
+
+def test_nothing_is_published_without_results(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        publish.main(["--results", str(tmp_path), "--out", str(tmp_path / "out")])
+    assert "run first: make reproduce-frequency" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_misprints(monkeypatch):
+    monkeypatch.setattr(as_printed, "INTERVAL", 0.01)
+    rows = {(what, where): (printed, corrected) for what, where, printed, corrected in as_printed.rows()}
+    (signs,) = (value for (what, _), value in rows.items() if what.startswith("sign"))
+    assert signs == ("11.58 and 31.42", "2 and 3")
+    zeros = {what[-1]: value for (what, _), value in rows.items() if what.startswith("delays begin")}
+    assert zeros["A"][1] == "0.66"
+    assert float(zeros["A"][0]) == pytest.approx(15.4, abs=0.2)
+    assert zeros["D"] == ("6.09", "3.6")
+    once = [float(v[1]) for (what, where), v in rows.items() if what.startswith("epsilon") and "rate" in where]
+    assert once == pytest.approx([0.42, 0.28, 0.33, 0.86])
+    literal = [v[0] for (what, where), v in rows.items() if what.startswith("epsilon") and "within" in where]
+    assert literal[1:] == ["never"] * 3

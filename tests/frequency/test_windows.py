@@ -56,4 +56,15 @@ def test_nothing_to_estimate():
 
 
 def test_belonging_prefers_the_nearest_in_ratio():
-    assert belonging(np.array([50.0, 100.0, 210.0]), np.array([200.0, 52.0, 101.0])).tolist() == [2, 0, 1]
+    assert belonging(np.array([50.0, 100.0, 210.0]), np.array([200.0, 52.0, 101.0]), 3).tolist() == [2, 0, 1]
+
+
+def test_a_disturbing_tone_that_is_not_found_does_not_push_the_others_along():
+    expected = np.array([146.4, 293.7, 440.3, 109.6, 163.9, 733.6, 99.5])
+    found = np.array([99.6, 109.8, 146.4, 293.7, 440.4, 733.9])
+    assert belonging(found, expected, 3).tolist() == [2, 3, 4]
+    assert belonging(found[2:], expected, 3).tolist() == [0, 1, 2]
+
+
+def test_a_wanted_tone_is_always_there():
+    assert belonging(np.array([1.0, 5.0]), np.array([1.0, 2.0, 5.0, 5.1]), 2).tolist() == [0, 1]

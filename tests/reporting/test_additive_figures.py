@@ -259,7 +259,7 @@ def test_results_that_are_missing_are_named_before_anything_is_drawn(tmp_path, m
 
 
 def test_names_of_figures():
-    assert list(STUDIES) == ["useful-redundancy", "additive"]
+    assert list(STUDIES) == ["useful-redundancy", "additive", "finite-time-frequency"]
     with pytest.raises(UsageError, match=r"additive has no figure 9; it has 2, 3, 4, 6, coloured, coverage$"):
         find_figures(["additive/9"])
     with pytest.raises(UsageError, match=r"'additive/colored' is neither.*did you mean 'additive/coloured'\?"):
