@@ -52,7 +52,7 @@ class DremGradient(DremOptions):
     -----
     ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)``, solved exactly over each sampling interval with Delta and
     Psi_k held, so that no gain is too large. The rate of convergence is ``gamma_k`` times the mean of ``Delta^2``. The
-    recursion is that of :class:`~ctid_cli.frequency.scalar_regressions.DremFiniteTime`, which gives the same estimate
+    recursion is that of :class:`~ctid_cli.frequency.drem_finite_time.DremFiniteTime`, which gives the same estimate
     without the part of the initial value.
 
     References

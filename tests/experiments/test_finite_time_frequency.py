@@ -22,7 +22,7 @@ SHORT = {
     "steps": acceptance.steps,
     "robust": lambda: acceptance.robust(seeds=3),
     "quiet": lambda: acceptance.quiet(seeds=1),
-    "efficient": lambda: acceptance.efficient(seeds=25),
+    "efficient": lambda: acceptance.efficient(seeds=12),
     "coarse": acceptance.coarse,
     "comparators": acceptance.comparators,
 }
@@ -115,7 +115,7 @@ def out(tmp_path_factory):
     run_here("recovery", folder, [finer])
     # As much noise in every second as with the published clock.
     run_here("recovery-in-noise", folder, [finer, "monte_carlo.runs=2", "disturbance.variance=0.0026667"])
-    run_here("efficiency", folder, [finer, "monte_carlo.runs=8"])
+    run_here("efficiency", folder, [finer, *BLOCKS, "monte_carlo.runs=8"])
     return folder
 
 
