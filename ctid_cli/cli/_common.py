@@ -9,13 +9,13 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
 
 import typer
 
-from ctid_cli.errors import CtidError, SpecError
+from ctid_cli.errors import CtidError, SpecError, StorageError
 
 Command = TypeVar("Command", bound=Callable[..., None])
 
@@ -23,6 +23,27 @@ Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder that hol
 Json = Annotated[bool, typer.Option("--json", help="Write JSON to stdout instead of text.")]
 
 INTERRUPTED = 130
+
+
+def write_files(files: Mapping[Path, bytes]) -> None:
+    """Write files, and make the folders that they need.
+
+    Parameters
+    ----------
+    files : mapping of Path to bytes
+        Content by name.
+
+    Raises
+    ------
+    StorageError
+        If one cannot be written.
+    """
+    for path, content in files.items():
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        except OSError as error:
+            raise StorageError(f"{error.filename or path} cannot be written: {error.strerror or error}") from error
 
 
 def guarded(command: Command) -> Command:

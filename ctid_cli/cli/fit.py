@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from ctid_cli.cli._common import Json, guarded
+from ctid_cli.cli._common import Json, guarded, write_files
 
 
 class InitialStateOption(StrEnum):
@@ -89,7 +89,8 @@ def fit(
     units = common_units(measurements if other is None else [*measurements, other])
     result = identify(options, [item.record for item in measurements], None if other is None else other.record)
     text = json.dumps(identification_object(result, measurements, units, other), allow_nan=False)
-    _write(out, {"fit.json": text.encode() + b"\n", "fit.svg": identification_svg(result, measurements, units)})
+    figure = identification_svg(result, measurements, units)
+    write_files({out / "fit.json": text.encode() + b"\n", out / "fit.svg": figure})
     if as_json:
         typer.echo(text)
     else:
@@ -112,14 +113,3 @@ def _delay_bounds(text: str) -> tuple[float, float]:
     if not 0 <= bounds[0] <= bounds[1] < float("inf"):
         raise UsageError(f"{allowed}; got {text!r}")
     return bounds
-
-
-def _write(folder: Path, files: dict[str, bytes]) -> None:
-    from ctid_cli.errors import StorageError
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, content in files.items():
-            (folder / name).write_bytes(content)
-    except OSError as error:
-        raise StorageError(f"{error.filename or folder} cannot be written: {error.strerror or error}") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time as clock
 from enum import StrEnum
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Self
 
 import typer
 
-from ctid_cli.cli._common import Json, guarded
+from ctid_cli.cli._common import Json, guarded, write_files
 from ctid_cli.cli._progress import LINE_EVERY
 
 if TYPE_CHECKING:
@@ -81,13 +82,19 @@ def track(
     from ctid_cli.frequency.automatic import choose_settings
     from ctid_cli.frequency.record_track import track_record
     from ctid_cli.reporting.track_plot import track_svg
-    from ctid_cli.reporting.track_report import track_bytes, track_object, track_table, track_text, write_files
+    from ctid_cli.reporting.track_report import track_bytes, track_object, track_table, track_text
     from ctid_cli.signals.sampled_signal import read_sampled_signal
 
     extension = out.suffix.lower()
     if extension not in (".csv", ".h5"):
         raise UsageError(f"--out must end in .csv or .h5, not {out.name!r}")
+    figure = out.with_suffix(".svg")
+    if any(_same(file, written) for written in (out, figure)):
+        raise UsageError(f"{file} would be overwritten by the track; write it elsewhere (--out FILE)")
     given = _interval(interval, rate)
+    for name, value in (("--from", start), ("--to", stop)):
+        if value is not None and not math.isfinite(value):
+            raise UsageError(f"{name} must be an instant, not {value:g}")
     for name, value in (("--every", every), ("--window", window)):
         if value is not None and not 0 < value < float("inf"):
             raise UsageError(f"{name} must be a positive number of seconds, not {value:g}")
@@ -99,7 +106,6 @@ def track(
             found = track_record(record.samples, record.interval, settings, every=every, on_progress=tell)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    figure = out.with_suffix(".svg")
     title = f"{file.name}: {settings.estimator.kind}"
     write_files(
         {
@@ -112,6 +118,10 @@ def track(
     else:
         typer.echo(track_text(record, settings, found))
         typer.echo(f"\nWritten: {out}, {figure}")
+
+
+def _same(one: Path, other: Path) -> bool:
+    return one.exists() and other.exists() and one.samefile(other)
 
 
 def _interval(interval: float | None, rate: float | None) -> float | None:

@@ -8,7 +8,7 @@ Names of the measures, each with the number of the tone behind it where it is on
   [s]; ``settling_after_step_1``: the same from the last step of a frequency to the end, counted from the step [s].
   They have no value if that never happened. Flags do not matter; an estimate that begins at the truth has settled at 0;
 - ``rms_1``, ``bias_1``: root mean square and mean of the error over the window [rad/s];
-- ``false_alarms``: alarms with no step of a frequency or an amplitude in the two periods of the lowest frequency before,
+- ``false_alarms``: alarms with no step of a frequency or an amplitude in the last two periods of the lowest frequency,
   of trackers that raise any;
 - ``valid_share``: share of the record with a valid estimate [%].
 

@@ -179,9 +179,10 @@ def _of_estimator(options: Any, clock: RegularSampling) -> Iterator[str]:
         yield f"its delays are filled after {filled:g} s, and the record ends at {duration:g} s; take a smaller h"
         return
     try:
-        options.start(clock.interval)
-    except ValueError as error:
-        yield str(error)
+        with np.errstate(all="ignore"):
+            options.start(clock.interval)
+    except (ValueError, ArithmeticError) as error:
+        yield str(error) if isinstance(error, ValueError) else "these values are too large or too small to compute with"
 
 
 def _fits(options: Any, signal: Any, disturbances: list[Any]) -> bool:

@@ -29,9 +29,28 @@ _SECONDS = swept(number("s", above=0.0))
 if TYPE_CHECKING:
     SignalSection = Section
     DisturbanceSection = Section
+    DisturbanceOrNone = Section
 else:
     SignalSection = section_for(MultiSine)
     DisturbanceSection = by_kind({kind: section_for(target, kind=kind) for kind, target in DISTURBANCES.items()})
+    DisturbanceOrNone = DisturbanceSection | Literal["none"]
+
+
+def disturbance_section(value: Any) -> Section | None:
+    """Check of the disturbance.
+
+    Parameters
+    ----------
+    value : Any
+        The section as it was read; null or the word "none" for no disturbance.
+
+    Returns
+    -------
+    Section or None
+        The section of the kind that it names.
+    """
+    section: Section | None = None if value is None or value == "none" else _disturbance(value)
+    return section
 
 
 class RegularDurationSection(Section):
@@ -58,7 +77,17 @@ class RegularDurationSection(Section):
         -------
         RegularSampling
             With ``duration / interval`` samples, rounded.
+
+        Raises
+        ------
+        ValueError
+            If the duration is shorter than two intervals.
         """
+        if not values["duration"] >= 2.0 * values["interval"]:
+            raise ValueError(
+                f"duration must be at least two sampling intervals of {values['interval']:g} s, "
+                f"not {values['duration']:g} s."
+            )
         # Beyond the largest whole number of samples any number of them is refused as too many.
         return RegularSampling(values["interval"], int(min(round(values["duration"] / values["interval"]), 2**62)))
 
@@ -88,6 +117,7 @@ def sampling_section(value: Any) -> Section:
 
 
 _sampling = check_of(SamplingSection)
+_disturbance = check_of(DisturbanceSection)
 if TYPE_CHECKING:
     AnySamplingSection = Section
 else:

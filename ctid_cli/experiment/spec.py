@@ -42,9 +42,10 @@ from ctid_cli.experiment.sections import (
 )
 from ctid_cli.experiment.signal_sections import (
     AnySamplingSection,
-    DisturbanceSection,
+    DisturbanceOrNone,
     SignalSection,
     TracksSection,
+    disturbance_section,
     sampling_section,
 )
 from ctid_cli.experiment.start_sections import StartsSection
@@ -218,7 +219,7 @@ class Spec(Section):
     signal: Annotated[SignalSection | None, checked(optional(SignalSection.model_validate))] = Field(
         default=None, description="A sum of sinusoids whose frequencies are estimated, in place of a system"
     )
-    disturbance: Annotated[DisturbanceSection | None, checked(optional(check_of(DisturbanceSection)))] = Field(
+    disturbance: Annotated[DisturbanceOrNone | None, checked(disturbance_section)] = Field(
         default=None, description="What is added to the signal; none by default"
     )
     sampling: Annotated[AnySamplingSection | None, checked(optional(sampling_section))] = Field(

@@ -23,6 +23,7 @@ from ctid_cli.frequency import (
 from ctid_cli.frequency.decimation import Decimation, low_pass, without_low
 from ctid_cli.frequency.regression import MOST_TONES
 from ctid_cli.frequency.spectrum import Peaks, find_peaks
+from ctid_cli.frequency.tracking import LARGEST_SAMPLE
 from ctid_cli.frequency.windows import estimate_window
 from ctid_cli.signals.checks import require_choice, require_integer, require_positive
 
@@ -36,6 +37,8 @@ INTEGRATION_SAMPLES = 60
 SAMPLES_PER_TONE = 8
 #: A signal that varies by less than this fraction of itself is constant.
 CONSTANT = 1e-12
+#: Powers of smaller samples would vanish.
+SMALLEST_SAMPLE = 1e-60
 #: Tones of the record of less than this fraction of the weakest wanted one (amplitudes) disturb nobody.
 HARMLESS = 0.2
 #: A constant part of less than this fraction disturbs nobody either.
@@ -193,7 +196,8 @@ def choose_settings(
     if peaks.omega.size == 0:
         raise DataError(
             f"no tone stands out of the spectrum of {samples.size * interval:.4g} s: the signal is noise, its tones "
-            "move too fast, or the record is shorter than two periods; use a longer record, or another part of it"
+            "move too fast, the record is shorter than two periods, or too much of it is missing; use a longer record, "
+            "or another part of it"
         )
     warnings = list(_doubts(peaks, tones, interval))
     offset = _offset(samples, float(peaks.amplitudes[:tones][-1]))
@@ -234,12 +238,19 @@ def _refuse_unusable(samples: Array, tones: int) -> None:
     present = samples[np.isfinite(samples)]
     if present.size < SAMPLES_PER_TONE * tones:
         raise DataError(
-            f"{present.size} samples are too few for {tones} tones; at least {SAMPLES_PER_TONE * tones} are needed"
+            f"samples that are not missing: {present.size}, too few for {tones} tones; at least "
+            f"{SAMPLES_PER_TONE * tones} are needed"
         )
     low, high = float(present.min()), float(present.max())
     if high - low <= CONSTANT * max(abs(low), abs(high)):
         what = "zero" if high == low == 0.0 else f"constant ({low:.6g})"
         raise DataError(f"the signal is {what} throughout: it has no tones")
+    largest = max(abs(low), abs(high))
+    if not SMALLEST_SAMPLE <= largest <= LARGEST_SAMPLE:
+        raise DataError(
+            f"the largest sample is {largest:.3g}, and the squares of such numbers cannot be computed with; give the "
+            "signal in another unit"
+        )
 
 
 def _doubts(peaks: Peaks, tones: int, interval: float) -> list[str]:
@@ -462,7 +473,8 @@ def _best_delay(omega: Array, amplitudes: Array, wanted: int, thin: float) -> fl
     for h in thin * np.arange(1, longest + 1):
         cosines = np.cos(omega * h)
         # Slope of prod_j (c - c_j) over w_i, at w_i.
-        slopes = h * np.sin(omega * h) * np.prod(np.where(others, 2.0 * np.abs(cosines[:, None] - cosines), 1.0), axis=1)
+        distances = np.where(others, 2.0 * np.abs(cosines[:, None] - cosines), 1.0)
+        slopes = h * np.sin(omega * h) * distances.prod(axis=1)
         worst = float((amplitudes * slopes * apart.min(axis=1))[:wanted].min())
         if worst > largest:
             best, largest = float(h), worst

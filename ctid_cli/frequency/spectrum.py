@@ -15,8 +15,8 @@ PADDING = 4
 SHORTEST_SEGMENT = 64
 LONGEST_SEGMENT = 2**18
 MOST_SAMPLES = 2**21
-#: A segment with a larger fraction of missing samples is left out.
-MOST_MISSING = 0.1
+#: A segment with a larger fraction of missing samples is left out, or with the second one if no segment had fewer.
+MOST_MISSING = (0.1, 0.5)
 #: A peak must stand so many times (in amplitude) above the median of the bins around it, so many on each side, and
 #: above what leaks from larger ones; two peaks are so many bins apart, and so is the lowest one from zero.
 ABOVE_FLOOR = 5.0
@@ -91,14 +91,17 @@ def find_peaks(samples: Array, interval: float, tones: int) -> Peaks:
     if missing.any():
         places = np.arange(values.size)
         values = np.interp(places, places[~missing], values[~missing])
-    found = []
-    size = min(values.size, LONGEST_SEGMENT)
-    while size >= min(SHORTEST_SEGMENT, values.size):
-        spectrum = median_spectrum(values, missing, size)
-        if spectrum is not None:
-            bins, amplitudes = _significant(spectrum)
-            found.append(Peaks(2.0 * np.pi * bins / (size * interval), amplitudes, size * interval))
-        size //= 2
+    found: list[Peaks] = []
+    for most_missing in MOST_MISSING:
+        if found:
+            break
+        size = min(values.size, LONGEST_SEGMENT)
+        while size >= min(SHORTEST_SEGMENT, values.size):
+            spectrum = median_spectrum(values, missing, size, most_missing)
+            if spectrum is not None:
+                bins, amplitudes = _significant(spectrum)
+                found.append(Peaks(2.0 * np.pi * bins / (size * interval), amplitudes, size * interval))
+            size //= 2
     if not found:
         return Peaks(np.empty(0), np.empty(0), values.size * interval)
     most = max(min(peaks.omega.size, tones) for peaks in found)
@@ -110,7 +113,7 @@ def find_peaks(samples: Array, interval: float, tones: int) -> Peaks:
     return next((peaks for peaks in good if peaks.segment <= LONGEST_FRACTION * values.size * interval), good[-1])
 
 
-def median_spectrum(values: Array, missing: NDArray[np.bool_], size: int) -> Array | None:
+def median_spectrum(values: Array, missing: NDArray[np.bool_], size: int, most_missing: float) -> Array | None:
     """Median over segments of the amplitude spectrum, with a Hann window.
 
     Parameters
@@ -121,6 +124,8 @@ def median_spectrum(values: Array, missing: NDArray[np.bool_], size: int) -> Arr
         Which samples were.
     size : int
         Samples in a segment, at most N; segments overlap by half, if they need not be fewer.
+    most_missing : float
+        A segment with a larger fraction of missing samples is left out.
 
     Returns
     -------
@@ -132,7 +137,7 @@ def median_spectrum(values: Array, missing: NDArray[np.bool_], size: int) -> Arr
     window /= window.sum()
     spectra = []
     for first in np.linspace(0, values.size - size, count).astype(int):
-        if missing[first : first + size].mean() > MOST_MISSING:
+        if missing[first : first + size].mean() > most_missing:
             continue
         part = values[first : first + size]
         spectra.append(2.0 * np.abs(np.fft.rfft((part - window @ part) * window, PADDING * size)))

@@ -109,7 +109,7 @@ def detail_text(found: FoundEstimate, again: Repeated | None, out: Path) -> str:
     row = found.row
     lines = [
         f"Estimate {row['id']} of {row['experiment']}",
-        f"{row['estimator']} ({row['kind']}), data set {row['replicate']}, start {_start(row)}",
+        f"{row['estimator']} ({row['kind']}), data set {row['replicate']}{_start(row)}",
         f"{row['status']}: {row['message']}",
     ]
     if row.get("converged") is not None:
@@ -163,7 +163,8 @@ def _origin_of(found: FoundEstimate) -> list[str]:
 
 def _repeated(found: FoundEstimate, again: Repeated | None, out: Path) -> list[str]:
     if again is not None:
-        return [_verdict(again), *(["", _history(again)] if again.history else [])]
+        what = "frequencies" if "measures" in found.row else "parameters"
+        return [_verdict(again, what), *(["", _history(again)] if again.history else [])]
     every = "" if "measures" in found.row else " and see every iteration"
     return [f"To make this data set and this estimate again{every}:", f"  {redo_command(found, out)}"]
 
@@ -246,15 +247,15 @@ def _moved(stored: Mapping[str, float | None], now: Mapping[str, float | None]) 
     return worst
 
 
-def _verdict(again: Repeated) -> str:
+def _verdict(again: Repeated, what: str) -> str:
     if again.difference is None:
-        return "Computed once more; there are no stored parameters to compare with."
+        return f"Computed once more; there are no stored {what} to compare with."
     if again.difference == 0:
-        return "Computed once more: the same parameters to the last digit."
+        return f"Computed once more: the same {what} to the last digit."
     if again.agrees:
-        return f"Computed once more: the same parameters, up to {again.difference:.1e} of their size."
+        return f"Computed once more: the same {what}, up to {again.difference:.1e} of their size."
     return (
-        f"Computed once more: parameters differ by up to {again.difference:.1e} of their size. "
+        f"Computed once more: {what} differ by up to {again.difference:.1e} of their size. "
         "Another version of the code or another processor computed the stored ones."
     )
 
@@ -287,7 +288,9 @@ def _conventions(shown: list[Parameter]) -> list[str]:
 
 
 def _start(row: Mapping[str, Any]) -> str:
+    if "measures" in row:
+        return ""
     if row["initial_delay"] is None:
-        return str(row["start"])
+        return f", start {row['start']}"
     label = delay_label(row["initial_delay"])
-    return f"{label} ({number(row['start_delay'])} s)" if label == "random" else label
+    return f", start {label} ({number(row['start_delay'])} s)" if label == "random" else f", start {label}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -14,11 +13,9 @@ from ctid_cli.estimators.identification import Identification
 from ctid_cli.experiment.worker import plain
 from ctid_cli.inference.derived import DerivedParameter
 from ctid_cli.reporting.estimate import Parameter, Units, parameter_table
-from ctid_cli.reporting.layout import count, number, text_table
+from ctid_cli.reporting.layout import count, number, text_table, wrapped
 from ctid_cli.signals.measurement import Measurement
 
-#: Width of paragraphs.
-WIDTH = 100
 FIT_DEFINITION = "100 (1 - ||y - x|| / ||y - mean y||)"
 R2_DEFINITION = "1 - ||y - x||^2 / ||y - mean y||^2"
 
@@ -221,20 +218,20 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
     fit, options, criteria, judged = result.fit, result.options, result.criteria, result.validation
     lines: list[str] = []
     for measurement, use in zip(measurements, fit.used, strict=True):
-        lines += _wrapped(_record_line(measurement, int(np.count_nonzero(use)), units))
-        lines += [line for note in measurement.notes for line in _wrapped(note, "  ")]
+        lines += wrapped(_record_line(measurement, int(np.count_nonzero(use)), units))
+        lines += [line for note in measurement.notes for line in wrapped(note, "  ")]
     low, high = options.delay_bounds
     searched = f"searched from {low:g} to {high:g} {units.time}" if low < high else f"known, {low:g} {units.time}"
     lines += [
         "",
         f"model            {count(options.poles, 'pole')}, {count(options.zeros, 'zero')}; delay {searched}",
         f"initial state    {TREATMENTS[options.initial_state]} (--initial-state {options.initial_state})",
-        *_wrapped(f"offset           {_offset(result, units)} (--offset {options.offset})", hanging=17),
+        *wrapped(f"offset           {_offset(result, units)} (--offset {options.offset})", hanging=17),
         f"input            {'constant' if measurements[0].record.input.hold == 'zoh' else 'straight lines'} between "
         f"its samples (--hold {measurements[0].record.input.hold})",
         "",
         parameter_table(parameters_of(result, units)),
-        *_wrapped(_covariance_line(result)),
+        *wrapped(_covariance_line(result)),
         "",
         _derived_table(derived_of(result, units)),
         "",
@@ -244,7 +241,7 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
     ]
     if judged is not None:
         lines += [
-            *_wrapped(
+            *wrapped(
                 f"validation       fit {number(judged.fit_percent, 5)} %, R2 {number(judged.r2, 6)} on {judged.name}, "
                 f"{count(judged.count, 'sample')}; initial state and offset treated in the same way",
                 hanging=17,
@@ -262,26 +259,14 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
     ]
     for k, test in enumerate(result.tests, start=1):
         label = "residuals" if len(measurements) == 1 else f"residuals {k}"
-        lines += _wrapped(f"{label:16} {test.sentence}", hanging=17)
+        lines += wrapped(f"{label:16} {test.sentence}", hanging=17)
     # What the line of the residuals says need not be said again.
     told = tuple(test.sentence for test in result.tests)
     warnings = [warning for warning in result.warnings if not warning.endswith(told)]
     if warnings:
         lines += ["", "Warnings:"]
-        lines += [line for warning in warnings for line in _wrapped(f"- {warning}", hanging=2)]
+        lines += [line for warning in warnings for line in wrapped(f"- {warning}", hanging=2)]
     return "\n".join(lines)
-
-
-def _wrapped(text: str, indent: str = "", hanging: int = 0) -> list[str]:
-    # Blanks at the beginning and between label and text are kept.
-    return textwrap.wrap(
-        text,
-        WIDTH,
-        initial_indent=indent,
-        subsequent_indent=indent + " " * hanging,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
 
 
 def _record_line(measurement: Measurement, used: int, units: Units) -> str:
@@ -324,7 +309,7 @@ def _derived_table(rows: Sequence[DerivedParameter]) -> str:
         for row in rows
     ]
     reasons = dict.fromkeys(row.reason for row in rows if row.reason)
-    return "\n".join([text_table(header, cells, "lrrrrl"), *(line for text in reasons for line in _wrapped(text))])
+    return "\n".join([text_table(header, cells, "lrrrrl"), *(line for text in reasons for line in wrapped(text))])
 
 
 def _modes(result: Identification, units: Units) -> list[dict[str, float | None]]:

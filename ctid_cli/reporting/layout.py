@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Sequence
+
+#: Width of paragraphs.
+WIDTH = 100
 
 
 def text_table(header: Sequence[str], rows: Sequence[Sequence[str]], align: str) -> str:
@@ -252,3 +256,35 @@ def delay_label(initial_delay: float | str | None) -> str:
     if initial_delay is None:
         return "none"
     return initial_delay if isinstance(initial_delay, str) else f"{initial_delay:g} s"
+
+
+def wrapped(text: str, indent: str = "", hanging: int = 0) -> list[str]:
+    """Lines of a paragraph of `WIDTH` columns.
+
+    Parameters
+    ----------
+    text : str
+        The paragraph; blanks inside it are kept.
+    indent : str, default ""
+        What every line begins with.
+    hanging : int, default 0
+        Further blanks before all lines but the first.
+
+    Returns
+    -------
+    list of str
+        The lines; words are never broken.
+
+    Examples
+    --------
+    >>> wrapped("- one", "  ", 2)
+    ['  - one']
+    """
+    return textwrap.wrap(
+        text,
+        WIDTH,
+        initial_indent=indent,
+        subsequent_indent=indent + " " * hanging,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )

@@ -30,7 +30,11 @@ GROUPS_PER_BLOCK = 2
 ESTIMATES_PER_BLOCK = 3
 
 #: Titles of the columns of measured frequencies.
-MEASURE_TITLES = {"median_settling_time": "settling", "median_settling_after_step": "after step"}
+MEASURE_TITLES = {
+    "median_settling_time": "settling",
+    "median_settling_after_step": "after step",
+    "false_alarms": "alarms",
+}
 
 _SHORT = {"snr_db": ("SNR", " dB")}
 
@@ -229,7 +233,7 @@ def frequency_table(name: str, rows: Sequence[Row], success: str, style: str = "
     """
     keys = list(dict.fromkeys(key for row in rows for key in row.settings))
     measures = list(dict.fromkeys(key for row in rows for key in row.measures or {}))
-    header = [*(setting_title(key) for key in keys), "estimator", "settled %", "95 %", "n"]
+    header = [*(setting_title(key) for key in keys), "estimator", "%", "95 %", "n"]
     header += [MEASURE_TITLES.get(key, key.removeprefix("median_").replace("_", " ")) for key in measures]
     body = []
     for row in rows:
@@ -241,11 +245,15 @@ def frequency_table(name: str, rows: Sequence[Row], success: str, style: str = "
     align = "l" * (len(keys) + 1) + "r" * (len(measures) + 4)
     foot = f"{RULE} settling: median over the data sets of the time until the slowest tone is in the band to stay [s], "
     foot += "from the start and after the last step of a frequency; - is never, or unknown. rms: median over the data "
-    foot += f"sets of the root-mean-square error of each tone over the window [rad/s]. {TIME}"
+    foot += "sets of the root-mean-square error of each tone over the window [rad/s]. "
+    if "false_alarms" in measures:
+        foot += "alarms: false ones, in all data sets together. "
+    foot += TIME
     if style == "md":
         table = markdown_table(header, body, align)
         return "\n\n".join([f"### {name}", f"Counted: {success}.", table, foot])
-    return "\n".join([name, f"Counted: {success}.", "", text_table(header, body, align), "", *_wrap(foot)])
+    counted = _wrap(f"Counted: {success}.")
+    return "\n".join([name, *counted, "", text_table(header, body, align), "", *_wrap(foot)])
 
 
 def record_table(

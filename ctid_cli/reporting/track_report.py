@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import textwrap
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,17 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctid_cli.errors import StorageError
+from ctid_cli.experiment.worker import plain
 from ctid_cli.frequency.automatic import Settings
 from ctid_cli.frequency.flags import MEANINGS, Flag
 from ctid_cli.frequency.record_track import RecordTrack
-from ctid_cli.reporting.layout import count, number, text_table
+from ctid_cli.reporting.layout import count, number, text_table, wrapped
 from ctid_cli.signals.sampled_signal import SampledSignal
 
 Array = NDArray[np.float64]
 
-#: Width of paragraphs.
-WIDTH = 100
 #: A smaller share of valid time is worth a warning.
 MOSTLY_VALID = 0.9
 #: Most frequent reasons for invalid rows that are named.
@@ -109,6 +106,8 @@ def track_warnings(track: RecordTrack, settings: Settings) -> list[str]:
             if share > 0
             else "No row is valid: there are no frequencies to report."
         )
+        if share == 0 and settings.estimator.online:
+            found.append("A record is easier for the methods that take it window by window: try --method automatic.")
         shares = {flag: float(np.mean((track.flags & int(flag)) != 0)) for flag in Flag}
         reasons = sorted((flag for flag in Flag if shares[flag] > 0), key=lambda flag: -shares[flag])
         found += [f"{100 * shares[flag]:.3g} %: {MEANINGS[flag]}" for flag in reasons[:MOST_REASONS]]
@@ -161,7 +160,7 @@ def track_object(signal: SampledSignal, settings: Settings, track: RecordTrack, 
         },
         "written": [str(file) for file in files],
     }
-    cleaned: dict[str, Any] = _plain(content)
+    cleaned: dict[str, Any] = plain(content)
     return cleaned
 
 
@@ -184,14 +183,14 @@ def track_text(signal: SampledSignal, settings: Settings, track: RecordTrack) ->
     """
     end = signal.start + (signal.samples.size - 1) * signal.interval
     gaps = f", {count(signal.missing, 'sample')} missing" if signal.missing else ""
-    lines = _wrapped(
+    lines = wrapped(
         f"{signal.file}: {count(signal.samples.size, 'sample')} of {signal.column!r} from {signal.start:.6g} to "
         f"{end:.6g} s, every {signal.interval:.6g} s ({1.0 / signal.interval:.6g} Hz){gaps}"
     )
     for note in signal.notes:
-        lines += _wrapped(note, "  ")
+        lines += wrapped(note, "  ")
     for reason in settings.reasons:
-        lines += _wrapped(f"- {reason}", "", 2)
+        lines += wrapped(f"- {reason}", "", 2)
     unit = f"amplitude [{signal.unit}]" if signal.unit else "amplitude"
     cells = [
         [
@@ -208,7 +207,7 @@ def track_text(signal: SampledSignal, settings: Settings, track: RecordTrack) ->
     lines += [
         "",
         text_table(header, cells, "rrrrrr"),
-        *_wrapped(
+        *wrapped(
             f"Medians over the valid ones of {count(track.t.size, 'row')}, one every {track.every:.4g} s; the spread "
             "is half the width of the central 68 %."
         ),
@@ -216,7 +215,7 @@ def track_text(signal: SampledSignal, settings: Settings, track: RecordTrack) ->
     warnings = track_warnings(track, settings)
     if warnings:
         lines += ["", "Warnings:"]
-        lines += [line for warning in warnings for line in _wrapped(f"- {warning}", "", 2)]
+        lines += [line for warning in warnings for line in wrapped(f"- {warning}", "", 2)]
     return "\n".join(lines)
 
 
@@ -299,27 +298,6 @@ def track_bytes(table: dict[str, NDArray[Any]], extension: str) -> bytes:
     return file.getvalue()
 
 
-def write_files(files: dict[Path, bytes]) -> None:
-    """Write files, and the folders that they need.
-
-    Parameters
-    ----------
-    files : dict of Path to bytes
-        Content by name.
-
-    Raises
-    ------
-    StorageError
-        If one cannot be written.
-    """
-    for path, content in files.items():
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
-        except OSError as error:
-            raise StorageError(f"{error.filename or path} cannot be written: {error.strerror or error}") from error
-
-
 def _cell(value: Any) -> str:
     if isinstance(value, bool | np.bool_):
         return "1" if value else "0"
@@ -336,24 +314,3 @@ def _to_spread(value: float | None, spread: float | None) -> str:
     if 0.0 < spread < value:
         digits = max(6, 2 + math.floor(math.log10(value)) - math.floor(math.log10(spread)))
     return f"{value:#.{min(digits, 10)}g}"
-
-
-def _wrapped(text: str, indent: str = "", hanging: int = 0) -> list[str]:
-    return textwrap.wrap(
-        text,
-        WIDTH,
-        initial_indent=indent,
-        subsequent_indent=indent + " " * hanging,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    return value

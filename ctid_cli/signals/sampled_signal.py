@@ -243,19 +243,27 @@ def _on_grid(table: Table, name: str, t: Array, values: Array, unit: str) -> tup
     if t.size < 2:
         raise DataError(f"{table.file}: one sample has no frequency")
     steps = np.diff(t)
-    counts = np.maximum(1.0, np.round(steps / np.median(steps)))
-    places = np.concatenate(([0.0], np.cumsum(counts)))
-    # The grid that fits all instants best in the sense of its two ends.
-    interval = float((t[-1] - t[0]) / places[-1])
-    stray = np.abs(t - (t[0] + places * interval))
-    worst = int(np.argmax(stray))
     rounding = 4 * np.finfo(float).eps * float(np.abs(t).max())
-    if stray[worst] > CLOCK_TOLERANCE * interval + rounding or places[-1] > MOST_FILLED * t.size:
+    # Where most neighbours of a sample are missing, the median is a multiple of the interval.
+    for usual in (float(np.median(steps)), float(steps.min())):
+        places = np.concatenate(([0.0], np.cumsum(np.maximum(1.0, np.round(steps / usual)))))
+        # The grid that fits all instants best in the sense of its two ends.
+        interval = float((t[-1] - t[0]) / places[-1])
+        stray = np.abs(t - (t[0] + places * interval))
+        worst = int(np.argmax(stray))
+        if stray[worst] <= CLOCK_TOLERANCE * interval + rounding:
+            break
+    else:
         raise DataError(
             f"{table.place(worst)}: the clock is not regular: the intervals run from {steps.min():.6g} to "
             f"{steps.max():.6g} {unit}, and {t[worst]:.9g} {unit} lies {stray[worst]:.3g} {unit} beside a grid of "
             f"{interval:.6g} {unit}; the estimators compare samples at fixed delays, so they need a regular clock. "
             "Resample the record, or give its clock (--interval or --rate) if the times in the file are only rounded"
+        )
+    if places[-1] > MOST_FILLED * t.size:
+        raise DataError(
+            f"{table.file}: of {places[-1] + 1:.6g} instants of a clock of {interval:.6g} {unit} the file has only "
+            f"{t.size}; use a part of the record with fewer gaps (--from, --to), or resample it"
         )
     if places[-1] + 1 == t.size:
         return values, interval, ""

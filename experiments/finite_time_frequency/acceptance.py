@@ -137,7 +137,7 @@ def cramer_rao(duration: float, interval: float, sigma: float, phases: tuple[flo
         angle = omega * t + phase
         columns += [t * np.cos(angle), np.cos(angle), np.sin(angle)]
     J = np.column_stack(columns)
-    return np.asarray(sigma * np.sqrt(np.diag(np.linalg.inv(J.T @ J))[::3]))
+    return np.asarray(sigma * np.sqrt(np.diag(np.linalg.inv(J.T @ J))[::3]), dtype=float)
 
 
 def drem(kind: type[Any], name: str, **options: Any) -> Any:

@@ -57,7 +57,8 @@ def sources(results: Results) -> dict[str, tuple[str, SignalSource]]:
 
 def grouped(results: Results) -> dict[tuple[str, str], list[Row]]:
     """Estimates by reading and estimator."""
-    cells, groups = sources(results), {}
+    cells = sources(results)
+    groups: dict[tuple[str, str], list[Row]] = {}
     for row in results.rows:
         groups.setdefault((cells[row["cell"]][0], row["estimator"]), []).append(row)
     return groups
@@ -77,16 +78,16 @@ def settling(results: Results) -> Iterator[Row]:
                 times = [settle(track, truth, band, since, until) for band in BANDS]
                 pieces.setdefault(f"from {since:g} s", []).append(np.array(times))
             off = np.abs(track.omega - truth).max(axis=1) > BANDS[0]
-            wrong.append(float((track.valid & off).sum()) * float(track.t[1] - track.t[0]))
-        for piece, times in pieces.items():
-            middle, longest = np.median(times, axis=0), np.max(times, axis=0)
+            wrong.append(float((off).sum()) * float(track.t[1] - track.t[0]))
+        for piece, measured in pieces.items():
+            middle, longest = np.median(measured, axis=0), np.max(measured, axis=0)
             yield {
                 "experiment": results.experiment,
                 "reading": reading,
                 "estimator": estimator,
                 "derived": "yes" if is_derived(estimator) else "no",
                 "piece": piece,
-                "data_sets": len(times),
+                "data_sets": len(measured),
                 **{f"within_{band:g}": none_if_never(value) for band, value in zip(BANDS, middle, strict=True)},
                 **{f"longest_{band:g}": none_if_never(value) for band, value in zip(BANDS, longest, strict=True)},
                 "valid_but_off_by_0.05": float(np.median(wrong)),

@@ -142,7 +142,7 @@ def paper_tables(results: Results) -> list[str]:
             f"{after.get(reading, '')}Time until both errors are below a band to stay"
             f"{', each piece from its beginning' if len(pieces) > 1 else ''}, to 0.01 s; root-mean-square errors "
             f"over {window[0]:g} to {window[1]:g} s ({sets}last columns: share of valid estimates, and how long one "
-            "was called valid with an error above 0.05)."
+            "was called valid with an error above 0.05). Whole records: error of the one estimate."
         )
         written.append(markdown_table(header, rows, "l" + "r" * (len(header) - 1)))
     return written

@@ -1,6 +1,10 @@
 """Experiments on the frequencies of a signal: specification, measures, storage."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
 
 import h5py
 import numpy as np
@@ -65,11 +69,17 @@ BROKEN = {
     "no last piece": ("{value: 2.0}", "{value: 2.0, until: 20}", 3, "signal.tones[0].frequency", "the last has none"),
     "text for pieces": ("3.0, phase", "fast, phase", 3, "signal.tones[1].frequency", "a list is allowed too"),
     "length twice": ("duration: 30}", "duration: 30, samples: 7}", 6, "sampling.samples", "keep one of the two"),
+    "numbers that overflow": ("{kind: esprit, tones: 2, averaging: 0.05}",
+                              "{kind: filter_regression, tones: 2, pole: 1e300}", 9, "estimators.esprit", "too large"),
     "window": ("[25, 30]", "[25, 31]", 11, "tracks.window", "ends at 30 s"),
     "track interval": ("tracks: {interval: 0.05", "tracks: {interval: 0.001", 11, "tracks.interval", "0.01 s"),
     "rule of systems": ("{band: 0.05, by: 8}", "{delay_relative_error: 1}", 10, "success.delay_relative_error", "band"),
     "no band": ("{band: 0.05, by: 8}", "{by: 8}", 10, "success.by", "add band"),
     "h too long": ("h: 0.7", "h: 8", 8, "estimators.restarting.h", "delays are filled after 32.5 s"),
+    "prefilter too long": ("prefilter: 0.5", "prefilter: 1e9", 8, "estimators.restarting.prefilter", "longer than the"),
+    "too many samples": ("interval: 0.01, d", "interval: 1e-300, d", 6, "sampling.duration", "samples in a record"),
+    "too long an interval": ("interval: 0.01, d", "interval: 50, d", 6, "sampling.duration", "two sampling intervals"),
+    "no such disturbance": ("{kind: uniform, half_width: 0.01}", "{kind: none}", 5, "disturbance.kind", "uniform, sine"),
     "no such word": ("jump", "leap", 4, "signal.phase_at_steps", "'jump', 'continuous'"),
     "no clock": ("sampling: {kind: regular, interval: 0.01, duration: 30}\n", "", 1, "sampling", "for example"),
 }  # fmt: skip
@@ -96,6 +106,15 @@ def test_a_duration_is_a_number_of_samples(tmp_path):
     assert [cell.source.sampling.samples for cell in build_plan(spec).data_cells] == [3000, 1500]
     again = spec_from_canonical(json.loads(json.dumps(spec.canonical())))
     assert build_plan(again).spec_hash == build_plan(spec).spec_hash
+
+
+def test_no_disturbance_has_three_spellings(tmp_path):
+    word, null = (load(tmp_path, SPEC.replace("{kind: uniform, half_width: 0.01}", text)) for text in ("none", "null"))
+    left_out = load(tmp_path, SPEC.replace("disturbance: {kind: uniform, half_width: 0.01}\n", ""))
+    assert len({build_plan(spec).spec_hash for spec in (word, null, left_out)}) == 1
+    (cell,) = build_plan(word).data_cells
+    record = cell.dataset(0).record
+    assert record.samples == pytest.approx(cell.source.signal.generate(0.01 * np.arange(3000)))
 
 
 def test_what_is_measured_belongs_to_the_identity_and_the_time_limit_does_not(tmp_path):
@@ -173,3 +192,53 @@ def test_results_are_sealed_and_read_back(tmp_path):
     assert (esprit["valid_share"] == 0).all(), "a step lies in the record"
     again = run_experiment(plan, folder, jobs=1)
     assert (again.computed, again.reused) == (0, 4)
+
+
+#: Runs the specification in a folder of its own; after each data set that is stored it says so and takes a nap.
+SLOW_RUN = """\
+import sys, time
+from pathlib import Path
+from ctid_cli.experiment import events
+from ctid_cli.experiment.engine import run_experiment
+from ctid_cli.experiment.plan import build_plan
+from ctid_cli.experiment.spec import load_spec
+
+def tell(event):
+    if isinstance(event, events.DataSetDone):
+        print("stored", flush=True)
+        time.sleep(0.3)
+
+run_experiment(build_plan(load_spec(Path(sys.argv[1]))), Path(sys.argv[2]), jobs=1, on_event=tell)
+"""
+
+
+def test_killed_and_resumed_gives_the_same_bytes_with_all_its_tracks(tmp_path):
+    text = SPEC.replace("runs: 2", "runs: 6").replace("tracks: {", "tracks: {runs: 6, ")
+    spec, place = load(tmp_path, text), tmp_path / "killed"
+    command = [sys.executable, "-c", SLOW_RUN, str(tmp_path / "spec.yaml"), str(place)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
+        assert [process.stdout.readline() for _ in range(2)] == ["stored\n"] * 2
+        os.killpg(process.pid, signal.SIGKILL)
+    assert not (place / "runs.h5").exists()
+    assert len(read_tracks(place)) in (2, 3), "of every data set that was stored, from the journal"
+    resumed = run_experiment(build_plan(spec), place, jobs=1)
+    assert resumed.reused >= 4
+    assert resumed.reused + resumed.computed == 12
+    run_experiment(build_plan(spec), tmp_path / "undisturbed", jobs=2)
+    assert (place / "runs.h5").read_bytes() == (tmp_path / "undisturbed" / "runs.h5").read_bytes()
+    assert len(read_tracks(place)) == 6
+
+
+def test_a_sealed_file_alone_has_the_tracks_and_the_measures(tmp_path):
+    folder = tmp_path / "out"
+    run_experiment(build_plan(load(tmp_path)), folder, jobs=1)
+    tracks, rows = read_tracks(folder), read_stored(folder).rows()
+    (folder / "journal.sqlite").unlink()
+    again = read_stored(folder).rows()
+    assert [row["measures"] for row in again] == [row["measures"] for row in rows]
+    alone = read_tracks(folder)
+    assert alone.keys() == tracks.keys()
+    for name, columns in tracks.items():
+        for column, values in columns.items():
+            assert np.array_equal(alone[name][column], values, equal_nan=True)
+            assert alone[name][column].dtype == values.dtype
