@@ -1,4 +1,4 @@
-"""Identification of continuous-time models, and Monte Carlo studies of it."""
+"""Identification of continuous-time models, frequencies of signals, and Monte Carlo studies of both."""
 
 from __future__ import annotations
 
@@ -19,6 +19,15 @@ if TYPE_CHECKING:
     from ctid_cli.filtering import simulate as simulate
     from ctid_cli.filtering import simulate_additive as simulate_additive
     from ctid_cli.filtering import simulate_loop as simulate_loop
+    from ctid_cli.frequency import AdaptiveObserver as AdaptiveObserver
+    from ctid_cli.frequency import DremFiniteTime as DremFiniteTime
+    from ctid_cli.frequency import DremGradient as DremGradient
+    from ctid_cli.frequency import DremWindow as DremWindow
+    from ctid_cli.frequency import Esprit as Esprit
+    from ctid_cli.frequency import FilterRegression as FilterRegression
+    from ctid_cli.frequency import NonlinearLeastSquares as NonlinearLeastSquares
+    from ctid_cli.frequency import RestartingLeastSquares as RestartingLeastSquares
+    from ctid_cli.frequency import fit_sinusoids as fit_sinusoids
     from ctid_cli.inference import Fit as Fit
     from ctid_cli.inference import Status as Status
     from ctid_cli.inference import cramer_rao_bound as cramer_rao_bound
@@ -37,15 +46,23 @@ __version__ = "0.1.0"
 
 # Imported when first asked for: `ctid --help` must not wait for numpy and numba.
 _HOME = {
+    "AdaptiveObserver": "frequency",
     "AdditiveModel": "models",
     "AdditiveSrivc": "estimators",
     "DelayProfile": "estimators",
     "DiscreteController": "models",
+    "DremFiniteTime": "frequency",
+    "DremGradient": "frequency",
+    "DremWindow": "frequency",
+    "Esprit": "frequency",
+    "FilterRegression": "frequency",
     "Fit": "inference",
     "HeldSignal": "signals",
     "Loop": "signals",
     "Lowpass": "estimators",
+    "NonlinearLeastSquares": "frequency",
     "Record": "signals",
+    "RestartingLeastSquares": "frequency",
     "Srivc": "estimators",
     "Start": "estimators",
     "Status": "inference",
@@ -57,6 +74,7 @@ _HOME = {
     "UsefulRedundancy": "estimators",
     "cramer_rao_bound": "inference",
     "fit_percent": "inference",
+    "fit_sinusoids": "frequency",
     "identify": "estimators",
     "minimise_redundantly": "estimators",
     "read_record": "signals",

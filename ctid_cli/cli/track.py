@@ -109,7 +109,7 @@ def track(
     title = f"{file.name}: {settings.estimator.kind}"
     write_files(
         {
-            out: track_bytes(track_table(found, record.start), extension),
+            out: track_bytes(track_table(found, record.start), extension, record.unit),
             figure: track_svg(found, record.start, record.unit, title),
         }
     )

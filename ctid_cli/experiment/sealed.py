@@ -269,11 +269,15 @@ def _write(file: h5py.File, manifest: Manifest, origins: Sequence[Origin], rows:
 
 
 def _write_tracks(file: h5py.File, tracks: Mapping[str, Mapping[str, Any]]) -> None:
+    from ctid_cli.frequency import Flag
+
+    bits = ", ".join(f"{int(flag)} {str(flag.name).lower()}" for flag in Flag)
     units = {"t": "s", "omega": MEASURE_UNITS["omega"], "flags": "-", "uncertainty": "rad/s"}
     for identifier, packed in tracks.items():
         group = file.require_group("tracks").create_group(identifier)
         for name, values in unpack_track(packed).items():
             _column(group, name, values).attrs["unit"] = units[name]
+        group["flags"].attrs["bits"] = f"{bits}; an estimate without any is valid"
 
 
 def _column(group: h5py.Group, name: str, values: np.ndarray[Any, Any]) -> h5py.Dataset:

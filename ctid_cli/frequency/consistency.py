@@ -1,4 +1,4 @@
-r"""Whether the frequencies found with one delay explain the signal at another one.
+r"""Whether the frequencies found explain the newest samples, and the signal at another delay.
 
 With the delay h alone, a frequency w and all its aliases ``2 pi k/h - w``, ``2 pi k/h + w`` are one and the same. At a
 second delay, a whole number of sampling intervals that shares no divisor with the first, they are not.
@@ -22,6 +22,17 @@ Array = NDArray[np.float64]
 GOLDEN_FRACTION = (np.sqrt(5.0) - 1.0) / 2.0
 #: The frequencies are inconsistent if they leave so many times the smallest possible squared residual.
 WORSE_THAN_BEST = 10.0
+#: Time constant of the detector of changes as a fraction of h.
+DETECTOR_SPAN = 1.0 / 14.0
+#: The signal changed if residuals are so much larger than before (mean squares), and than rounding.
+ALARM_RATIO = 30.0
+ROUNDING_FLOOR = 1e-18
+#: The usual level of a residual is that of so many times n h.
+USUAL_SPANS = 20
+#: It sinks so many times as fast as it rises, so that it follows an estimate that converges; in noise it is too low
+#: therefore, and so much more is needed to contradict an estimate.
+SINKING = 50.0
+CONTRADICTION_RATIO = 300.0
 #: Added to the unit diagonal of the scaled second moments, so that the best fit exists even if it is not unique.
 REGULARISATION = 1e-10
 
@@ -48,6 +59,44 @@ def second_lag(lag: int) -> int:
         return 0
     wanted = GOLDEN_FRACTION * lag
     return min((m for m in range(1, lag) if gcd(m, lag) == 1), key=lambda m: abs(m - wanted))
+
+
+@njit(cache=True, nogil=True)
+def contradicts(row: Array, theta: Array, levels: Array, fast: float, slow: float) -> bool:
+    """Whether the newest row leaves a residual unlike those of the rows before.
+
+    Parameters
+    ----------
+    row : ndarray, shape (n + 1,)
+        Regressors and regressand.
+    theta : ndarray, shape (n,)
+        Parameters.
+    levels : ndarray, shape (4,)
+        Number of rows, recent and usual mean square of the residual, usual mean square of the regressand; changed in
+        place.
+    fast, slow : float
+        Weights of the newest row in the recent and in the usual means [-].
+
+    Returns
+    -------
+    bool
+        True for some time after a change of the signal, until the usual mean has followed.
+    """
+    n = theta.size
+    residual = row[n]
+    for i in range(n):
+        residual -= theta[i] * row[i]
+    square = residual * residual
+    if not np.isfinite(square):
+        return False
+    levels[0] += 1.0
+    levels[1] += max(fast, 1.0 / levels[0]) * (square - levels[1])
+    usual = max(slow, 1.0 / levels[0])
+    levels[3] += usual * (row[n] * row[n] - levels[3])
+    if levels[1] < levels[2]:
+        usual = max(min(SINKING * slow, fast), 1.0 / levels[0])
+    levels[2] += usual * (levels[1] - levels[2])
+    return bool(levels[1] > CONTRADICTION_RATIO * levels[2] + ROUNDING_FLOOR * levels[3])
 
 
 @njit(cache=True, nogil=True)

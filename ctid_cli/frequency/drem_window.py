@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ctid_cli.frequency.consistency import observe_second_delay
+from ctid_cli.frequency.consistency import DETECTOR_SPAN, USUAL_SPANS, contradicts, observe_second_delay
 from ctid_cli.frequency.decoding import decode
 from ctid_cli.frequency.delay_options import DelayRegression
 from ctid_cli.frequency.flags import GAP, STARTING, UNDETERMINED
@@ -137,6 +137,7 @@ class DremWindow(DelayRegression):
             "check": np.zeros((n + 1, n + 1)),
             "counters": np.zeros(4, np.int64),
             "doubts": np.array([0, 0, LONG_AGO], np.int64),
+            "levels": np.zeros(4),
         }
         return Recursion(advance_window, constants, state, clock.weights, np.nan, clock.notes)
 
@@ -203,6 +204,7 @@ def advance_window(
     check: Array,
     counters: IntArray,
     doubts: IntArray,
+    levels: Array,
 ) -> None:
     """Least squares on every mixed regression over a sliding window.
 
@@ -241,6 +243,8 @@ def advance_window(
         Place of the newest sample, of the newest row and of the next entry of the window, and mixed rows so far.
     doubts : ndarray of int, shape (3,)
         See :func:`~ctid_cli.frequency.scalar_regressions.judge_mixed`.
+    levels : ndarray, shape (4,)
+        See :func:`~ctid_cli.frequency.consistency.contradicts`.
     """
     n = omega.shape[1]
     row, check_row = np.empty(n + 1), np.empty(n + 1)
@@ -249,6 +253,7 @@ def advance_window(
     polynomial, work, sensitivities = np.empty(n + 1), np.empty(n + 1), np.empty((n, n))
     sums = np.empty(2 * n + 3)
     keep = 1.0 - 1.0 / (CHECK_SPANS * n * lag)
+    fast, slow = 1.0 / max(1.0, DETECTOR_SPAN * lag), 1.0 / (USUAL_SPANS * n * lag)
     for k in range(samples.size):
         counters[0] = counters[0] + 1 if counters[0] + 1 < history.size else 0
         counters[1] = counters[1] + 1 if counters[1] + 1 < rows.shape[0] else 0
@@ -297,6 +302,7 @@ def advance_window(
                 elapsed,
                 interval,
                 started,
+                started and contradicts(row, theta, levels, fast, slow),
                 check,
                 check_delay,
                 doubts,

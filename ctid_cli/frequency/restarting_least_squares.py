@@ -9,7 +9,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ctid_cli.frequency.consistency import check_consistency, observe_second_delay
+from ctid_cli.frequency.consistency import (
+    ALARM_RATIO,
+    DETECTOR_SPAN,
+    ROUNDING_FLOOR,
+    check_consistency,
+    observe_second_delay,
+)
 from ctid_cli.frequency.decoding import FIRST_PERIODS, cosine_sensitivities, decode, flag_uncertain, still_doubtful
 from ctid_cli.frequency.delay_options import DelayRegression
 from ctid_cli.frequency.flags import CHANGED, GAP, STARTING, UNDETERMINED
@@ -35,14 +41,9 @@ EAGER_ROWS = 40
 FIRST_ROWS_PER_TONE = 2
 ROWS_PER_TONE = 4
 STARTING_SPAN = 0.25
-#: Time constant of the detector as a fraction of h, and the data that it needs before it may raise an alarm: so many h,
-#: and so many lengths of the prefilter.
-DETECTOR_SPAN = 1.0 / 14.0
+#: The data that the detector needs before it may raise an alarm: so many h, and so many lengths of the prefilter.
 ARMING_SPAN = 1.43
 ARMING_PREFILTERS = 2
-#: An alarm is raised by residuals so much larger than those of the fit (mean squares), and than rounding.
-ALARM_RATIO = 30.0
-ROUNDING_FLOOR = 1e-18
 #: Older data are dropped if the whole fit leaves so many times the mean squared residual of the newer data alone; first
 #: checked after so many lengths of the prefilter.
 MIXED_RATIO = 6.0

@@ -11,7 +11,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ctid_cli.frequency.checks import one_for_each
-from ctid_cli.frequency.consistency import check_consistency, observe_second_delay
+from ctid_cli.frequency.consistency import (
+    DETECTOR_SPAN,
+    USUAL_SPANS,
+    check_consistency,
+    contradicts,
+    observe_second_delay,
+)
 from ctid_cli.frequency.decoding import cosine_sensitivities, decode, flag_uncertain, propagate, still_doubtful
 from ctid_cli.frequency.delay_options import DelayClock, DelayRegression
 from ctid_cli.frequency.flags import GAP, STARTING, UNCERTAIN, UNDETERMINED
@@ -203,6 +209,7 @@ def scalar_recursion(options: DremOptions, interval: float, *, finite_time: bool
         "check": np.zeros((n + 1, n + 1)),
         "counters": np.zeros(3, np.int64),
         "doubts": np.array([0, 0, LONG_AGO], np.int64),
+        "levels": np.zeros(4),
     }
     return Recursion(advance_scalars, constants, state, clock.weights, past, clock.notes)
 
@@ -218,6 +225,7 @@ def judge_mixed(
     elapsed: float,
     interval: float,
     started: bool,
+    contradicted: bool,
     check: Array,
     check_delay: float,
     doubts: IntArray,
@@ -245,6 +253,8 @@ def judge_mixed(
         Sampling interval [s].
     started : bool
         Whether there are enough rows for a verdict that lasts.
+    contradicted : bool
+        Whether the newest rows contradict the estimate.
     check : ndarray, shape (n + 1, n + 1)
         Second moments at the second delay.
     check_delay : float
@@ -270,7 +280,7 @@ def judge_mixed(
         slopes[i] = (1.0 + abs(theta[i])) * relative
     propagate(sensitivities, slopes, rounding)
     flag = 0
-    if flag_uncertain(omega, uncertainty, rounding, span, elapsed):
+    if flag_uncertain(omega, uncertainty, rounding, span, elapsed) or contradicted:
         flag = UNCERTAIN
         if started:
             doubts[2] = 0
@@ -313,6 +323,7 @@ def advance_scalars(
     check: Array,
     counters: IntArray,
     doubts: IntArray,
+    levels: Array,
 ) -> None:
     """Gradient and finite-time estimate of every mixed regression.
 
@@ -362,6 +373,8 @@ def advance_scalars(
         Place of the newest sample and of the newest row, and mixed rows so far.
     doubts : ndarray of int, shape (3,)
         See :func:`judge_mixed`.
+    levels : ndarray, shape (4,)
+        See :func:`~ctid_cli.frequency.consistency.contradicts`.
     """
     n = gains.size
     row, check_row = np.empty(n + 1), np.empty(n + 1)
@@ -370,6 +383,7 @@ def advance_scalars(
     sensitivities = np.empty((n, n))
     polynomial, work = np.empty(n + 1), np.empty(n + 1)
     keep = 1.0 - 1.0 / (CHECK_SPANS * n * lag)
+    fast, slow = 1.0 / max(1.0, DETECTOR_SPAN * lag), 1.0 / (USUAL_SPANS * n * lag)
     remember = 1.0 - 1.0 / (RECENT_SPANS * n * lag)
     z, q = sums[0], sums[1]
     fastest = 0
@@ -430,6 +444,7 @@ def advance_scalars(
                 elapsed,
                 interval,
                 started,
+                started and contradicts(row, theta, levels, fast, slow),
                 check,
                 check_delay,
                 doubts,

@@ -20,6 +20,7 @@ from ctid_cli.signals.sampled_signal import SampledSignal
 
 Array = NDArray[np.float64]
 
+_UNITS = {"t": "s", "omega": "rad/s", "frequency": "Hz"}
 #: A smaller share of valid time is worth a warning.
 MOSTLY_VALID = 0.9
 #: Most frequent reasons for invalid rows that are named.
@@ -266,7 +267,7 @@ def track_table(track: RecordTrack, start: float) -> dict[str, NDArray[Any]]:
     }
 
 
-def track_bytes(table: dict[str, NDArray[Any]], extension: str) -> bytes:
+def track_bytes(table: dict[str, NDArray[Any]], extension: str, unit: str | None = None) -> bytes:
     """The file of a track.
 
     Parameters
@@ -274,7 +275,9 @@ def track_bytes(table: dict[str, NDArray[Any]], extension: str) -> bytes:
     table : dict of ndarray
         What :func:`track_table` returns.
     extension : {".csv", ".h5"}
-        Kind of the file. An HDF5 file has one data set for each column.
+        Kind of the file. An HDF5 file has one data set for each column, with its unit as an attribute.
+    unit : str, optional
+        Unit of the signal.
 
     Returns
     -------
@@ -293,8 +296,11 @@ def track_bytes(table: dict[str, NDArray[Any]], extension: str) -> bytes:
         for name, values in table.items():
             if values.dtype == object:
                 store.create_dataset(name, data=[str(value) for value in values], dtype=h5py.string_dtype())
-            else:
-                store.create_dataset(name, data=values)
+                continue
+            column = store.create_dataset(name, data=values)
+            column_unit = {**_UNITS, "amplitude": unit}.get(name.partition("_")[0])
+            if column_unit is not None:
+                column.attrs["unit"] = column_unit
     return file.getvalue()
 
 

@@ -243,23 +243,20 @@ def _on_grid(table: Table, name: str, t: Array, values: Array, unit: str) -> tup
     if t.size < 2:
         raise DataError(f"{table.file}: one sample has no frequency")
     steps = np.diff(t)
-    rounding = 4 * np.finfo(float).eps * float(np.abs(t).max())
-    # Where most neighbours of a sample are missing, the median is a multiple of the interval.
-    for usual in (float(np.median(steps)), float(steps.min())):
-        places = np.concatenate(([0.0], np.cumsum(np.maximum(1.0, np.round(steps / usual)))))
-        # The grid that fits all instants best in the sense of its two ends.
-        interval = float((t[-1] - t[0]) / places[-1])
-        stray = np.abs(t - (t[0] + places * interval))
-        worst = int(np.argmax(stray))
-        if stray[worst] <= CLOCK_TOLERANCE * interval + rounding:
-            break
-    else:
-        raise DataError(
+    places, interval, stray = _nearest_grid(t, float(np.median(steps)))
+    tolerance = 4 * np.finfo(float).eps * float(np.abs(t).max())
+    worst = int(np.argmax(stray))
+    if stray[worst] > CLOCK_TOLERANCE * interval + tolerance:
+        # Where most neighbours of a sample are missing, the median is a multiple of the interval.
+        complaint = (
             f"{table.place(worst)}: the clock is not regular: the intervals run from {steps.min():.6g} to "
             f"{steps.max():.6g} {unit}, and {t[worst]:.9g} {unit} lies {stray[worst]:.3g} {unit} beside a grid of "
             f"{interval:.6g} {unit}; the estimators compare samples at fixed delays, so they need a regular clock. "
             "Resample the record, or give its clock (--interval or --rate) if the times in the file are only rounded"
         )
+        places, interval, stray = _nearest_grid(t, float(steps.min()))
+        if not stray.max() <= CLOCK_TOLERANCE * interval + tolerance:
+            raise DataError(complaint)
     if places[-1] > MOST_FILLED * t.size:
         raise DataError(
             f"{table.file}: of {places[-1] + 1:.6g} instants of a clock of {interval:.6g} {unit} the file has only "
@@ -270,6 +267,14 @@ def _on_grid(table: Table, name: str, t: Array, values: Array, unit: str) -> tup
     filled = np.full(int(places[-1]) + 1, np.nan)
     filled[places.astype(np.int64)] = values
     return filled, interval, f"The times leave out {filled.size - t.size} instants of the clock; they count as missing."
+
+
+def _nearest_grid(t: Array, usual: float) -> tuple[Array, float, Array]:
+    """Place of each instant on a grid of about this interval, its interval, and how far each lies beside it."""
+    places = np.concatenate(([0.0], np.cumsum(np.maximum(1.0, np.round(np.diff(t) / usual)))))
+    # The grid that fits all instants best in the sense of its two ends.
+    interval = float((t[-1] - t[0]) / places[-1])
+    return places, interval, np.abs(t - (t[0] + places * interval))
 
 
 def _window(

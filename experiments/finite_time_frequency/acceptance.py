@@ -82,7 +82,7 @@ def near(item: str, name: str, value: float, target: float, tolerance: float) ->
 
 
 def clock(interval: float, duration: float) -> Array:
-    return interval * np.arange(round(duration / interval))
+    return np.asarray(interval * np.arange(round(duration / interval)), dtype=float)
 
 
 def stepped(interval: float, duration: float = 90.0) -> tuple[Array, Array]:

@@ -78,7 +78,7 @@ def settling(results: Results) -> Iterator[Row]:
                 times = [settle(track, truth, band, since, until) for band in BANDS]
                 pieces.setdefault(f"from {since:g} s", []).append(np.array(times))
             off = np.abs(track.omega - truth).max(axis=1) > BANDS[0]
-            wrong.append(float((off).sum()) * float(track.t[1] - track.t[0]))
+            wrong.append(float((track.valid & off).sum()) * float(track.t[1] - track.t[0]))
         for piece, measured in pieces.items():
             middle, longest = np.median(measured, axis=0), np.max(measured, axis=0)
             yield {

@@ -113,6 +113,10 @@ def test_missing_samples_are_flagged(ctid, tmp_path):
         (T, signal(), ("--out", "track.txt"), ".csv or .h5"),
         (T, signal(), ("--signal", "z"), "'z'"),
         (T, signal(), ("--from", 100), "no sample lies"),
+        (T, signal(), ("--from", "nan"), "--from must be an instant"),
+        (T, signal(), ("--to", "inf"), "--to must be an instant"),
+        (T, 1e200 * signal(), (), "another unit"),
+        (T, np.where(np.random.default_rng(1).random(T.size) < 0.1, signal(), np.nan), (), "too much of it is missing"),
     ],
 )
 def test_mistakes_are_one_sentence(ctid, tmp_path, t, y, options, message):
@@ -121,6 +125,37 @@ def test_mistakes_are_one_sentence(ctid, tmp_path, t, y, options, message):
     assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert not (tmp_path / "t.csv").exists()
+
+
+def test_many_single_samples_may_be_missing(ctid, tmp_path):
+    y = np.where(np.random.default_rng(1).random(T.size) < 0.6, signal(), np.nan)
+    out = tmp_path / "t.csv"
+    content = json.loads(ctid("track", write(tmp_path / "a.csv", T, y), "--tones", 2, "--json", "--out", out).stdout)
+    assert [tone["frequency_hz"] for tone in content["tones"]] == pytest.approx([12.0, 19.0], abs=0.02)
+    assert content["method"] == "nonlinear_least_squares"
+
+
+@pytest.mark.parametrize("name", ["track.csv", "track.svg"])
+def test_the_record_is_not_overwritten(ctid, tmp_path, name):
+    file = write(tmp_path / name, T, signal())
+    before = file.read_bytes()
+    done = ctid("track", file, "--tones", 2, "--out", tmp_path / "track.csv", code=2)
+    assert "would be overwritten" in done.stderr
+    assert file.read_bytes() == before
+
+
+def test_an_output_that_cannot_be_written(ctid, record, tmp_path):
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    done = ctid("track", record, "--tones", 2, "--out", tmp_path / "file" / "t.csv", code=6)
+    assert "cannot be written" in done.stderr
+
+
+def test_an_online_method_that_finds_nothing_says_what_to_try(ctid, tmp_path):
+    y = signal() + 3.0 * np.random.default_rng(1).standard_normal(T.size)
+    options = ("--tones", 2, "--method", "drem_finite_time", "--out", tmp_path / "t.csv")
+    text = ctid("track", write(tmp_path / "a.csv", T, y), *options).stdout
+    assert "No row is valid" in text
+    assert "--method automatic" in text
 
 
 def test_an_unknown_unit_of_time(ctid, tmp_path):

@@ -40,6 +40,15 @@ def test_partials_of_a_decaying_string():
         assert part in text
 
 
+@pytest.mark.parametrize(("omega", "angle"), [((2.0,), 2.03), ((2.0, 2.1), 2.1), ((1.0, 2.0, 3.0), 2.4)])
+def test_the_delay_makes_noise_matter_least(omega, angle):
+    t = 0.02 * np.arange(20_000)
+    y = sum(np.sin(w * t + w) for w in omega)
+    estimator = choose_settings(y, 0.02, len(omega), method="restarting_least_squares").estimator
+    assert max(omega) * estimator.h == pytest.approx(angle, abs=0.15)
+    assert max(omega) * 1.1 * estimator.h <= np.pi + 1e-9
+
+
 def test_the_online_tracker_finds_the_string_too():
     track, found = medians(plucked(), 1 / 8000.0, 4, method="restarting_least_squares")[1:]
     assert found == pytest.approx([146.3, 292.9, 439.9, 587.4], abs=0.3)
@@ -71,7 +80,7 @@ def test_delay_of_the_regression_follows_the_highest_tone():
     t = 0.001 * np.arange(20_000)
     settings = choose_settings(np.sin(30.0 * t) + np.sin(50.0 * t), 0.001, 2, method="restarting_least_squares")
     assert 1.8 < settings.estimator.h * 50.0 < 2.6
-    assert settings.estimator.prefilter == pytest.approx(1.5 * settings.estimator.h)
+    assert settings.estimator.prefilter == pytest.approx(2.0 * settings.estimator.h)
 
 
 def test_noise_makes_windows_longer():

@@ -191,7 +191,9 @@ def test_impossible_observers_are_refused(options, message):
 
 def test_observers_too_fast_for_the_clock_are_refused():
     options = AdaptiveObserver(tones=2, initial_frequencies=(2.0, 5.0))
-    with pytest.raises(ValueError, match=r"the fastest pole of the observer, 3.456 rad/s, needs a sampling interval below"):
+    with pytest.raises(
+        ValueError, match=r"the fastest pole of the observer, 3.456 rad/s, needs a sampling interval below"
+    ):
         options.start(0.5)
 
 

@@ -61,7 +61,9 @@ def test_no_estimate_is_valid_where_there_are_no_two_tones(options, name):
     assert not track.valid.any()
 
 
-@pytest.mark.parametrize("name", [name for name in NO_TWO_TONES if name not in TOLD_APART | {"a bias", "a square wave"}])
+@pytest.mark.parametrize(
+    "name", [name for name in NO_TWO_TONES if name not in TOLD_APART | {"a bias", "a square wave"}]
+)
 @pytest.mark.parametrize("options", BATCH, ids=lambda options: options.kind)
 def test_no_record_is_called_valid_that_has_no_two_tones(options, name):
     assert not options.estimate(NO_TWO_TONES[name], INTERVAL).valid
@@ -115,6 +117,17 @@ def test_flags_say_what_is_wrong(options):
     assert flags("a large bias") & (Flag.UNCERTAIN | Flag.COMPLEX_ROOTS | Flag.OUT_OF_BOUNDS)
     if not isinstance(options, FilterRegression):
         assert flags("an alias") & Flag.INCONSISTENT
+
+
+@pytest.mark.parametrize("jump", [True, False])
+@pytest.mark.parametrize("options", ONLINE[:-1], ids=lambda options: options.kind)
+def test_no_estimate_from_before_a_step_stays_valid(options, jump):
+    true = np.where(T[:, None] < 30.0, [1.8, 3.2], [2.0, 3.0])
+    phase = true * T[:, None] if jump else np.vstack([np.zeros(2), np.cumsum(true[:-1], axis=0)]) * INTERVAL
+    track = options.start(INTERVAL).run(np.sin(phase).sum(axis=1))
+    error = np.abs(track.omega - true).max(axis=1)
+    assert track.valid[2990:3000].all()
+    assert (track.valid & (error > 0.1)).sum() <= 5  # until the residual shows it
 
 
 @pytest.mark.parametrize("omega", [3.2, 4.0, 6.0, 7.0, 8.5, 11.0, 20.0, 60.0])

@@ -132,7 +132,10 @@ def test_every_alias_is_told_from_the_frequency_itself(n, noise):
             aliased = omega.copy()
             aliased[-1] = alias
             # In noise, the two must really differ at the second delay.
-            if abs(np.cos(alias * second * interval) - np.cos(omega[-1] * second * interval)) > (0.1 if noise else 0.0) + 10 * noise:
+            if (
+                abs(np.cos(alias * second * interval) - np.cos(omega[-1] * second * interval))
+                > (0.1 if noise else 0.0) + 10 * noise
+            ):
                 assert check_consistency(gram, aliased, second * interval, 1e-8) == Flag.INCONSISTENT
 
 

@@ -94,7 +94,10 @@ def test_csv_and_hdf5_hold_the_same():
     assert frame["omega_1"][:10].isna().all()
     assert frame["flags"].fillna("").tolist() == ["gap"] * 10 + ["uncertain complex_roots"] * 2 + [""] * 28
     assert frame["valid"].tolist() == [0] * 12 + [1] * 28
-    with h5py.File(io.BytesIO(track_bytes(table, ".h5"))) as store:
+    with h5py.File(io.BytesIO(track_bytes(table, ".h5", "Pa"))) as store:
+        units = {name: column.attrs.get("unit") for name, column in store.items()}
+        assert (units["t"], units["omega_2"], units["frequency_1_hz"]) == ("s", "rad/s", "Hz")
+        assert (units["amplitude_1"], units["valid"]) == ("Pa", None)
         assert list(store) == list(frame.columns)
         for name in frame.columns[:-1]:
             assert store[name][()] == pytest.approx(frame[name].to_numpy(), nan_ok=True)

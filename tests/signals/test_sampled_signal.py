@@ -71,6 +71,17 @@ def test_an_irregular_clock_is_refused_unless_one_is_given(tmp_path):
     assert "not used" in read_sampled_signal(file, interval=0.1).notes[0]
 
 
+def test_most_lines_may_be_missing_from_a_regular_clock(tmp_path):
+    kept = np.flatnonzero(np.random.default_rng(0).random(2000) < 0.3)
+    file = write(tmp_path / "a.csv", (0.1 * kept, np.sin(0.01 * kept)), "t,y")
+    signal = read_sampled_signal(file)
+    assert signal.interval == pytest.approx(0.1)
+    assert np.flatnonzero(np.isfinite(signal.samples)).tolist() == (kept - kept[0]).tolist()
+    few = kept[::30]
+    with pytest.raises(DataError, match=rf"the file has only {few.size + 1}; use a part"):
+        read_sampled_signal(write(tmp_path / "b.csv", (0.1 * np.append(few, few[-1] + 1), np.append(few, 0.0)), "t,y"))
+
+
 def test_a_window(tmp_path):
     file = write(tmp_path / "a.csv", (2.0 + 0.1 * np.arange(50), Y), "t,y")
     signal = read_sampled_signal(file, start=2.5, stop=3.0)
