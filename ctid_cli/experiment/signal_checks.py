@@ -117,6 +117,7 @@ def signal_warnings(spec: Spec) -> list[Complaint]:
     if spec.signal is None:
         return []
     signal = variants(spec.signal)[0].options
+    clocks = variants(spec.sampling) if spec.sampling is not None else []
     warnings: list[Complaint] = []
     for name, section in spec.estimators.items():
         cases = variants(section)
@@ -131,6 +132,14 @@ def signal_warnings(spec: Spec) -> list[Complaint]:
             if hasattr(case.options, "h") and signal.highest_frequency > math.pi / case.options.h
         ]
         warnings += grouped(aliased, len(cases))
+        names = [field for field in type(section).model_fields if field != "kind"]
+        rounded = [
+            (("estimators", name, *field_in(note, names)), note, {**case.swept, **_prefixed("sampling", clock.swept)})
+            for case, clock in itertools.product(cases, clocks)
+            if case.options.online
+            for note in case.options.start(clock.options.interval).notes
+        ]
+        warnings += grouped(rounded, len(cases) * len(clocks))
         if not cases[0].options.online and signal.frequency_steps:
             message = "gives one estimate of the whole record, in which a frequency steps"
             warnings.append((("estimators", name, "kind"), message))

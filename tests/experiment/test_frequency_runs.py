@@ -94,6 +94,23 @@ def test_mistakes_are_named_with_their_place(tmp_path, case):
     assert message in problem.message
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "key", "message"),
+    [
+        ("h: 0.7", "h: 1.2", "estimators.restarting.h", "above pi/h = 2.618 rad/s are seen as lower ones"),
+        ("interval: 0.01, d", "interval: 0.04, d", "estimators.restarting.h", "0.72 s"),
+    ],
+)
+def test_what_is_unwise_is_a_warning(tmp_path, old, new, key, message):
+    always = "estimators.esprit.kind: gives one estimate of the whole record, in which a frequency steps"
+    assert [warning.partition(": ")[2] for warning in load(tmp_path).warnings] == [always]
+    text = SPEC.replace(old, new).replace("averaging: 0.05", "averaging: 0.04")
+    (first, second) = load(tmp_path, text).warnings
+    assert f": {key}: " in first
+    assert message in first
+    assert second.endswith(always)
+
+
 def test_a_system_has_no_estimator_of_frequencies(tmp_path):
     text = SYSTEM + "\n".join(SPEC.splitlines()[5:7]) + "\n  one: {kind: esprit, tones: 2}\n"
     (problem,) = problems(tmp_path, f"experiment: one\n{text}monte_carlo: {{runs: 1, seed: 1}}\n")

@@ -58,7 +58,7 @@ def test_filter_converges_to_the_frequencies(n, algorithm):
         errors.append(np.abs(track.omega[-1] - OMEGA[n]).max())
         if algorithm == "least_squares":
             assert track.valid[-3000 * finer :].all()
-    # Lines between the samples are all that is wrong with it: an error of second order, or less with an even one beside.
+    # Lines between the samples are all that is wrong with it: an error of second order, or one that falls faster.
     assert errors[0] < (1e-3 if algorithm == "least_squares" else 0.05)
     assert 3.0 < errors[0] / errors[1] < 9.0
 

@@ -216,8 +216,8 @@ def test_a_missing_sample_is_a_gap_until_it_leaves_the_delays():
         ({"lowest_frequency": 9.0}, r"lowest_frequency \(9 rad/s\) must be below highest_frequency \(7.85398 rad/s\)"),
         (
             {"highest_frequency": 8.0},
-            r"with h = 0.4 s, frequencies above pi/h = 7.85398 rad/s are seen as lower ones, but highest_frequency is 8 "
-            r"rad/s; use an h below 0.392699 s",
+            r"with h = 0.4 s, frequencies above pi/h = 7.85398 rad/s are seen as lower ones, but highest_frequency is "
+            r"8 rad/s; use an h below 0.392699 s",
         ),
     ],
 )
