@@ -33,6 +33,10 @@ USUAL_SPANS = 20
 #: therefore, and so much more is needed to contradict an estimate.
 SINKING = 50.0
 CONTRADICTION_RATIO = 300.0
+#: Verdicts are given, and rows at the second delay looked at, so many times in a delay h, but at most so many samples
+#: apart.
+VERDICTS_PER_DELAY = 64
+MOST_BETWEEN = 8
 #: Added to the unit diagonal of the scaled second moments, so that the best fit exists even if it is not unique.
 REGULARISATION = 1e-10
 
@@ -59,6 +63,27 @@ def second_lag(lag: int) -> int:
         return 0
     wanted = GOLDEN_FRACTION * lag
     return min((m for m in range(1, lag) if gcd(m, lag) == 1), key=lambda m: abs(m - wanted))
+
+
+def samples_between_verdicts(lag: int) -> int:
+    """How often an estimate is judged.
+
+    Parameters
+    ----------
+    lag : int
+        Delay h in sampling intervals.
+
+    Returns
+    -------
+    int
+        Number of samples: neighbours on a fine clock have nothing new to say.
+
+    Examples
+    --------
+    >>> [samples_between_verdicts(lag) for lag in (1, 100, 200, 700)]
+    [1, 1, 3, 8]
+    """
+    return max(1, min(lag // VERDICTS_PER_DELAY, MOST_BETWEEN))
 
 
 @njit(cache=True, nogil=True)

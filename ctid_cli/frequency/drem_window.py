@@ -9,7 +9,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ctid_cli.frequency.consistency import DETECTOR_SPAN, USUAL_SPANS, contradicts, observe_second_delay
+from ctid_cli.frequency.consistency import (
+    DETECTOR_SPAN,
+    USUAL_SPANS,
+    contradicts,
+    observe_second_delay,
+    samples_between_verdicts,
+)
 from ctid_cli.frequency.decoding import decode
 from ctid_cli.frequency.delay_options import DelayRegression
 from ctid_cli.frequency.flags import GAP, STARTING, UNDETERMINED
@@ -128,6 +134,7 @@ class DremWindow(DelayRegression):
             clock.bottom,
             clock.second_lag,
             clock.second_delay,
+            samples_between_verdicts(clock.lag),
         )
         state = {
             "samples": np.full(2 * n * clock.lag + 1, np.nan),
@@ -138,6 +145,7 @@ class DremWindow(DelayRegression):
             "counters": np.zeros(4, np.int64),
             "doubts": np.array([0, 0, LONG_AGO], np.int64),
             "levels": np.zeros(4),
+            "possible_errors": np.full(n, np.nan),
         }
         return Recursion(advance_window, constants, state, clock.weights, np.nan, clock.notes)
 
@@ -197,6 +205,7 @@ def advance_window(
     bottom: float,
     check_lag: int,
     check_delay: float,
+    every: int,
     history: Array,
     rows: Array,
     window: Array,
@@ -205,6 +214,7 @@ def advance_window(
     counters: IntArray,
     doubts: IntArray,
     levels: Array,
+    possible_errors: Array,
 ) -> None:
     """Least squares on every mixed regression over a sliding window.
 
@@ -231,6 +241,8 @@ def advance_window(
         Second delay in sampling intervals.
     check_delay : float
         The same [s].
+    every : int
+        Samples from one verdict to the next.
     history, rows : ndarray
         Rings of samples and of rows.
     window : ndarray, shape (M, 2 n + 3)
@@ -245,6 +257,8 @@ def advance_window(
         See :func:`~ctid_cli.frequency.scalar_regressions.judge_mixed`.
     levels : ndarray, shape (4,)
         See :func:`~ctid_cli.frequency.consistency.contradicts`.
+    possible_errors : ndarray, shape (n,)
+        What may be wrong with the frequencies according to the last verdict [rad/s].
     """
     n = omega.shape[1]
     row, check_row = np.empty(n + 1), np.empty(n + 1)
@@ -252,7 +266,7 @@ def advance_window(
     theta, errors, rounding, roots, slopes = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     polynomial, work, sensitivities = np.empty(n + 1), np.empty(n + 1), np.empty((n, n))
     sums = np.empty(2 * n + 3)
-    keep = 1.0 - 1.0 / (CHECK_SPANS * n * lag)
+    keep = 1.0 - every / (CHECK_SPANS * n * lag)
     fast, slow = 1.0 / max(1.0, DETECTOR_SPAN * lag), 1.0 / (USUAL_SPANS * n * lag)
     for k in range(samples.size):
         counters[0] = counters[0] + 1 if counters[0] + 1 < history.size else 0
@@ -261,7 +275,8 @@ def advance_window(
         form_row(history, counters[0], lag, table, row)
         for i in range(n + 1):
             rows[counters[1], i] = row[i]
-        observe_second_delay(history, counters[0], check_lag, table, check_row, check, keep)
+        if counters[0] % every == 0:
+            observe_second_delay(history, counters[0], check_lag, table, check_row, check, keep)
         scale = mix_rows(rows, counters[1], first_row, spacing, plan, matrix, minors, mixed)
         delta = mixed[n]
         flag = 0
@@ -282,36 +297,43 @@ def advance_window(
         if sums[2 * n + 2] < enough:
             flag |= STARTING
         if sums[2 * n] > 0.0:
-            relative = np.sqrt(sums[2 * n + 1] / sums[2 * n])
             for i in range(n):
                 theta[i] = sums[i] / sums[2 * n]
-                square = sums[n + i] / sums[2 * n]
-                scatter = square - theta[i] * theta[i]
-                errors[i] = np.sqrt(scatter) if scatter > SCATTER_ROUNDING * square else 0.0
             flag |= decode(theta, delay, top, bottom, polynomial, work, roots, omega[k])
-            span = (rows.shape[0] + 2 * n * lag + sums[2 * n + 2]) * interval
-            elapsed = (rows.shape[0] + 2 * n * lag + counters[3]) * interval
             started = sums[2 * n + 2] >= enough
-            flag |= judge_mixed(
-                theta,
-                roots,
-                errors,
-                relative,
-                delay,
-                span,
-                elapsed,
-                interval,
-                started,
-                started and contradicts(row, theta, levels, fast, slow),
-                check,
-                check_delay,
-                doubts,
-                sensitivities,
-                slopes,
-                rounding,
-                omega[k],
-                uncertainty[k],
-            )
+            contradicted = started and contradicts(row, theta, levels, fast, slow)
+            if doubts[0] == 0 or contradicted:
+                relative = np.sqrt(sums[2 * n + 1] / sums[2 * n])
+                for i in range(n):
+                    square = sums[n + i] / sums[2 * n]
+                    scatter = square - theta[i] * theta[i]
+                    errors[i] = np.sqrt(scatter) if scatter > SCATTER_ROUNDING * square else 0.0
+                span = (rows.shape[0] + 2 * n * lag + sums[2 * n + 2]) * interval
+                elapsed = (rows.shape[0] + 2 * n * lag + counters[3]) * interval
+                doubts[1] = judge_mixed(
+                    theta,
+                    roots,
+                    errors,
+                    relative,
+                    delay,
+                    span,
+                    elapsed,
+                    interval,
+                    started,
+                    contradicted,
+                    check,
+                    check_delay,
+                    doubts,
+                    sensitivities,
+                    slopes,
+                    rounding,
+                    omega[k],
+                    possible_errors,
+                )
+            doubts[0] = (doubts[0] + 1) % every if started else 0
+            doubts[2] += 1
+            for i in range(n):
+                uncertainty[k, i] = possible_errors[i]
         else:
             for i in range(n):
                 omega[k, i] = uncertainty[k, i] = np.nan

@@ -15,6 +15,7 @@ from ctid_cli.frequency.consistency import (
     ROUNDING_FLOOR,
     check_consistency,
     observe_second_delay,
+    samples_between_verdicts,
 )
 from ctid_cli.frequency.decoding import FIRST_PERIODS, cosine_sensitivities, decode, flag_uncertain, still_doubtful
 from ctid_cli.frequency.delay_options import DelayRegression
@@ -175,6 +176,7 @@ class RestartingLeastSquares(DelayRegression):
             float(interval),
             np.array([clock.delay, clock.top, clock.bottom, clock.second_delay]),
             clock.second_lag,
+            samples_between_verdicts(clock.lag),
         )
         state = {
             "samples": np.full(2 * n * clock.lag + 1, np.nan),
@@ -310,6 +312,7 @@ def advance_restarting(
     interval: float,
     clock: Array,
     check_lag: int,
+    every: int,
     history: Array,
     older: Array,
     newer: Array,
@@ -347,6 +350,8 @@ def advance_restarting(
         Delay h [s], cosines of the lowest and of the highest frequency times h, second delay [s].
     check_lag : int
         Second delay in sampling intervals.
+    every : int
+        Samples from one look at the second delay to the next.
     history : ndarray
         Ring of samples.
     older, newer : ndarray, shape (n + 1, n + 1)
@@ -400,7 +405,8 @@ def advance_restarting(
                         older[i, j] *= keep
             levels[1] = keep * levels[1] + 1.0
             accumulate_row(row, newer, keep)
-            observe_second_delay(history, counters[0], check_lag, table, check_row, check, keep)
+            if counters[0] % every == 0:
+                observe_second_delay(history, counters[0], check_lag, table, check_row, check, keep**every)
             mixed = False
             if counters[1] >= counters[2]:
                 # Does the newer half fit much better than the whole?

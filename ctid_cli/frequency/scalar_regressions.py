@@ -17,6 +17,7 @@ from ctid_cli.frequency.consistency import (
     check_consistency,
     contradicts,
     observe_second_delay,
+    samples_between_verdicts,
 )
 from ctid_cli.frequency.decoding import cosine_sensitivities, decode, flag_uncertain, propagate, still_doubtful
 from ctid_cli.frequency.delay_options import DelayClock, DelayRegression
@@ -34,8 +35,7 @@ MIXING_ROUNDING = 1e-15
 #: or too much alike to show that they disagree.
 ROWS_PER_TONE = 4
 STARTING_SPAN = 0.25
-#: The check at the second delay is made every so many samples, and forgets over so many times n h.
-CHECK_EVERY = 8
+#: The check at the second delay forgets over so many times n h.
 CHECK_SPANS = 4
 #: The residuals that show how far an estimate can be trusted are remembered over so many times n h.
 RECENT_SPANS = 2
@@ -199,6 +199,7 @@ def scalar_recursion(options: DremOptions, interval: float, *, finite_time: bool
         clock.bottom,
         clock.second_lag,
         clock.second_delay,
+        samples_between_verdicts(clock.lag),
     )
     state = {
         "samples": np.full(2 * n * clock.lag + 1, past),
@@ -210,6 +211,7 @@ def scalar_recursion(options: DremOptions, interval: float, *, finite_time: bool
         "counters": np.zeros(3, np.int64),
         "doubts": np.array([0, 0, LONG_AGO], np.int64),
         "levels": np.zeros(4),
+        "possible_errors": np.full(n, np.nan),
     }
     return Recursion(advance_scalars, constants, state, clock.weights, past, clock.notes)
 
@@ -260,7 +262,7 @@ def judge_mixed(
     check_delay : float
         The same [s].
     doubts : ndarray of int, shape (3,)
-        Samples since the last verdict at the second delay, that verdict, and samples since the estimate was uncertain.
+        Samples since the last verdict, that verdict, and samples since the estimate was uncertain.
     sensitivities, slopes, rounding : ndarray, shapes (n, n), (n,), (n,)
         Work space.
     omega : ndarray, shape (n,)
@@ -271,7 +273,7 @@ def judge_mixed(
     Returns
     -------
     int
-        UNCERTAIN or 0; the verdict at the second delay is left in `doubts`.
+        The verdict: what is wrong with the estimate.
     """
     n = theta.size
     cosine_sensitivities(roots, delay, slopes, sensitivities)
@@ -286,11 +288,7 @@ def judge_mixed(
             doubts[2] = 0
     elif still_doubtful(omega, doubts[2] * interval):
         flag = UNCERTAIN
-    doubts[2] += 1
-    if doubts[0] == 0:
-        doubts[1] = check_consistency(check, omega, check_delay, NEGLIGIBLE)
-    doubts[0] = (doubts[0] + 1) % CHECK_EVERY
-    return flag
+    return flag | check_consistency(check, omega, check_delay, NEGLIGIBLE)
 
 
 @njit(cache=True, nogil=True)
@@ -315,6 +313,7 @@ def advance_scalars(
     bottom: float,
     check_lag: int,
     check_delay: float,
+    every: int,
     history: Array,
     rows: Array,
     theta: Array,
@@ -324,6 +323,7 @@ def advance_scalars(
     counters: IntArray,
     doubts: IntArray,
     levels: Array,
+    possible_errors: Array,
 ) -> None:
     """Gradient and finite-time estimate of every mixed regression.
 
@@ -358,6 +358,8 @@ def advance_scalars(
         Second delay in sampling intervals.
     check_delay : float
         The same [s].
+    every : int
+        Samples from one verdict to the next.
     history, rows : ndarray
         Rings of samples and of rows.
     theta : ndarray, shape (n,)
@@ -375,6 +377,8 @@ def advance_scalars(
         See :func:`judge_mixed`.
     levels : ndarray, shape (4,)
         See :func:`~ctid_cli.frequency.consistency.contradicts`.
+    possible_errors : ndarray, shape (n,)
+        What may be wrong with the frequencies according to the last verdict [rad/s].
     """
     n = gains.size
     row, check_row = np.empty(n + 1), np.empty(n + 1)
@@ -382,7 +386,7 @@ def advance_scalars(
     errors, roots, slopes, rounding = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     sensitivities = np.empty((n, n))
     polynomial, work = np.empty(n + 1), np.empty(n + 1)
-    keep = 1.0 - 1.0 / (CHECK_SPANS * n * lag)
+    keep = 1.0 - every / (CHECK_SPANS * n * lag)
     fast, slow = 1.0 / max(1.0, DETECTOR_SPAN * lag), 1.0 / (USUAL_SPANS * n * lag)
     remember = 1.0 - 1.0 / (RECENT_SPANS * n * lag)
     z, q = sums[0], sums[1]
@@ -397,7 +401,8 @@ def advance_scalars(
         form_row(history, counters[0], lag, table, row)
         for i in range(n + 1):
             rows[counters[1], i] = row[i]
-        observe_second_delay(history, counters[0], check_lag, table, check_row, check, keep)
+        if counters[0] % every == 0:
+            observe_second_delay(history, counters[0], check_lag, table, check_row, check, keep)
         scale = normalisation * mix_rows(rows, counters[1], first_row, spacing, plan, matrix, minors, mixed)
         delta = normalisation * mixed[n]
         flag = 0
@@ -426,34 +431,40 @@ def advance_scalars(
             flag |= STARTING
         flag |= decode(theta, delay, top, bottom, polynomial, work, roots, omega[k])
         if recent[n] > 0.0:
-            relative = np.sqrt(recent[n + 1] / recent[n])
-            for i in range(n):
-                errors[i] = np.sqrt(recent[i] / recent[n])
-            # Rows that carry weight: (sum w)^2/sum w^2.
-            remembered = q[fastest] * q[fastest] / recent[n + 2] if recent[n + 2] > 0.0 else 0.0
-            span = (rows.shape[0] + 2 * n * lag + remembered) * interval
-            elapsed = (rows.shape[0] + 2 * n * lag + counters[2]) * interval
             started = counters[2] >= enough
-            flag |= judge_mixed(
-                theta,
-                roots,
-                errors,
-                relative,
-                delay,
-                span,
-                elapsed,
-                interval,
-                started,
-                started and contradicts(row, theta, levels, fast, slow),
-                check,
-                check_delay,
-                doubts,
-                sensitivities,
-                slopes,
-                rounding,
-                omega[k],
-                uncertainty[k],
-            )
+            contradicted = started and contradicts(row, theta, levels, fast, slow)
+            if doubts[0] == 0 or contradicted:
+                relative = np.sqrt(recent[n + 1] / recent[n])
+                for i in range(n):
+                    errors[i] = np.sqrt(recent[i] / recent[n])
+                # Rows that carry weight: (sum w)^2/sum w^2.
+                remembered = q[fastest] * q[fastest] / recent[n + 2] if recent[n + 2] > 0.0 else 0.0
+                span = (rows.shape[0] + 2 * n * lag + remembered) * interval
+                elapsed = (rows.shape[0] + 2 * n * lag + counters[2]) * interval
+                doubts[1] = judge_mixed(
+                    theta,
+                    roots,
+                    errors,
+                    relative,
+                    delay,
+                    span,
+                    elapsed,
+                    interval,
+                    started,
+                    contradicted,
+                    check,
+                    check_delay,
+                    doubts,
+                    sensitivities,
+                    slopes,
+                    rounding,
+                    omega[k],
+                    possible_errors,
+                )
+            doubts[0] = (doubts[0] + 1) % every if started else 0
+            doubts[2] += 1
+            for i in range(n):
+                uncertainty[k, i] = possible_errors[i]
         else:
             for i in range(n):
                 uncertainty[k, i] = np.nan

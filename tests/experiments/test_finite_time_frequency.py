@@ -8,6 +8,7 @@ import pytest
 
 from ctid_cli.experiment.plan import build_plan
 from ctid_cli.experiment.spec import load_spec
+from ctid_cli.experiment.store import read_tracks
 from ctid_cli.reporting.figures.finite_time_frequency import CONFIGS, DERIVED
 from ctid_cli.reporting.study import data_folder
 from experiments.finite_time_frequency import acceptance, as_printed, measured, publish
@@ -142,7 +143,7 @@ def test_settling_times_are_those_of_a_direct_simulation(study):
     assert not {"esprit", "nonlinear_least_squares"} & {row["estimator"] for row in rows}
 
 
-def test_a_step_is_measured_piece_by_piece_and_invalid_silence_is_told_from_validity(study):
+def test_a_step_is_measured_piece_by_piece_and_what_is_valid_but_wrong_is_found(study):
     rows = list(measured.settling(study["step"]))
     assert {row["piece"] for row in rows} == {"from 0 s", "from 30 s"}
     for reading, longest in (("jump", 2.9), ("continuous", 2.9)):
@@ -151,7 +152,15 @@ def test_a_step_is_measured_piece_by_piece_and_invalid_silence_is_told_from_vali
         assert row["valid_but_off_by_0.05"] < 0.1
         slow = one(rows, estimator="finite_time", piece="from 30 s", reading=reading)
         assert slow["within_0.001"] > 13
-        assert slow["valid_but_off_by_0.05"] > 0.1
+    row = one(rows, estimator="restarting_prefiltered", piece="from 30 s", reading="continuous")
+    (stored,) = (
+        r for r in study["step"].rows if r["estimator"] == row["estimator"] and r["phase_at_steps"] == "continuous"
+    )
+    track = read_tracks(study["step"].folder)[stored["id"]]
+    truth = np.where((track["t"] > 29.999)[:, None], [2.0, 3.0], [1.8, 3.2])
+    wrong = (track["flags"] == 0) & (np.abs(track["omega"] - truth) > 0.05).any(axis=1)
+    assert wrong.any()
+    assert row["valid_but_off_by_0.05"] == pytest.approx(0.01 * wrong.sum())
 
 
 def test_medians_over_data_sets(study):
