@@ -128,6 +128,11 @@ class FilterRegression(OnlineEstimator):
         """
         n = self.tones
         order = 2 * n
+        if self.pole * interval > np.pi:
+            raise ValueError(
+                f"pole = {self.pole:g} rad/s is beyond what samples every {interval:g} s can show; "
+                f"use one below {np.pi / interval:g} rad/s."
+            )
         dynamics = self.pole * (np.eye(order, k=-1) - np.eye(order))
         gain = np.zeros(order)
         gain[0] = self.pole

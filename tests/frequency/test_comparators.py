@@ -189,6 +189,12 @@ def test_impossible_observers_are_refused(options, message):
         AdaptiveObserver(**{"tones": 2, "initial_frequencies": (2.0, 5.0), **options})
 
 
+@pytest.mark.parametrize("pole", [320.0, 1e300])
+def test_filters_too_fast_for_the_clock_are_refused(pole):
+    with pytest.raises(ValueError, match=r"is beyond what samples every 0\.01 s can show; use one below 314\.159 rad/s"):
+        FilterRegression(tones=2, pole=pole).start(INTERVAL)
+
+
 def test_observers_too_fast_for_the_clock_are_refused():
     options = AdaptiveObserver(tones=2, initial_frequencies=(2.0, 5.0))
     with pytest.raises(
