@@ -191,7 +191,9 @@ def test_impossible_observers_are_refused(options, message):
 
 @pytest.mark.parametrize("pole", [320.0, 1e300])
 def test_filters_too_fast_for_the_clock_are_refused(pole):
-    with pytest.raises(ValueError, match=r"is beyond what samples every 0\.01 s can show; use one below 314\.159 rad/s"):
+    with pytest.raises(
+        ValueError, match=r"is beyond what samples every 0\.01 s can show; use one below 314\.159 rad/s"
+    ):
         FilterRegression(tones=2, pole=pole).start(INTERVAL)
 
 
