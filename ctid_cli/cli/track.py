@@ -130,7 +130,7 @@ def _interval(interval: float | None, rate: float | None) -> float | None:
     if interval is not None and rate is not None:
         raise UsageError("--interval and --rate say the same; give one of them")
     for name, value in (("--interval", interval), ("--rate", rate)):
-        if value is not None and not 0 < value < float("inf"):
+        if value is not None and not (0 < value < math.inf and 1.0 / value < math.inf):
             raise UsageError(f"{name} must be a positive number, not {value:g}")
     return interval if rate is None else 1.0 / rate
 

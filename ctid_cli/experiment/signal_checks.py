@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ctid_cli.errors import DataError
 from ctid_cli.experiment.frequency_measures import true_frequencies
 from ctid_cli.experiment.sections import Complaint, Variant, field_in, grouped, variants
 from ctid_cli.experiment.yaml_source import KeyPath
-from ctid_cli.frequency import FREQUENCY_ESTIMATORS, DremWindow
+from ctid_cli.frequency import FREQUENCY_ESTIMATORS, DremWindow, Esprit
 from ctid_cli.signals import RegularSampling, SineDisturbance
 
 if TYPE_CHECKING:
@@ -173,10 +174,11 @@ def _of_clock(spec: Spec, signal: Variant, clock: Variant) -> Iterator[Failure]:
 
 def _of_estimator(options: Any, clock: RegularSampling) -> Iterator[str]:
     if not options.online:
+        yield from _of_batch(options, clock)
         return
     duration = clock.interval * clock.samples
     # First of all, since the estimator would keep all the samples of such a time.
-    for name in ("prefilter", "difference", "d", *(("memory",) if options.kind == DremWindow.kind else ())):
+    for name in ("prefilter", "difference", "d", "hold", *(("memory",) if options.kind == DremWindow.kind else ())):
         value = getattr(options, name, 0.0)
         if value > duration:
             yield f"{name} = {value:g} s is longer than the record, {duration:g} s"
@@ -192,6 +194,20 @@ def _of_estimator(options: Any, clock: RegularSampling) -> Iterator[str]:
             options.start(clock.interval)
     except (ValueError, ArithmeticError) as error:
         yield str(error) if isinstance(error, ValueError) else "these values are too large or too small to compute with"
+
+
+def _of_batch(options: Any, clock: RegularSampling) -> Iterator[str]:
+    initial = getattr(options, "initial_frequencies", None)
+    if initial is not None:
+        highest = math.pi / clock.interval
+        if max(initial) >= highest:
+            yield f"initial_frequencies must be below {highest:.4g} rad/s, pi over the sampling interval"
+        return
+    start = options if isinstance(options, Esprit) else Esprit(tones=options.tones, averaging=options.averaging)
+    try:
+        start.blocks(clock.samples, clock.interval)
+    except (ValueError, DataError) as error:
+        yield str(error)
 
 
 def _fits(options: Any, signal: Any, disturbances: list[Any]) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ctid_cli.frequency.checks import one_for_each
+from ctid_cli.frequency.checks import one_for_each, samples_in
 from ctid_cli.frequency.decoding import flag_uncertain
 from ctid_cli.frequency.flags import GAP, OUT_OF_BOUNDS, STARTING, UNDETERMINED
 from ctid_cli.frequency.moments import factorise, substitute
@@ -132,7 +132,7 @@ class AdaptiveObserver(OnlineEstimator):
             float(interval),
             poles,
             float(self.rate),
-            round(self.hold / interval),
+            samples_in(self.hold, interval),
             float(self.smallest_gap),
             float(self.lowest_frequency),
             float(self.highest_frequency),

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.errors import DataError
+from ctid_cli.frequency.checks import LARGEST_SAMPLE
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.regression import MOST_TONES
 from ctid_cli.signals.checks import require_positive
@@ -147,9 +148,10 @@ def present_samples(samples: ArrayLike, interval: float) -> tuple[Array, Array]:
             f"and type {values.dtype}."
         )
     values = values.astype(np.float64)
-    places = np.flatnonzero(np.isfinite(values))
+    with np.errstate(invalid="ignore"):
+        places = np.flatnonzero(np.abs(values) <= LARGEST_SAMPLE)
     if not places.size:
-        raise DataError("the record holds no finite sample.")
+        raise DataError(f"the record holds no finite sample of a size up to {LARGEST_SAMPLE:g}.")
     return values[places], interval * places.astype(np.float64)
 
 

@@ -20,10 +20,10 @@ from ctid_cli.frequency import (
     NonlinearLeastSquares,
     RestartingLeastSquares,
 )
+from ctid_cli.frequency.checks import LARGEST_SAMPLE
 from ctid_cli.frequency.decimation import Decimation, low_pass, without_low
 from ctid_cli.frequency.regression import MOST_TONES
 from ctid_cli.frequency.spectrum import Peaks, find_peaks
-from ctid_cli.frequency.tracking import LARGEST_SAMPLE
 from ctid_cli.frequency.windows import estimate_window
 from ctid_cli.signals.checks import require_choice, require_integer, require_positive
 
@@ -367,14 +367,14 @@ def _choose_window(
     duration = thinned.size * thin
     least = WINDOW_SAMPLES_PER_TONE * count
     if window is not None:
-        length = round(window / thin)
+        length = round(min(window / thin, thinned.size + 1.0))
         if not least <= length <= thinned.size:
             raise ValueError(
                 f"window must be between {least * thin:.4g} s, for {count} tones, and the {duration:.4g} s that the "
                 f"filters leave of the record, not {window:g}."
             )
         return length, f"Windows of {length * thin:.4g} s, as asked for."
-    closest = _closest(band.expected, tones)
+    closest = _closest(band.expected, tones, thin)
     lowest = closest >= float(band.expected[:tones].min()) * (1.0 - 1e-12)
     of_what = "periods of the lowest tone" if lowest else "beats of the closest tones"
     length = max(least, int(np.ceil(BEATS * 2.0 * np.pi / (closest * thin))))
@@ -408,12 +408,12 @@ def _choose_window(
     return best, f"Windows of {best * thin:.4g} s, {periods:.3g} periods of the lowest tone: {why}."
 
 
-def _closest(expected: Array, tones: int) -> float:
-    """Smallest distance of a wanted tone from any other, and from zero [rad/s]."""
+def _closest(expected: Array, tones: int, thin: float) -> float:
+    """Smallest distance of a wanted tone from any other, from zero, and from its own image above Nyquist [rad/s]."""
     marks = np.concatenate(([0.0], expected))
     distance = np.abs(expected[:tones, None] - marks)
     distance[np.arange(tones), 1 + np.arange(tones)] = np.inf
-    return float(distance.min())
+    return float(min(distance.min(), 2.0 * (np.pi / thin - expected[:tones].max())))
 
 
 def _batch(kind: str, tones: int) -> Any:

@@ -1,10 +1,13 @@
-"""Checks of options that hold one number for each tone."""
+"""Options that hold one number for each tone, and times that are counted in samples."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from ctid_cli.signals.checks import require_positive
+
+#: A sample larger than this counts as missing: its powers would overflow.
+LARGEST_SAMPLE = 1e30
 
 
 def one_for_each(name: str, values: Sequence[float] | None, count: int, unit: str) -> tuple[float, ...] | None:
@@ -39,3 +42,26 @@ def one_for_each(name: str, values: Sequence[float] | None, count: int, unit: st
     for number in numbers:
         require_positive(name, number, unit)
     return numbers
+
+
+def samples_in(duration: float, interval: float) -> int:
+    """Sampling intervals nearest to a time, however long it is.
+
+    Parameters
+    ----------
+    duration : float
+        Time [s].
+    interval : float
+        Sampling interval [s].
+
+    Returns
+    -------
+    int
+        No more than a counter of samples can hold.
+
+    Examples
+    --------
+    >>> samples_in(2.0, 0.01), samples_in(1e300, 0.01) == 1 << 62
+    (200, True)
+    """
+    return round(min(duration / interval, float(1 << 62)))

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 #: The second delay is near this fraction of the first, as far from every simple ratio as can be.
 GOLDEN_FRACTION = (np.sqrt(5.0) - 1.0) / 2.0
+#: A number without a common divisor lies within this distance of any place, for all delays that are allowed.
+SEARCHED = 100
 #: The frequencies are inconsistent if they leave so many times the smallest possible squared residual.
 WORSE_THAN_BEST = 10.0
 #: Time constant of the detector of changes as a fraction of h.
@@ -62,7 +64,8 @@ def second_lag(lag: int) -> int:
     if lag == 1:
         return 0
     wanted = GOLDEN_FRACTION * lag
-    return min((m for m in range(1, lag) if gcd(m, lag) == 1), key=lambda m: abs(m - wanted))
+    near = range(max(1, round(wanted) - SEARCHED), min(lag, round(wanted) + SEARCHED + 1))
+    return min((m for m in near if gcd(m, lag) == 1), key=lambda m: abs(m - wanted))
 
 
 def samples_between_verdicts(lag: int) -> int:

@@ -124,6 +124,8 @@ class DelayRegression(OnlineEstimator):
             notes.append(
                 f"h = {self.h:g} s is no whole number of sampling intervals of {interval:g} s; {delay:g} s is used."
             )
+        if self.prefilter > 0:
+            whole_delay("prefilter", self.prefilter, interval)
         if self.difference > 0:
             whole_delay("difference", self.difference, interval)
         second = second_lag(lag)

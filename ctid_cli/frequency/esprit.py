@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 #: Rows of the Hankel matrix as a fraction of the samples, and the largest number of them.
 ROWS_FRACTION = 0.4
 MOST_ROWS = 400
+#: More samples than this make a matrix too large to decompose; averages show as much.
+MOST_AVERAGES = 100_000
 #: Singular values below this fraction of the largest are rounding.
 RANK_TOLERANCE = 1e-11
 
@@ -82,6 +84,61 @@ class Esprit:
         require_not_negative("lowest_frequency", self.lowest_frequency, "rad/s")
         if self.highest_frequency is not None:
             require_positive("highest_frequency", self.highest_frequency, "rad/s")
+            if self.highest_frequency <= self.lowest_frequency:
+                raise ValueError(
+                    f"lowest_frequency ({self.lowest_frequency:g} rad/s) must be below highest_frequency "
+                    f"({self.highest_frequency:g} rad/s)."
+                )
+
+    def blocks(self, count: int, interval: float) -> tuple[int, int, float]:
+        """How a record is averaged and arranged.
+
+        Parameters
+        ----------
+        count : int
+            Number of samples.
+        interval : float
+            Sampling interval [s].
+
+        Returns
+        -------
+        block : int
+            Samples that are averaged.
+        rows : int
+            Rows of the Hankel matrix.
+        highest : float
+            Upper bound of the frequencies [rad/s].
+
+        Raises
+        ------
+        DataError
+            If the samples are too few or too many.
+        ValueError
+            If the bounds do not fit to the averaging.
+        """
+        block = max(1, round(min(self.averaging / interval, float(count))))
+        highest = np.pi / (block * interval)
+        if self.highest_frequency is not None:
+            if self.highest_frequency > highest * (1.0 + 1e-12):
+                raise ValueError(
+                    f"averages over {block * interval:g} s show frequencies up to {highest:g} rad/s, but "
+                    f"highest_frequency is {self.highest_frequency:g} rad/s; use an averaging below "
+                    f"{np.pi / self.highest_frequency:g} s."
+                )
+            highest = self.highest_frequency
+        averages = count // block
+        rows = min(int(ROWS_FRACTION * averages), MOST_ROWS)
+        if rows < 2 * self.tones + 1:
+            raise DataError(
+                f"{averages} samples, after the averaging, are too few for {self.tones} tones; use a longer record "
+                "or a shorter averaging."
+            )
+        if averages > MOST_AVERAGES:
+            raise DataError(
+                f"{averages:,} samples are more than the {MOST_AVERAGES:,} that ESPRIT takes; use an averaging of at "
+                f"least {count / MOST_AVERAGES * interval:.2g} s, or a part of the record."
+            )
+        return block, rows, highest
 
     def estimate(self, samples: ArrayLike, interval: float) -> FrequencyEstimate:
         """Estimate the frequencies of a record.
@@ -111,23 +168,8 @@ class Esprit:
                 "ESPRIT needs a record without missing samples; nonlinear_least_squares takes one with gaps."
             )
         n = self.tones
-        block = max(1, round(self.averaging / interval))
-        highest = np.pi / (block * interval)
-        if self.highest_frequency is not None:
-            if self.highest_frequency > highest * (1.0 + 1e-12):
-                raise ValueError(
-                    f"averages over {block * interval:g} s show frequencies up to {highest:g} rad/s, but "
-                    f"highest_frequency is {self.highest_frequency:g} rad/s; use an averaging below "
-                    f"{np.pi / self.highest_frequency:g} s."
-                )
-            highest = self.highest_frequency
+        block, rows, highest = self.blocks(y.size, interval)
         averages = y[: y.size // block * block].reshape(-1, block).mean(axis=1)
-        rows = min(int(ROWS_FRACTION * averages.size), MOST_ROWS)
-        if rows < 2 * n + 1:
-            raise DataError(
-                f"{averages.size} samples, after the averaging, are too few for {n} tones; use a longer record or a "
-                "shorter averaging."
-            )
         hankel = np.lib.stride_tricks.sliding_window_view(averages, averages.size - rows + 1)
         vectors, singular_values, _ = np.linalg.svd(hankel, full_matrices=False)
         flags = Flag(0)

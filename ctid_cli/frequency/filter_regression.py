@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ctid_cli.filtering.exponential import held_step
-from ctid_cli.frequency.checks import one_for_each
+from ctid_cli.frequency.checks import one_for_each, samples_in
 from ctid_cli.frequency.decoding import flag_uncertain, root_real_parts, root_sensitivities
 from ctid_cli.frequency.flags import COMPLEX_ROOTS, GAP, OUT_OF_BOUNDS, STARTING, UNDETERMINED
 from ctid_cli.frequency.moments import accumulate_row, factorise, least_squares, moment_uncertainty, squared_residual
@@ -153,9 +153,9 @@ class FilterRegression(OnlineEstimator):
             float(interval),
             # The effective length of an exponential window, and the mean delay of the filter.
             (2.0 / self.forgetting + order / self.pole) / interval,
-            round(self.hold / interval),
+            samples_in(self.hold, interval),
             # A gap empties the filter; it takes about twice its mean delay to fill again.
-            round(2 * order / (self.pole * interval)),
+            samples_in(2 * order / self.pole, interval),
             float(self.lowest_frequency) ** 2,
             float(highest) ** 2,
         )

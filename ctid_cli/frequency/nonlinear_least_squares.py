@@ -82,6 +82,8 @@ class NonlinearLeastSquares:
         require_integer("max_iterations", self.max_iterations, 1)
         require_positive("tolerance", self.tolerance, "rad")
         initial = one_for_each("initial_frequencies", self.initial_frequencies, self.tones, "rad/s")
+        if initial is not None and len(set(initial)) < len(initial):
+            raise ValueError(f"initial_frequencies must differ from each other, not {self.initial_frequencies!r}.")
         object.__setattr__(self, "initial_frequencies", initial)
 
     def estimate(self, samples: ArrayLike, interval: float) -> FrequencyEstimate:

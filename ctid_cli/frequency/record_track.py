@@ -101,7 +101,7 @@ def track_record(
         wanted_step = every
     elif not settings.estimator.online:
         wanted_step = max(wanted_step, min(OVERLAP * settings.window_seconds, thinned.size * thin / FEWEST_WINDOWS))
-    step = max(1, round(wanted_step / thin))
+    step = max(1, round(min(wanted_step / thin, float(thinned.size))))
     tell = on_progress or (lambda done, total: None)
     follow = _online if settings.estimator.online else _windows
     places, omega, amplitudes, flags, uncertainty = follow(thinned, settings, step, tell)

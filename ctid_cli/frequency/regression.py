@@ -24,6 +24,8 @@ IntArray = NDArray[np.int64]
 
 #: More tones than this cannot be told apart in double precision.
 MOST_TONES = 8
+#: Longest delay in sampling intervals: the samples of twice n delays are kept.
+LONGEST_DELAY = 10_000_000
 
 
 def delay_table(tones: int) -> IntArray:
@@ -80,9 +82,14 @@ def whole_delay(name: str, delay: float, interval: float) -> int:
     Raises
     ------
     ValueError
-        If the delay is shorter than half an interval.
+        If the delay is shorter than half an interval, or longer than ten million.
     """
     require_positive("interval", interval, "s")
+    if delay / interval > LONGEST_DELAY:
+        raise ValueError(
+            f"{name} = {delay:g} s is more than {LONGEST_DELAY:,} sampling intervals of {interval:g} s; keep fewer "
+            "of the samples."
+        )
     count = round(delay / interval)
     if count < 1:
         raise ValueError(f"{name} = {delay:g} s is shorter than half a sampling interval of {interval:g} s.")

@@ -69,8 +69,8 @@ class RestartingLeastSquares(DelayRegression):
         Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals. The best
         one is 0.7 to 0.8 times pi over the highest frequency.
     memory : float, optional
-        Data older than this are forgotten exponentially [s]; by default 100 h. A slow drift is followed with a lag of
-        this size and never raises an alarm.
+        Data older than this are forgotten exponentially [s]; by default 100 h. A slow drift, or a step too small
+        to be seen in the noise, is followed with a lag of this size and raises no alarm.
     solution : {"least_squares", "total_least_squares"}, default "least_squares"
         Total least squares allows for white noise in the regressors too: no bias without a prefilter.
     prefilter : float, default 0.0
@@ -379,12 +379,13 @@ def advance_restarting(
         flag = 0
         if counters[3] > 0:
             counters[3] -= 1
-            flag = CHANGED
+            flag = CHANGED if np.isfinite(samples[k]) else CHANGED | GAP
         elif not complete:
             flag = GAP if counters[1] > 0 else STARTING
         else:
             if counters[1] == 0:
-                counters[2] = settings[2]
+                # The first comparison needs an older half.
+                counters[2] = settings[2] // 2
                 for i in range(n + 1):
                     for j in range(n + 1):
                         older[i, j] = newer[i, j] = check[i, j] = 0.0

@@ -12,14 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.errors import DataError
+from ctid_cli.frequency.checks import LARGEST_SAMPLE
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.prefilter import convolve, fast_convolve
 from ctid_cli.signals.checks import require_positive
 
 Array = NDArray[np.float64]
-
-#: A sample larger than this counts as missing: its powers would overflow.
-LARGEST_SAMPLE = 1e30
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,8 +295,13 @@ class Tracker:
         DataError
             If the state is not one of this estimator with these options and this sampling interval.
         """
-        arrays = {name: np.asarray(array) for name, array in state.items()}
-        same = arrays.keys() == self._state.keys() and all(
+        # Lists, as a state is after its way through a text file, have lost their kind of number.
+        arrays = {
+            name: np.asarray(array, dtype=self._state[name].dtype if isinstance(array, list) else None)
+            for name, array in state.items()
+            if name in self._state
+        }
+        same = arrays.keys() == self._state.keys() == state.keys() and all(
             (arrays[name].shape, arrays[name].dtype) == (own.shape, own.dtype) for name, own in self._state.items()
         )
         if not same or not np.array_equal(arrays["fingerprint"], self._state["fingerprint"]):

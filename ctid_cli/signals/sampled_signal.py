@@ -280,8 +280,8 @@ def _nearest_grid(t: Array, usual: float) -> tuple[Array, float, Array]:
 def _window(
     table: Table, first: float, interval: float, count: int, start: float | None, stop: float | None, unit: str
 ) -> tuple[int, int]:
-    low = 0 if start is None else max(0, int(np.ceil((start - first) / interval - 1e-6)))
-    high = count if stop is None else min(count, int(np.floor((stop - first) / interval + 1e-6)) + 1)
+    low = 0 if start is None else int(np.ceil(np.clip((start - first) / interval - 1e-6, 0.0, count)))
+    high = count if stop is None else int(np.floor(np.clip((stop - first) / interval + 1e-6, -1.0, count - 1))) + 1
     if low >= high:
         last = first + (count - 1) * interval
         raise DataError(

@@ -115,6 +115,10 @@ def test_missing_samples_are_flagged(ctid, tmp_path):
         (T, signal(), ("--from", 100), "no sample lies"),
         (T, signal(), ("--from", "nan"), "--from must be an instant"),
         (T, signal(), ("--to", "inf"), "--to must be an instant"),
+        (T, signal(), ("--from", 1e308), "no sample lies"),
+        (T, signal(), ("--to", -1e308), "no sample lies"),
+        (T, signal(), ("--window", 1e308), "window must be between"),
+        (T, signal(), ("--rate", 1e-320), "--rate must be a positive number"),
         (T, 1e200 * signal(), (), "another unit"),
         (T, np.where(np.random.default_rng(1).random(T.size) < 0.1, signal(), np.nan), (), "too much of it is missing"),
     ],
@@ -125,6 +129,15 @@ def test_mistakes_are_one_sentence(ctid, tmp_path, t, y, options, message):
     assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert not (tmp_path / "t.csv").exists()
+
+
+@pytest.mark.parametrize("every", [50, 1e308])
+@pytest.mark.parametrize("method", ["esprit", "restarting_least_squares"])
+def test_rows_farther_apart_than_the_record_is_long_are_one(ctid, record, tmp_path, method, every):
+    out = tmp_path / "track.csv"
+    done = ctid("track", record, "--tones", 2, "--every", every, "--method", method, "--out", out)
+    assert len(pd.read_csv(out)) == 1
+    assert not done.stderr
 
 
 def test_many_single_samples_may_be_missing(ctid, tmp_path):

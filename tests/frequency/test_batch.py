@@ -152,3 +152,20 @@ def test_too_few_iterations_are_reported():
     y = tones(2, COUNT).sum(axis=1)
     estimate = NonlinearLeastSquares(tones=2, initial_frequencies=(1.1, 1.9), max_iterations=1).estimate(y, INTERVAL)
     assert estimate.flags & Flag.NOT_CONVERGED
+
+
+def test_options_that_contradict_each_other_are_refused():
+    with pytest.raises(ValueError, match=r"lowest_frequency \(5 rad/s\) must be below highest_frequency \(2 rad/s\)"):
+        Esprit(tones=1, lowest_frequency=5.0, highest_frequency=2.0)
+    with pytest.raises(ValueError, match=r"initial_frequencies must differ"):
+        NonlinearLeastSquares(tones=2, initial_frequencies=(2.0, 2.0))
+
+
+def test_records_too_long_for_esprit_are_told_what_to_average():
+    with pytest.raises(DataError, match=r"200,000 samples are more than the 100,000 .* at least 0\.02 s"):
+        Esprit(tones=1).estimate(np.zeros(200_000), 0.01)
+
+
+def test_huge_samples_are_missing_ones():
+    with pytest.raises(DataError, match=r"no finite sample of a size up to 1e\+30"):
+        NonlinearLeastSquares(tones=1).estimate(np.full(100, 1e200), 0.01)

@@ -257,3 +257,23 @@ def test_options_that_the_clock_cannot_meet_are_refused():
         tracker(memory=0.05)
     with pytest.raises(ValueError, match=r"difference = 0.001 s is shorter than half a sampling interval"):
         tracker(difference=0.001)
+
+
+def test_a_second_change_during_the_flush_is_found_behind_a_prefilter_too():
+    # Both frequencies step, three seconds apart, and one of them back nine seconds later.
+    t = INTERVAL * np.arange(9000)
+    first = np.where(t < 33.0, 1.8, 1.2)
+    second = np.select([t < 30.0, t < 42.0], [3.0, 4.0], 3.0)
+    y = np.sin(np.cumsum(first) * INTERVAL) + np.cos(np.cumsum(second) * INTERVAL)
+    track = tracker(h=0.7, prefilter=1.0).run(y)
+    error = np.abs(track.omega - np.column_stack([first, second])).max(axis=1)
+    assert error[4800:].max() < 1e-9
+    assert track.valid[-2000:].all()
+    assert (track.valid & (error > 0.1)).sum() <= 40  # three steps, each noticed within 0.15 s
+
+
+def test_a_sample_that_is_missing_during_the_flush_is_a_gap_too():
+    y = np.concatenate((tones(2, 1500).sum(axis=1), tones(2, 500, omega=[1.3, 2.5]).sum(axis=1)))
+    y[1520] = np.nan
+    track = tracker().run(y)
+    assert Flag(int(track.flags[1520])) & (Flag.GAP | Flag.CHANGED) == Flag.GAP | Flag.CHANGED

@@ -194,3 +194,40 @@ def test_comparators_say_that_they_are_derived():
     for kind in ("adaptive_observer", "filter_regression"):
         text = FREQUENCY_ESTIMATORS[kind].__doc__
         assert text.count("erived, not the published algorithm") == 2
+
+
+def test_a_state_may_go_through_a_text_file():
+    import json
+
+    options = RestartingLeastSquares(tones=2, h=0.4, prefilter=0.2)
+    y = tones(2, 600).sum(axis=1)
+    tracker = options.start(INTERVAL)
+    tracker.run(y[:333])
+    text = json.dumps({name: array.tolist() for name, array in tracker.state().items()})
+    again = options.restore(INTERVAL, json.loads(text)).run(y[333:])
+    expected = tracker.run(y[333:])
+    assert np.array_equal(again.omega, expected.omega, equal_nan=True)
+    assert np.array_equal(again.flags, expected.flags)
+
+
+@pytest.mark.parametrize("extra", [{}, {"more": np.zeros(1)}])
+def test_states_with_more_or_fewer_parts_are_refused(extra):
+    options = RestartingLeastSquares(tones=2, h=0.4)
+    state = options.start(INTERVAL).state() | extra
+    if not extra:
+        del state["counters"]
+    with pytest.raises(DataError, match=r"this is not the state of"):
+        options.restore(INTERVAL, state)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"prefilter": 0.004}, r"prefilter = 0\.004 s is shorter than half a sampling interval"),
+        ({"h": 1e300}, r"h = 1e\+300 s is more than 10,000,000 sampling intervals"),
+        ({"h": 1e6}, r"h = 1e\+06 s is more than 10,000,000 sampling intervals"),
+    ],
+)
+def test_delays_that_a_clock_cannot_have_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        RestartingLeastSquares(**{"tones": 1, "h": 0.4, **options}).start(INTERVAL)
