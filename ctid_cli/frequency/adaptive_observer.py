@@ -333,7 +333,7 @@ def advance_observer(
         determined = factorise(moments, 0.0, factor, scales)
         for p in range(n):
             omega[k, p] = np.sqrt(squares[p])
-            average[p] += min(smoothing, 1.0) * (omega[k, p] - average[p])
+            average[p] += smoothing * (omega[k, p] - average[p])
             uncertainty[k, p] = np.nan
             if determined:
                 for j in range(n):

@@ -106,10 +106,8 @@ def fit_sinusoids(samples: ArrayLike, interval: float, omega: ArrayLike, *, bias
         require_positive("omega", float(frequency), "rad/s")
     # The middle of the record as origin of time: sines and cosines are then as different as the record allows.
     middle = 0.5 * (t[0] + t[-1])
-    design = harmonic_design(t - middle, frequencies, bias=bias)
-    coefficients = solve_design(design, y)
+    _, coefficients, residual = fit_amplitudes(y, t - middle, frequencies, bias=bias)
     n = frequencies.size
-    residual = y - design @ coefficients
     phases = np.arctan2(coefficients[n : 2 * n], coefficients[:n]) - frequencies * middle
     return Sinusoids(
         frequencies,
@@ -211,6 +209,39 @@ def solve_design(design: Array, y: Array) -> Array:
     return np.asarray(coefficients)
 
 
+def fit_amplitudes(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[Array, Array, Array]:
+    """Sines and cosines of known frequencies, by least squares.
+
+    Parameters
+    ----------
+    y : ndarray, shape (N,)
+        Samples.
+    t : ndarray, shape (N,)
+        Their instants [s].
+    omega : ndarray, shape (n,)
+        Frequencies [rad/s].
+    bias : bool
+        Whether there is a constant.
+
+    Returns
+    -------
+    design : ndarray, shape (N, p)
+        Sines, cosines and, if asked for, a constant.
+    coefficients : ndarray, shape (p,)
+        Of these columns [signal unit].
+    residual : ndarray, shape (N,)
+        What they leave [signal unit].
+
+    Raises
+    ------
+    DataError
+        If the sinusoids cannot be told apart.
+    """
+    design = harmonic_design(t, omega, bias=bias)
+    coefficients = solve_design(design, y)
+    return design, coefficients, y - design @ coefficients
+
+
 def frequency_errors(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[Array, Array, float]:
     r"""Gauss-Newton step of the frequencies, and the error that the residual could make.
 
@@ -242,9 +273,7 @@ def frequency_errors(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[A
     """
     n = omega.size
     time = t - 0.5 * (t[0] + t[-1])
-    design = harmonic_design(time, omega, bias=bias)
-    coefficients = solve_design(design, y)
-    residual = y - design @ coefficients
+    design, coefficients, residual = fit_amplitudes(y, time, omega, bias=bias)
     slopes = time[:, None] * (design[:, n : 2 * n] * coefficients[:n] - design[:, :n] * coefficients[n : 2 * n])
     # What of the slopes the amplitudes cannot follow.
     orthogonal, _ = np.linalg.qr(design)
@@ -287,13 +316,11 @@ def flag_insignificant(y: Array, t: Array, omega: Array, *, bias: bool) -> Flag:
     analysis", *Proc. Royal Society A* 125 (1929) 54-59, for many samples).
     """
     try:
-        design = harmonic_design(t - 0.5 * (t[0] + t[-1]), omega, bias=bias)
-        coefficients = solve_design(design, y)
+        _, coefficients, residual = fit_amplitudes(y, t - 0.5 * (t[0] + t[-1]), omega, bias=bias)
     except DataError:
         return Flag.UNDETERMINED
     n = omega.size
-    residual = y - design @ coefficients
-    variance = float(residual @ residual) / max(y.size - design.shape[1] - n, 1)
+    variance = float(residual @ residual) / max(y.size - coefficients.size - n, 1)
     weakest = float((coefficients[:n] ** 2 + coefficients[n : 2 * n] ** 2).min())
     strongest_of_noise = 4.0 * variance / y.size * np.log(0.5 * y.size / FALSE_TONE)
     return Flag(0) if weakest > strongest_of_noise else Flag.UNDETERMINED

@@ -1,10 +1,10 @@
-"""Options that hold one number for each tone, and times that are counted in samples."""
+"""Options that hold one number for each tone, bounds of frequencies, and times that are counted in samples."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ctid_cli.signals.checks import require_positive
+from ctid_cli.signals.checks import require_not_negative, require_positive
 
 #: A sample larger than this counts as missing: its powers would overflow.
 LARGEST_SAMPLE = 1e30
@@ -65,3 +65,26 @@ def samples_in(duration: float, interval: float) -> int:
     (200, True)
     """
     return round(min(duration / interval, float(1 << 62)))
+
+
+def require_bounds(lowest: float, highest: float | None) -> None:
+    """Refuse bounds of frequencies that leave nothing between them.
+
+    Parameters
+    ----------
+    lowest : float
+        Option ``lowest_frequency`` [rad/s].
+    highest : float or None
+        Option ``highest_frequency`` [rad/s]; None for no bound.
+
+    Raises
+    ------
+    ValueError
+        If the lower one is negative, or not below the upper one.
+    """
+    require_not_negative("lowest_frequency", lowest, "rad/s")
+    if highest is None:
+        return
+    require_positive("highest_frequency", highest, "rad/s")
+    if lowest >= highest:
+        raise ValueError(f"lowest_frequency ({lowest:g} rad/s) must be below highest_frequency ({highest:g} rad/s).")

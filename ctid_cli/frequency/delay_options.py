@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ctid_cli.frequency.checks import require_bounds
 from ctid_cli.frequency.consistency import second_lag
 from ctid_cli.frequency.prefilter import impulse_response
 from ctid_cli.frequency.regression import MOST_TONES, delay_table, whole_delay
@@ -150,9 +151,5 @@ class DelayRegression(OnlineEstimator):
                 f"with h = {delay:g} s, frequencies above pi/h = {unique:g} rad/s are seen as lower ones, but "
                 f"highest_frequency is {highest:g} rad/s; use an h below {np.pi / highest:g} s."
             )
-        if self.lowest_frequency >= highest:
-            raise ValueError(
-                f"lowest_frequency ({self.lowest_frequency:g} rad/s) must be below highest_frequency "
-                f"({highest:g} rad/s)."
-            )
+        require_bounds(self.lowest_frequency, highest)
         return min(highest, unique)

@@ -10,11 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.amplitudes import flag_insignificant, frequency_errors, present_samples
+from ctid_cli.frequency.checks import require_bounds
 from ctid_cli.frequency.decoding import flag_uncertain
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.regression import MOST_TONES
 from ctid_cli.frequency.tracking import FrequencyEstimate
-from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
+from ctid_cli.signals.checks import require_integer, require_not_negative
 
 Array = NDArray[np.float64]
 
@@ -81,14 +82,7 @@ class Esprit:
     def __post_init__(self) -> None:
         require_integer("tones", self.tones, 1, MOST_TONES)
         require_not_negative("averaging", self.averaging, "s")
-        require_not_negative("lowest_frequency", self.lowest_frequency, "rad/s")
-        if self.highest_frequency is not None:
-            require_positive("highest_frequency", self.highest_frequency, "rad/s")
-            if self.highest_frequency <= self.lowest_frequency:
-                raise ValueError(
-                    f"lowest_frequency ({self.lowest_frequency:g} rad/s) must be below highest_frequency "
-                    f"({self.highest_frequency:g} rad/s)."
-                )
+        require_bounds(self.lowest_frequency, self.highest_frequency)
 
     def blocks(self, count: int, interval: float) -> tuple[int, int, float]:
         """How a record is averaged and arranged.

@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ctid_cli.filtering.exponential import held_step
-from ctid_cli.frequency.checks import one_for_each, samples_in
+from ctid_cli.frequency.checks import one_for_each, require_bounds, samples_in
 from ctid_cli.frequency.decoding import flag_uncertain, root_real_parts, root_sensitivities
 from ctid_cli.frequency.flags import COMPLEX_ROOTS, GAP, OUT_OF_BOUNDS, STARTING, UNDETERMINED
 from ctid_cli.frequency.moments import accumulate_row, factorise, least_squares, moment_uncertainty, squared_residual
@@ -97,14 +97,7 @@ class FilterRegression(OnlineEstimator):
         require_positive("forgetting", self.forgetting, "1/s")
         require_choice("algorithm", self.algorithm, get_args(Algorithm))
         require_not_negative("hold", self.hold, "s")
-        require_not_negative("lowest_frequency", self.lowest_frequency, "rad/s")
-        if self.highest_frequency is not None:
-            require_positive("highest_frequency", self.highest_frequency, "rad/s")
-            if self.highest_frequency <= self.lowest_frequency:
-                raise ValueError(
-                    f"lowest_frequency ({self.lowest_frequency:g} rad/s) must be below highest_frequency "
-                    f"({self.highest_frequency:g} rad/s)."
-                )
+        require_bounds(self.lowest_frequency, self.highest_frequency)
         for name, unit in (("gains", "-"), ("initial_frequencies", "rad/s")):
             object.__setattr__(self, name, one_for_each(name, getattr(self, name), self.tones, unit))
 
