@@ -10,10 +10,14 @@ import control
 import numpy as np
 from scipy import optimize, signal
 
-from ctid_cli.estimators import Start, Svf, TdSrivc
-from ctid_cli.filtering import simulate
-from ctid_cli.models import TransferFunction
-from ctid_cli.signals import Prbs, Record, WhiteNoise
+from ctid_cli.estimation.common import Start
+from ctid_cli.estimators.svf import Svf
+from ctid_cli.estimators.td_srivc import TdSrivc
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.excitation import Prbs
+from ctid_cli.signals.noise import WhiteNoise
+from ctid_cli.signals.record import Record
 
 SYSTEM = TransferFunction([2], [0.25, 0.7, 1], 8.0)
 BOUNDS = (0.0, 15.0)

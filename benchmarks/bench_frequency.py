@@ -4,17 +4,15 @@ import time
 
 import numpy as np
 
-from ctid_cli.frequency import (
-    AdaptiveObserver,
-    DremFiniteTime,
-    DremGradient,
-    DremWindow,
-    Esprit,
-    FilterRegression,
-    NonlinearLeastSquares,
-    RestartingLeastSquares,
-)
+from ctid_cli.frequency.adaptive_observer import AdaptiveObserver
+from ctid_cli.frequency.drem_finite_time import DremFiniteTime
+from ctid_cli.frequency.drem_gradient import DremGradient
+from ctid_cli.frequency.drem_window import DremWindow
+from ctid_cli.frequency.esprit import Esprit
+from ctid_cli.frequency.filter_regression import FilterRegression
+from ctid_cli.frequency.nonlinear_least_squares import NonlinearLeastSquares
 from ctid_cli.frequency.regression import delay_table
+from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 
 INTERVAL = 0.001
 SAMPLES = 200_000

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from bench_measured import exact_zoh, multi_start
 
-from ctid_cli.estimators import Start
-from ctid_cli.experiment.plan import build_plan
-from ctid_cli.experiment.spec import load_spec
+from ctid_cli.estimation.common import Start
+from ctid_cli.running.plan import build_plan
+from ctid_cli.specification.spec import load_spec
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "useful_redundancy"
 METHODS = ("delay_profile", "profile_spectral", "proposed", "proposed_spectral")

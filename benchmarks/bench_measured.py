@@ -12,11 +12,15 @@ import time
 import numpy as np
 from scipy import linalg, optimize, signal
 
-from ctid_cli.estimators import Svf
-from ctid_cli.estimators.measured import DelayProfile
-from ctid_cli.filtering import simulate
-from ctid_cli.models import TransferFunction
-from ctid_cli.signals import HeldSignal, Prbs, Record, Step, WhiteNoise, read_record
+from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.estimators.svf import Svf
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.csv_file import read_record
+from ctid_cli.signals.excitation import Prbs, Step
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.noise import WhiteNoise
+from ctid_cli.signals.record import Record
 
 TARGET = 10
 #: Largest relative excess of our cost.

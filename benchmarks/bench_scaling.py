@@ -4,9 +4,9 @@ import time
 
 import numpy as np
 
-from ctid_cli.filtering import filter_data, second_moments
-from ctid_cli.models import TransferFunction
-from ctid_cli.signals import Record
+from ctid_cli.filtering.bank import filter_data, second_moments
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.record import Record
 
 LENGTHS = (1_000, 10_000, 100_000, 1_000_000)
 SYSTEM = TransferFunction([2], [0.25, 0.7, 1], 8.0123)

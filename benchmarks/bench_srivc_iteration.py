@@ -4,12 +4,15 @@ import time
 
 import numpy as np
 
-from ctid_cli.estimators.problems import CoefficientProblem
-from ctid_cli.estimators.refined_iv import iterate
-from ctid_cli.filtering import filter_data, simulate
-from ctid_cli.inference import Structure
-from ctid_cli.models import TransferFunction
-from ctid_cli.signals import Prbs, Record, WhiteNoise
+from ctid_cli.estimation.problems import CoefficientProblem
+from ctid_cli.estimation.refined_iv import iterate
+from ctid_cli.filtering.bank import filter_data
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.excitation import Prbs
+from ctid_cli.signals.noise import WhiteNoise
+from ctid_cli.signals.record import Record
 
 ITERATIONS = 20
 REPEATS = 100

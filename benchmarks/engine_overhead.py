@@ -17,9 +17,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from ctid_cli.experiment.engine import run_experiment, usable_processors
-from ctid_cli.experiment.pool import kill_workers
-from tests.experiment.fakes import FakePlan, Toy
+from ctid_cli.running.engine import run_experiment, usable_processors
+from ctid_cli.running.pool import kill_workers
+from tests.running.fakes import FakePlan, Toy
 
 TASK = 0.05
 TARGET = 0.10

@@ -24,19 +24,7 @@ class DataError(UsageError):
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing wrong in a specification, with its place in the file.
-
-    Parameters
-    ----------
-    file : str
-        Name of the file as the user gave it.
-    line, column : int
-        Position of the offending key or value, counted from 1.
-    key : str
-        Key path, for example ``sampling.interval``; empty for the file as a whole.
-    message : str
-        What is wrong and what is allowed.
-    """
+    """One thing wrong in a specification, with its place in the file."""
 
     file: str
     line: int

@@ -10,26 +10,48 @@ import typing
 import pytest
 
 import ctid_cli
+from ctid_cli.estimators.registry import ESTIMATORS
+from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
+from ctid_cli.signals.excitation import EXCITATIONS
+from ctid_cli.signals.multi_sine import DISTURBANCES
+from ctid_cli.signals.noise import NOISES
+from ctid_cli.signals.sampling import SAMPLINGS
+
+
+def members_of(name, member):
+    """A callable and, of a class, its public methods, by name."""
+    yield name, member
+    if inspect.isclass(member):
+        for method_name, method in vars(member).items():
+            if not method_name.startswith("_") and callable(getattr(member, method_name)):
+                plain = inspect.unwrap(getattr(method, "__func__", method))
+                # Methods that a library put into the class, such as pydantic's, are documented there.
+                if inspect.isfunction(plain) and plain.__module__ == member.__module__:
+                    yield f"{name}.{method_name}", plain
 
 
 def public_callables():
+    """What `ctid_cli` exports, and every class whose options a specification gives."""
+    for name in ctid_cli.__all__:
+        member = getattr(ctid_cli, name)
+        if callable(member):
+            yield from members_of(name, member)
+    for registry in (DISTURBANCES, ESTIMATORS, EXCITATIONS, FREQUENCY_ESTIMATORS, NOISES, SAMPLINGS):
+        for kind, member in registry.items():
+            if member.__name__ not in ctid_cli.__all__:
+                yield from members_of(kind, member)
+
+
+def internal_docstrings():
+    """The docstring of every other function, method and class of the package."""
+    public = {id(inspect.unwrap(member)) for member in CALLABLES.values()}
     for info in pkgutil.walk_packages(ctid_cli.__path__, "ctid_cli."):
-        if "._" in info.name:
-            continue
         module = importlib.import_module(info.name)
         for name, member in vars(module).items():
-            if name.startswith("_") or getattr(member, "__module__", None) != info.name:
-                continue
-            if inspect.isclass(member):
-                yield f"{info.name}.{name}", member
-                for method_name, method in vars(member).items():
-                    if not method_name.startswith("_") and callable(getattr(member, method_name)):
-                        plain = inspect.unwrap(getattr(method, "__func__", method))
-                        # Methods that a library put into the class, such as pydantic's, are documented there.
-                        if inspect.isfunction(plain) and plain.__module__ == info.name:
-                            yield f"{info.name}.{name}.{method_name}", plain
-            elif callable(member) and inspect.isfunction(plain := inspect.unwrap(member)):
-                yield f"{info.name}.{name}", plain
+            if getattr(member, "__module__", None) == info.name and callable(member):
+                for full, found in members_of(f"{info.name}.{name}", inspect.unwrap(member)):
+                    if id(found) not in public and found.__doc__:
+                        yield full, found.__doc__
 
 
 def documented(text):
@@ -90,8 +112,16 @@ def test_the_check_sees_what_is_missing_and_what_is_too_much():
 
     assert documented(inspect.getdoc(function)) == ["one", "rest", "three"]
     assert expected(function) == ["one", "two", "rest"]
-    assert {
-        "ctid_cli.signals.excitation.Prbs",
-        "ctid_cli.signals.excitation.Prbs.generate",
-    } <= CALLABLES.keys()
-    assert "ctid_cli.signals.record.Record.from_arrays" in CALLABLES
+    assert {"Prbs", "Prbs.generate", "Record.from_arrays"} <= CALLABLES.keys()
+
+
+def test_the_public_surface_is_small_and_shown():
+    assert len(ctid_cli.__all__) <= 60
+    assert set(ctid_cli.__all__) <= set(dir(ctid_cli))
+
+
+def test_internal_docstrings_do_not_repeat_signatures():
+    sections = re.compile(r"^ *(Parameters|Returns|Yields|Raises|Attributes)\n *-{3,}", re.MULTILINE)
+    found = dict(internal_docstrings())
+    assert len(found) > 500
+    assert [name for name, text in found.items() if sections.search(text)] == []

@@ -22,37 +22,12 @@ class CheckCommand(TyperCommand):
     further = typer.main.get_group(_further).commands
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """Parse the command line.
-
-        Parameters
-        ----------
-        info_name : str or None
-            Name under which the command was called.
-        args : list of str
-            The words after it.
-        parent : context or None, default None
-            Of the program.
-        **extra : Any
-            Settings of the context.
-
-        Returns
-        -------
-        context
-            Of this command, or of the further check that the first word names.
-        """
+        """Parse the command line."""
         if args and args[0] in self.further:
             return self.further[args[0]].make_context(f"{info_name} {args[0]}", args[1:], parent, **extra)
         return super().make_context(info_name, args, parent, **extra)
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Write the end of the help: the further checks.
-
-        Parameters
-        ----------
-        ctx : context
-            Of this command.
-        formatter : formatter
-            To write to.
-        """
+        """Write the end of the help: the further checks."""
         with formatter.section("Further checks"):
             formatter.write_dl([(name, command.get_short_help_str(80)) for name, command in self.further.items()])

@@ -26,18 +26,7 @@ INTERRUPTED = 130
 
 
 def write_files(files: Mapping[Path, bytes]) -> None:
-    """Write files, and make the folders that they need.
-
-    Parameters
-    ----------
-    files : mapping of Path to bytes
-        Content by name.
-
-    Raises
-    ------
-    StorageError
-        If one cannot be written.
-    """
+    """Write files, and make the folders that they need."""
     for path, content in files.items():
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -47,19 +36,7 @@ def write_files(files: Mapping[Path, bytes]) -> None:
 
 
 def guarded(command: Command) -> Command:
-    """Turn the exceptions of a command into one message and an exit code.
-
-    Parameters
-    ----------
-    command : callable
-        Body of a command.
-
-    Returns
-    -------
-    callable
-        The same command: a ``CtidError`` ends in its message and exit code, Ctrl-C in 130, and any other exception
-        in a traceback file and one line that names it.
-    """
+    """Turn the exceptions of a command into one message and an exit code."""
 
     @functools.wraps(command)
     def wrapper(*args: Any, **kwargs: Any) -> None:

@@ -11,35 +11,13 @@ import typer
 from ctid_cli.errors import Problem, SpecError, UsageError
 
 if TYPE_CHECKING:
-    from ctid_cli.experiment.plan import Plan
+    from ctid_cli.running.plan import Plan
 
 
 def load_plans(configs: Sequence[Path], overrides: Sequence[str], runs: int | None = None) -> list[tuple[Path, Plan]]:
-    """Read and check experiment files; warnings go to stderr.
-
-    Parameters
-    ----------
-    configs : sequence of Path
-        Experiment files.
-    overrides : sequence of str
-        ``key=value`` replacements, applied to each of them.
-    runs : int, optional
-        Data sets per data cell, in place of the files' own number.
-
-    Returns
-    -------
-    list of (Path, Plan)
-        In the order given.
-
-    Raises
-    ------
-    SpecError
-        With the problems of all files.
-    UsageError
-        If two files describe the same experiment.
-    """
-    from ctid_cli.experiment.plan import build_plan
-    from ctid_cli.experiment.spec import load_spec
+    """Read and check experiment files; warnings go to stderr."""
+    from ctid_cli.running.plan import build_plan
+    from ctid_cli.specification.spec import load_spec
 
     problems: list[Problem] = []
     plans: list[tuple[Path, Plan]] = []
@@ -64,18 +42,7 @@ def load_plans(configs: Sequence[Path], overrides: Sequence[str], runs: int | No
 
 
 def workload(plan: Plan) -> str:
-    """How much work a plan asks for.
-
-    Parameters
-    ----------
-    plan : Plan
-        The plan.
-
-    Returns
-    -------
-    str
-        For example ``40 data sets (2 data cells), 280 estimates``.
-    """
+    """How much work a plan asks for."""
     from ctid_cli.reporting.layout import count
 
     tasks = plan.tasks()

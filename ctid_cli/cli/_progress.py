@@ -18,7 +18,7 @@ from ctid_cli.reporting.layout import count, seconds
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from ctid_cli.experiment.events import Event
+    from ctid_cli.running.events import Event
 
 #: Seconds between two lines where stderr is not a terminal.
 LINE_EVERY = 10.0
@@ -27,15 +27,7 @@ QUICK = 2.0
 
 
 class Reporter:
-    """Shows the events of one run on stderr.
-
-    Parameters
-    ----------
-    experiment : str
-        Name shown in front.
-    clock : callable, optional
-        Source of time [s].
-    """
+    """Shows the events of one run on stderr."""
 
     def __init__(self, experiment: str, clock: Callable[[], float] = time.monotonic) -> None:
         self.experiment = experiment
@@ -55,14 +47,8 @@ class Reporter:
             self._bar.stop()
 
     def __call__(self, event: Event) -> None:
-        """Show one event.
-
-        Parameters
-        ----------
-        event : Event
-            What happened.
-        """
-        from ctid_cli.experiment import events
+        """Show one event."""
+        from ctid_cli.running import events
 
         match event:
             case events.PlanReady():
@@ -110,7 +96,7 @@ class Reporter:
         self._bar.start()
 
     def _advance(self, event: Any) -> None:
-        from ctid_cli.experiment.manifest import FAILURES
+        from ctid_cli.storage.manifest import FAILURES
 
         self.failed += sum(row["status"] in FAILURES for row in event.rows)
         now = self._clock()
@@ -132,20 +118,9 @@ class Reporter:
 
 
 def json_lines(event: Event) -> list[str]:
-    """An event as JSON objects, one per line; a data set gives one object per estimate.
-
-    Parameters
-    ----------
-    event : Event
-        What happened.
-
-    Returns
-    -------
-    list of str
-        Each object names its kind under ``event``.
-    """
-    from ctid_cli.experiment import events
+    """An event as JSON objects, one per line; a data set gives one object per estimate."""
     from ctid_cli.reporting.estimate import as_object
+    from ctid_cli.running import events
 
     if isinstance(event, events.DataSetDone):
         lines = [{"event": "estimate", **as_object(row)} for row in event.rows]

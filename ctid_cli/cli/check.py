@@ -33,7 +33,7 @@ def check(
 
     from ctid_cli.inference.record_check import check_record_quality
     from ctid_cli.reporting.record_report import record_object, record_text
-    from ctid_cli.signals import read_measurement
+    from ctid_cli.signals.measurement import read_measurement
 
     measurement = read_measurement(file, time=time, input=input, output=output, hold=hold.value, start=start, stop=stop)
     report = check_record_quality(

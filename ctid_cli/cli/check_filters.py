@@ -32,8 +32,8 @@ def check_filters(
     import json
 
     from ctid_cli.errors import UsageError
-    from ctid_cli.filtering import FilterSet
-    from ctid_cli.filtering import check_filters as verify
+    from ctid_cli.filtering.filter_set import FilterSet
+    from ctid_cli.filtering.filter_set import check_filters as verify
     from ctid_cli.reporting.filter_report import filter_object, filter_text
     from ctid_cli.signals.checks import require_integer, require_positive
 

@@ -31,10 +31,10 @@ def export(
     import json
 
     from ctid_cli.errors import StorageError
-    from ctid_cli.experiment.store import load_estimates
-    from ctid_cli.experiment.summary import export_rows
     from ctid_cli.reporting.estimate import as_object
     from ctid_cli.reporting.results import read_results
+    from ctid_cli.storage.store import load_estimates
+    from ctid_cli.storage.summary import export_rows
 
     results = read_results(out, experiment)
     if style is ExportFormat.csv:

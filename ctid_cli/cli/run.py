@@ -10,8 +10,8 @@ import typer
 from ctid_cli.cli._common import Out, guarded
 
 if TYPE_CHECKING:
-    from ctid_cli.experiment.engine import RunSummary
-    from ctid_cli.experiment.events import Event, PlanReady
+    from ctid_cli.running.engine import RunSummary
+    from ctid_cli.running.events import Event, PlanReady
 
 
 @guarded
@@ -45,7 +45,7 @@ def run(
     from ctid_cli.cli._planning import load_plans
     from ctid_cli.cli._progress import Reporter, json_lines
     from ctid_cli.errors import TooManyFailuresError
-    from ctid_cli.experiment.engine import preview, run_experiment
+    from ctid_cli.running.engine import preview, run_experiment
 
     plans = load_plans(configs, overrides or [], runs)
     if dry_run:

@@ -26,8 +26,8 @@ def show(
     """
     import json
 
-    from ctid_cli.experiment.store import find_estimate
     from ctid_cli.reporting.detail import detail_object, detail_text, repeat
+    from ctid_cli.storage.store import find_estimate
 
     found = find_estimate(out, id)
     again = repeat(found) if history else None

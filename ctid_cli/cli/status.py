@@ -24,9 +24,9 @@ def status(
     """
     import json
 
-    from ctid_cli.experiment.store import experiment_status
     from ctid_cli.reporting.overview import overview_text, status_object, status_text
     from ctid_cli.reporting.results import experiments_in, read_results
+    from ctid_cli.storage.store import experiment_status
 
     if experiment is None:
         found = [experiment_status(out / name) for name in experiments_in(out)]

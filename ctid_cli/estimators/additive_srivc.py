@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.additive_estimate import Covariance, SubmodelEstimate, estimate_submodels
-from ctid_cli.estimators.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
-from ctid_cli.estimators.common import Start, StartFrom, check_iteration, check_record
-from ctid_cli.estimators.modal_start import automatic_start
-from ctid_cli.estimators.refined_iv import StepRule
+from ctid_cli.estimation.additive_estimate import Covariance, SubmodelEstimate, estimate_submodels
+from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
+from ctid_cli.estimation.common import Start, StartFrom, check_iteration, check_record
+from ctid_cli.estimation.modal_start import automatic_start
+from ctid_cli.estimation.refined_iv import StepRule
 from ctid_cli.filtering.bank import filter_data
 from ctid_cli.filtering.submodels import InitialState
 from ctid_cli.inference.additive_derived import additive_derived
@@ -129,8 +129,8 @@ class AdditiveSrivc:
     --------
     >>> import numpy as np
     >>> from ctid_cli import HeldSignal, Record
-    >>> from ctid_cli.filtering import simulate_additive
-    >>> from ctid_cli.models import AdditiveModel, Submodel, Term
+    >>> from ctid_cli.filtering.sampled import simulate_additive
+    >>> from ctid_cli.models.additive import AdditiveModel, Submodel, Term
     >>> system = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
     >>> rng = np.random.default_rng(1)
     >>> t = 0.05 * np.arange(4000)
@@ -223,18 +223,7 @@ class AdditiveSrivc:
 
 
 def check_terms(terms: tuple[Term, ...]) -> None:
-    """Check that a sum of terms determines its parameters.
-
-    Parameters
-    ----------
-    terms : tuple of Term
-        Degrees of the submodels.
-
-    Raises
-    ------
-    ValueError
-        If two terms integrate or two have direct feed-through, or there are too many poles.
-    """
+    """Check that a sum of terms determines its parameters."""
     if sum(term.integrators > 0 for term in terms) > 1:
         raise ValueError("terms may have integrators in one submodel only: several could not be told apart")
     if sum(term.zeros == term.order for term in terms) > 1:
@@ -246,15 +235,7 @@ def check_terms(terms: tuple[Term, ...]) -> None:
 
 
 class PreparedAdditiveSrivc:
-    """A record checked and laid out for :class:`AdditiveSrivc`.
-
-    Parameters
-    ----------
-    options : AdditiveSrivc
-        The estimator.
-    record : Record
-        The record.
-    """
+    """A record checked and laid out for :class:`AdditiveSrivc`."""
 
     def __init__(self, options: AdditiveSrivc, record: Record) -> None:
         self.options = options
@@ -273,24 +254,7 @@ class PreparedAdditiveSrivc:
         self._automatic: tuple[AdditiveModel, str] | None = None
 
     def fit(self, start: Start | None = None) -> AdditiveFit:
-        """Estimate the submodels.
-
-        Parameters
-        ----------
-        start : Start, optional
-            ``start.model`` has the degrees of the terms, and its delay is not used; without it a start is found from
-            the record.
-
-        Returns
-        -------
-        AdditiveFit
-            The estimate.
-
-        Raises
-        ------
-        DataError
-            If the start does not fit the terms, or nothing can be estimated from it.
-        """
+        """Estimate the submodels."""
         options = self.options
         if start is not None and start.model is not None:
             model, method = start.model, "The start was given."

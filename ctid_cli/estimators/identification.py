@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.measured import AppliedModel, DelayProfile, MeasuredFit, PreparedProfile
+from ctid_cli.estimators.delay_profile import AppliedModel, DelayProfile, MeasuredFit, PreparedProfile
 from ctid_cli.inference.conditioning import (
     CLOSE_TO_ONE,
     LARGE_STANDARD_ERROR,
@@ -48,22 +48,7 @@ DECISIVE = 10.0
 
 @dataclass(frozen=True)
 class Estimate:
-    """One parameter of the model, or of an experiment.
-
-    Parameters
-    ----------
-    name : str
-        ``b0 …``, ``a1 …``, ``delay``, ``x1 …`` (initial state), ``offset``; the last two with the number of the
-        experiment where there are several.
-    value : float
-        Estimate; coefficients belong to descending powers.
-    standard_error : float
-        In the same unit; NaN where it is not defined.
-    low, high : float
-        95 % interval; NaN where it is not defined.
-    status : str
-        ``free``, ``fixed``, ``at bound``, or ``undetermined`` (the data do not tell its value).
-    """
+    """One parameter of the model, or of an experiment."""
 
     name: str
     value: float
@@ -75,25 +60,13 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Validation:
-    """The model on a record that it was not estimated from.
-
-    Parameters
-    ----------
-    name : str
-        The record.
-    applied : AppliedModel
-        Output errors, initial state and offset.
-    fit_percent : float
-        ``100 (1 - ||y - x|| / ||y - mean y||)`` [%].
-    r2 : float
-        ``1 - ||y - x||^2 / ||y - mean y||^2`` [-].
-    count : int
-        Number of samples that were compared.
-    """
+    """The model on a record that it was not estimated from."""
 
     name: str
     applied: AppliedModel = field(repr=False)
+    #: ``100 (1 - ||y - x|| / ||y - mean y||)`` [%].
     fit_percent: float
+    #: ``1 - ||y - x||^2 / ||y - mean y||^2`` [-].
     r2: float
     count: int
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.additive_estimate import Covariance, estimate_submodels
-from ctid_cli.estimators.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
-from ctid_cli.estimators.common import (
+from ctid_cli.estimation.additive_estimate import Covariance, estimate_submodels
+from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
+from ctid_cli.estimation.common import (
     Start,
     StartFrom,
     check_iteration,
@@ -20,13 +20,13 @@ from ctid_cli.estimators.common import (
     finish,
     history_entry,
 )
-from ctid_cli.estimators.problems import (
+from ctid_cli.estimation.problems import (
     CoefficientProblem,
     least_squares_start,
     refit_numerator,
     with_stable_denominator,
 )
-from ctid_cli.estimators.refined_iv import Equations, Iterated, StepRule, iterate
+from ctid_cli.estimation.refined_iv import Equations, Iterated, StepRule, iterate
 from ctid_cli.filtering.bank import FilterData, filter_data, standard_rows
 from ctid_cli.inference.diagnostics import percent_from_r_squared
 from ctid_cli.inference.fit import Fit, IterationRecord
@@ -199,15 +199,7 @@ class Srivc:
 
 
 class PreparedSrivc:
-    """A record checked and laid out for :class:`Srivc`.
-
-    Parameters
-    ----------
-    options : Srivc
-        The estimator.
-    record : Record
-        The record.
-    """
+    """A record checked and laid out for :class:`Srivc`."""
 
     def __init__(self, options: Srivc, record: Record) -> None:
         self.options = options
@@ -216,23 +208,7 @@ class PreparedSrivc:
         check_record(record, self.data, self.structure.size)
 
     def fit(self, start: Start | None = None) -> Fit:
-        """Estimate the coefficients.
-
-        Parameters
-        ----------
-        start : Start, optional
-            Initial parameters, as the sum of submodels that they make; by least squares without them.
-
-        Returns
-        -------
-        Fit
-            The estimate.
-
-        Raises
-        ------
-        DataError
-            If the start does not fit the degrees, or the equations of the least-squares start are singular.
-        """
+        """Estimate the coefficients."""
         options = self.options
         problem = CoefficientProblem(self.data, self.structure, options.delay)
         if start is not None and start.model is not None:
@@ -273,13 +249,6 @@ class PreparedSubmodelSrivc:
     """A record checked and laid out for :class:`Srivc` as additive SRIVC with a single submodel.
 
     This is how it runs in closed loop (CLSRIVC), and in open loop where steps are relaxed.
-
-    Parameters
-    ----------
-    options : Srivc
-        The estimator.
-    record : Record
-        The record, with its loop for closed-loop instruments.
     """
 
     def __init__(self, options: Srivc, record: Record) -> None:
@@ -293,24 +262,6 @@ class PreparedSubmodelSrivc:
     def fit(self, start: Start | None = None) -> Fit:
         """Estimate the coefficients.
 
-        Parameters
-        ----------
-        start : Start, optional
-            Initial parameters, as the sum of submodels that they make; by least squares without them.
-
-        Returns
-        -------
-        Fit
-            The estimate.
-
-        Raises
-        ------
-        DataError
-            If the start does not fit the degrees, the equations of the least-squares start are singular, or the loop of
-            the start is unstable.
-
-        Notes
-        -----
         It is additive SRIVC with a single submodel; coefficients and covariance are converted to the monic form.
         """
         options, problem, structure = self.options, self.problem, self.structure
@@ -350,25 +301,7 @@ class PreparedSubmodelSrivc:
 
 
 def given_coefficients(model: AdditiveModel, structure: Structure) -> Array:
-    """Initial coefficients from a sum of submodels.
-
-    Parameters
-    ----------
-    model : AdditiveModel
-        The start.
-    structure : Structure
-        Degrees.
-
-    Returns
-    -------
-    ndarray, shape (n + m + 1,)
-        ``(a_1 … a_n, b_0 … b_m)``, unstable poles reflected.
-
-    Raises
-    ------
-    DataError
-        If the sum has another number of poles, or more zeros.
-    """
+    """Initial coefficients from a sum of submodels."""
     whole = unfactored(model)
     if whole.order != structure.poles or whole.numerator.size > structure.zeros + 1:
         raise DataError(
@@ -380,22 +313,7 @@ def given_coefficients(model: AdditiveModel, structure: Structure) -> Array:
 
 
 def initial_coefficients(problem: CoefficientProblem, svf_cutoff: float, variant: StepRule) -> Array | None:
-    """Least-squares start; the guarded variant re-fits the numerator to the output error.
-
-    Parameters
-    ----------
-    problem : CoefficientProblem
-        Record, degrees and delay.
-    svf_cutoff : float
-        Cut-off of the state-variable filter [rad/s].
-    variant : {"plain", "guarded", "relaxed"}
-        Variant of the iteration.
-
-    Returns
-    -------
-    ndarray, shape (n + m + 1,) or None
-        Start; None if the equations are singular.
-    """
+    """Least-squares start; the guarded variant re-fits the numerator to the output error."""
     data: FilterData = problem.data
     theta = least_squares_start(data, problem.structure, problem.delay, svf_cutoff)
     if theta is not None and variant == "guarded":

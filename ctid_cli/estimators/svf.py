@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar, get_args
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.common import Start, StartFrom, check_record, check_structure, finish, history_entry
-from ctid_cli.estimators.problems import CoefficientProblem, least_squares_start
+from ctid_cli.estimation.common import Start, StartFrom, check_record, check_structure, finish, history_entry
+from ctid_cli.estimation.problems import CoefficientProblem, least_squares_start
 from ctid_cli.filtering.bank import filter_data
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.sensitivity import Structure
@@ -109,15 +109,7 @@ class Svf:
 
 
 class PreparedSvf:
-    """A record checked and laid out for :class:`Svf`.
-
-    Parameters
-    ----------
-    options : Svf
-        The estimator.
-    record : Record
-        The record.
-    """
+    """A record checked and laid out for :class:`Svf`."""
 
     def __init__(self, options: Svf, record: Record) -> None:
         self.options = options
@@ -126,23 +118,7 @@ class PreparedSvf:
         check_record(record, self.data, self.structure.size)
 
     def fit(self, start: Start | None = None) -> Fit:
-        """Estimate the coefficients.
-
-        Parameters
-        ----------
-        start : Start, optional
-            Ignored: least squares needs no start.
-
-        Returns
-        -------
-        Fit
-            The estimate.
-
-        Raises
-        ------
-        DataError
-            If the equations are singular.
-        """
+        """Estimate the coefficients."""
         options = self.options
         theta = least_squares_start(self.data, self.structure, options.delay, options.svf_cutoff)
         if theta is None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.common import (
+from ctid_cli.estimation.common import (
     Start,
     StartFrom,
     check_iteration,
@@ -19,9 +19,9 @@ from ctid_cli.estimators.common import (
     history_entry,
     initial_delay,
 )
-from ctid_cli.estimators.delay_search import Descent, Minimum, bound_in_the_way, delay_step, descend
-from ctid_cli.estimators.problems import CoefficientProblem, DelayProblem
-from ctid_cli.estimators.refined_iv import Equations, Iterated, Variant, iterate
+from ctid_cli.estimation.delay_search import Descent, Minimum, bound_in_the_way, delay_step, descend
+from ctid_cli.estimation.problems import CoefficientProblem, DelayProblem
+from ctid_cli.estimation.refined_iv import Equations, Iterated, Variant, iterate
 from ctid_cli.estimators.srivc import initial_coefficients
 from ctid_cli.filtering.bank import FilterData, filter_data
 from ctid_cli.filtering.lowpass import Lowpass
@@ -167,15 +167,7 @@ class TdSrivc:
 
 
 class PreparedTdSrivc:
-    """A record checked, laid out and filtered for :class:`TdSrivc`.
-
-    Parameters
-    ----------
-    options : TdSrivc
-        The estimator.
-    record : Record
-        The record.
-    """
+    """A record checked, laid out and filtered for :class:`TdSrivc`."""
 
     def __init__(self, options: TdSrivc, record: Record) -> None:
         self.options = options
@@ -197,23 +189,7 @@ class PreparedTdSrivc:
             self.search_data = filter_data(filtered, greatest, options.hold_output)
 
     def fit(self, start: Start | None = None) -> Fit:
-        """Estimate coefficients and delay from one start.
-
-        Parameters
-        ----------
-        start : Start, optional
-            Initial delay; the middle of the bounds by default.
-
-        Returns
-        -------
-        Fit
-            The estimate.
-
-        Raises
-        ------
-        DataError
-            If the start lies outside the bounds, or the equations of the start are singular.
-        """
+        """Estimate coefficients and delay from one start."""
         options = self.options
         delay = initial_delay(start, options.delay_bounds)
         history: list[IterationRecord] = []
@@ -225,20 +201,7 @@ class PreparedTdSrivc:
         return self.refine(found, history)
 
     def refine(self, found: Descent, history: list[IterationRecord]) -> Fit:
-        """Go on from a delay and coefficients that a search on filtered data has found.
-
-        Parameters
-        ----------
-        found : Descent
-            Result of the search.
-        history : list of IterationRecord
-            Its accepted steps; those of the refinement are added.
-
-        Returns
-        -------
-        Fit
-            The estimate.
-        """
+        """Go on from a delay and coefficients that a search on filtered data has found."""
         cost = _SampleCost(self.data, self.structure, self.options)
         refined = cost.descend(found.minimum.delay, found.minimum.theta, "refine", history)
         if refined is None:

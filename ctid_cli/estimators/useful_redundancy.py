@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.common import Start, StartFrom, check_iteration, check_structure, initial_delay
-from ctid_cli.estimators.delay_grid import scan
-from ctid_cli.estimators.delay_search import Descent, Minimum, descend
-from ctid_cli.estimators.filtered_costs import Effort, FilteredCost, Search, filtered_costs
-from ctid_cli.estimators.redundancy import Path, RedundantMinimum, SearchStatus, Visit, minimise_redundantly
+from ctid_cli.estimation.common import Start, StartFrom, check_iteration, check_structure, initial_delay
+from ctid_cli.estimation.delay_grid import scan
+from ctid_cli.estimation.delay_search import Descent, Minimum, descend
+from ctid_cli.estimation.filtered_costs import Effort, FilteredCost, Search, filtered_costs
+from ctid_cli.estimation.redundancy import Path, RedundantMinimum, SearchStatus, Visit, minimise_redundantly
 from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.inference.answer import output_bandwidth
@@ -43,26 +43,16 @@ NOTHING = 100.0
 
 @dataclass(frozen=True, eq=False)
 class FilterPath:
-    """One solver path: Gauss-Newton on the delay with one filter.
-
-    Parameters
-    ----------
-    round : int
-        Round of the search, counted from 1.
-    filter : int
-        Index of the filter, 0 for that of the longest period.
-    delays : ndarray, shape (K,)
-        Accepted trial delays [s], where it started first: the incumbent, or a period of the filter away from it.
-    costs : ndarray, shape (K,)
-        ``100 ||y - x|| / ||y - mean y||`` of the filtered data there [%].
-    coefficients : ndarray, shape (K, n + m + 1)
-        ``(a_1 … a_n, b_0 … b_m)`` there.
-    """
+    """One solver path: Gauss-Newton on the delay with one filter."""
 
     round: int
     filter: int
+    #: Accepted trial delays [s], where it started first: the incumbent, or a period of the filter away from it, shape
+    #: (K,).
     delays: Array
+    #: ``100 ||y - x|| / ||y - mean y||`` of the filtered data there [%], shape (K,).
     costs: Array
+    #: ``(a_1 … a_n, b_0 … b_m)`` there, shape (K, n + m + 1).
     coefficients: Array
 
 
@@ -157,7 +147,7 @@ class UsefulRedundancy:
     --------
     >>> import numpy as np
     >>> from ctid_cli import HeldSignal, Record, TransferFunction, UsefulRedundancy, simulate
-    >>> from ctid_cli.estimators import Start
+    >>> from ctid_cli.estimation.common import Start
     >>> t = 0.05 * np.arange(2000)
     >>> u = HeldSignal(t, np.random.default_rng(0).choice([-1.0, 1.0], t.size))
     >>> y = simulate(TransferFunction([2], [0.25, 0.7, 1], delay=8), u, t)
@@ -255,15 +245,7 @@ class UsefulRedundancy:
 
 
 class PreparedUsefulRedundancy:
-    """A record checked, laid out and filtered for :class:`UsefulRedundancy`.
-
-    Parameters
-    ----------
-    options : UsefulRedundancy
-        The estimator.
-    record : Record
-        The record.
-    """
+    """A record checked, laid out and filtered for :class:`UsefulRedundancy`."""
 
     def __init__(self, options: UsefulRedundancy, record: Record) -> None:
         self.options = options
@@ -293,53 +275,15 @@ class PreparedUsefulRedundancy:
         self._known: dict[int, tuple[float, list[Minimum | None]]] = {}
 
     def member_costs(self, delay: float) -> Array:
-        """Costs of all filters at a delay, each with its own coefficients.
-
-        Parameters
-        ----------
-        delay : float
-            Delay [s].
-
-        Returns
-        -------
-        ndarray, shape (filters,)
-            ``100 ||y_k - x_k|| / ||y_k - mean y_k||`` [%], of the filter of longest period first.
-        """
+        """Costs of all filters at a delay, each with its own coefficients."""
         return np.array([self._percent(k, minimum) for k, minimum in enumerate(self._minima(delay))])
 
     def reference_cost(self, delay: float) -> float:
-        """J0 at the nearest point of a lattice of a tenth of the shortest period: the mean of all members' costs.
-
-        Parameters
-        ----------
-        delay : float
-            Delay [s].
-
-        Returns
-        -------
-        float
-            J0 [%].
-        """
+        """J0 at the nearest point of a lattice of a tenth of the shortest period: the mean of all members' costs."""
         return self._at(delay)[0]
 
     def fit(self, start: Start | None = None) -> RedundantFit:
-        """Estimate coefficients and delay from one start.
-
-        Parameters
-        ----------
-        start : Start, optional
-            Initial delay; the middle of the bounds by default.
-
-        Returns
-        -------
-        RedundantFit
-            The estimate.
-
-        Raises
-        ------
-        DataError
-            If the start lies outside the bounds, or nothing can be computed at any candidate.
-        """
+        """Estimate coefficients and delay from one start."""
         options = self.options
         delay = initial_delay(start, options.delay_bounds)
         paths: list[FilterPath] = []

@@ -44,33 +44,19 @@ WHOLE_INTERVAL = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class FilterData:
-    """A record laid out for the compiled passes.
+    """A record laid out for the compiled passes."""
 
-    Parameters
-    ----------
-    t, y : ndarray, shape (N,)
-        Sampling instants [s] and outputs, masked samples bridged by straight lines.
-    use : ndarray of bool, shape (N,)
-        Samples that enter sums: present, and not before the start-up time.
-    tu, u : ndarray, shape (M,)
-        Breaks [s] and values of the input.
-    input_foh : bool
-        Whether the input is held linearly.
-    y_foh : bool
-        Whether the output is taken as linear between samples (else constant). It never biases a converged estimate.
-    interval : float or None
-        The common interval [s] if input and output share one regular clock.
-    common_clock : bool
-        Whether ``tu`` equals ``t``.
-    """
-
+    #: Sampling instants [s] and outputs, masked samples bridged by straight lines, shape (N,).
     t: Array
     y: Array
+    #: Samples that enter sums: present, and not before the start-up time, shape (N,).
     use: BoolArray
+    #: Breaks [s] and values of the input, shape (M,).
     tu: Array
     u: Array
     input_foh: bool
     y_foh: bool
+    #: The common interval [s] if input and output share one regular clock.
     interval: float | None
     common_clock: bool
 
@@ -86,39 +72,12 @@ class FilterData:
 
 
 def plain_array(values: ArrayLike) -> Array:
-    """A fresh, writeable, contiguous array.
-
-    Parameters
-    ----------
-    values : array_like
-        Numbers.
-
-    Returns
-    -------
-    ndarray
-        A copy. Compiled code tells read-only arrays from others and would be compiled anew for every mixture of them.
-    """
+    """A fresh, writeable, contiguous array."""
     return np.array(values, dtype=np.float64, order="C")
 
 
 def filter_data(record: Record, start: float = 0.0, hold_output: Hold = "foh") -> FilterData:
-    """Lay a record out for filtering.
-
-    Parameters
-    ----------
-    record : Record
-        The record.
-    start : float, default 0.0
-        Samples earlier than this after the first input break [s] do not enter sums: the longest trial delay, so that
-        the delayed input is known wherever the output is compared.
-    hold_output : {"foh", "zoh"}, default "foh"
-        Interpolation of the measured output inside the estimator's own filters.
-
-    Returns
-    -------
-    FilterData
-        Arrays for the compiled passes.
-    """
+    """Lay a record out for filtering."""
     slack = 1e-9 * (record.interval or 0.0)
     use = record.valid & (record.t >= record.input.t[0] + start - slack)
     on_grid = record.input_on_grid
@@ -138,20 +97,7 @@ def filter_data(record: Record, start: float = 0.0, hold_output: Hold = "foh") -
 
 @njit(cache=True, nogil=True)
 def scaled_denominator(coefficients: Array, w0: float) -> Array:
-    """Coefficients of a monic denominator in the time unit 1/w0.
-
-    Parameters
-    ----------
-    coefficients : ndarray, shape (n + 1,)
-        Monic, descending powers.
-    w0 : float
-        Characteristic frequency [rad/s].
-
-    Returns
-    -------
-    ndarray, shape (n + 1,)
-        ``a_k / w0^k``.
-    """
+    """Coefficients of a monic denominator in the time unit 1/w0."""
     scaled = np.empty(coefficients.size)
     for k in range(coefficients.size):
         scaled[k] = coefficients[k] / w0**k
@@ -160,26 +106,7 @@ def scaled_denominator(coefficients: Array, w0: float) -> Array:
 
 @njit(cache=True, nogil=True)
 def double_chain(a: Array, b: Array) -> tuple[float, Array, Array, Array, Array]:
-    """Realise 1/A driven by the input and a second 1/A driven by the output of B/A.
-
-    Parameters
-    ----------
-    a : ndarray, shape (n + 1,)
-        Monic denominator, descending powers.
-    b : ndarray, shape (m + 1,)
-        Numerator, ``m < n``.
-
-    Returns
-    -------
-    w0 : float
-        Time unit is 1/w0 [rad/s].
-    dynamics, gain : ndarray, shapes (2 n, 2 n), (2 n,)
-        The cascade in that unit.
-    powers : ndarray, shape (n, n)
-        Row k: ``p^k/A v`` (p in rad/s) from the n states of either chain.
-    output : ndarray, shape (n,)
-        ``B/A v`` from the first n states.
-    """
+    """Realise 1/A driven by the input and a second 1/A driven by the output of B/A."""
     n = a.size - 1
     m = b.size - 1
     w0 = time_scale(a)
@@ -231,22 +158,7 @@ def _to_standard(mapping: Array, rows: Array, gram: Array, want_rows: bool) -> A
 
 @njit(cache=True, nogil=True)
 def split_delay(delay: float, interval: float) -> tuple[int, float]:
-    """Whole intervals by which the read-out lags, and the fraction of an interval read beyond that break.
-
-    Parameters
-    ----------
-    delay : float
-        Delay [s].
-    interval : float
-        Sampling interval [s].
-
-    Returns
-    -------
-    shift : int
-        ``t_k - delay`` lies in the interval that starts at break ``k - shift``.
-    fraction : float
-        Position in that interval, in [0, 1).
-    """
+    """Whole intervals by which the read-out lags, and the fraction of an interval read beyond that break."""
     ratio = delay / interval
     shift = int(np.ceil(ratio))
     fraction = shift - ratio
@@ -332,21 +244,7 @@ def _evaluate(coefficients: Array, point: complex) -> tuple[complex, complex, co
 
 @njit(cache=True, nogil=True)
 def modal_condition(roots: ComplexArray, slopes: ComplexArray, curvatures: ComplexArray) -> float:
-    """How much the partial fractions of ``p^k/A^2`` amplify rounding, against the peak gain of each.
-
-    Parameters
-    ----------
-    roots : ndarray, shape (n,)
-        Poles [rad/s].
-    slopes, curvatures : ndarray, shape (n,)
-        ``A'`` and ``A''/A'`` there.
-
-    Returns
-    -------
-    float
-        Gains are compared at zero frequency and at the magnitude of every pole; the worst power k counts. Infinite
-        with a repeated pole.
-    """
+    """How much the partial fractions of ``p^k/A^2`` amplify rounding, against the peak gain of each."""
     n = roots.size
     worst = 0.0
     for k in range(n):
@@ -372,26 +270,7 @@ def modal_condition(roots: ComplexArray, slopes: ComplexArray, curvatures: Compl
 
 @njit(cache=True, nogil=True)
 def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Array]:
-    """Partial fractions of the standard rows.
-
-    Parameters
-    ----------
-    a : ndarray, shape (n + 1,)
-        Monic denominator.
-    b : ndarray, shape (m + 1,)
-        Numerator, ``m < n``.
-
-    Returns
-    -------
-    condition : float
-        Amplification of rounding by the expansion; infinite with a repeated pole or one at the origin.
-    poles : ndarray, shape (modes,)
-        One pole of each conjugate pair [rad/s].
-    residues : ndarray, shape (modes,)
-        ``x = sum Re(residue z)``.
-    mapping : ndarray, shape (3 n + 3, 3 n + 2)
-        Standard rows from the rows of the modal pass.
-    """
+    """Partial fractions of the standard rows."""
     n = a.size - 1
     w0 = time_scale(a)
     roots = polynomial_roots(scaled_denominator(a, w0)) * w0
@@ -563,30 +442,7 @@ def standard_moments(
     want_rows: bool,
     limit: float,
 ) -> Array:
-    """Second moments of the standard rows, or the rows: one compiled entry, so that a call costs one crossing.
-
-    Parameters
-    ----------
-    a : ndarray, shape (n + 1,)
-        Monic denominator, descending powers.
-    b : ndarray, shape (m + 1,)
-        Numerator, ``m < n``.
-    delay : float
-        Delay of the input [s].
-    interval : float
-        Common interval of a regular clock [s]; 0 on any other.
-    tu, u, input_foh, t, y, y_foh, common_clock, use : ndarray, bool
-        The record, see :class:`FilterData`.
-    want_rows : bool
-        Whether the rows are wanted in the place of their moments.
-    limit : float
-        Amplification of rounding up to which partial fractions are used.
-
-    Returns
-    -------
-    ndarray
-        Moments, shape (3 n + 3, 3 n + 3), or rows, shape (count, 3 n + 3).
-    """
+    """Second moments of the standard rows, or the rows: one compiled entry, so that a call costs one crossing."""
     condition, poles, residues, mapping = modal_map(a, b)
     if condition < limit:
         return _modal(
@@ -619,48 +475,10 @@ def _run(data: FilterData, a: Array, b: Array, delay: float, want_rows: bool, fo
 
 
 def second_moments(data: FilterData, a: Array, b: Array, delay: float = 0.0, form: Form = "auto") -> Array:
-    """Sums of products of the standard rows over the used samples.
-
-    Parameters
-    ----------
-    data : FilterData
-        The record.
-    a : ndarray, shape (n + 1,)
-        Monic denominator, descending powers.
-    b : ndarray, shape (m + 1,)
-        Numerator, ``m < n``.
-    delay : float, default 0.0
-        Delay of the input [s].
-    form : {"auto", "modal", "chain"}, default "auto"
-        Realisation of 1/A; ``auto`` takes partial fractions while they are well conditioned. Both give the same.
-
-    Returns
-    -------
-    ndarray, shape (3 n + 3, 3 n + 3)
-        Second moments in the order of the standard rows.
-    """
+    """Sums of products of the standard rows over the used samples."""
     return _run(data, a, b, delay, False, form)
 
 
 def standard_rows(data: FilterData, a: Array, b: Array, delay: float = 0.0, form: Form = "auto") -> Array:
-    """The standard rows themselves.
-
-    Parameters
-    ----------
-    data : FilterData
-        The record.
-    a : ndarray, shape (n + 1,)
-        Monic denominator, descending powers.
-    b : ndarray, shape (m + 1,)
-        Numerator, ``m < n``.
-    delay : float, default 0.0
-        Delay of the input [s].
-    form : {"auto", "modal", "chain"}, default "auto"
-        Realisation of 1/A.
-
-    Returns
-    -------
-    ndarray, shape (count, 3 n + 3)
-        One line per used sample.
-    """
+    """The standard rows themselves."""
     return _run(data, a, b, delay, True, form)

@@ -11,17 +11,7 @@ Array = NDArray[np.float64]
 
 @njit(cache=True, nogil=True)
 def place(target: Array, row: int, column: int, source: Array) -> None:
-    """Copy a small matrix into a larger one. (Slice assignment costs seconds of compilation in every kernel.)
-
-    Parameters
-    ----------
-    target : ndarray
-        Matrix to write into.
-    row, column : int
-        Where the upper left corner goes.
-    source : ndarray
-        Matrix to copy.
-    """
+    """Copy a small matrix into a larger one. (Slice assignment costs seconds of compilation in every kernel.)"""
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):
             target[row + i, column + j] = source[i, j]
@@ -45,18 +35,6 @@ def _multiply(left: Array, right: Array, out: Array) -> None:
 def exponential_minus_identity(matrix: Array) -> Array:
     r"""``exp(M) - I`` of a small matrix.
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (n, n)
-        M, dimensionless.
-
-    Returns
-    -------
-    ndarray, shape (n, n)
-        ``exp(M) - I``.
-
-    Notes
-    -----
     Scaling and squaring on ``X = exp(M/2^s) - I`` by ``X <- 2 X + X X``. Squaring X instead of I + X keeps the
     relative accuracy of slow modes when a fast one forces many squarings (poles spread over six decades).
     """
@@ -90,26 +68,7 @@ def exponential_minus_identity(matrix: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def held_step(dynamics: Array, gain: Array, step: float) -> tuple[Array, Array, Array]:
-    r"""Exact map of ``z' = F z + g v`` over one step with v constant or linear.
-
-    Parameters
-    ----------
-    dynamics : ndarray, shape (n, n)
-        F [1/time].
-    gain : ndarray, shape (n,)
-        g [1/time].
-    step : float
-        Length of the step [time].
-
-    Returns
-    -------
-    transition : ndarray, shape (n, n)
-        ``E = exp(F step)``.
-    from_value : ndarray, shape (n,)
-        Response of z to ``v = 1``.
-    from_change : ndarray, shape (n,)
-        Response of z to v rising from 0 to 1 over the step.
-    """
+    r"""Exact map of ``z' = F z + g v`` over one step with v constant or linear."""
     n = gain.size
     augmented = np.zeros((n + 2, n + 2))
     for i in range(n):

@@ -103,36 +103,10 @@ def _check_beta(beta: float) -> None:
 def sufficient_number_of_filters(beta: float, bandwidth: float, largest_error: float) -> int:
     r"""A number of filters that satisfies the necessary condition (40) for sure; often many fewer do.
 
-    Parameters
-    ----------
-    beta : float
-        Ratio of the longest to the shortest period [-], from :data:`LEAST_BETA` to 10.
-    bandwidth : float
-        Bandwidth of the system [rad/s].
-    largest_error : float
-        Largest delay error to start from [s].
-
-    Returns
-    -------
-    int
-        Number of filters; 1 where, by (37), the filter of longest period converges to zero by itself.
-
-    Raises
-    ------
-    ValueError
-        If an argument is out of its range.
-
-    Notes
-    -----
     Equations (55)-(57): with i0 the first maximum of the longest period, by (36), that is not below the largest error,
     ``nf >= (1/M + beta - 2)/(1/M - 1)``, ``M = (z - 4/(z pi^2))/(z + 2 - 4/((z + 2) pi^2))``, ``z = 4 i0 - 3``. All of
     that rests on (36). With the true extrema the number suffices from beta = 1.7192 on; below, errors just beyond the
     first maximum of the longest period lie under every positive minimum, and no number of filters helps.
-
-    Examples
-    --------
-    >>> sufficient_number_of_filters(10, 26.85, 15), sufficient_number_of_filters(10, 2.02, 15)
-    (114, 1)
     """
     _check_beta(beta)
     require_positive("bandwidth", bandwidth, "rad/s")
@@ -149,45 +123,26 @@ def sufficient_number_of_filters(beta: float, bandwidth: float, largest_error: f
 
 @dataclass(frozen=True)
 class ServedInterval:
-    """Delay errors from which the same filters lead closer to zero, to the same minima.
+    """Delay errors from which the same filters lead closer to zero, to the same minima."""
 
-    Parameters
-    ----------
-    low, high : float
-        Ends of the open interval of absolute delay errors [s].
-    filters : tuple of int
-        Indices of the filters that help, that of the minimum nearest to zero first.
-    minimum : float
-        The minimum nearest to zero [s], at most ``low``.
-    """
-
+    #: Ends of the open interval of absolute delay errors [s].
     low: float
     high: float
     filters: tuple[int, ...]
+    #: The minimum nearest to zero [s], at most ``low``.
     minimum: float
 
 
 @dataclass(frozen=True)
 class FilterCheck:
-    """Whether a set of ideal low-pass filters leads from every delay error closer to zero.
+    """Whether a set of ideal low-pass filters leads from every delay error closer to zero."""
 
-    Parameters
-    ----------
-    cutoffs : tuple of float
-        Cut-off frequencies [rad/s].
-    largest_error : float
-        Largest absolute delay error looked at [s].
-    intervals : tuple of ServedInterval
-        Where some filter helps, by rising error; together with the gaps they fill the range.
-    gaps : tuple of (float, float)
-        Open intervals of absolute delay errors [s] from which no filter leads closer to zero.
-    exact : bool
-        Whether the extrema are the roots of (51), else the approximation (36).
-    """
-
+    #: Cut-off frequencies [rad/s].
     cutoffs: tuple[float, ...]
+    #: Largest absolute delay error looked at [s].
     largest_error: float
     intervals: tuple[ServedInterval, ...]
+    #: Open intervals of absolute delay errors [s] from which no filter leads closer to zero.
     gaps: tuple[tuple[float, float], ...]
     exact: bool
 
@@ -197,25 +152,7 @@ class FilterCheck:
         return not self.gaps
 
     def path(self, initial_error: float) -> list[tuple[int, float]]:
-        """Descents that lead from a delay error towards zero.
-
-        Parameters
-        ----------
-        initial_error : float
-            Delay error to start from [s], of either sign.
-
-        Returns
-        -------
-        list of (int, float)
-            Index of the filter and delay error [s] where its descent ends, step by step. Each step takes the filter
-            whose minimum is nearest to zero, the lowest index of several. The last error is zero unless the path runs
-            into a gap.
-
-        Raises
-        ------
-        ValueError
-            If the initial error lies outside the range of the check.
-        """
+        """Descents that lead from a delay error towards zero."""
         if not abs(initial_error) <= self.largest_error:
             raise ValueError(
                 f"the check covers delay errors up to {self.largest_error:g} s, not {abs(initial_error):g} s; "

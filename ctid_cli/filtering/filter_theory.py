@@ -38,35 +38,8 @@ def ideal_cost(delay_error: ArrayLike, cutoff: float, noise_intensity: float = 0
 
     The input is white noise of unit intensity.
 
-    Parameters
-    ----------
-    delay_error : array_like
-        Estimated minus true delay [s].
-    cutoff : float
-        Cut-off frequency of the ideal filter [rad/s].
-    noise_intensity : float, default 0.0
-        Intensity of white output noise [output unit² s]. It lifts the cost by what an ideal low-pass filter of this
-        cut-off lets through.
-
-    Returns
-    -------
-    ndarray, shape of ``delay_error``
-        Cost [output unit²]; 0-dimensional for a single number.
-
-    Raises
-    ------
-    ValueError
-        If the cut-off frequency is not positive or the noise intensity is negative.
-
-    Notes
-    -----
     Equation (50): ``J(d) = 2 wc/pi - 2 sin(wc d)/(pi d) + lambda wc/pi``, the integral (35) with
     ``|L G0| = 1`` up to wc. Near d = 0 a series keeps all digits: ``J(d) ~ wc^3 d^2/(3 pi)``.
-
-    Examples
-    --------
-    >>> ideal_cost([0.0, 1.0, 1e6], cutoff=2 * np.pi).round(4)
-    array([0., 4., 4.])
     """
     require_positive("cutoff", cutoff, "rad/s")
     require_not_negative("noise_intensity", noise_intensity, "output unit² s")
@@ -84,35 +57,9 @@ def ideal_cost(delay_error: ArrayLike, cutoff: float, noise_intensity: float = 0
 def extrema(cutoff: float, count: int, exact: bool = False) -> Array:
     r"""Positive delay errors at which the ideal cost has its extrema.
 
-    Parameters
-    ----------
-    cutoff : float
-        Cut-off frequency [rad/s].
-    count : int
-        How many, from the smallest on.
-    exact : bool, default False
-        Whether to solve (51) to the last digit instead of approximating by (36).
-
-    Returns
-    -------
-    ndarray, shape (count,)
-        Extrema [s]: maximum, minimum, maximum, ... The global minimum at zero is not among them.
-
-    Raises
-    ------
-    ValueError
-        If the cut-off frequency is not positive or the count not a whole number, zero or more.
-
-    Notes
-    -----
     The extrema are those of ``sin(x)/x``, ``x = wc d``: the roots of ``tan x = x`` (51), one just below each
     ``q = (i + 1/2) pi``. Equation (36) is ``x ~ q - 1/q``; it lies above the root, by 0.15 % for i = 1, 0.018 % for
     i = 2, and less beyond.
-
-    Examples
-    --------
-    >>> extrema(1.0, 3).round(4), extrema(1.0, 3, exact=True).round(4)
-    (array([ 4.5002,  7.7267, 10.9046]), array([ 4.4934,  7.7253, 10.9041]))
     """
     require_positive("cutoff", cutoff, "rad/s")
     require_integer("count", count, 0)
@@ -128,30 +75,7 @@ def extrema(cutoff: float, count: int, exact: bool = False) -> Array:
 
 
 def convergence_region(cutoff: float, exact: bool = False) -> float:
-    r"""Delay error up to which a descent of the ideal cost ends at zero.
-
-    Parameters
-    ----------
-    cutoff : float
-        Cut-off frequency [rad/s].
-    exact : bool, default False
-        Whether to solve (51) to the last digit instead of approximating by (37).
-
-    Returns
-    -------
-    float
-        First maximum of the cost [s]: (37), ``(3 pi/2 - 2/(3 pi))/wc``, about 0.716 periods.
-
-    Raises
-    ------
-    ValueError
-        If the cut-off frequency is not positive.
-
-    Examples
-    --------
-    >>> round(convergence_region(0.202), 3), round(convergence_region(0.202, exact=True), 3)
-    (22.278, 22.245)
-    """
+    r"""Delay error up to which a descent of the ideal cost ends at zero."""
     return float(extrema(cutoff, 1, exact)[0])
 
 
@@ -164,46 +88,10 @@ def filtered_cost(
 ) -> Array:
     r"""Cost of a delay error for any rational system and any low-pass filter, the rational part being known.
 
-    Parameters
-    ----------
-    delay_error : array_like
-        Estimated minus true delay [s].
-    system : TransferFunction
-        Stable system; its own delay does not matter.
-    lowpass : Lowpass or TransferFunction
-        Low-pass filter.
-    input_spectrum : callable or None, default None
-        Spectral density of the input [input unit² s] at an array of frequencies [rad/s], an even function; None is
-        white noise of unit intensity.
-    noise_intensity : float, default 0.0
-        Intensity of white output noise [output unit² s].
-
-    Returns
-    -------
-    ndarray, shape of ``delay_error``
-        Cost [output unit²]; 0-dimensional for a single number.
-
-    Raises
-    ------
-    ValueError
-        If the system or the filter is not stable, the integral does not exist because the two together have as many
-        zeros as poles (for noise: the filter alone), the noise intensity is negative, the input spectrum is negative
-        or not finite somewhere, or the integrand turns more than some ten thousand times before it fades.
-
-    Notes
-    -----
     Equation (35). With ``1 - cos w d = 2 sin²(w d/2)`` no term of the integrand is negative, so small costs keep their
     digits too: the relative error is below 1e-10 for white input. Up to ten times the fastest corner frequency, or one
     oscillation, panels are halved until their Gauss-Legendre sums settle; what is left of slowly falling gains beyond
     it is a Fourier integral.
-
-    Examples
-    --------
-    A system whose output has the autocorrelation ``exp(-2 |d|)/4``:
-
-    >>> cost = filtered_cost([0.0, 1.0], TransferFunction([1, 1], [1, 2]), Lowpass(1.0, 1))
-    >>> np.allclose(cost, [0.0, 2 * (0.25 - 0.25 * np.exp(-2.0))], rtol=1e-12)
-    True
     """
     require_not_negative("noise_intensity", noise_intensity, "output unit² s")
     parts = (system, lowpass)

@@ -22,43 +22,14 @@ Array = NDArray[np.float64]
 
 
 def free_response_size(terms: Sequence[Term]) -> int:
-    """Number of parameters of the free responses.
-
-    Parameters
-    ----------
-    terms : sequence of Term
-        Degrees of the submodels.
-
-    Returns
-    -------
-    int
-        The order of the whole model.
-    """
+    """Number of parameters of the free responses."""
     return sum(term.order for term in terms)
 
 
 def free_response(
     theta: Array, free: Array, terms: Sequence[Term], elapsed: Array
 ) -> tuple[Array, Array, Array] | None:
-    """Free response and its sensitivities.
-
-    Parameters
-    ----------
-    theta : ndarray, shape (p,)
-        ``a_1 … a_n, b_0 … b_m`` of each submodel in turn.
-    free : ndarray, shape (f,)
-        ``c_0 … c_(n+l-1)`` of each submodel in turn.
-    terms : sequence of Term
-        Degrees of the submodels.
-    elapsed : ndarray, shape (N,)
-        Time since the first sample [s].
-
-    Returns
-    -------
-    x, by_theta, by_free : ndarray, shapes (N,), (N, p), (N, f), or None
-        The response [output unit] and its derivatives, zero with respect to every b; None where a submodel has nearly
-        repeated poles.
-    """
+    """Free response and its sensitivities."""
     combined: list[Array] = []
     degrees = []
     place_theta, place_free = 0, 0

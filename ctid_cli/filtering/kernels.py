@@ -41,17 +41,6 @@ INVERSE_FACTORIALS = tuple(1.0 / math.factorial(k + 2) for k in range(11))
 def accumulate(block: Array, count: int, gram: Array) -> None:
     """Add the products of buffered rows to the upper triangle of a Gram matrix.
 
-    Parameters
-    ----------
-    block : ndarray, shape (q, BLOCK)
-        Rows, one column per sample.
-    count : int
-        Columns that are filled.
-    gram : ndarray, shape (q, q)
-        Sums; what is below the diagonal is not meaningful.
-
-    Notes
-    -----
     Two rows with two others at a time: each number that is loaded enters two products, which halves the time.
     """
     q = block.shape[0]
@@ -117,35 +106,7 @@ def regular_chain_pass(
     rows: Array,
     gram: Array,
 ) -> None:
-    """Pass over a regular clock in chain form: any poles, repeated ones included.
-
-    Parameters
-    ----------
-    transition, from_value, from_change : ndarray
-        One-interval map of the input filter, shapes (nz, nz), (nz,), (nz,).
-    output_map : ndarray, shape (nz + 2,)
-        ``x_k`` from ``[z_j, u_j, u_(j+1) - u_j]`` with ``j = k - shift``.
-    u : ndarray, shape (N,)
-        Input samples.
-    input_foh : bool
-        Whether the input is held linearly.
-    shift : int
-        Whole intervals by which the read-out lags the sample.
-    y_transition, y_from_value, y_from_change : ndarray
-        One-interval map of the output filter, shapes (ny, ny), (ny,), (ny,); ny may be 0.
-    y : ndarray, shape (N,)
-        Output samples, gaps filled.
-    y_foh : bool
-        Whether the output is held linearly.
-    use : ndarray of bool, shape (N,)
-        Samples that enter rows and moments.
-    output : ndarray, shape (N,) or (0,)
-        Receives x at every sample, if asked for.
-    rows : ndarray, shape (count, nz + 3 + ny) or (0, 0)
-        Receives the rows ``[z_j, u_j, du_j, z_y, y_k - x_k]``, if asked for.
-    gram : ndarray, shape (nz + 3 + ny, nz + 3 + ny) or (0, 0)
-        Receives their second moments, if asked for.
-    """
+    """Pass over a regular clock in chain form: any poles, repeated ones included."""
     nz, ny = from_value.size, y_from_value.size
     q = nz + 3 + ny
     n_samples = y.size
@@ -201,18 +162,7 @@ def regular_chain_pass(
 
 @njit(cache=True, nogil=True)
 def shortest_gap(t: Array, tu: Array) -> float:
-    """Shortest interval between neighbouring instants of either clock.
-
-    Parameters
-    ----------
-    t, tu : ndarray, shapes (N,), (M,)
-        Increasing instants.
-
-    Returns
-    -------
-    float
-        The interval; 0 if neither clock has two instants.
-    """
+    """Shortest interval between neighbouring instants of either clock."""
     gap = np.inf
     for k in range(t.size - 1):
         gap = min(gap, t[k + 1] - t[k])
@@ -253,21 +203,7 @@ def _step_functions(x: complex) -> tuple[complex, complex, complex]:
 
 @njit(cache=True, nogil=True)
 def step_weights(pole: complex, step: float) -> tuple[complex, complex, complex, complex, complex, complex]:
-    """Weights with which a mode and its square move over a step.
-
-    Parameters
-    ----------
-    pole : complex
-        p [rad/s].
-    step : float
-        Length h of the step [s].
-
-    Returns
-    -------
-    tuple of complex
-        ``exp(p h)``, the weight of z in w, those of the value at the start and of the change over the step in z, and
-        the same two in w, for ``z = 1/(s - p) v`` and ``w = 1/(s - p)^2 v`` with v linear over the step.
-    """
+    """Weights with which a mode and its square move over a step."""
     x = pole * step
     decay, value, slope = _step_functions(x)
     square = step * step
@@ -323,40 +259,7 @@ def modal_pass(
     rows: Array,
     gram: Array,
 ) -> None:
-    """Pass in modal form, for simple poles, on any clock.
-
-    Parameters
-    ----------
-    poles : ndarray, shape (modes,)
-        Simple non-zero poles, one of each conjugate pair (that with positive imaginary part) [rad/s].
-    output_map : ndarray, shape (modes,)
-        Residues r: ``x = sum Re(r z)``, twice the residue for a pair.
-    interval : float
-        The common interval [s] of a regular clock, which makes every exponential a constant; 0 on an irregular one.
-    shift, fraction : int, float
-        The delay on a regular clock, see :func:`ctid_cli.filtering.bank.split_delay`.
-    tu, u : ndarray, shape (M,)
-        Breaks [s] and values of the input.
-    input_foh : bool
-        Whether the input is held linearly.
-    delay : float
-        Delay [s].
-    t, y : ndarray, shape (N,)
-        Sampling instants [s] and outputs, gaps filled.
-    y_foh : bool
-        Whether the output is held linearly.
-    common_clock : bool
-        Whether ``tu`` equals ``t``, so that exponentials can be shared.
-    use : ndarray of bool, shape (N,)
-        Samples that enter rows and moments.
-    output : ndarray, shape (N,) or (0,)
-        Receives x at every sample, if asked for.
-    rows : ndarray, shape (count, 3 n + 2) or (0, 0)
-        Receives ``[z, w, v(t_k - tau), z_y, y_k - x_k]``; n numbers each for z, w and z_y: the real part of a mode and,
-        for a pair, the imaginary part after it.
-    gram : ndarray, shape (3 n + 2, 3 n + 2) or (0, 0)
-        Receives their second moments, if asked for.
-    """
+    """Pass in modal form, for simple poles, on any clock."""
     modes = poles.size
     n = 0
     for i in range(modes):
@@ -453,24 +356,7 @@ def modal_pass(
 
 @njit(cache=True, nogil=True)
 def transition_table(dynamics: Array, gain: Array, longest: float) -> tuple[Array, float, Array]:
-    r"""Transitions over the multiples of a small quantum, digit by digit.
-
-    Parameters
-    ----------
-    dynamics, gain : ndarray, shapes (n, n), (n,)
-        F and g of ``z' = F z + g v``.
-    longest : float
-        Longest step that will be asked for.
-
-    Returns
-    -------
-    table : ndarray, shape (levels, BASE, n + 2, n + 2)
-        ``exp(M d BASE^l q)`` for digit d of level l, M acting on ``[z, v, v']``.
-    quantum : float
-        q, so small that a short Taylor series covers what is left.
-    augmented : ndarray, shape (n + 2, n + 2)
-        M.
-    """
+    r"""Transitions over the multiples of a small quantum, digit by digit."""
     n = gain.size
     augmented = np.zeros((n + 2, n + 2))
     place(augmented, 0, 0, dynamics)
@@ -551,35 +437,7 @@ def irregular_chain_pass(
     rows: Array,
     gram: Array,
 ) -> None:
-    """Pass over an irregular clock in chain form: any poles, repeated ones included.
-
-    Parameters
-    ----------
-    dynamics, gain : ndarray, shapes (nz, nz), (nz,)
-        Input filter, in the time unit of all times below.
-    output_map : ndarray, shape (nz,)
-        x from z.
-    tu, u : ndarray, shape (M,)
-        Breaks and values of the input.
-    input_foh : bool
-        Whether the input is held linearly.
-    delay : float
-        Delay.
-    y_dynamics, y_gain : ndarray, shapes (ny, ny), (ny,)
-        Output filter; ny may be 0.
-    t, y : ndarray, shape (N,)
-        Sampling instants and outputs, gaps filled.
-    y_foh : bool
-        Whether the output is held linearly.
-    use : ndarray of bool, shape (N,)
-        Samples that enter rows and moments.
-    output : ndarray, shape (N,) or (0,)
-        Receives x at every sample, if asked for.
-    rows : ndarray, shape (count, nz + 2 + ny) or (0, 0)
-        Receives ``[z(t_k - tau), v(t_k - tau), z_y, y_k - x_k]``, if asked for.
-    gram : ndarray, shape (nz + 2 + ny, nz + 2 + ny) or (0, 0)
-        Receives their second moments, if asked for.
-    """
+    """Pass over an irregular clock in chain form: any poles, repeated ones included."""
     nz, ny = gain.size, y_gain.size
     q = nz + 2 + ny
     n_samples, n_breaks = t.size, tu.size

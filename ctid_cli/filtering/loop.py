@@ -175,37 +175,7 @@ def _closed_loop(
 def loop_state_space(
     model: AdditiveModel | TransferFunction, controller: Controller, interval: float, enters: Enters = "controller"
 ) -> tuple[Array, Array, Array, Array]:
-    r"""State-space form of the closed loop from ``(r, v)`` to ``(u, x)``.
-
-    Parameters
-    ----------
-    model : AdditiveModel or TransferFunction
-        The plant; any proper model, any delay.
-    controller : Controller
-        What makes the input from reference and output.
-    interval : float
-        Sampling interval [s].
-    enters : {"controller", "input"}, default "controller"
-        Whether r enters before or behind the controller.
-
-    Returns
-    -------
-    A : ndarray, shape (n, n)
-        Dynamics; states of the model, its delay line, and the controller.
-    B : ndarray, shape (n, 2)
-        From reference and noise.
-    C : ndarray, shape (2, n)
-        To input and noise-free output.
-    D : ndarray, shape (2, 2)
-        Direct feedthrough.
-
-    Raises
-    ------
-    DataError
-        If the loop has no solution (direct gains of -1 round the loop), or the model has more zeros than poles.
-    ValueError
-        If the interval is not positive or it is not said where the reference enters.
-    """
+    r"""State-space form of the closed loop from ``(r, v)`` to ``(u, x)``."""
     require_choice("enters", enters, get_args(Enters))
     sampled = sampled_model(model, interval)
     discrete = _realised(controller)
@@ -228,34 +198,7 @@ def loop_state_space(
 
 
 def loop_radius(model: AdditiveModel | TransferFunction, controller: Controller, interval: float) -> float:
-    """Largest magnitude of the poles of the sampled loop: it is stable below 1.
-
-    Parameters
-    ----------
-    model : AdditiveModel or TransferFunction
-        The plant; any proper model, any delay.
-    controller : Controller
-        What makes the input from reference and output.
-    interval : float
-        Sampling interval [s].
-
-    Returns
-    -------
-    float
-        Spectral radius [-], poles that cancel included.
-
-    Raises
-    ------
-    DataError
-        As :func:`loop_state_space`.
-    ValueError
-        If the interval is not positive.
-
-    Examples
-    --------
-    >>> round(loop_radius(TransferFunction([1.0], [1.0, 0.0]), DiscreteController([0.5], [1.0]), 1.0), 12)
-    0.5
-    """
+    """Largest magnitude of the poles of the sampled loop: it is stable below 1."""
     dynamics = loop_state_space(model, controller, interval)[0]
     return float(np.abs(np.linalg.eigvals(dynamics)).max(initial=0.0))
 
@@ -269,33 +212,6 @@ def input_sensitivity(
 ) -> NDArray[np.complex128]:
     r"""Frequency response from the reference to the input of the noise-free loop.
 
-    Parameters
-    ----------
-    model : AdditiveModel or TransferFunction
-        The plant G; any proper model, any delay.
-    controller : Controller
-        What makes the input from reference and output, C.
-    interval : float
-        Sampling interval [s].
-    frequencies : array_like, shape (W,)
-        Angular frequencies w [rad/s].
-    enters : {"controller", "input"}, default "controller"
-        Whether r enters before or behind the controller.
-
-    Returns
-    -------
-    ndarray, shape (W,)
-        ``C/(1 + G C)``, or ``1/(1 + G C)`` for a reference behind the controller, at ``exp(j w interval)``.
-
-    Raises
-    ------
-    DataError
-        As :func:`loop_state_space`.
-    ValueError
-        If the interval is not positive or it is not said where the reference enters.
-
-    Notes
-    -----
     Evaluated on the state space of the loop, so it stays finite where model or controller integrate.
     """
     loop = loop_state_space(model, controller, interval, enters)

@@ -22,42 +22,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class SampledModel:
-    r"""``z_(k+1) = F z_k + g u_(k-shift)``, ``x_k = c z_k + d u_(k-shift)`` for an input held between the samples.
+    r"""``z_(k+1) = F z_k + g u_(k-shift)``, ``x_k = c z_k + d u_(k-shift)`` for an input held between the samples."""
 
-    Parameters
-    ----------
-    transition : ndarray, shape (n, n)
-        F, block diagonal for a sum of submodels.
-    from_input : ndarray, shape (n,)
-        g.
-    output : ndarray, shape (n,)
-        c.
-    direct : float
-        d.
-    shift : int
-        Whole samples by which the input arrives late.
-    """
-
+    #: F, block diagonal for a sum of submodels, shape (n, n).
     transition: Array
+    #: g, shape (n,).
     from_input: Array
+    #: c, shape (n,).
     output: Array
     direct: float
     shift: int
 
     def state_space(self) -> tuple[Array, Array, Array, Array]:
-        """Realisation with the late inputs as further states.
-
-        Returns
-        -------
-        A : ndarray, shape (n + shift, n + shift)
-            Dynamics.
-        B : ndarray, shape (n + shift, 1)
-            From the input.
-        C : ndarray, shape (1, n + shift)
-            To the output.
-        D : ndarray, shape (1, 1)
-            Direct feedthrough.
-        """
+        """Realisation with the late inputs as further states."""
         n, size = self.from_input.size, self.from_input.size + self.shift
         A, B, C, D = np.zeros((size, size)), np.zeros((size, 1)), np.zeros((1, size)), np.zeros((1, 1))
         A[:n, :n], C[0, :n] = self.transition, self.output
@@ -73,27 +50,6 @@ class SampledModel:
 def sampled_model(model: AdditiveModel | TransferFunction, interval: float) -> SampledModel:
     r"""Exact zero-order-hold equivalent of a model at rest.
 
-    Parameters
-    ----------
-    model : AdditiveModel or TransferFunction
-        Any proper model, integrators, repeated poles and any delay included.
-    interval : float
-        Sampling interval h [s].
-
-    Returns
-    -------
-    SampledModel
-        Its states are those of each submodel in turn.
-
-    Raises
-    ------
-    DataError
-        If the model has more zeros than poles.
-    ValueError
-        If the interval is not positive.
-
-    Notes
-    -----
     With the delay ``(shift - fraction) h``, ``0 <= fraction < 1``, the output at ``t_k`` is that of the undelayed model
     ``fraction h`` after ``t_(k-shift)``, while it still holds ``u_(k-shift)``.
     """
@@ -133,69 +89,14 @@ def _part(part: TransferFunction, interval: float, fraction: float) -> tuple[Arr
 
 
 def sampled_state_space(model: AdditiveModel | TransferFunction, interval: float) -> tuple[Array, Array, Array, Array]:
-    r"""State-space form ``A, B, C, D`` of :func:`sampled_model`.
-
-    Parameters
-    ----------
-    model : AdditiveModel or TransferFunction
-        Any proper model, integrators, repeated poles and any delay included.
-    interval : float
-        Sampling interval [s].
-
-    Returns
-    -------
-    A : ndarray, shape (n + shift, n + shift)
-        Dynamics: block diagonal for the submodels, then one state for each whole sample of delay, rounded up.
-    B : ndarray, shape (n + shift, 1)
-        From the input.
-    C : ndarray, shape (1, n + shift)
-        To the output.
-    D : ndarray, shape (1, 1)
-        Direct feedthrough.
-
-    Raises
-    ------
-    DataError
-        If the model has more zeros than poles.
-    ValueError
-        If the interval is not positive.
-
-    Examples
-    --------
-    >>> A, B, C, D = sampled_state_space(TransferFunction([1.0], [1.0, 1.0], delay=0.2), 0.1)
-    >>> A.round(4)
-    array([[0.9048, 0.    , 0.0952],
-           [0.    , 0.    , 0.    ],
-           [0.    , 1.    , 0.    ]])
-    """
+    r"""State-space form ``A, B, C, D`` of :func:`sampled_model`."""
     return sampled_model(model, interval).state_space()
 
 
 def state_space_response(
     A: ArrayLike, B: ArrayLike, C: ArrayLike, D: ArrayLike, frequencies: ArrayLike, interval: float
 ) -> NDArray[np.complex128]:
-    r"""``C (q I - A)^(-1) B + D`` at ``q = exp(j w h)``.
-
-    Parameters
-    ----------
-    A : array_like, shape (n, n)
-        Dynamics.
-    B : array_like, shape (n, inputs)
-        From the inputs.
-    C : array_like, shape (outputs, n)
-        To the outputs.
-    D : array_like, shape (outputs, inputs)
-        Direct feedthrough.
-    frequencies : array_like, shape (W,)
-        Angular frequencies w [rad/s].
-    interval : float
-        Sampling interval h [s].
-
-    Returns
-    -------
-    ndarray, shape (W, outputs, inputs)
-        Complex gains.
-    """
+    r"""``C (q I - A)^(-1) B + D`` at ``q = exp(j w h)``."""
     dynamics, inputs, outputs, feedthrough = (np.asarray(matrix, dtype=float) for matrix in (A, B, C, D))
     q = np.exp(1j * np.asarray(frequencies, dtype=float) * interval)
     resolvent = q[:, None, None] * np.eye(len(dynamics)) - dynamics
@@ -231,7 +132,7 @@ def simulate_additive(model: AdditiveModel, signal: HeldSignal, times: ArrayLike
 
     Examples
     --------
-    >>> from ctid_cli.models import Submodel
+    >>> from ctid_cli.models.additive import Submodel
     >>> model = AdditiveModel([Submodel([1.0], [1.0, 1.0]), Submodel([2.0], [0.5, 1.0])])
     >>> simulate_additive(model, HeldSignal([0.0], [1.0]), [1.0]).round(6)
     array([2.36145])

@@ -21,18 +21,7 @@ APART = 0.2
 
 @njit(cache=True, nogil=True)
 def time_scale(denominator: Array) -> float:
-    """Characteristic frequency of a monic polynomial.
-
-    Parameters
-    ----------
-    denominator : ndarray, shape (n + 1,)
-        Monic, descending powers.
-
-    Returns
-    -------
-    float
-        ``|a_n|^(1/n)`` [rad/s], the geometric mean of the poles; with poles at the origin, of the other ones.
-    """
+    """Characteristic frequency of a monic polynomial."""
     order = denominator.size - 1
     for k in range(order, 0, -1):
         if denominator[k] != 0.0:
@@ -42,18 +31,7 @@ def time_scale(denominator: Array) -> float:
 
 @njit(cache=True, nogil=True)
 def polynomial_roots(coefficients: Array) -> ComplexArray:
-    """Roots of a monic real polynomial, fastest first and conjugates side by side.
-
-    Parameters
-    ----------
-    coefficients : ndarray, shape (n + 1,)
-        Monic, descending powers, scaled so that the roots lie around 1.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Roots by falling magnitude; of a conjugate pair the one with positive imaginary part comes first.
-    """
+    """Roots of a monic real polynomial, fastest first and conjugates side by side."""
     n = coefficients.size - 1
     roots = np.zeros(n, np.complex128)
     if n == 1:
@@ -176,22 +154,7 @@ def _pair_conjugates(raw: ComplexArray) -> ComplexArray:
 
 @njit(cache=True, nogil=True)
 def chain(roots: ComplexArray) -> tuple[Array, Array, Array]:
-    """Chain of unit-gain sections and the map from its states to ``s^k/A``.
-
-    Parameters
-    ----------
-    roots : ndarray, shape (n,)
-        Poles as :func:`polynomial_roots` returns them.
-
-    Returns
-    -------
-    dynamics : ndarray, shape (n, n)
-        F of ``z' = F z + g v``: block lower bidiagonal.
-    gain : ndarray, shape (n,)
-        g.
-    powers : ndarray, shape (n, n)
-        Row k gives ``s^k/A v`` as a combination of the states.
-    """
+    """Chain of unit-gain sections and the map from its states to ``s^k/A``."""
     n = roots.size
     dynamics = np.zeros((n, n))
     gain = np.zeros(n)

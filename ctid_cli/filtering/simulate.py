@@ -47,7 +47,7 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
 
     Examples
     --------
-    >>> from ctid_cli.signals import HeldSignal
+    >>> from ctid_cli.signals.held import HeldSignal
     >>> step = HeldSignal([0.0], [1.0])
     >>> simulate(TransferFunction([1], [1, 1], delay=0.5), step, [0.25, 1.5]).round(6)
     array([0.      , 0.632121])

@@ -40,21 +40,6 @@ REMEMBERED = 256
 class RecordSpectra:
     """Spectra of a record's output and of its input at any delay.
 
-    Parameters
-    ----------
-    record : Record
-        The record.
-    window : tuple of float
-        First and last instant of the window [s].
-    count : int
-        Number of frequencies, from ``2 pi / T`` in steps of as much; the mean, at zero frequency, comes on top.
-    greatest_delay : float
-        The greatest delay that will be asked for [s].
-    keep_mean : bool, default True
-        Whether the zero frequency is kept. Without it a constant offset of the output has no effect at all.
-
-    Notes
-    -----
     The input is exact. The output is joined by straight lines between its samples, missing ones left out. That keeps
     the values and slopes at the ends of the window and damps the curvature between them: a wave ``exp(jwt)`` by
     ``(sin(wh/2)/(wh/2))^2`` in an interval of length h. The mean of that factor over the window is taken out of the
@@ -86,25 +71,7 @@ class RecordSpectra:
         return self.window[1] - self.window[0]
 
     def inputs(self, delay: float, count: int | None = None) -> ComplexArray:
-        """Spectrum of the delayed input over the window.
-
-        Parameters
-        ----------
-        delay : float
-            Delay [s], from 0 to the greatest one.
-        count : int, optional
-            Number of frequencies that are needed, from the lowest; all by default.
-
-        Returns
-        -------
-        ndarray, shape (count,)
-            Spectrum of ``u(t - delay)`` [input unit].
-
-        Raises
-        ------
-        ValueError
-            If the delay is out of range.
-        """
+        """Spectrum of the delayed input over the window."""
         if not 0.0 <= delay <= self.greatest_delay:
             raise ValueError(f"the delay must lie between 0 and {self.greatest_delay:g} s, not {delay:g} s")
         needed = self.frequencies.size if count is None else count
@@ -120,43 +87,7 @@ class RecordSpectra:
 def record_spectra(
     record: Record, start: float, highest: float, greatest_delay: float, *, keep_mean: bool = True
 ) -> RecordSpectra:
-    """Lay out the spectra of a record.
-
-    Parameters
-    ----------
-    record : Record
-        The record.
-    start : float
-        The window starts this long after the first input break [s], or at the first sample if that is later: the
-        greatest trial delay, so that the delayed input is known in the whole window. It ends at the last sample.
-    highest : float
-        Highest frequency of interest [rad/s]; half the (median) sampling frequency where that is lower.
-    greatest_delay : float
-        The greatest delay that will be asked for [s].
-    keep_mean : bool, default True
-        Whether the zero frequency is kept. Without it a constant offset of the output has no effect at all.
-
-    Returns
-    -------
-    RecordSpectra
-        The spectra.
-
-    Raises
-    ------
-    DataError
-        If fewer than two samples lie in the window, or it is too short for one period of the highest frequency.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from ctid_cli.signals import Record
-    >>> t = np.arange(0.0, 10.5, 0.5)
-    >>> spectra = record_spectra(Record.from_arrays(t, np.ones(21), t), 2.0, 2.0, 2.0)
-    >>> spectra.window, spectra.frequencies.round(3).tolist()
-    ((2.0, 10.0), [0.0, 0.785, 1.571])
-    >>> spectra.outputs.round(3)
-    array([6.+0.j   , 0.+1.273j, 0.+0.637j])
-    """
+    """Lay out the spectra of a record."""
     present = record.t[record.valid]
     first = max(float(record.input.t[0]) + start, float(present[0]))
     inside = present[present >= first]
@@ -178,20 +109,7 @@ def record_spectra(
 
 
 def lowpass_weight(frequencies: Array, lowpass: Lowpass | None) -> Array:
-    """Squared gain of a Butterworth low-pass filter.
-
-    Parameters
-    ----------
-    frequencies : ndarray, shape (K,)
-        Frequencies [rad/s].
-    lowpass : Lowpass or None
-        The filter; None lets everything pass.
-
-    Returns
-    -------
-    ndarray, shape (K,)
-        ``1/(1 + (w/w_c)^(2 order))`` [-].
-    """
+    """Squared gain of a Butterworth low-pass filter."""
     if lowpass is None:
         return np.ones(frequencies.size)
     # Far above a sharp filter the power overflows to infinity and the weight is 0, as it should be.

@@ -56,28 +56,7 @@ def _add_mode(mapping: Array, row: int, column: int, paired: bool, weight: compl
 def pooled_modes(
     theta: Array, degrees: IntArray, closed: bool
 ) -> tuple[float, ComplexArray, IntArray, ComplexArray, Array, int, float, int, Array, Array, Array]:
-    """Partial fractions of all submodels, and the rows of psi and phi as maps of the rows of the pass.
-
-    Parameters
-    ----------
-    theta : ndarray, shape (p,)
-        ``a_1 … a_n, b_0 … b_m`` of each submodel in turn, ``a_n`` not zero.
-    degrees : ndarray of int, shape (K, 3)
-        Numbers of poles n, of zeros m and of integrators l of each submodel; integrators in one of them at most.
-    closed : bool
-        Whether the rows are those of a closed loop, see :func:`ctid_cli.filtering.submodel_pass.submodel_pass`.
-
-    Returns
-    -------
-    condition : float
-        Amplification of rounding by the expansions; infinite where a submodel has a repeated pole.
-    poles, owner, residues, origin, origin_owner, direct, direct_owner
-        Arguments of the pass.
-    instruments, regressors : ndarray, shape (p, q)
-        psi and phi from the rows of the pass.
-    output : ndarray, shape (q,)
-        Model output driven by z from the rows of the pass.
-    """
+    """Partial fractions of all submodels, and the rows of psi and phi as maps of the rows of the pass."""
     submodels = degrees.shape[0]
     n, order_at_origin, origin_owner, direct_owner = 0, 0, 0, 0
     for i in range(submodels):
@@ -236,22 +215,7 @@ class PooledModes(NamedTuple):
 
 
 def simple_modes(theta: Array, degrees: IntArray, closed: bool) -> PooledModes | None:
-    """Partial fractions where they are well conditioned.
-
-    Parameters
-    ----------
-    theta : ndarray, shape (p,)
-        ``a_1 … a_n, b_0 … b_m`` of each submodel in turn.
-    degrees : ndarray of int, shape (K, 3)
-        Numbers of poles, zeros and integrators of each submodel.
-    closed : bool
-        Whether the rows are those of a closed loop.
-
-    Returns
-    -------
-    PooledModes or None
-        None where a submodel has (nearly) repeated poles, or its coefficients overflow.
-    """
+    """Partial fractions where they are well conditioned."""
     try:
         modes = PooledModes(*pooled_modes(plain_array(theta), degrees, closed))
     except (ZeroDivisionError, np.linalg.LinAlgError):

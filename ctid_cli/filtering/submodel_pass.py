@@ -283,56 +283,7 @@ def submodel_pass(
     rows: Array,
     gram: Array,
 ) -> None:
-    """Pass over a regular record for a sum of submodels with simple poles.
-
-    Parameters
-    ----------
-    poles : ndarray, shape (modes,)
-        Poles of all submodels but those at the origin, of each conjugate pair that with positive imaginary part
-        [rad/s]; simple within each submodel.
-    owner : ndarray of int, shape (modes,)
-        Submodel of each mode.
-    residues : ndarray, shape (modes,)
-        ``x_i = sum Re(residue z)`` over its modes, twice the residue for a pair.
-    origin : ndarray, shape (l,)
-        Weights of ``1/p u … 1/p^l u`` in the output of the submodel that integrates.
-    origin_owner, direct_owner : int
-        The submodel that integrates, and that with direct feed-through; any where there is none.
-    direct : float
-        Direct feed-through.
-    submodels : int
-        Their number K.
-    interval : float
-        Sampling interval [s].
-    shift, fraction : int, float
-        The delay, see :func:`ctid_cli.filtering.bank.split_delay`.
-    u : ndarray, shape (N,) or (N + 1,)
-        Input samples; one more where straight lines lead beyond the record.
-    input_foh : bool
-        Whether the input is held linearly.
-    y : ndarray, shape (N,)
-        Output samples, gaps filled.
-    y_foh : bool
-        Whether what filters see of the output is held linearly.
-    use : ndarray of bool, shape (N,)
-        Samples that enter rows and moments.
-    reference : ndarray, shape (N,) or (0,)
-        Reference of the closed loop; empty in open loop. Closed loops hold their input (no straight lines).
-    numerator, denominator : ndarray, shape (nc + 1,)
-        Controller in q, monic, numerator padded to the same length; not used in open loop.
-    at_controller : bool
-        Whether the reference enters at the controller, ``v = C (r - x)``, or at the input, ``v = r - C x``.
-    state : ndarray, shape (modes, 4)
-        States z, w, e and z_u at the start, overwritten with those at the end: z, w and z_u one interval after the
-        last sample (less the delay), e at the last sample.
-    integrals : ndarray, shape (2, l)
-        Integrals of v and of u at the start, overwritten with those at the end.
-    rows : ndarray, shape (count, q) or (0, 0)
-        Receives ``[z, w, 1/p v … 1/p^l v, v, e, y - x]`` and in closed loop ``[z_u, 1/p u … 1/p^l u, u]`` after that,
-        all at ``t_k - delay`` but e and the error; ``q = 3 n + l + 2`` and ``n + l + 1`` more.
-    gram : ndarray, shape (q, q) or (0, 0)
-        Receives their second moments, if asked for.
-    """
+    """Pass over a regular record for a sum of submodels with simple poles."""
     modes = poles.size
     places = _row_of_mode(poles)
     n = places[modes]

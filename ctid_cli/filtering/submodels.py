@@ -45,19 +45,11 @@ InitialState = Literal["rest", "periodic", "estimated"]
 
 @dataclass(frozen=True, eq=False)
 class LoopData:
-    """The feedback around a record, laid out for the compiled pass.
+    """The feedback around a record, laid out for the compiled pass."""
 
-    Parameters
-    ----------
-    reference : ndarray, shape (N,)
-        Reference at the sampling instants; empty in open loop.
-    numerator, denominator : ndarray, shape (nc + 1,)
-        Controller in descending powers of q, monic, both of one length.
-    at_controller : bool
-        Whether the reference enters at the controller, ``u = C (r - y)``, or at the input, ``u = r - C y``.
-    """
-
+    #: Reference at the sampling instants; empty in open loop, shape (N,).
     reference: Array
+    #: Controller in descending powers of q, monic, both of one length, shape (nc + 1,).
     numerator: Array
     denominator: Array
     at_controller: bool
@@ -74,49 +66,23 @@ OPEN_LOOP = LoopData(np.zeros(0), np.ones(1), np.ones(1), True)
 
 @dataclass(frozen=True, eq=False)
 class SubmodelMoments:
-    """Second moments at one parameter vector, in the terms of the module's equations.
+    """Second moments at one parameter vector, in the terms of the module's equations."""
 
-    Parameters
-    ----------
-    instrument_regressor : ndarray, shape (p, p)
-        ``sum psi phi'``.
-    instrument_error : ndarray, shape (p,)
-        ``sum psi eps``.
-    hessian : ndarray, shape (p, p)
-        ``sum psi psi'``.
-    squared_error : float
-        ``sum eps^2`` [output unit^2].
-    output_power : float
-        Sum of squares of the model output driven by z [output unit^2].
-    """
-
+    #: ``sum psi phi'``, shape (p, p).
     instrument_regressor: Array
+    #: ``sum psi eps``, shape (p,).
     instrument_error: Array
+    #: ``sum psi psi'``, shape (p, p).
     hessian: Array
+    #: ``sum eps^2`` [output unit^2].
     squared_error: float
+    #: Sum of squares of the model output driven by z [output unit^2].
     output_power: float
 
 
 class SubmodelFilter:
     """The filters of a record for sums of submodels of one structure.
 
-    Parameters
-    ----------
-    data : FilterData
-        The record.
-    terms : sequence of Term
-        Degrees of the submodels.
-    delay : float, default 0.0
-        Delay of the input [s].
-    loop : LoopData, optional
-        The feedback, on a regular clock; none by default.
-    initial_state : {"rest", "periodic", "estimated"}, default "rest"
-        State at the first sample: at rest; that of a record which is one period of a steady state, on a regular clock
-        without gaps and without integrators; or free responses, whose parameters (see
-        :mod:`ctid_cli.filtering.free_response`) follow those of the model in every vector and matrix.
-
-    Notes
-    -----
     On a regular clock all submodels are filtered in one compiled pass of their pooled modes. Any other clock, and
     submodels with (nearly) repeated poles, go through :func:`ctid_cli.filtering.bank.standard_rows` submodel by
     submodel, several times slower.
@@ -148,18 +114,7 @@ class SubmodelFilter:
             self._u = np.concatenate((rolled, rolled[:2]))
 
     def moments(self, theta: Array) -> SubmodelMoments | None:
-        """Second moments at one parameter vector.
-
-        Parameters
-        ----------
-        theta : ndarray, shape (p,)
-            ``a_1 … a_n, b_0 … b_m`` of each submodel in turn.
-
-        Returns
-        -------
-        SubmodelMoments or None
-            The moments; None where theta describes no model, or something overflows.
-        """
+        """Second moments at one parameter vector."""
         # What overflows is found by the sums not being finite.
         with np.errstate(all="ignore"):
             if self.free:
@@ -191,18 +146,7 @@ class SubmodelFilter:
         )
 
     def rows(self, theta: Array) -> tuple[Array, Array, Array, Array] | None:
-        """Instruments, regressors, output error and model output at the used samples.
-
-        Parameters
-        ----------
-        theta : ndarray, shape (p,)
-            ``a_1 … a_n, b_0 … b_m`` of each submodel in turn, then the parameters of free responses if there are any.
-
-        Returns
-        -------
-        (psi, phi, eps, x) or None
-            Shapes (count, p), (count, p), (count,), (count,), x driven by z; None where theta describes no model.
-        """
+        """Instruments, regressors, output error and model output at the used samples."""
         if not self.free:
             return self._rows(self.data, theta)
         data = self.data

@@ -150,17 +150,7 @@ class AdaptiveObserver(OnlineEstimator):
 
 @njit(cache=True, nogil=True)
 def place_poles(squares: Array, poles: Array, gains: Array) -> None:
-    """Observer gains for given frequencies.
-
-    Parameters
-    ----------
-    squares : ndarray, shape (n,)
-        Squared frequencies, all different [(rad/s)^2].
-    poles : ndarray, shape (2 n,)
-        Rates of the observer [rad/s].
-    gains : ndarray, shape (2 n,)
-        Receives ``l_11, l_12, l_21, l_22 ...``.
-    """
+    """Observer gains for given frequencies."""
     for i in range(squares.size):
         omega = np.sqrt(squares[i])
         value = complex(1.0, 0.0)
@@ -176,21 +166,7 @@ def place_poles(squares: Array, poles: Array, gains: Array) -> None:
 
 @njit(cache=True, nogil=True)
 def observer_slope(states: Array, y: float, squares: Array, gains: Array, slope: Array) -> None:
-    """Time derivative of the observer and of its sensitivities.
-
-    Parameters
-    ----------
-    states : ndarray, shape (n + 1, 2 n)
-        Observer states, and below them their derivatives with respect to each squared frequency.
-    y : float
-        Signal.
-    squares : ndarray, shape (n,)
-        Squared frequencies.
-    gains : ndarray, shape (2 n,)
-        Observer gains.
-    slope : ndarray, shape (n + 1, 2 n)
-        Receives the derivative.
-    """
+    """Time derivative of the observer and of its sensitivities."""
     n = squares.size
     for p in range(n + 1):
         error = y if p == 0 else 0.0
@@ -223,39 +199,7 @@ def advance_observer(
     average: Array,
     counters: IntArray,
 ) -> None:
-    """Observer, sensitivities and recursive Gauss-Newton steps.
-
-    Parameters
-    ----------
-    samples : ndarray, shape (N,)
-        New samples.
-    omega, uncertainty : ndarray, shape (N, n)
-        Receive the estimates.
-    flags : ndarray of uint16, shape (N,)
-        Receives the flags.
-    interval : float
-        Sampling interval [s].
-    poles : ndarray, shape (2 n,)
-        Rates of the observer [rad/s].
-    rate : float
-        Rate of the adaptation [1/s].
-    hold : int
-        Samples before the adaptation.
-    smallest_gap, lowest, highest : float
-        Bounds [rad/s].
-    squares : ndarray, shape (n,)
-        Squared frequencies.
-    observer : ndarray, shape (n + 1, 2 n)
-        States and sensitivities.
-    moments : ndarray, shape (n + 1, n + 1)
-        Mean products of the sensitivities of the prediction and of the error, lower triangle.
-    last : ndarray, shape (1,)
-        Last sample.
-    average : ndarray, shape (n,)
-        Recent mean of the frequencies [rad/s].
-    counters : ndarray of int, shape (1,)
-        Samples so far.
-    """
+    """Observer, sensitivities and recursive Gauss-Newton steps."""
     n = squares.size
     gains, no_gains, xi = np.empty(2 * n), np.zeros(2 * n), np.empty(n + 1)
     stage, total, slope = np.empty_like(observer), np.empty_like(observer), np.empty_like(observer)

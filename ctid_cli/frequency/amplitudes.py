@@ -119,25 +119,7 @@ def fit_sinusoids(samples: ArrayLike, interval: float, omega: ArrayLike, *, bias
 
 
 def present_samples(samples: ArrayLike, interval: float) -> tuple[Array, Array]:
-    """Samples that are there, with their instants.
-
-    Parameters
-    ----------
-    samples : array_like, shape (N,)
-        Signal [signal unit]; NaN where missing.
-    interval : float
-        Sampling interval [s].
-
-    Returns
-    -------
-    values, t : ndarray, shape (M,)
-        Samples [signal unit] and their time since the first of all [s].
-
-    Raises
-    ------
-    DataError
-        If the samples are not a series of real numbers, or none is there.
-    """
+    """Samples that are there, with their instants."""
     require_positive("interval", interval, "s")
     values = np.asarray(samples)
     if values.ndim != 1 or values.dtype.kind not in "fiu":
@@ -154,22 +136,7 @@ def present_samples(samples: ArrayLike, interval: float) -> tuple[Array, Array]:
 
 
 def harmonic_design(t: Array, omega: Array, *, bias: bool) -> Array:
-    """Sines, cosines and, if asked for, a constant.
-
-    Parameters
-    ----------
-    t : ndarray, shape (N,)
-        Instants [s].
-    omega : ndarray, shape (n,)
-        Frequencies [rad/s].
-    bias : bool
-        Whether there is a constant column.
-
-    Returns
-    -------
-    ndarray, shape (N, 2 n) or (N, 2 n + 1)
-        Columns.
-    """
+    """Sines, cosines and, if asked for, a constant."""
     angles = t[:, None] * omega
     columns = [np.sin(angles), np.cos(angles)]
     if bias:
@@ -178,25 +145,7 @@ def harmonic_design(t: Array, omega: Array, *, bias: bool) -> Array:
 
 
 def solve_design(design: Array, y: Array) -> Array:
-    """Least squares that refuses what the samples do not determine.
-
-    Parameters
-    ----------
-    design : ndarray, shape (N, p)
-        Columns.
-    y : ndarray, shape (N,)
-        Samples.
-
-    Returns
-    -------
-    ndarray, shape (p,)
-        Coefficients.
-
-    Raises
-    ------
-    DataError
-        If they are not determined.
-    """
+    """Least squares that refuses what the samples do not determine."""
     count, unknowns = design.shape
     if count < unknowns:
         raise DataError(f"{count} samples cannot determine {unknowns} amplitudes; use a longer record.")
@@ -210,67 +159,14 @@ def solve_design(design: Array, y: Array) -> Array:
 
 
 def fit_amplitudes(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[Array, Array, Array]:
-    """Sines and cosines of known frequencies, by least squares.
-
-    Parameters
-    ----------
-    y : ndarray, shape (N,)
-        Samples.
-    t : ndarray, shape (N,)
-        Their instants [s].
-    omega : ndarray, shape (n,)
-        Frequencies [rad/s].
-    bias : bool
-        Whether there is a constant.
-
-    Returns
-    -------
-    design : ndarray, shape (N, p)
-        Sines, cosines and, if asked for, a constant.
-    coefficients : ndarray, shape (p,)
-        Of these columns [signal unit].
-    residual : ndarray, shape (N,)
-        What they leave [signal unit].
-
-    Raises
-    ------
-    DataError
-        If the sinusoids cannot be told apart.
-    """
+    """Sines and cosines of known frequencies, by least squares."""
     design = harmonic_design(t, omega, bias=bias)
     coefficients = solve_design(design, y)
     return design, coefficients, y - design @ coefficients
 
 
 def frequency_errors(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[Array, Array, float]:
-    r"""Gauss-Newton step of the frequencies, and the error that the residual could make.
-
-    Parameters
-    ----------
-    y : ndarray, shape (N,)
-        Samples.
-    t : ndarray, shape (N,)
-        Their instants [s].
-    omega : ndarray, shape (n,)
-        Frequencies [rad/s].
-    bias : bool
-        Whether there is a constant.
-
-    Returns
-    -------
-    step : ndarray, shape (n,)
-        Correction of the frequencies by least squares [rad/s].
-    uncertainty : ndarray, shape (n,)
-        ``sqrt([(J'J)^-1]_ii e'e)`` [rad/s], J the derivatives with respect to all unknowns, e the residual: the error
-        if all of the residual lay in the worst direction. Rounding counts as residual.
-    misfit : float
-        ``e'e`` at the frequencies as given [signal unit^2].
-
-    Raises
-    ------
-    DataError
-        If the sinusoids cannot be told apart.
-    """
+    r"""Gauss-Newton step of the frequencies, and the error that the residual could make."""
     n = omega.size
     time = t - 0.5 * (t[0] + t[-1])
     design, coefficients, residual = fit_amplitudes(y, time, omega, bias=bias)
@@ -293,24 +189,6 @@ def frequency_errors(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[A
 def flag_insignificant(y: Array, t: Array, omega: Array, *, bias: bool) -> Flag:
     r"""Compare the weakest tone with the strongest that white noise of the residual's size would seem to have.
 
-    Parameters
-    ----------
-    y : ndarray, shape (N,)
-        Samples.
-    t : ndarray, shape (N,)
-        Their instants [s].
-    omega : ndarray, shape (n,)
-        Frequencies [rad/s].
-    bias : bool
-        Whether there is a constant.
-
-    Returns
-    -------
-    Flag
-        ``UNDETERMINED`` if a tone is no stronger than noise, or the tones cannot be told apart.
-
-    Notes
-    -----
     Each of the N/2 ordinates of the periodogram of white noise of variance s^2 exceeds ``N A^2/4 = g s^2`` with the
     probability ``exp(-g)``, the largest with ``N/2 exp(-g)`` (R. A. Fisher, "Tests of significance in harmonic
     analysis", *Proc. Royal Society A* 125 (1929) 54-59, for many samples).

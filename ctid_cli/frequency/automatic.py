@@ -9,20 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
-from ctid_cli.frequency import (
-    FREQUENCY_ESTIMATORS,
-    AdaptiveObserver,
-    DremFiniteTime,
-    DremGradient,
-    DremWindow,
-    Esprit,
-    FilterRegression,
-    NonlinearLeastSquares,
-    RestartingLeastSquares,
-)
+from ctid_cli.frequency.adaptive_observer import AdaptiveObserver
 from ctid_cli.frequency.checks import LARGEST_SAMPLE
 from ctid_cli.frequency.decimation import Decimation, low_pass, without_low
+from ctid_cli.frequency.drem_finite_time import DremFiniteTime
+from ctid_cli.frequency.drem_gradient import DremGradient
+from ctid_cli.frequency.drem_window import DremWindow
+from ctid_cli.frequency.esprit import Esprit
+from ctid_cli.frequency.filter_regression import FilterRegression
+from ctid_cli.frequency.nonlinear_least_squares import NonlinearLeastSquares
+from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
 from ctid_cli.frequency.regression import MOST_TONES
+from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.frequency.spectrum import Peaks, find_peaks
 from ctid_cli.frequency.windows import estimate_window
 from ctid_cli.signals.checks import require_choice, require_integer, require_positive
@@ -77,35 +75,16 @@ SUSPICIOUS = 0.9
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """What to do with a record to find the frequencies of its tones.
-
-    Parameters
-    ----------
-    estimator : Any
-        Estimator with its options, one of :data:`~ctid_cli.frequency.FREQUENCY_ESTIMATORS`.
-    tones : int
-        Number of wanted tones; the estimator may have more, which only share their band.
-    expected : ndarray, shape (m,)
-        Where the spectrum shows the tones of the estimator [rad/s], the wanted ones first.
-    offset : float
-        Constant that is subtracted first [signal unit].
-    decimation : Decimation
-        Filter and thinning before the estimator.
-    interval : float
-        Sampling interval of what the estimator gets [s].
-    window : int
-        Samples, of those, in a window of a batch estimator, and in the stretch from which amplitudes are found.
-    reasons : tuple of str
-        What was chosen and why, one sentence each.
-    warnings : tuple of str
-        What may be wrong, one sentence each.
-    """
+    """What to do with a record to find the frequencies of its tones."""
 
     estimator: Any
     tones: int
+    #: Where the spectrum shows the tones of the estimator [rad/s], the wanted ones first, shape (m,).
     expected: Array
+    #: Constant that is subtracted first [signal unit].
     offset: float
     decimation: Decimation
+    #: Sampling interval of what the estimator gets [s].
     interval: float
     window: int
     reasons: tuple[str, ...]
@@ -143,47 +122,12 @@ def choose_settings(
 ) -> Settings:
     """Choose an estimator and everything that it needs.
 
-    Parameters
-    ----------
-    samples : ndarray, shape (N,)
-        Signal on a regular clock [signal unit]; NaN where missing.
-    interval : float
-        Sampling interval [s].
-    tones : int
-        Number of tones wanted, 1 to 8: those that are strongest for most of the record.
-    method : str, optional
-        Kind of the estimator; by default ESPRIT over windows, or nonlinear least squares if samples are missing.
-    window : float, optional
-        Length of the windows [s]; by default as short as gives certain estimates.
-
-    Returns
-    -------
-    Settings
-        With sentences that say what was chosen.
-
-    Raises
-    ------
-    DataError
-        If no tone can be found in the record: it is constant, too short, or shows no peak.
-    ValueError
-        If an option is out of range.
-
-    Notes
-    -----
     The tones are the strongest peaks of the median spectrum of the record's segments. A low-pass whose stop band begins
     before what would fold onto them, and before the next strong tone, allows to keep only some samples in each period
     of the highest tone. Tones that no filter can keep away are estimated too. The delay h of the regressions is the one
     at which noise moves the wanted tones least, below ``pi/(1.1 w_max)`` (frequencies become ambiguous at pi/w_max),
     with a prefilter of 2 h. Windows begin with three beats of the closest tones and are doubled until nearly all
     estimates are certain.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> t = 0.001 * np.arange(5000)
-    >>> settings = choose_settings(np.sin(300 * t) + np.sin(450 * t), 0.001, 2)
-    >>> settings.estimator.kind, settings.wanted.round()
-    ('esprit', array([300., 450.]))
     """
     require_integer("tones", tones, 1, MOST_TONES)
     require_positive("interval", interval, "s")

@@ -11,29 +11,7 @@ LARGEST_SAMPLE = 1e30
 
 
 def one_for_each(name: str, values: Sequence[float] | None, count: int, unit: str) -> tuple[float, ...] | None:
-    """Check an option that holds one positive number for each tone.
-
-    Parameters
-    ----------
-    name : str
-        The option as the user writes it.
-    values : sequence of float or None
-        What was given.
-    count : int
-        Number of tones.
-    unit : str
-        Unit of the numbers.
-
-    Returns
-    -------
-    tuple of float or None
-        The numbers.
-
-    Raises
-    ------
-    ValueError
-        If there are too few or too many, or one is not positive.
-    """
+    """Check an option that holds one positive number for each tone."""
     if values is None:
         return None
     numbers = tuple(float(value) for value in values)
@@ -45,43 +23,12 @@ def one_for_each(name: str, values: Sequence[float] | None, count: int, unit: st
 
 
 def samples_in(duration: float, interval: float) -> int:
-    """Sampling intervals nearest to a time, however long it is.
-
-    Parameters
-    ----------
-    duration : float
-        Time [s].
-    interval : float
-        Sampling interval [s].
-
-    Returns
-    -------
-    int
-        No more than a counter of samples can hold.
-
-    Examples
-    --------
-    >>> samples_in(2.0, 0.01), samples_in(1e300, 0.01) == 1 << 62
-    (200, True)
-    """
+    """Sampling intervals nearest to a time, however long it is."""
     return round(min(duration / interval, float(1 << 62)))
 
 
 def require_bounds(lowest: float, highest: float | None) -> None:
-    """Refuse bounds of frequencies that leave nothing between them.
-
-    Parameters
-    ----------
-    lowest : float
-        Option ``lowest_frequency`` [rad/s].
-    highest : float or None
-        Option ``highest_frequency`` [rad/s]; None for no bound.
-
-    Raises
-    ------
-    ValueError
-        If the lower one is negative, or not below the upper one.
-    """
+    """Refuse bounds of frequencies that leave nothing between them."""
     require_not_negative("lowest_frequency", lowest, "rad/s")
     if highest is None:
         return

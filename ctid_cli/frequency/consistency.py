@@ -44,23 +44,7 @@ REGULARISATION = 1e-10
 
 
 def second_lag(lag: int) -> int:
-    """Second delay for a given first one.
-
-    Parameters
-    ----------
-    lag : int
-        Delay h in sampling intervals, at least 1.
-
-    Returns
-    -------
-    int
-        A smaller number without a common divisor, or 0 for ``lag = 1``, where only the sampling itself can alias.
-
-    Examples
-    --------
-    >>> [second_lag(lag) for lag in (1, 2, 10, 100, 700)]
-    [0, 1, 7, 61, 433]
-    """
+    """Second delay for a given first one."""
     if lag == 1:
         return 0
     wanted = GOLDEN_FRACTION * lag
@@ -69,47 +53,13 @@ def second_lag(lag: int) -> int:
 
 
 def samples_between_verdicts(lag: int) -> int:
-    """How often an estimate is judged.
-
-    Parameters
-    ----------
-    lag : int
-        Delay h in sampling intervals.
-
-    Returns
-    -------
-    int
-        Number of samples: neighbours on a fine clock have nothing new to say.
-
-    Examples
-    --------
-    >>> [samples_between_verdicts(lag) for lag in (1, 100, 200, 700)]
-    [1, 1, 3, 8]
-    """
+    """How often an estimate is judged."""
     return max(1, min(lag // VERDICTS_PER_DELAY, MOST_BETWEEN))
 
 
 @njit(cache=True, nogil=True)
 def contradicts(row: Array, theta: Array, levels: Array, fast: float, slow: float) -> bool:
-    """Whether the newest row leaves a residual unlike those of the rows before.
-
-    Parameters
-    ----------
-    row : ndarray, shape (n + 1,)
-        Regressors and regressand.
-    theta : ndarray, shape (n,)
-        Parameters.
-    levels : ndarray, shape (4,)
-        Number of rows, recent and usual mean square of the residual, usual mean square of the regressand; changed in
-        place.
-    fast, slow : float
-        Weights of the newest row in the recent and in the usual means [-].
-
-    Returns
-    -------
-    bool
-        True for some time after a change of the signal, until the usual mean has followed.
-    """
+    """Whether the newest row leaves a residual unlike those of the rows before."""
     n = theta.size
     residual = row[n]
     for i in range(n):
@@ -131,25 +81,7 @@ def contradicts(row: Array, theta: Array, levels: Array, fast: float, slow: floa
 def observe_second_delay(
     history: Array, newest: int, lag: int, table: Array, row: Array, gram: Array, keep: float
 ) -> None:
-    """Take the row at the second delay into account.
-
-    Parameters
-    ----------
-    history : ndarray, shape (M,)
-        Ring of samples.
-    newest : int
-        Place of the newest one.
-    lag : int
-        Second delay in sampling intervals; 0 for none.
-    table : ndarray, shape (n + 1, 2 n + 1)
-        Coefficients of the delay regression.
-    row : ndarray, shape (n + 1,)
-        Work space.
-    gram : ndarray, shape (n + 1, n + 1)
-        Second moments of the rows at the second delay; changed in place.
-    keep : float
-        Factor on what was there before.
-    """
+    """Take the row at the second delay into account."""
     if lag > 0 and form_row(history, newest, lag, table, row):
         accumulate_row(row, gram, keep)
 
@@ -158,24 +90,6 @@ def observe_second_delay(
 def check_consistency(gram: Array, omega: Array, delay: float, negligible: float) -> int:
     """Compare the residual that the frequencies leave at the second delay with the smallest possible one.
 
-    Parameters
-    ----------
-    gram : ndarray, shape (n + 1, n + 1)
-        Second moments of the rows at the second delay, lower triangle.
-    omega : ndarray, shape (n,)
-        Frequencies [rad/s].
-    delay : float
-        Second delay [s]; 0 for none.
-    negligible : float
-        Fraction of the regressand's second moment below which a residual is none.
-
-    Returns
-    -------
-    int
-        The flag, or 0.
-
-    Notes
-    -----
     Where noise in the regressors leads least squares far astray, the true frequencies are called inconsistent, too;
     they are uncertain there anyway.
     """

@@ -14,80 +14,28 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Decimation:
-    """A symmetrical finite impulse response, of whose output every so many samples are kept.
+    """A symmetrical finite impulse response, of whose output every so many samples are kept."""
 
-    Parameters
-    ----------
-    weights : ndarray, shape (L + 1,)
-        Impulse response; one weight for none.
-    factor : int, default 1
-        One of so many samples is kept.
-    longest_gap : int, default 0
-        Gaps of up to so many samples are bridged by straight lines first.
-    """
-
+    #: Impulse response; one weight for none, shape (L + 1,).
     weights: Array
     factor: int = 1
     longest_gap: int = 0
 
     def apply(self, samples: Array) -> Array:
-        """Filter and thin a record.
-
-        Parameters
-        ----------
-        samples : ndarray, shape (N,)
-            Signal [signal unit]; NaN where missing.
-
-        Returns
-        -------
-        ndarray, shape (ceil((N - L) / factor),)
-            Output k rests on the samples ``factor k ... factor k + L``; NaN if one of them is missing.
-        """
+        """Filter and thin a record."""
         bridged = bridge_gaps(samples, self.longest_gap)
         if self.weights.size == 1:
             return bridged[:: self.factor]
         return fast_convolve(bridged, self.weights)[:: self.factor]
 
     def gain(self, omega: Array, interval: float) -> Array:
-        """Factor by which the filter changes amplitudes.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (n,)
-            Frequencies [rad/s].
-        interval : float
-            Sampling interval of the record [s].
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            Gains [-], not negative.
-        """
+        """Factor by which the filter changes amplitudes."""
         places = np.arange(self.weights.size) - 0.5 * (self.weights.size - 1)
         return np.asarray(np.abs(np.cos(np.multiply.outer(omega * interval, places)) @ self.weights))
 
 
 def bridge_gaps(samples: Array, longest: int) -> Array:
-    """Fill short gaps by straight lines.
-
-    Parameters
-    ----------
-    samples : ndarray, shape (N,)
-        Signal [signal unit]; NaN where missing.
-    longest : int
-        Longest gap that is bridged, in samples.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        The same with fewer gaps; those at the ends of the record stay.
-
-    Examples
-    --------
-    >>> nan = float("nan")
-    >>> bridge_gaps(np.array([nan, 0.0, nan, 2.0, nan, nan, 5.0]), 1)
-    array([nan,  0.,  1.,  2., nan, nan,  5.])
-    """
+    """Fill short gaps by straight lines."""
     missing = ~np.isfinite(samples)
     if longest < 1 or not missing.any() or missing.all():
         return samples
@@ -104,27 +52,7 @@ def bridge_gaps(samples: Array, longest: int) -> Array:
 def low_pass(pass_edge: float, stop_edge: float, attenuation: float, interval: float) -> Array:
     r"""Symmetrical low-pass of gain 1 at zero frequency.
 
-    Parameters
-    ----------
-    pass_edge, stop_edge : float
-        Ends of the transition [rad/s].
-    attenuation : float
-        Of the stop band, and of the error in the pass band [dB], above 21.
-    interval : float
-        Sampling interval [s].
-
-    Returns
-    -------
-    ndarray, shape (L + 1,)
-        Impulse response; L is even, so that the delay is a whole number of samples.
-
-    Notes
-    -----
     Sine cardinal times Kaiser's window: ``L = (attenuation - 7.95)/(2.285 (stop_edge - pass_edge) interval)``.
-
-    References
-    ----------
-    A. V. Oppenheim and R. W. Schafer, *Discrete-Time Signal Processing*, 3rd ed., Pearson 2010, sec. 7.6.
     """
     half = int(np.ceil((attenuation - 7.95) / (2.285 * (stop_edge - pass_edge) * interval) / 2.0))
     if attenuation > 50.0:
@@ -138,24 +66,7 @@ def low_pass(pass_edge: float, stop_edge: float, attenuation: float, interval: f
 
 
 def without_low(weights: Array, stop_edge: float, pass_edge: float, attenuation: float, interval: float) -> Array:
-    """Add a high-pass to a filter.
-
-    Parameters
-    ----------
-    weights : ndarray, shape (K,)
-        Symmetrical impulse response, K odd.
-    stop_edge, pass_edge : float
-        Ends of the transition [rad/s].
-    attenuation : float
-        Below `stop_edge` [dB].
-    interval : float
-        Sampling interval [s].
-
-    Returns
-    -------
-    ndarray
-        Symmetrical impulse response of both, of gain 0 at zero frequency.
-    """
+    """Add a high-pass to a filter."""
     high = -low_pass(stop_edge, pass_edge, attenuation, interval)
     high[high.size // 2] += 1.0
     return np.asarray(np.convolve(weights, high))

@@ -27,22 +27,6 @@ TINY = 1e-30
 def real_roots(coefficients: Array, work: Array, roots: Array) -> bool:
     """Roots of a monic polynomial whose roots are all real, largest first.
 
-    Parameters
-    ----------
-    coefficients : ndarray, shape (n + 1,)
-        Monic, descending powers.
-    work : ndarray, shape (n + 1,)
-        Work space.
-    roots : ndarray, shape (n,)
-        Receives the roots.
-
-    Returns
-    -------
-    bool
-        Whether n real roots were found; if not, `roots` holds nothing of use.
-
-    Notes
-    -----
     Right of its largest root a polynomial with only real roots is convex and increasing, so Newton's iteration from the
     Samuelson bound falls monotonically on the largest root. It is divided out, the last two roots come from the
     quadratic formula, and each root is polished on the undivided polynomial. A step that rises shows complex roots.
@@ -117,22 +101,7 @@ def real_roots(coefficients: Array, work: Array, roots: Array) -> bool:
 
 @njit(cache=True, nogil=True)
 def root_real_parts(coefficients: Array, work: Array, roots: Array) -> bool:
-    """Real parts of the roots of any monic polynomial, largest first.
-
-    Parameters
-    ----------
-    coefficients : ndarray, shape (n + 1,)
-        Monic, descending powers.
-    work : ndarray, shape (n + 1,)
-        Work space.
-    roots : ndarray, shape (n,)
-        Receives the real parts.
-
-    Returns
-    -------
-    bool
-        Whether all roots are real.
-    """
+    """Real parts of the roots of any monic polynomial, largest first."""
     n = roots.size
     if real_roots(coefficients, work, roots):
         return True
@@ -161,28 +130,7 @@ def root_real_parts(coefficients: Array, work: Array, roots: Array) -> bool:
 def decode(
     theta: Array, delay: float, top: float, bottom: float, polynomial: Array, work: Array, roots: Array, omega: Array
 ) -> int:
-    """Frequencies that belong to the parameters of the delay regression, ascending.
-
-    Parameters
-    ----------
-    theta : ndarray, shape (n,)
-        Parameters [-].
-    delay : float
-        Delay h that the regression really used [s].
-    top, bottom : float
-        Cosines of the lowest and of the highest frequency times the delay.
-    polynomial, work : ndarray, shape (n + 1,)
-        Work space.
-    roots : ndarray, shape (n,)
-        Receives the cosines within the bounds, descending.
-    omega : ndarray, shape (n,)
-        Receives the frequencies [rad/s], ascending.
-
-    Returns
-    -------
-    int
-        Flags: complex roots (their real parts were used), frequencies put on a bound.
-    """
+    """Frequencies that belong to the parameters of the delay regression, ascending."""
     n = theta.size
     polynomial[0] = 1.0
     for k in range(n):
@@ -205,17 +153,7 @@ def decode(
 
 @njit(cache=True, nogil=True)
 def root_sensitivities(roots: Array, slopes: Array, out: Array) -> None:
-    """Derivatives of the frequencies with respect to the coefficients of their polynomial.
-
-    Parameters
-    ----------
-    roots : ndarray, shape (n,)
-        Roots of ``x^n + theta_1 x^(n-1) + ... + theta_n``.
-    slopes : ndarray, shape (n,)
-        Derivative of each frequency with respect to its root.
-    out : ndarray, shape (n, n)
-        Receives ``d omega_i/d theta_k``: a coefficient moves a root by ``-x^(n-k)/P'(x)``. Infinite for a double root.
-    """
+    """Derivatives of the frequencies with respect to the coefficients of their polynomial."""
     n = roots.size
     for i in range(n):
         slope = 1.0
@@ -230,19 +168,7 @@ def root_sensitivities(roots: Array, slopes: Array, out: Array) -> None:
 
 @njit(cache=True, nogil=True)
 def cosine_sensitivities(roots: Array, delay: float, slopes: Array, out: Array) -> None:
-    """Derivatives of the frequencies with respect to the parameters of the delay regression.
-
-    Parameters
-    ----------
-    roots : ndarray, shape (n,)
-        Cosines.
-    delay : float
-        Delay h [s].
-    slopes : ndarray, shape (n,)
-        Work space.
-    out : ndarray, shape (n, n)
-        Receives ``d omega_i/d theta_k`` [rad/s].
-    """
+    """Derivatives of the frequencies with respect to the parameters of the delay regression."""
     for i in range(roots.size):
         square = 1.0 - roots[i] * roots[i]
         slopes[i] = -1.0 / (delay * np.sqrt(square)) if square > 0.0 else -np.inf
@@ -251,20 +177,7 @@ def cosine_sensitivities(roots: Array, delay: float, slopes: Array, out: Array) 
 
 @njit(cache=True, nogil=True)
 def room_of(omega: Array, place: int) -> float:
-    """How far a frequency can be wrong before it is another one.
-
-    Parameters
-    ----------
-    omega : ndarray, shape (n,)
-        Frequencies [rad/s], ascending.
-    place : int
-        Which of them.
-
-    Returns
-    -------
-    float
-        The frequency itself or the distance to a neighbour, whichever is least [rad/s].
-    """
+    """How far a frequency can be wrong before it is another one."""
     room = omega[place]
     if place > 0:
         room = min(room, omega[place] - omega[place - 1])
@@ -275,17 +188,7 @@ def room_of(omega: Array, place: int) -> float:
 
 @njit(cache=True, nogil=True)
 def propagate(sensitivities: Array, errors: Array, out: Array) -> None:
-    """Largest errors of the frequencies that given errors of the parameters can make.
-
-    Parameters
-    ----------
-    sensitivities : ndarray, shape (n, n)
-        ``d omega_i/d theta_k`` [rad/s].
-    errors : ndarray, shape (n,)
-        Absolute errors of the parameters.
-    out : ndarray, shape (n,)
-        Receives ``sum_k |d omega_i/d theta_k| errors_k`` [rad/s].
-    """
+    """Largest errors of the frequencies that given errors of the parameters can make."""
     for i in range(out.size):
         total = 0.0
         for k in range(errors.size):
@@ -295,20 +198,7 @@ def propagate(sensitivities: Array, errors: Array, out: Array) -> None:
 
 @njit(cache=True, nogil=True)
 def still_doubtful(omega: Array, quiet: float) -> bool:
-    """Whether an estimate was uncertain less than a period, or a beat, ago.
-
-    Parameters
-    ----------
-    omega : ndarray, shape (n,)
-        Frequencies [rad/s], ascending.
-    quiet : float
-        Time since it was uncertain [s].
-
-    Returns
-    -------
-    bool
-        True if so: the misfit of other signals vanishes for a while in every beat.
-    """
+    """Whether an estimate was uncertain less than a period, or a beat, ago."""
     least = np.inf
     for i in range(omega.size):
         least = min(least, room_of(omega, i))
@@ -319,26 +209,6 @@ def still_doubtful(omega: Array, quiet: float) -> bool:
 def flag_uncertain(omega: Array, uncertainty: Array, rounding: Array, span: float, elapsed: float) -> int:
     """Compare what may be wrong with a frequency with the frequency itself and with the distance to its neighbours.
 
-    Parameters
-    ----------
-    omega : ndarray, shape (n,)
-        Frequencies [rad/s], ascending.
-    uncertainty : ndarray, shape (n,)
-        Possible errors as the misfit shows them [rad/s]; in place enlarged if the data are short, and by rounding.
-    rounding : ndarray, shape (n,)
-        Possible errors by rounding [rad/s].
-    span : float
-        Time from the first to the last sample that the estimate rests on [s].
-    elapsed : float
-        Time since the first sample of all, or since the restart [s].
-
-    Returns
-    -------
-    int
-        The flag, or 0.
-
-    Notes
-    -----
     Within a part of a period, or of the beat of two neighbours, a bias, a drift or another tone hardly differs from a
     change of the frequencies, and hardly shows as a misfit. Measured errors grow like the fifth power of the missing
     part: the possible error is multiplied by ``(period/span)^5``. The same holds for the first two periods: later a
@@ -360,34 +230,7 @@ def flag_uncertain(omega: Array, uncertainty: Array, rounding: Array, span: floa
 def frequencies_of(
     theta: ArrayLike, delay: float, *, lowest: float = 0.0, highest: float | None = None
 ) -> tuple[Array, Flag]:
-    """Frequencies that belong to the parameters of the delay regression.
-
-    Parameters
-    ----------
-    theta : array_like, shape (n,)
-        Parameters [-].
-    delay : float
-        Delay h [s].
-    lowest : float, default 0.0
-        Lower bound of the frequencies [rad/s].
-    highest : float, optional
-        Upper bound [rad/s]; by default pi/h, beyond which frequencies cannot be told apart.
-
-    Returns
-    -------
-    omega : ndarray, shape (n,)
-        Frequencies [rad/s], ascending.
-    flags : Flag
-        What is wrong with them.
-
-    Examples
-    --------
-    >>> omega, flags = frequencies_of([0.3349, -0.0858], 0.7)
-    >>> omega.round(3), flags == 0
-    (array([2., 3.]), True)
-    >>> frequencies_of([0.0, 0.5], 0.7)[1].sentences
-    ('The estimated parameters belong to no set of real frequencies.',)
-    """
+    """Frequencies that belong to the parameters of the delay regression."""
     values = np.ascontiguousarray(theta, dtype=float)
     n = values.size
     omega, roots = np.empty(n), np.empty(n)

@@ -22,59 +22,26 @@ NOTEWORTHY_ROUNDING = 0.01
 
 @dataclass(frozen=True)
 class DelayClock:
-    """The delay regression at a sampling interval.
-
-    Parameters
-    ----------
-    lag, second_lag : int
-        Delay h, and the delay of the check against aliases, in sampling intervals.
-    delay, second_delay : float
-        The same [s].
-    top, bottom : float
-        Cosines of the lowest and of the highest frequency times h [-].
-    table : ndarray, shape (n + 1, 2 n + 1)
-        Coefficients of the regression.
-    weights : ndarray, shape (L + 1,)
-        Impulse response of the prefilter.
-    notes : tuple of str
-        Sentences about rounding.
-    """
+    """The delay regression at a sampling interval."""
 
     lag: int
     second_lag: int
+    #: The same [s].
     delay: float
     second_delay: float
+    #: Cosines of the lowest and of the highest frequency times h [-].
     top: float
     bottom: float
+    #: Coefficients of the regression, shape (n + 1, 2 n + 1).
     table: Array
+    #: Impulse response of the prefilter, shape (L + 1,).
     weights: Array
     notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class DelayRegression(OnlineEstimator):
-    """Options of an estimator on the delay regression.
-
-    Parameters
-    ----------
-    tones : int
-        Number of sinusoids n, 1 to 8.
-    h : float
-        Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals.
-    prefilter : float, default 0.0
-        Length of a Hann low-pass in front of the regression [s]; 0 for none.
-    difference : float, default 0.0
-        If positive, the signal this much earlier is subtracted [s], which removes a constant bias.
-    lowest_frequency : float, default 0.0
-        Lower bound of the frequencies [rad/s].
-    highest_frequency : float, optional
-        Upper bound of the frequencies [rad/s]; by default pi/h, beyond which they cannot be told apart.
-
-    Raises
-    ------
-    ValueError
-        If an option is out of range.
-    """
+    """Options of an estimator on the delay regression."""
 
     tones: int = field(metadata={"doc": "Number of sinusoids, 1 to 8"})
     h: float = field(metadata={"doc": "Delay of the regression, below pi over the highest frequency", "unit": "s"})
@@ -100,23 +67,7 @@ class DelayRegression(OnlineEstimator):
         self._check_bounds(self.h)
 
     def clock(self, interval: float) -> DelayClock:
-        """The regression at a sampling interval.
-
-        Parameters
-        ----------
-        interval : float
-            Sampling interval [s].
-
-        Returns
-        -------
-        DelayClock
-            Delays in whole intervals, bounds and tables.
-
-        Raises
-        ------
-        ValueError
-            If a delay is too short or too long at this interval.
-        """
+        """The regression at a sampling interval."""
         lag = whole_delay("h", self.h, interval)
         delay = lag * interval
         highest = self._check_bounds(delay)

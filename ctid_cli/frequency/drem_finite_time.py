@@ -71,7 +71,7 @@ class DremFiniteTime(DremOptions):
     Examples
     --------
     >>> import numpy as np
-    >>> from ctid_cli.frequency import DremFiniteTime
+    >>> from ctid_cli.frequency.drem_finite_time import DremFiniteTime
     >>> t = 0.01 * np.arange(400)
     >>> tracker = DremFiniteTime(tones=2, h=0.6, d=0.4).start(0.01)
     >>> track = tracker.run(np.sin(2 * t) + np.cos(3 * t))

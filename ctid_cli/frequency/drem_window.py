@@ -152,25 +152,7 @@ class DremWindow(DelayRegression):
 
 @njit(cache=True, nogil=True)
 def slide(window: Array, newer: Array, place: int, sums: Array) -> int:
-    """Put an entry into a sliding window and sum the window.
-
-    Parameters
-    ----------
-    window : ndarray, shape (M, q)
-        Entries newer than the last turn up to `place`, and from there on, for each older entry, the sum of it and
-        all that came after it before the turn.
-    newer : ndarray, shape (q,)
-        Sum of the entries newer than the last turn, without the one at `place`.
-    place : int
-        Where the new entry was written.
-    sums : ndarray, shape (q,)
-        Receives the sums over the last M entries.
-
-    Returns
-    -------
-    int
-        Place of the next entry.
-    """
+    """Put an entry into a sliding window and sum the window."""
     length, width = window.shape
     for i in range(width):
         newer[i] += window[place, i]
@@ -216,50 +198,7 @@ def advance_window(
     levels: Array,
     possible_errors: Array,
 ) -> None:
-    """Least squares on every mixed regression over a sliding window.
-
-    Parameters
-    ----------
-    samples : ndarray, shape (N,)
-        New samples.
-    omega, uncertainty : ndarray, shape (N, n)
-        Receive the estimates.
-    flags : ndarray of uint16, shape (N,)
-        Receives the flags.
-    table : ndarray, shape (n + 1, 2 n + 1)
-        Coefficients of the regression.
-    plan : ndarray of int
-        Order of the minors.
-    lag, enough, first_row, spacing : int
-        Delay h in sampling intervals, rows before an estimate can be valid, first stacked row, and distance d in
-        sampling intervals.
-    interval, delay : float
-        Sampling interval and delay h [s].
-    top, bottom : float
-        Cosines of the bounds of the frequencies.
-    check_lag : int
-        Second delay in sampling intervals.
-    check_delay : float
-        The same [s].
-    every : int
-        Samples from one verdict to the next.
-    history, rows : ndarray
-        Rings of samples and of rows.
-    window : ndarray, shape (M, 2 n + 3)
-        ``Delta Psi_k``, ``Psi_k^2``, ``Delta^2``, squared rounding error and 1, or sums of them.
-    newer : ndarray, shape (2 n + 3,)
-        Sums over the newer part of the window.
-    check : ndarray, shape (n + 1, n + 1)
-        Second moments at the second delay.
-    counters : ndarray of int, shape (4,)
-        Place of the newest sample, of the newest row and of the next entry of the window, and mixed rows so far.
-    doubts : ndarray of int, shape (3,)
-        See :func:`~ctid_cli.frequency.scalar_regressions.judge_mixed`.
-    levels : ndarray, shape (4,)
-        See :func:`~ctid_cli.frequency.consistency.contradicts`.
-    possible_errors : ndarray, shape (n,)
-        What may be wrong with the frequencies according to the last verdict [rad/s].
-    """
+    """Least squares on every mixed regression over a sliding window."""
     n = omega.shape[1]
     row, check_row = np.empty(n + 1), np.empty(n + 1)
     matrix, minors, mixed = np.empty((n, n + 1)), np.empty(2 ** (n + 1)), np.empty(n + 1)

@@ -62,7 +62,7 @@ class Esprit:
     Examples
     --------
     >>> import numpy as np
-    >>> from ctid_cli.frequency import Esprit
+    >>> from ctid_cli.frequency.esprit import Esprit
     >>> t = 0.01 * np.arange(1000)
     >>> estimate = Esprit(tones=2, averaging=0.05).estimate(np.sin(2 * t) + np.cos(3 * t), 0.01)
     >>> estimate.omega.round(9), estimate.valid

@@ -162,21 +162,7 @@ class FilterRegression(OnlineEstimator):
 
 
 def derivative_rows(tones: int, pole: float) -> Array:
-    """Regressors and regressand as combinations of the filter states.
-
-    Parameters
-    ----------
-    tones : int
-        Number of sinusoids n.
-    pole : float
-        Rate l of the filter [rad/s].
-
-    Returns
-    -------
-    ndarray, shape (n + 1, 2 n + 1)
-        Rows for ``phi_k = (-1)^(k + 1) z^(2 (n - k))``, k = 1 ... n, and ``z^(2 n)`` from the signal and the states
-        ``w_j = (l/(s + l))^j y``, by ``s w_j = l (w_(j-1) - w_j)``.
-    """
+    """Regressors and regressand as combinations of the filter states."""
     order = 2 * tones
     rows = np.zeros((tones + 1, order + 1))
     for k in range(tones + 1):
@@ -192,26 +178,7 @@ def derivative_rows(tones: int, pole: float) -> Array:
 def decode_squares(
     coefficients: Array, lowest: float, highest: float, polynomial: Array, work: Array, roots: Array, omega: Array
 ) -> int:
-    """Frequencies whose squares are the roots of a polynomial, ascending.
-
-    Parameters
-    ----------
-    coefficients : ndarray, shape (n,)
-        Monic polynomial without its leading coefficient.
-    lowest, highest : float
-        Bounds of the squared frequencies [(rad/s)^2].
-    polynomial, work : ndarray, shape (n + 1,)
-        Work space.
-    roots : ndarray, shape (n,)
-        Receives the squares within the bounds, ascending.
-    omega : ndarray, shape (n,)
-        Receives the frequencies [rad/s], ascending.
-
-    Returns
-    -------
-    int
-        Flags.
-    """
+    """Frequencies whose squares are the roots of a polynomial, ascending."""
     n = coefficients.size
     polynomial[0] = 1.0
     for k in range(n):
@@ -255,44 +222,7 @@ def advance_filter(
     estimate: Array,
     counters: IntArray,
 ) -> None:
-    """Chain of filters, regression with forgetting, and least squares or gradient steps.
-
-    Parameters
-    ----------
-    samples : ndarray, shape (N,)
-        New samples.
-    omega, uncertainty : ndarray, shape (N, n)
-        Receive the estimates.
-    flags : ndarray of uint16, shape (N,)
-        Receives the flags.
-    transition, from_value, from_change : ndarray
-        One-interval map of the chain.
-    derivatives : ndarray, shape (n + 1, 2 n + 1)
-        Regression row from the signal and the states.
-    keep : float
-        Factor on older moments.
-    by_gradient : bool
-        Whether the parameters follow the gradient.
-    gains : ndarray, shape (n,)
-        Gains times the interval.
-    interval : float
-        Sampling interval [s].
-    memory : float
-        Samples that the estimate rests on.
-    hold, refill : int
-        Samples before least squares shows an estimate, and after a gap before rows are used.
-    lowest, highest : float
-        Bounds of the squared frequencies.
-    chain : ndarray, shape (2 n + 1,)
-        Last sample and states.
-    moments : ndarray, shape (n + 1, n + 1)
-        Second moments of the rows that forget.
-    estimate : ndarray, shape (3, n)
-        Coefficients, frequencies and their uncertainty.
-    counters : ndarray of int, shape (4,)
-        Samples so far, samples to wait after a gap (with 1 more while the gap lasts), samples since the last
-        refresh, flags of the last estimate.
-    """
+    """Chain of filters, regression with forgetting, and least squares or gradient steps."""
     n = omega.shape[1]
     order = 2 * n
     row, moved = np.empty(n + 1), np.empty(order)

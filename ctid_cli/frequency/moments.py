@@ -14,17 +14,7 @@ ROUNDING = 4e-15
 
 @njit(cache=True, nogil=True)
 def accumulate_row(row: Array, gram: Array, keep: float) -> None:
-    """Add a row to the lower triangle of second moments that forget.
-
-    Parameters
-    ----------
-    row : ndarray, shape (q,)
-        Row.
-    gram : ndarray, shape (q, q)
-        Second moments; only the lower triangle is kept.
-    keep : float
-        Factor on what was there before.
-    """
+    """Add a row to the lower triangle of second moments that forget."""
     for i in range(row.size):
         for j in range(i + 1):
             gram[i, j] = keep * gram[i, j] + row[i] * row[j]
@@ -32,20 +22,7 @@ def accumulate_row(row: Array, gram: Array, keep: float) -> None:
 
 @njit(cache=True, nogil=True)
 def squared_residual(gram: Array, theta: Array) -> float:
-    """Sum of the squared residuals ``psi - phi' theta``.
-
-    Parameters
-    ----------
-    gram : ndarray, shape (n + 1, n + 1)
-        Second moments of ``[phi psi]``, lower triangle.
-    theta : ndarray, shape (n,)
-        Parameters.
-
-    Returns
-    -------
-    float
-        Not negative.
-    """
+    """Sum of the squared residuals ``psi - phi' theta``."""
     n = theta.size
     total = gram[n, n]
     for i in range(n):
@@ -58,24 +35,7 @@ def squared_residual(gram: Array, theta: Array) -> float:
 
 @njit(cache=True, nogil=True)
 def factorise(gram: Array, ridge: float, factor: Array, scales: Array) -> bool:
-    """Cholesky factor of the regressors' second moments, scaled to a unit diagonal.
-
-    Parameters
-    ----------
-    gram : ndarray, shape (n + 1, n + 1)
-        Second moments of ``[phi psi]``, lower triangle.
-    ridge : float
-        Added to the unit diagonal.
-    factor : ndarray, shape (n, n)
-        Receives the lower factor.
-    scales : ndarray, shape (n,)
-        Receives the square roots of the diagonal.
-
-    Returns
-    -------
-    bool
-        Whether the moments are positive definite beyond rounding.
-    """
+    """Cholesky factor of the regressors' second moments, scaled to a unit diagonal."""
     n = scales.size
     for i in range(n):
         scales[i] = np.sqrt(gram[i, i])
@@ -99,15 +59,7 @@ def factorise(gram: Array, ridge: float, factor: Array, scales: Array) -> bool:
 
 @njit(cache=True, nogil=True)
 def substitute(factor: Array, values: Array) -> None:
-    """Solve ``L L' x = b`` in place.
-
-    Parameters
-    ----------
-    factor : ndarray, shape (n, n)
-        Lower factor L.
-    values : ndarray, shape (n,)
-        b, replaced by x.
-    """
+    """Solve ``L L' x = b`` in place."""
     n = values.size
     for i in range(n):
         total = values[i]
@@ -123,19 +75,7 @@ def substitute(factor: Array, values: Array) -> None:
 
 @njit(cache=True, nogil=True)
 def least_squares(gram: Array, factor: Array, scales: Array, theta: Array) -> None:
-    """Least-squares parameters from second moments and their factor.
-
-    Parameters
-    ----------
-    gram : ndarray, shape (n + 1, n + 1)
-        Second moments of ``[phi psi]``, lower triangle.
-    factor : ndarray, shape (n, n)
-        From :func:`factorise`.
-    scales : ndarray, shape (n,)
-        From :func:`factorise`.
-    theta : ndarray, shape (n,)
-        Receives the parameters.
-    """
+    """Least-squares parameters from second moments and their factor."""
     n = theta.size
     for i in range(n):
         theta[i] = gram[n, i] / scales[i]
@@ -157,25 +97,6 @@ def moment_uncertainty(
 ) -> None:
     r"""Error that the misfit of the equations would make if all of it lay in the worst direction.
 
-    Parameters
-    ----------
-    gram : ndarray, shape (n + 1, n + 1)
-        Second moments of ``[phi psi]``, lower triangle.
-    factor, scales : ndarray, shapes (n, n), (n,)
-        From :func:`factorise`.
-    misfit : float
-        Sum of squared residuals that may move the estimate.
-    theta : ndarray, shape (n,)
-        Parameters.
-    sensitivities : ndarray, shape (n, n)
-        ``g_ik = d omega_i/d theta_k`` [rad/s].
-    uncertainty : ndarray, shape (n,)
-        Receives the possible error of each frequency by the misfit [rad/s].
-    rounding : ndarray, shape (n,)
-        Receives that by rounding [rad/s].
-
-    Notes
-    -----
     Residuals e at the true parameters move the estimate by ``G^-1 Phi' e`` and a frequency by at most
     ``sqrt(g' G^-1 g e'e)`` (Cauchy-Schwarz), whatever the e: noise, a bias, another tone. The residual left by
     the fit stands for ``e'e``; as a difference of moments it is known up to rounding only, and taken for no less.

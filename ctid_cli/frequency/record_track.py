@@ -28,30 +28,20 @@ PIECE = 50_000
 
 @dataclass(frozen=True, eq=False)
 class RecordTrack:
-    """Frequencies and amplitudes over time.
+    """Frequencies and amplitudes over time."""
 
-    Parameters
-    ----------
-    t : ndarray, shape (N,)
-        Instants since the first sample of the record [s]: the newest sample of an online estimate, the middle of the
-        window of a batch estimate.
-    omega : ndarray, shape (N, n)
-        Frequencies [rad/s], ascending; NaN where there is no estimate.
-    amplitudes : ndarray, shape (N, n)
-        Amplitudes [signal unit]; NaN where they are not determined.
-    flags : ndarray of uint16, shape (N,)
-        Bit field of :class:`~ctid_cli.frequency.flags.Flag`.
-    uncertainty : ndarray, shape (N, n)
-        Error that the misfit could make in its worst direction [rad/s]; NaN if unknown.
-    every : float
-        Time from one row to the next [s].
-    """
-
+    #: Instants since the first sample of the record [s]: the newest sample of an online estimate, the middle of the
+    #: window of a batch estimate, shape (N,).
     t: Array
+    #: Frequencies [rad/s], ascending; NaN where there is no estimate, shape (N, n).
     omega: Array
+    #: Amplitudes [signal unit]; NaN where they are not determined, shape (N, n).
     amplitudes: Array
+    #: Bit field of :class:`~ctid_cli.frequency.flags.Flag`, shape (N,).
     flags: NDArray[np.uint16]
+    #: Error that the misfit could make in its worst direction [rad/s]; NaN if unknown, shape (N, n).
     uncertainty: Array
+    #: Time from one row to the next [s].
     every: float
 
     @property
@@ -68,32 +58,7 @@ def track_record(
     every: float | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> RecordTrack:
-    """Follow the frequencies of a recorded signal.
-
-    Parameters
-    ----------
-    samples : ndarray, shape (N,)
-        Signal on a regular clock [signal unit]; NaN where missing.
-    interval : float
-        Sampling interval [s].
-    settings : Settings
-        Estimator, filters and window.
-    every : float, optional
-        Time from one row to the next [s], rounded to the samples that the estimator gets; by default about a thousandth
-        of the record; windows overlap by half, or by more if they would be fewer than a hundred.
-    on_progress : callable, optional
-        Called with the number of samples that are done and their total, of those that the estimator gets.
-
-    Returns
-    -------
-    RecordTrack
-        One row for each of these instants.
-
-    Raises
-    ------
-    ValueError
-        If the estimator's options make no sense at this sampling interval.
-    """
+    """Follow the frequencies of a recorded signal."""
     thinned = settings.decimation.apply(samples - settings.offset)
     thin = settings.interval
     wanted_step = samples.size * interval / USUAL_ROWS

@@ -29,29 +29,7 @@ LONGEST_DELAY = 10_000_000
 
 
 def delay_table(tones: int) -> IntArray:
-    """Coefficients of the delay regression.
-
-    Parameters
-    ----------
-    tones : int
-        Number of sinusoids n, 1 to 8.
-
-    Returns
-    -------
-    ndarray of int, shape (n + 1, 2 n + 1)
-        ``[phi_1 ... phi_n psi] = T [y(t) y(t - h) ... y(t - 2 n h)]``.
-
-    Raises
-    ------
-    ValueError
-        If the number of tones is out of range.
-
-    Examples
-    --------
-    >>> delay_table(1)
-    array([[ 0,  2,  0],
-           [-1,  0, -1]])
-    """
+    """Coefficients of the delay regression."""
     require_integer("tones", tones, 1, MOST_TONES)
     table = np.zeros((tones + 1, 2 * tones + 1), np.int64)
     for k in range(1, tones + 1):
@@ -63,27 +41,7 @@ def delay_table(tones: int) -> IntArray:
 
 
 def whole_delay(name: str, delay: float, interval: float) -> int:
-    """Sampling intervals nearest to a delay.
-
-    Parameters
-    ----------
-    name : str
-        The option as the user writes it.
-    delay : float
-        Delay [s].
-    interval : float
-        Sampling interval [s].
-
-    Returns
-    -------
-    int
-        At least 1.
-
-    Raises
-    ------
-    ValueError
-        If the delay is shorter than half an interval, or longer than ten million.
-    """
+    """Sampling intervals nearest to a delay."""
     require_positive("interval", interval, "s")
     if delay / interval > LONGEST_DELAY:
         raise ValueError(
@@ -97,24 +55,7 @@ def whole_delay(name: str, delay: float, interval: float) -> int:
 
 
 def regression_rows(samples: ArrayLike, tones: int, lag: int) -> tuple[Array, Array]:
-    """Regressand and regressors of a whole record.
-
-    Parameters
-    ----------
-    samples : array_like, shape (N,)
-        Signal at a regular clock [signal unit]; NaN where missing.
-    tones : int
-        Number of sinusoids n.
-    lag : int
-        Delay h in sampling intervals.
-
-    Returns
-    -------
-    psi : ndarray, shape (N,)
-        Regressand [signal unit]; NaN before sample ``2 n lag`` and wherever a sample it needs is missing.
-    phi : ndarray, shape (N, n)
-        Regressors [signal unit].
-    """
+    """Regressand and regressors of a whole record."""
     y = np.asarray(samples, dtype=float)
     table = delay_table(tones)
     rows = np.full((y.size, tones + 1), np.nan)
@@ -126,49 +67,13 @@ def regression_rows(samples: ArrayLike, tones: int, lag: int) -> tuple[Array, Ar
 
 
 def theta_of(omega: ArrayLike, delay: float) -> Array:
-    """Parameters of the regression that belong to given frequencies.
-
-    Parameters
-    ----------
-    omega : array_like, shape (n,)
-        Frequencies [rad/s].
-    delay : float
-        Delay h [s].
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        theta [-].
-
-    Examples
-    --------
-    >>> theta_of([2.0, 3.0], 0.7).round(4)
-    array([ 0.3349, -0.0858])
-    """
+    """Parameters of the regression that belong to given frequencies."""
     return np.asarray(np.poly(np.cos(np.asarray(omega, dtype=float) * delay))[1:])
 
 
 def determinant_from_tones(components: ArrayLike, omega: ArrayLike, lag: int, spacing: int, interval: float) -> Array:
     r"""Determinant of the stacked regressors by its closed form.
 
-    Parameters
-    ----------
-    components : array_like, shape (N, n)
-        The sinusoids of the signal one by one, on the clock [signal unit].
-    omega : array_like, shape (n,)
-        Their frequencies [rad/s].
-    lag, spacing : int
-        Delay h and distance d of the stacked rows, in sampling intervals.
-    interval : float
-        Sampling interval [s].
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        Determinant of the matrix with rows ``phi(t - j d)``, j = 0 ... n - 1 [signal unit^n]; NaN before it is defined.
-
-    Notes
-    -----
     ``phi(t) = 2^n sum_i [c_i^(n-1) ... c_i 1] y_i(t - n h)``, hence
     ``det = 2^(n n) det[y_i(t - n h - j d)] prod_(i<j) (c_i - c_j)``. It vanishes identically if two c_i agree or if all
     ``w_i d`` are multiples of pi of one parity.
@@ -189,20 +94,7 @@ def determinant_from_tones(components: ArrayLike, omega: ArrayLike, lag: int, sp
 
 
 def minor_plan(tones: int) -> IntArray:
-    """Order in which all maximal minors of an n x (n + 1) matrix are built up from smaller ones.
-
-    Parameters
-    ----------
-    tones : int
-        Number of rows n.
-
-    Returns
-    -------
-    ndarray of int, shape (steps, 5)
-        Each step: bit pattern of the minor's columns, row and column of the factor, pattern of the smaller minor, sign.
-        The minor of the first k rows is expanded along the last of them. There are ``(n + 1) 2^n`` steps at most,
-        against n! products of a plain expansion, and no division: a singular matrix is no special case.
-    """
+    """Order in which all maximal minors of an n x (n + 1) matrix are built up from smaller ones."""
     steps = []
     for pattern in range(1, 2 ** (tones + 1) - 1):
         columns = [c for c in range(tones + 1) if pattern >> c & 1]
@@ -214,26 +106,7 @@ def minor_plan(tones: int) -> IntArray:
 
 @njit(cache=True, nogil=True)
 def form_row(history: Array, newest: int, lag: int, table: Array, row: Array) -> bool:
-    """Regression row at the newest sample.
-
-    Parameters
-    ----------
-    history : ndarray, shape (M,)
-        Ring of the last M > 2 n lag samples; NaN where missing or not yet arrived.
-    newest : int
-        Place of the newest sample in the ring.
-    lag : int
-        Delay h in sampling intervals.
-    table : ndarray, shape (n + 1, 2 n + 1)
-        :func:`delay_table` as floating-point numbers.
-    row : ndarray, shape (n + 1,)
-        Receives ``[phi_1 ... phi_n psi]``.
-
-    Returns
-    -------
-    bool
-        Whether every sample that the row needs is there.
-    """
+    """Regression row at the newest sample."""
     count, width = table.shape
     for k in range(count):
         row[k] = 0.0
@@ -254,32 +127,7 @@ def form_row(history: Array, newest: int, lag: int, table: Array, row: Array) ->
 def mix_rows(
     rows: Array, newest: int, first: int, spacing: int, plan: IntArray, matrix: Array, minors: Array, mixed: Array
 ) -> float:
-    """Determinant and right-hand sides of the scalar regressions at the newest row.
-
-    Parameters
-    ----------
-    rows : ndarray, shape (M, n + 1)
-        Ring of the last regression rows.
-    newest : int
-        Place of the newest row in the ring.
-    first : int
-        Number j0 of the first stacked row: rows ``t - j0 d ... t - (j0 + n - 1) d`` are stacked.
-    spacing : int
-        Distance d in sampling intervals.
-    plan : ndarray of int, shape (steps, 5)
-        :func:`minor_plan`.
-    matrix : ndarray, shape (n, n + 1)
-        Work space.
-    minors : ndarray, shape (2^(n + 1),)
-        Work space.
-    mixed : ndarray, shape (n + 1,)
-        Receives ``[Psi_1 ... Psi_n Delta]``; not finite if a row is missing.
-
-    Returns
-    -------
-    float
-        Product of the lengths of the rows: rounding makes errors of Delta and Psi_k of this size times 1e-16.
-    """
+    """Determinant and right-hand sides of the scalar regressions at the newest row."""
     n = matrix.shape[0]
     size = rows.shape[0]
     place = newest - first * spacing

@@ -103,7 +103,7 @@ class RestartingLeastSquares(DelayRegression):
     Examples
     --------
     >>> import numpy as np
-    >>> from ctid_cli.frequency import RestartingLeastSquares
+    >>> from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
     >>> t = 0.01 * np.arange(3000)
     >>> w = np.where(t < 15, 1.8, 2.0)
     >>> y = np.sin(w * t) + np.cos(3 * t) + 0.1 * np.random.default_rng(0).standard_normal(3000)
@@ -191,22 +191,7 @@ class RestartingLeastSquares(DelayRegression):
 
 
 def noise_covariance(table: Array, weights: Array, lag: int) -> Array:
-    """Covariance of the regression rows of filtered white noise.
-
-    Parameters
-    ----------
-    table : ndarray, shape (n + 1, 2 n + 1)
-        Coefficients T of the regression.
-    weights : ndarray, shape (L + 1,)
-        Impulse response of the prefilter.
-    lag : int
-        Delay h in sampling intervals.
-
-    Returns
-    -------
-    ndarray, shape (n + 1, n + 1)
-        ``C = T R T'``, R the correlation of filtered noise of unit variance at multiples of h.
-    """
+    """Covariance of the regression rows of filtered white noise."""
     width = table.shape[1]
     correlation = [
         float(weights[j * lag :] @ weights[: weights.size - j * lag]) if j * lag < weights.size else 0.0
@@ -218,17 +203,7 @@ def noise_covariance(table: Array, weights: Array, lag: int) -> Array:
 
 @njit(cache=True, nogil=True)
 def total_least_squares(gram: Array, whitener: Array, theta: Array) -> None:
-    """Parameters for which the noise in all columns of the regression is least.
-
-    Parameters
-    ----------
-    gram : ndarray, shape (n + 1, n + 1)
-        Second moments of ``[phi psi]``, lower triangle.
-    whitener : ndarray, shape (n + 1, n + 1)
-        Inverse M of the lower Cholesky factor of the noise covariance C.
-    theta : ndarray, shape (n,)
-        Receives the parameters; NaN if the smallest eigenvalue belongs to none.
-    """
+    """Parameters for which the noise in all columns of the regression is least."""
     size = gram.shape[0]
     half, full = np.zeros((size, size)), np.zeros((size, size))
     for i in range(size):
@@ -261,31 +236,7 @@ def judge(
     frequencies: Array,
     possible_errors: Array,
 ) -> tuple[int, bool]:
-    """Frequencies that belong to fitted parameters, and how far they can be trusted.
-
-    Parameters
-    ----------
-    gram : ndarray, shape (n + 1, n + 1)
-        Second moments of ``[phi psi]``, lower triangle.
-    factor, scales : ndarray, shapes (n, n), (n,)
-        From :func:`~ctid_cli.frequency.moments.factorise`.
-    theta : ndarray, shape (n,)
-        Parameters.
-    clock : ndarray, shape (4,)
-        Delay h [s], cosines of the lowest and of the highest frequency times h, second delay [s].
-    span, elapsed : float
-        Time that the moments rest on, and since the restart [s].
-    frequencies, possible_errors : ndarray, shape (n,)
-        Receive the estimates [rad/s].
-
-    Returns
-    -------
-    flags : int
-        What is wrong with them.
-    judges : bool
-        Whether the fit is good enough to judge other samples by. Rows of the first periods are so much alike that a fit
-        to noise leaves next to no residual.
-    """
+    """Frequencies that belong to fitted parameters, and how far they can be trusted."""
     n = theta.size
     roots, slopes, rounding = np.empty(n), np.empty(n), np.empty(n)
     sensitivities = np.empty((n, n))
@@ -321,51 +272,7 @@ def advance_restarting(
     levels: Array,
     counters: IntArray,
 ) -> None:
-    """Least squares with alarm, flush, restart and comparison with the newer data alone.
-
-    Parameters
-    ----------
-    samples : ndarray, shape (N,)
-        New samples, prefiltered.
-    omega, uncertainty : ndarray, shape (N, n)
-        Receive the estimates.
-    flags : ndarray of uint16, shape (N,)
-        Receives the flags.
-    table : ndarray, shape (n + 1, 2 n + 1)
-        Coefficients of the regression.
-    lag : int
-        Delay h in sampling intervals.
-    settings : ndarray of int, shape (5,)
-        Time constant of the detector, rows before an alarm, rows before the first comparison, samples to flush, rows
-        before an estimate can be valid.
-    memory : float
-        Rows that are remembered.
-    whitener : ndarray, shape (n + 1, n + 1)
-        Inverse of the Cholesky factor of the rows' noise covariance, for total least squares.
-    total : bool
-        Whether that is used.
-    interval : float
-        Sampling interval [s].
-    clock : ndarray, shape (4,)
-        Delay h [s], cosines of the lowest and of the highest frequency times h, second delay [s].
-    check_lag : int
-        Second delay in sampling intervals.
-    every : int
-        Samples from one look at the second delay to the next.
-    history : ndarray
-        Ring of samples.
-    older, newer : ndarray, shape (n + 1, n + 1)
-        Second moments before and since the last comparison.
-    check : ndarray, shape (n + 1, n + 1)
-        Second moments at the second delay.
-    estimate : ndarray, shape (3, n)
-        theta, frequencies and their uncertainty.
-    levels : ndarray, shape (4,)
-        Weight of the older and of the newer moments, recent mean squared residual, threshold of the alarm.
-    counters : ndarray of int, shape (6,)
-        Place of the newest sample, rows since the restart, rows at the next comparison, samples still to flush, flags
-        of the last estimate, and whether it is good enough to judge new samples by.
-    """
+    """Least squares with alarm, flush, restart and comparison with the newer data alone."""
     n = omega.shape[1]
     row, check_row = np.empty(n + 1), np.empty(n + 1)
     scales, trial, trial_omega, trial_errors = np.empty(n), np.empty(n), np.empty(n), np.empty(n)

@@ -47,42 +47,7 @@ NEGLIGIBLE = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class DremOptions(DelayRegression):
-    """Options that the finite-time and the gradient estimate share.
-
-    Parameters
-    ----------
-    tones : int
-        Number of sinusoids n.
-    h : float
-        Delay of the regression [s].
-    d : float
-        Distance of the stacked rows [s].
-    epsilon : float, default 1.0
-        Normalisation of the mixed regression [-].
-    gamma : float or tuple of float, default 1.0
-        Adaptation gain, one for all parameters or one for each.
-    initial_frequencies : tuple of float, optional
-        Frequencies before there is an estimate [rad/s].
-    first_row : int, default 1
-        Number of the first stacked row.
-    power : int or "literal", default 1
-        Power of ``epsilon`` in the mixed regression.
-    gated : bool, default True
-        Whether the estimation waits until the delays are filled.
-    prefilter : float, default 0.0
-        Length of a Hann low-pass in front of the regression [s].
-    difference : float, default 0.0
-        Distance of the two samples whose difference is taken against a bias [s].
-    lowest_frequency : float, default 0.0
-        Lower bound of the frequencies [rad/s].
-    highest_frequency : float, optional
-        Upper bound of the frequencies [rad/s].
-
-    Raises
-    ------
-    ValueError
-        If an option is out of range.
-    """
+    """Options that the finite-time and the gradient estimate share."""
 
     d: float = field(metadata={"doc": "Distance of the stacked rows", "unit": "s"})
     epsilon: float = field(default=1.0, metadata={"doc": "Normalisation of the mixed regression"})
@@ -113,64 +78,18 @@ class DremOptions(DelayRegression):
 
 
 def check_mixing(d: float, first_row: int) -> None:
-    """Refuse impossible options of the mixing.
-
-    Parameters
-    ----------
-    d : float
-        Distance of the stacked rows [s].
-    first_row : int
-        Number of the first stacked row.
-
-    Raises
-    ------
-    ValueError
-        If one is out of range.
-    """
+    """Refuse impossible options of the mixing."""
     require_positive("d", d, "s")
     require_integer("first_row", first_row, 0, 1000)
 
 
 def rows_before_valid(tones: int, clock: DelayClock) -> int:
-    """Rows that must have arrived before an estimate can be valid.
-
-    Parameters
-    ----------
-    tones : int
-        Number of sinusoids n.
-    clock : DelayClock
-        Delays and prefilter.
-
-    Returns
-    -------
-    int
-        Four for each tone, and no less than n h/4: fewer are too much alike.
-    """
+    """Rows that must have arrived before an estimate can be valid."""
     return max(ROWS_PER_TONE * tones, int(STARTING_SPAN * tones * clock.lag))
 
 
 def scalar_recursion(options: DremOptions, interval: float, *, finite_time: bool) -> Recursion:
-    """The recursion that the finite-time and the gradient estimate share.
-
-    Parameters
-    ----------
-    options : DremOptions
-        Options.
-    interval : float
-        Sampling interval [s].
-    finite_time : bool
-        Which of the two estimates is decoded.
-
-    Returns
-    -------
-    Recursion
-        With the state before the first sample.
-
-    Raises
-    ------
-    ValueError
-        If the options make no sense at this sampling interval.
-    """
+    """The recursion that the finite-time and the gradient estimate share."""
     n = options.tones
     clock = options.clock(interval)
     spacing = whole_delay("d", options.d, interval)
@@ -237,44 +156,7 @@ def judge_mixed(
     omega: Array,
     uncertainty: Array,
 ) -> int:
-    """What may be wrong with frequencies from mixed regressions.
-
-    Parameters
-    ----------
-    theta, roots : ndarray, shape (n,)
-        Parameters and cosines.
-    errors : ndarray, shape (n,)
-        Errors of the parameters that the misfit shows.
-    relative : float
-        Relative error of the mixed regressions by rounding.
-    delay : float
-        Delay h [s].
-    span, elapsed : float
-        Time that the estimate rests on, and since the first sample [s].
-    interval : float
-        Sampling interval [s].
-    started : bool
-        Whether there are enough rows for a verdict that lasts.
-    contradicted : bool
-        Whether the newest rows contradict the estimate.
-    check : ndarray, shape (n + 1, n + 1)
-        Second moments at the second delay.
-    check_delay : float
-        The same [s].
-    doubts : ndarray of int, shape (3,)
-        Samples since the last verdict, that verdict, and samples since the estimate was uncertain.
-    sensitivities, slopes, rounding : ndarray, shapes (n, n), (n,), (n,)
-        Work space.
-    omega : ndarray, shape (n,)
-        Frequencies [rad/s].
-    uncertainty : ndarray, shape (n,)
-        Receives what may be wrong with them [rad/s].
-
-    Returns
-    -------
-    int
-        The verdict: what is wrong with the estimate.
-    """
+    """What may be wrong with frequencies from mixed regressions."""
     n = theta.size
     cosine_sensitivities(roots, delay, slopes, sensitivities)
     propagate(sensitivities, errors, uncertainty)
@@ -325,61 +207,7 @@ def advance_scalars(
     levels: Array,
     possible_errors: Array,
 ) -> None:
-    """Gradient and finite-time estimate of every mixed regression.
-
-    Parameters
-    ----------
-    samples : ndarray, shape (N,)
-        New samples.
-    omega, uncertainty : ndarray, shape (N, n)
-        Receive the estimates.
-    flags : ndarray of uint16, shape (N,)
-        Receives the flags.
-    table : ndarray, shape (n + 1, 2 n + 1)
-        Coefficients of the regression.
-    plan : ndarray of int
-        Order of the minors.
-    lag, enough, first_row, spacing : int
-        Delay h in sampling intervals, rows before an estimate can be valid, first stacked row, and distance d in
-        sampling intervals.
-    normalisation : float
-        Factor on the mixed regression.
-    gains : ndarray, shape (n,)
-        gamma Ts.
-    initial : ndarray, shape (n,)
-        theta(0).
-    finite_time : bool
-        Whether the initial values are taken out of the estimate.
-    interval, delay : float
-        Sampling interval and delay h [s].
-    top, bottom : float
-        Cosines of the bounds of the frequencies.
-    check_lag : int
-        Second delay in sampling intervals.
-    check_delay : float
-        The same [s].
-    every : int
-        Samples from one verdict to the next.
-    history, rows : ndarray
-        Rings of samples and of rows.
-    theta : ndarray, shape (n,)
-        Estimate before the samples.
-    sums : ndarray, shape (2, n)
-        z and q.
-    recent : ndarray, shape (n + 3,)
-        Recent sums of the squared residuals, of Delta^2 and of the squared rounding errors; squared weights of the rows
-        in the fastest estimate.
-    check : ndarray, shape (n + 1, n + 1)
-        Second moments at the second delay.
-    counters : ndarray of int, shape (3,)
-        Place of the newest sample and of the newest row, and mixed rows so far.
-    doubts : ndarray of int, shape (3,)
-        See :func:`judge_mixed`.
-    levels : ndarray, shape (4,)
-        See :func:`~ctid_cli.frequency.consistency.contradicts`.
-    possible_errors : ndarray, shape (n,)
-        What may be wrong with the frequencies according to the last verdict [rad/s].
-    """
+    """Gradient and finite-time estimate of every mixed regression."""
     n = gains.size
     row, check_row = np.empty(n + 1), np.empty(n + 1)
     matrix, minors, mixed = np.empty((n, n + 1)), np.empty(2 ** (n + 1)), np.empty(n + 1)

@@ -33,20 +33,13 @@ LONGEST_FRACTION = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Peaks:
-    """Peaks of a spectrum.
+    """Peaks of a spectrum."""
 
-    Parameters
-    ----------
-    omega : ndarray, shape (m,)
-        Frequencies [rad/s], the largest peak first.
-    amplitudes : ndarray, shape (m,)
-        Amplitudes, median over the record [signal unit], descending.
-    segment : float
-        Length of the segments [s]; tones closer than ``4 pi/segment`` make one peak.
-    """
-
+    #: Frequencies [rad/s], the largest peak first, shape (m,).
     omega: Array
+    #: Amplitudes, median over the record [signal unit], descending, shape (m,).
     amplitudes: Array
+    #: Length of the segments [s]; tones closer than ``4 pi/segment`` make one peak.
     segment: float
 
     @property
@@ -58,33 +51,9 @@ class Peaks:
 def find_peaks(samples: Array, interval: float, tones: int) -> Peaks:
     """Peaks of the median spectrum of a record's segments, of a length that shows as many strong ones as wanted.
 
-    Parameters
-    ----------
-    samples : ndarray, shape (N,)
-        Signal [signal unit]; NaN where missing.
-    interval : float
-        Sampling interval [s].
-    tones : int
-        Number of tones wanted.
-
-    Returns
-    -------
-    Peaks
-        All peaks that stand out, perhaps fewer than wanted.
-
-    Notes
-    -----
     The median over segments shows what is there most of the time, not what is loud for a moment. Long segments tell
     close tones apart and short ones stand it if a tone moves: of the lengths N, N/2, N/4, ... the longest is taken that
     shows the weakest of the wanted peaks (nearly) as large as any length does.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> t = 0.1 * np.arange(1000)
-    >>> peaks = find_peaks(np.sin(2 * t) + 0.5 * np.sin(3 * t), 0.1, 2)
-    >>> peaks.omega[:2].round(1), peaks.amplitudes[:2].round(1)
-    (array([2., 3.]), array([1. , 0.5]))
     """
     missing = ~np.isfinite(samples)
     values = np.asarray(samples, dtype=float)
@@ -114,24 +83,7 @@ def find_peaks(samples: Array, interval: float, tones: int) -> Peaks:
 
 
 def median_spectrum(values: Array, missing: NDArray[np.bool_], size: int, most_missing: float) -> Array | None:
-    """Median over segments of the amplitude spectrum, with a Hann window.
-
-    Parameters
-    ----------
-    values : ndarray, shape (N,)
-        Signal, gaps bridged [signal unit].
-    missing : ndarray of bool, shape (N,)
-        Which samples were.
-    size : int
-        Samples in a segment, at most N; segments overlap by half, if they need not be fewer.
-    most_missing : float
-        A segment with a larger fraction of missing samples is left out.
-
-    Returns
-    -------
-    ndarray, shape (PADDING size // 2 + 1,), or None
-        Amplitudes [signal unit], ``PADDING`` for each bin; None if every segment has too many gaps.
-    """
+    """Median over segments of the amplitude spectrum, with a Hann window."""
     count = max(1, min(2 * values.size // size - 1, MOST_SAMPLES // size))
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(size) + 0.5) / size)
     window /= window.sum()

@@ -84,28 +84,12 @@ class FrequencyTrack:
 
 @dataclass(frozen=True, eq=False)
 class Recursion:
-    """A compiled recursion with everything it needs.
-
-    Parameters
-    ----------
-    advance : callable
-        ``advance(samples, omega, uncertainty, flags, *constants, *state.values())`` takes the samples in order, changes
-        the state in place and writes one row of results for each sample.
-    constants : tuple
-        Arguments that never change.
-    state : dict of ndarray
-        Everything that does, by name.
-    weights : ndarray, shape (L + 1,)
-        Impulse response of the prefilter, newest sample first; one weight for none.
-    past : float
-        What the prefilter takes for the samples before the first one: NaN or 0.
-    notes : tuple of str
-        Sentences about options that could not be met exactly.
-    """
+    """A compiled recursion with everything it needs."""
 
     advance: Callable[..., None]
     constants: tuple[Any, ...]
     state: dict[str, NDArray[Any]]
+    #: Impulse response of the prefilter, newest sample first; one weight for none, shape (L + 1,).
     weights: Array = field(default_factory=lambda: np.ones(1))
     past: float = np.nan
     notes: tuple[str, ...] = ()
@@ -119,65 +103,15 @@ class OnlineEstimator:
     tones: int
 
     def recursion(self, interval: float) -> Recursion:
-        """The compiled recursion for a sampling interval.
-
-        Parameters
-        ----------
-        interval : float
-            Sampling interval [s].
-
-        Returns
-        -------
-        Recursion
-            With the state before the first sample.
-
-        Raises
-        ------
-        ValueError
-            If the options make no sense at this sampling interval.
-        """
+        """The compiled recursion for a sampling interval."""
         raise NotImplementedError
 
     def start(self, interval: float) -> Tracker:
-        """Begin before the first sample.
-
-        Parameters
-        ----------
-        interval : float
-            Sampling interval [s].
-
-        Returns
-        -------
-        Tracker
-            Takes the samples.
-
-        Raises
-        ------
-        ValueError
-            If the options make no sense at this sampling interval.
-        """
+        """Begin before the first sample."""
         return Tracker(self, interval)
 
     def restore(self, interval: float, state: Mapping[str, ArrayLike]) -> Tracker:
-        """Go on where another tracker stopped.
-
-        Parameters
-        ----------
-        interval : float
-            Sampling interval [s], the same as before.
-        state : mapping of str to array_like
-            What :meth:`Tracker.state` returned.
-
-        Returns
-        -------
-        Tracker
-            Gives the same numbers, bit for bit, as the one whose state it is.
-
-        Raises
-        ------
-        DataError
-            If the state is not one of this estimator with these options and this sampling interval.
-        """
+        """Go on where another tracker stopped."""
         tracker = Tracker(self, interval)
         tracker.load(state)
         return tracker

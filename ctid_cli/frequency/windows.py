@@ -24,45 +24,19 @@ NEAR = 0.05
 
 @dataclass(frozen=True, eq=False)
 class WindowEstimate:
-    """Frequencies of one window.
+    """Frequencies of one window."""
 
-    Parameters
-    ----------
-    omega, uncertainty : ndarray, shape (n,)
-        Frequencies, ascending, and what may be wrong with them [rad/s]; NaN where there is no estimate.
-    flags : Flag
-        Why they must not be trusted.
-    everything : ndarray, shape (m,)
-        Frequencies of all tones that were estimated [rad/s]: those wanted, and those that only share their band.
-    """
-
+    #: Frequencies, ascending, and what may be wrong with them [rad/s]; NaN where there is no estimate, shape (n,).
     omega: Array
     uncertainty: Array
     flags: Flag
+    #: Frequencies of all tones that were estimated [rad/s]: those wanted, and those that only share their band, shape
+    #: (m,).
     everything: Array
 
 
 def estimate_window(estimator: Any, samples: Array, interval: float, expected: Array, wanted: int) -> WindowEstimate:
-    """Estimate the frequencies of one window, and keep those of the tones that are wanted.
-
-    Parameters
-    ----------
-    estimator : Esprit or NonlinearLeastSquares
-        Batch estimator of m tones.
-    samples : ndarray, shape (N,)
-        Signal [signal unit]; NaN where missing.
-    interval : float
-        Sampling interval [s].
-    expected : ndarray, shape (m,)
-        Frequencies that the spectrum shows [rad/s], those of the wanted tones first.
-    wanted : int
-        Number n of wanted tones, at most m.
-
-    Returns
-    -------
-    WindowEstimate
-        The estimate. If more tones were estimated than are wanted, those that belong to the wanted ones are kept.
-    """
+    """Estimate the frequencies of one window, and keep those of the tones that are wanted."""
     none = np.full(wanted, np.nan)
     missing = ~np.isfinite(samples)
     if missing.any() and (not isinstance(estimator, NonlinearLeastSquares) or missing.mean() > MOST_MISSING):
@@ -84,22 +58,7 @@ def estimate_window(estimator: Any, samples: Array, interval: float, expected: A
 
 
 def wanted_tones(found: FrequencyEstimate, expected: Array, wanted: int) -> WindowEstimate:
-    """Keep the tones that are wanted.
-
-    Parameters
-    ----------
-    found : FrequencyEstimate
-        Estimate of m tones.
-    expected : ndarray, shape (M,)
-        Frequencies that the spectrum shows [rad/s], those of the wanted tones first; no fewer than were estimated.
-    wanted : int
-        Number n of wanted tones, at most m.
-
-    Returns
-    -------
-    WindowEstimate
-        What is wrong with a tone that only shares the band does not make the others invalid.
-    """
+    """Keep the tones that are wanted."""
     omega, uncertainty = found.omega, found.uncertainty
     if omega.size == wanted or not np.isfinite(omega).all():
         return WindowEstimate(omega[:wanted], uncertainty[:wanted], found.flags, omega)
@@ -116,32 +75,8 @@ def wanted_tones(found: FrequencyEstimate, expected: Array, wanted: int) -> Wind
 def belonging(found: Array, expected: Array, wanted: int) -> NDArray[np.intp]:
     """Which of the estimated frequencies belong to the wanted tones.
 
-    Parameters
-    ----------
-    found : ndarray, shape (m,)
-        Estimated frequencies [rad/s].
-    expected : ndarray, shape (M,)
-        Frequencies that the spectrum shows [rad/s], those of the wanted tones first, M at least m.
-    wanted : int
-        Number n of wanted tones, at most m.
-
-    Returns
-    -------
-    ndarray of int, shape (n,)
-        For each wanted tone the place of its estimate. Every estimate belongs to one of the expected tones; of those
-        that only share the band some may have none.
-
-    Notes
-    -----
     The sum over all pairs of ``x/(x + NEAR)`` is least, with x the distance of the logarithms: one pair that fits is
     worth more than several that nearly do, and a tone that strayed far is as good as any other that did.
-
-    Examples
-    --------
-    >>> belonging(np.array([0.1, 2.1, 3.2]), np.array([3.0, 2.0, 9.0]), 3)
-    array([2, 1, 0])
-    >>> belonging(np.array([1.0, 1.1, 1.5, 3.0]), np.array([1.5, 3.0, 1.1, 1.7, 1.0]), 2)
-    array([2, 3])
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -154,24 +89,7 @@ def belonging(found: Array, expected: Array, wanted: int) -> NDArray[np.intp]:
 
 
 def amplitudes_of(samples: Array, interval: float, omega: Array, everything: Array) -> Array:
-    """Amplitudes of sinusoids of known frequencies in a window.
-
-    Parameters
-    ----------
-    samples : ndarray, shape (N,)
-        Signal [signal unit]; NaN where missing.
-    interval : float
-        Sampling interval [s].
-    omega : ndarray, shape (n,)
-        Frequencies [rad/s].
-    everything : ndarray, shape (m,)
-        Frequencies of all tones of the window, these among them.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Amplitudes [signal unit]; NaN where they are not determined.
-    """
+    """Amplitudes of sinusoids of known frequencies in a window."""
     frequencies = np.unique(everything[everything > 0])
     if not np.isfinite(omega).all() or not np.isin(omega, frequencies).all():
         return np.full(omega.size, np.nan)

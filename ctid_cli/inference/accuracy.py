@@ -18,24 +18,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ParameterAccuracy:
-    """Parameters of the true system and the covariance of their estimates.
-
-    Parameters
-    ----------
-    model : AdditiveModel or TransferFunction
-        The true system.
-    names : tuple of str
-        What is estimated: the parameters of an additive model, or ``a1 … an, b0 … bm`` of a transfer function, followed
-        by ``delay`` if that is estimated too.
-    values : ndarray, shape (p,)
-        Their true values.
-    covariance : ndarray, shape (p, p)
-        Covariance of their estimates.
-    """
+    """Parameters of the true system and the covariance of their estimates."""
 
     model: AdditiveModel | TransferFunction
     names: tuple[str, ...]
+    #: Their true values, shape (p,).
     values: Array
+    #: Covariance of their estimates, shape (p, p).
     covariance: Array
 
     @property
@@ -47,23 +36,6 @@ class ParameterAccuracy:
     def factored(self, terms: Sequence[Term] | None = None) -> ParameterAccuracy:
         """Accuracy of the sum of submodels into which an estimated transfer function is factored.
 
-        Parameters
-        ----------
-        terms : sequence of Term, optional
-            Orders of the submodels, as :func:`ctid_cli.models.factoring.factored` takes them.
-
-        Returns
-        -------
-        ParameterAccuracy
-            Of ``factored(model, terms)``; that of an additive model is returned as it is.
-
-        Raises
-        ------
-        FactoringError
-            If the model is no sum of such submodels.
-
-        Notes
-        -----
         By the delta method. Factoring undoes the sum of submodels whose numerators have full length, so its derivatives
         are the inverse of those of the sum; this holds for estimated numerators of any length.
         """
@@ -96,30 +68,7 @@ class ParameterAccuracy:
 def estimated_parameters(
     model: AdditiveModel | TransferFunction, zeros: int | None = None, *, delay: bool = False
 ) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-    """Names and true values of what is estimated.
-
-    Parameters
-    ----------
-    model : AdditiveModel or TransferFunction
-        The true system, in the form in which it is estimated.
-    zeros : int, optional
-        Degree of the estimated numerator of a transfer function, if more than the model's own.
-    delay : bool, default False
-        Whether the delay of a transfer function is estimated too.
-
-    Returns
-    -------
-    names : tuple of str
-        The parameters.
-    values : ndarray, shape (p,)
-        Their values.
-
-    Raises
-    ------
-    ValueError
-        If the estimated numerator has a lower degree than the model's, or a higher one than the denominator, or zeros
-        or the delay are asked of an additive model.
-    """
+    """Names and true values of what is estimated."""
     if isinstance(model, AdditiveModel):
         if zeros is not None or delay:
             raise ValueError("an additive model has its degrees in its terms and a known delay; leave both out")

@@ -25,51 +25,9 @@ def additive_derived(
 ) -> tuple[DerivedParameter, ...]:
     r"""What users read off the submodels of a sum, with standard errors by the delta method.
 
-    Parameters
-    ----------
-    model : AdditiveModel
-        The estimate.
-    covariance : array_like, shape (p, p)
-        Covariance of ``model.theta``.
-    level : float, default 0.95
-        Confidence level of the intervals [-].
-    gain_unit : str, default "output unit/input unit"
-        Unit of the static gains.
-
-    Returns
-    -------
-    tuple of DerivedParameter
-        For the first submodel, and so on for the others: of a real pole ``g1_pole`` [rad/s] and ``g1_time_constant``
-        [s]; of a complex pair ``g1_pole_real``, ``g1_pole_imag`` [rad/s], ``g1_natural_frequency`` [rad/s],
-        ``g1_natural_frequency_hz`` [Hz] and ``g1_damping`` [-]; and ``g1_static_gain``. A submodel of two real poles
-        has frequency and damping as well. Where there are several poles or pairs in one submodel, they are numbered
-        from the fastest. Integrators are fixed at the origin and have no accuracy.
-
-    Raises
-    ------
-    ValueError
-        If the covariance does not fit the model.
-
-    Notes
-    -----
     As :func:`ctid_cli.inference.derived_parameters`. Each quantity depends on the parameters of its own submodel alone,
     so a pole is undetermined only where it cannot be told from another one of the same submodel. With
     ``A = 1 + a_1 p + … + a_n p^n``, a pole moves by ``dp/da_k = -p^k/A'(p)``.
-
-    Examples
-    --------
-    >>> model = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([2.0], [0.5, 1.0])])
-    >>> for row in additive_derived(model, 1e-4 * np.eye(5)):
-    ...     print(f"{row.name} {row.estimate:.3g} ± {row.standard_error:.2g} {row.unit}")
-    g1_pole_real -0.5 ± 0.028 rad/s
-    g1_pole_imag 1.94 ± 0.037 rad/s
-    g1_natural_frequency 2 ± 0.04 rad/s
-    g1_natural_frequency_hz 0.318 ± 0.0064 Hz
-    g1_damping 0.25 ± 0.011 -
-    g1_static_gain 3 ± 0.01 output unit/input unit
-    g2_pole -2 ± 0.04 rad/s
-    g2_time_constant 0.5 ± 0.01 s
-    g2_static_gain 2 ± 0.01 output unit/input unit
     """
     C = np.asarray(covariance, dtype=float)
     size = model.theta.size

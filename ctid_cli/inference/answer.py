@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ctid_cli.inference.faults import outliers
 from ctid_cli.inference.input_moves import InputMoves, input_moves
-from ctid_cli.signals import Record
+from ctid_cli.signals.record import Record
 
 Array = NDArray[np.float64]
 
@@ -44,126 +44,62 @@ REPEATS = 0.3
 
 @dataclass(frozen=True)
 class Grid:
-    """Input and output on a regular grid, without their linear trends.
+    """Input and output on a regular grid, without their linear trends."""
 
-    Parameters
-    ----------
-    interval : float
-        Spacing [s]: the median interval of the record.
-    u : ndarray, shape (n,)
-        Input [input unit].
-    y : ndarray, shape (n,)
-        Output [output unit], interpolated; zero in holes.
-    known : ndarray of bool, shape (n,)
-        False in holes: where no output was measured for more than three intervals.
-    """
-
+    #: Spacing [s]: the median interval of the record.
     interval: float
+    #: Input [input unit], shape (n,).
     u: Array
+    #: Output [output unit], interpolated; zero in holes, shape (n,).
     y: Array
+    #: False in holes: where no output was measured for more than three intervals, shape (n,).
     known: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class DelayHint:
-    """When the output begins to answer the input.
+    """When the output begins to answer the input."""
 
-    Parameters
-    ----------
-    early, late : float
-        The answer begins between these times after a change of the input [s]; at ``late`` it is certain.
-    strength : float
-        Greatest answer over the standard deviation of what chance gives [-].
-    """
-
+    #: The answer begins between these times after a change of the input [s]; at ``late`` it is certain.
     early: float
     late: float
+    #: Greatest answer over the standard deviation of what chance gives [-].
     strength: float
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What the output shows of the input.
+    """What the output shows of the input."""
 
-    Parameters
-    ----------
-    bandwidth : float
-        Frequency below which 95 % of the answer lies [rad/s]; the Nyquist frequency where no answer is seen.
-    visible_up_to : float
-        Highest frequency at which output and input are coherent [rad/s]; nan where they are nowhere.
-    explained : float
-        Share of the variance of the output that follows the input linearly, 0 to 1; nan where the input moves too
-        seldom to tell.
-    input_band : tuple of float
-        Frequencies between which 95 % of the power of the input lies [rad/s].
-    delay : DelayHint or None
-        When the answer begins; None where no answer is seen.
-    period : float
-        Time after which the input repeats itself [s]; nan where it does not.
-    before : float
-        Greatest answer of the input to the output, that is at negative lags, over the standard deviation of what
-        chance gives [-]; nan where it cannot be told. Feedback shows here.
-    """
-
+    #: Frequency below which 95 % of the answer lies [rad/s]; the Nyquist frequency where no answer is seen.
     bandwidth: float
+    #: Highest frequency at which output and input are coherent [rad/s]; nan where they are nowhere.
     visible_up_to: float
     explained: float
+    #: Frequencies between which 95 % of the power of the input lies [rad/s].
     input_band: tuple[float, float]
     delay: DelayHint | None
+    #: Time after which the input repeats itself [s]; nan where it does not.
     period: float
+    #: Greatest answer of the input to the output, that is at negative lags, over the standard deviation of what chance
+    #: gives [-]; nan where it cannot be told. Feedback shows here.
     before: float
 
 
 def output_bandwidth(record: Record) -> float:
     """Frequency below which 95 % of the answer of the output to the input lies.
 
-    Parameters
-    ----------
-    record : Record
-        The record; any clock, missing samples allowed.
-
-    Returns
-    -------
-    float
-        Bandwidth [rad/s], never above the Nyquist frequency of the median interval, and equal to it where no answer
-        to the input is seen.
-
-    Notes
-    -----
     The power of the answer is the power of the output times its squared coherence with the input, which leaves out
     the noise, whatever its colour. Power is counted twice, as it is and divided by that of the input where there is
     any, and the larger of the two bandwidths is returned: a resonance that this input hardly excites bends the cost
     of a fit as a function of the delay all the same. After an input of three steps or fewer, the bandwidth is
     that of a first-order system as fast as the answer.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from ctid_cli import HeldSignal, Record, TransferFunction, simulate
-    >>> t = 0.05 * np.arange(4000)
-    >>> u = HeldSignal(t, np.random.default_rng(0).choice([-1.0, 1.0], t.size))
-    >>> y = simulate(TransferFunction([2], [0.25, 0.7, 1], delay=8.0), u, t)
-    >>> bool(2 < output_bandwidth(Record(t, y, u)) < 5)
-    True
     """
     return analyse_answer(record).bandwidth
 
 
 def analyse_answer(record: Record, moves: InputMoves | None = None) -> Answer:
-    """Band and delay of the answer of the output to the input.
-
-    Parameters
-    ----------
-    record : Record
-        The record.
-    moves : InputMoves, optional
-        How its input moves, where that is known already.
-
-    Returns
-    -------
-    Answer
-        Its bandwidth, its share of the output, and when it begins.
-    """
+    """Band and delay of the answer of the output to the input."""
     moves = moves or input_moves(record)
     grid = regular_grid(record)
     nyquist = math.pi / grid.interval
@@ -194,18 +130,6 @@ def analyse_answer(record: Record, moves: InputMoves | None = None) -> Answer:
 def regular_grid(record: Record) -> Grid:
     """Record on a regular grid.
 
-    Parameters
-    ----------
-    record : Record
-        The record, with any clock.
-
-    Returns
-    -------
-    Grid
-        Its input and output at the median interval, detrended.
-
-    Notes
-    -----
     Outliers are left out. The output is joined by straight lines between its samples. An input that changes between
     the grid points changes late, by half an interval on average.
     """

@@ -40,35 +40,6 @@ def open_loop_accuracy(
 ) -> ParameterAccuracy:
     r"""Accuracy in open loop, for white noise held between the samples as the input.
 
-    Parameters
-    ----------
-    model : AdditiveModel or TransferFunction
-        The true, stable system; its type chooses the parameters. Its delay is known.
-    interval : float
-        Sampling interval [s].
-    input_standard_deviation : float
-        Standard deviation of the input [input unit].
-    innovation_variance : float
-        Variance of e in the output noise ``v = H(q) e`` [output unit^2].
-    noise_filter : (array_like, array_like), default white
-        Numerator and denominator of H in powers of q^-1.
-    samples : int
-        Number of samples N.
-    zeros : int, optional
-        Degree of the estimated numerator of a transfer function, if more than the model's own.
-
-    Returns
-    -------
-    ParameterAccuracy
-        The parameters and the limit of N times their covariance, over N.
-
-    Raises
-    ------
-    DataError
-        If the sensitivities are not stationary, or do not determine the parameters.
-
-    Notes
-    -----
     With the sensitivities ``psi = dx/d theta`` and ``M = E psi psi'`` the estimates of SRIVC and of its additive form
     approach [1]_
 
@@ -76,20 +47,6 @@ def open_loop_accuracy(
               \Sigma = \sum_\tau R_v(\tau)\, E\,\psi(t+\tau)\psi(t)' = \sigma_e^2 \operatorname{cov} H(q)\psi,
 
     which for white noise is ``sigma^2 M^-1``, the Cramér-Rao bound. Both covariances solve discrete Lyapunov equations.
-
-    References
-    ----------
-    .. [1] L. Ljung, *System Identification: Theory for the User*, 2nd ed., Prentice Hall, 1999, section 9.4.
-
-    Examples
-    --------
-    A gain alone, ``y = b0 u + v``, has the variance ``var v/(N var u)``:
-
-    >>> accuracy = open_loop_accuracy(
-    ...     TransferFunction([3.0], [1.0]), 0.1, input_standard_deviation=2.0, innovation_variance=0.04, samples=100
-    ... )
-    >>> accuracy.names, accuracy.standard_errors.round(6)
-    (('b0',), array([0.01]))
     """
     require_positive("input_standard_deviation", input_standard_deviation, "input unit")
     names, values = estimated_parameters(model, zeros)
@@ -118,51 +75,10 @@ def closed_loop_accuracy(
 ) -> ParameterAccuracy:
     r"""Accuracy in a closed loop with a known controller, for white noise as the reference.
 
-    Parameters
-    ----------
-    model : AdditiveModel or TransferFunction
-        The true system; its type chooses the parameters. Its delay is known.
-    interval : float
-        Sampling interval [s].
-    controller : DiscreteController
-        The controller; the loop must be stable.
-    reference_standard_deviation : float
-        Standard deviation of the reference [unit of the output, or of the input where it enters there].
-    innovation_variance : float
-        Variance of e in the output noise ``v = H(q) e`` [output unit^2].
-    noise_filter : (array_like, array_like), default white
-        Numerator and denominator of H in powers of q^-1.
-    samples : int
-        Number of samples N.
-    enters : {"controller", "input"}, default "controller"
-        Where the reference enters: ``u = C (r - y)`` or ``u = r - C y``.
-    instruments : {"closed_loop", "open_loop"}, default "closed_loop"
-        Whether the estimator filters the noise-free input of the loop, or the input itself.
-    zeros : int, optional
-        Degree of the estimated numerator of a transfer function, if more than the model's own.
-
-    Returns
-    -------
-    ParameterAccuracy
-        The parameters and the limit of N times their covariance, over N.
-
-    Raises
-    ------
-    DataError
-        If the loop is not stable; if the input itself serves as the instrument though it is correlated with the noise,
-        so that the estimates are biased; if the sensitivities do not determine the parameters.
-
-    Notes
-    -----
     As :func:`open_loop_accuracy`, with psi driven by the noise-free input of the loop, ``S r``. With the input itself,
     ``u = S (r - v)`` for a reference that enters at the controller, and white noise, psi has the part of the noise
     too: feedback then is a second reference, and the variances are somewhat smaller [1]_. That needs a sample of delay
     around the loop.
-
-    References
-    ----------
-    .. [1] U. Forssell and L. Ljung, Closed-loop identification revisited, Automatica 35 (1999) 1215-1241.
-       https://doi.org/10.1016/S0005-1098(99)00022-9
     """
     require_positive("reference_standard_deviation", reference_standard_deviation, "unit of the reference")
     require_choice("enters", enters, get_args(Enters))
@@ -195,24 +111,7 @@ def require_uncorrelated_input(
     controller: DiscreteController,
     noise_filter: tuple[ArrayLike, ArrayLike],
 ) -> None:
-    """Refuse instruments made from the input of a loop if they are correlated with the noise at the same sample.
-
-    Parameters
-    ----------
-    model : AdditiveModel or TransferFunction
-        The true system.
-    interval : float
-        Sampling interval [s].
-    controller : DiscreteController
-        The controller.
-    noise_filter : (array_like, array_like)
-        Numerator and denominator of the noise filter in powers of q^-1.
-
-    Raises
-    ------
-    DataError
-        If the noise is coloured, or white and runs round the loop without a sample of delay: the estimates are biased.
-    """
+    """Refuse instruments made from the input of a loop if they are correlated with the noise at the same sample."""
     if any(np.size(part) > 1 for part in noise_filter):
         raise DataError(
             "the noise is coloured, so in closed loop the input is correlated with it, and instruments from the input "
@@ -228,22 +127,7 @@ def require_uncorrelated_input(
 def output_variance(
     model: AdditiveModel | TransferFunction, interval: float, *, input_standard_deviation: float
 ) -> float:
-    """Variance of the noise-free output in open loop, for white noise held between the samples as the input.
-
-    Parameters
-    ----------
-    model : AdditiveModel or TransferFunction
-        The stable system.
-    interval : float
-        Sampling interval [s].
-    input_standard_deviation : float
-        Standard deviation of the input [input unit].
-
-    Returns
-    -------
-    float
-        Variance [output unit^2]; infinite if the system is not stable.
-    """
+    """Variance of the noise-free output in open loop, for white noise held between the samples as the input."""
     if not model.is_stable:
         return float("inf")
     return float(_covariance(sensitivity_system(model, interval), [input_standard_deviation])[0, 0])

@@ -26,26 +26,6 @@ def describe_conditioning(
 ) -> tuple[str, ...]:
     """Sentences on parameters that the data do not determine, none if all is well.
 
-    Parameters
-    ----------
-    covariance : array_like, shape (p, p)
-        Covariance of the estimates; NaN where it is not defined.
-    estimates : array_like, shape (p,)
-        Parameters.
-    names : sequence of str
-        Their names: ``a1 …``, ``b0 …``, ``delay``, and others for the initial state or an offset.
-    condition_number : float
-        Of the scaled ``sum psi psi'`` [-].
-    hessian : array_like, shape (p, p), optional
-        ``sum psi psi'``: names the parameters of a singular direction where there is no covariance.
-
-    Returns
-    -------
-    tuple of str
-        Sentences, most serious first.
-
-    Notes
-    -----
     Three rules. A standard error is not defined, or the condition number exceeds 1e8: the parameters with more than a
     tenth of the singular direction (unit diagonal) are named. A standard error exceeds ten times the magnitude of a
     coefficient or of the delay; initial states and offsets may well be zero and are not looked at. Two estimates have

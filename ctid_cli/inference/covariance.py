@@ -11,22 +11,6 @@ Array = NDArray[np.float64]
 def white_noise_covariance(hessian: Array, squared_error: float, count: int) -> Array:
     r"""Covariance ``s^2 (sum psi psi')^-1`` with ``s^2 = sum eps^2 / (N - p)``.
 
-    Parameters
-    ----------
-    hessian : ndarray, shape (p, p)
-        ``sum psi psi'``, psi the sensitivities of the simulated output.
-    squared_error : float
-        ``sum eps^2`` [output unit^2].
-    count : int
-        Number of samples N in the sums.
-
-    Returns
-    -------
-    ndarray, shape (p, p)
-        Covariance of the parameters; NaN where the matrix is singular or ``N <= p``.
-
-    Notes
-    -----
     Valid for a converged estimate of a model that contains the system, and white output noise. Refined instrumental
     variables then are as good as maximum likelihood, so this is also the Cramér-Rao bound with the estimated variance.
     """
@@ -49,18 +33,7 @@ def white_noise_covariance(hessian: Array, squared_error: float, count: int) -> 
 
 
 def condition_number(hessian: Array) -> float:
-    """Condition number of ``sum psi psi'`` with unit diagonal, whatever the units of the parameters.
-
-    Parameters
-    ----------
-    hessian : ndarray, shape (p, p)
-        ``sum psi psi'``.
-
-    Returns
-    -------
-    float
-        Ratio of the extreme eigenvalues [-]; infinite if singular.
-    """
+    """Condition number of ``sum psi psi'`` with unit diagonal, whatever the units of the parameters."""
     diagonal = np.diag(hessian)
     if not np.isfinite(hessian).all() or (diagonal <= 0).any():
         return float("inf")

@@ -10,23 +10,13 @@ from numpy.typing import ArrayLike
 
 @dataclass(frozen=True)
 class InformationCriteria:
-    """Criteria of one fit; smaller is better, and only differences between fits to the same samples mean anything.
+    """Criteria of one fit; smaller is better, and only differences between fits to the same samples mean anything."""
 
-    Parameters
-    ----------
-    aic, aicc, bic : float
-        Akaike's, the small-sample corrected, and the Bayesian criterion [-].
-    fpe : float
-        Final prediction error [output unit^2].
-    count : int
-        Number of samples N.
-    parameters : int
-        Number of estimated parameters p, without the noise variance.
-    """
-
+    #: Akaike's, the small-sample corrected, and the Bayesian criterion [-].
     aic: float
     aicc: float
     bic: float
+    #: Final prediction error [output unit^2].
     fpe: float
     count: int
     parameters: int
@@ -35,23 +25,6 @@ class InformationCriteria:
 def information_criteria(squared_error: float, count: int, parameters: int) -> InformationCriteria:
     r"""AIC, AICc, BIC and FPE of an output-error model with white Gaussian noise.
 
-    Parameters
-    ----------
-    squared_error : float
-        Sum of squared output errors [output unit^2].
-    count : int
-        Number of samples N in the sum.
-    parameters : int
-        Number p of everything estimated from them: coefficients, delay, initial state, offset; without the noise
-        variance.
-
-    Returns
-    -------
-    InformationCriteria
-        NaN where N is too small for a formula; minus infinity for a perfect fit.
-
-    Notes
-    -----
     With ``V = squared_error / N``:
 
     .. math::
@@ -65,11 +38,6 @@ def information_criteria(squared_error: float, count: int, parameters: int) -> I
     ``aic`` adds ``N (ln 2 pi + 1)`` and corrects with p in the place of ``p + 1``.
 
     The criteria take residuals as independent: with coloured residuals all of them favour too many parameters.
-
-    Examples
-    --------
-    >>> information_criteria(squared_error=50.0, count=50, parameters=3).aic
-    6.0
     """
     undefined = float("nan")
     if count < 1 or squared_error < 0:
@@ -87,20 +55,6 @@ def information_criteria(squared_error: float, count: int, parameters: int) -> I
 def r_t_squared(residuals: ArrayLike, output: ArrayLike) -> float:
     """``R_T^2 = 1 - s_e^2 / s_y^2``, the coefficient of determination of the simulated output by variances.
 
-    Parameters
-    ----------
-    residuals : array_like, shape (N,)
-        Measured minus simulated output [output unit]; NaN marks a missing sample.
-    output : array_like, shape (N,)
-        Measured output [output unit].
-
-    Returns
-    -------
-    float
-        R_T^2 [-]; NaN where the output is constant.
-
-    Notes
-    -----
     Both variances are taken about the means, as in CONTSID and CAPTAIN: unlike :func:`r_squared`, it does not see a
     constant error.
     """
@@ -113,33 +67,9 @@ def young_information_criterion(
 ) -> float:
     r"""Young's criterion: fit and relative parameter errors in one number; the more negative the better.
 
-    Parameters
-    ----------
-    residuals : array_like, shape (N,)
-        Measured minus simulated output [output unit]; NaN marks a missing sample.
-    output : array_like, shape (N,)
-        Measured output [output unit].
-    estimates : array_like, shape (p,)
-        Parameters.
-    covariance : array_like, shape (p, p)
-        Their covariance, ``s^2 P`` in the formula.
-
-    Returns
-    -------
-    float
-        YIC [-]; NaN where the output is constant or a standard error is not defined, infinite where an estimate is
-        zero.
-
-    Notes
-    -----
     .. math:: YIC = \ln \frac{s_e^2}{s_y^2} + \ln NEVN, \qquad NEVN = \frac{1}{p} \sum_i \frac{s^2 p_{ii}}{\theta_i^2},
 
     natural logarithms, variances about the means. A delay is one of the parameters if it is estimated.
-
-    References
-    ----------
-    .. [1] P. C. Young, *Recursive Estimation and Time-Series Analysis*, 2nd ed., Springer, 2011.
-       https://doi.org/10.1007/978-3-642-21981-8
     """
     residual_variance, output_variance = _variances(residuals, output)
     theta = np.asarray(estimates, dtype=float)

@@ -15,16 +15,9 @@ QUADRATIC_TOLERANCE = 0.1
 
 @dataclass(frozen=True)
 class DelayInterval:
-    """Delays that the data do not reject.
+    """Delays that the data do not reject."""
 
-    Parameters
-    ----------
-    low, high : float
-        Ends [s].
-    open_low, open_high : bool
-        Whether the search bound was reached first: the delays beyond that end were not searched and may be as good.
-    """
-
+    #: Ends [s].
     low: float
     high: float
     open_low: bool
@@ -44,38 +37,6 @@ def profile_likelihood_interval(
 ) -> DelayInterval:
     r"""Interval of delays around the estimate whose best fits are not significantly worse.
 
-    Parameters
-    ----------
-    squared_error_at : callable
-        Sum of squared output errors [output unit^2] at a given delay [s], smallest over all other parameters. A value
-        that is not finite counts as significantly worse.
-    estimate : float
-        Delay with the smallest sum [s].
-    squared_error : float
-        The sum there [output unit^2].
-    count : int
-        Number of samples N.
-    parameters : int
-        Number of estimated parameters p, the delay included.
-    bounds : tuple of float
-        Smallest and largest delay to consider [s].
-    level : float, default 0.95
-        Confidence level [-].
-    inflation : float, default 1.0
-        Variance of the delay by the sandwich over that for white noise [-]: widens the interval for coloured noise.
-
-    Returns
-    -------
-    DelayInterval
-        The connected part that holds the estimate; its ends are NaN where ``N <= p`` or the inflation is not finite.
-
-    Raises
-    ------
-    ValueError
-        If the estimate lies outside the bounds.
-
-    Notes
-    -----
     The delays with
 
     .. math:: S(\tau) \le S_{\min} \Big(1 + c \, \frac{F_{1, N - p}(level)}{N - p}\Big),
@@ -140,32 +101,6 @@ def quadratic_is_doubtful(
 ) -> bool:
     r"""Whether the interval ``estimate +- z se`` of the delay should not be trusted.
 
-    Parameters
-    ----------
-    squared_error_at : callable
-        Sum of squared output errors [output unit^2] at a given delay [s], smallest over all other parameters.
-    estimate : float
-        Delay with the smallest sum [s].
-    standard_error : float
-        Of the delay [s].
-    squared_error : float
-        The sum at the estimate [output unit^2].
-    count : int
-        Number of samples N.
-    parameters : int
-        Number of estimated parameters p, the delay included.
-    bounds : tuple of float
-        Smallest and largest delay to consider [s].
-    inflation : float, default 1.0
-        Variance of the delay by the sandwich over that for white noise [-], if ``standard_error`` is the sandwich's.
-
-    Returns
-    -------
-    bool
-        True where the standard error is not defined, two of them reach a bound, or the cost is not quadratic so far.
-
-    Notes
-    -----
     A quadratic profile rises by ``c (2 se)^2 s^2 / se^2 = 4 c s^2`` at ``estimate +- 2 se``, ``s^2 = S_min / (N - p)``,
     c the inflation. The interval is doubtful if the square root of the actual rise, which is the length of the
     interval, differs from that by more than 10 % on either side: a 95 % interval would cover below 93 % or above 97 %.

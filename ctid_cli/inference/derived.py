@@ -19,27 +19,14 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class DerivedParameter:
-    """A quantity computed from the coefficients, and its accuracy.
-
-    Parameters
-    ----------
-    name : str
-        For example ``time_constant_1``; poles are numbered from the fastest, a complex pair has one number.
-    estimate : float
-        Value [unit].
-    standard_error : float
-        By the delta method [unit]; NaN where it is not defined.
-    low, high : float
-        Confidence interval [unit]; NaN where it is not defined.
-    unit : str
-        For example ``s`` or ``rad/s``; ``-`` if there is none.
-    reason : str
-        Why the accuracy is not defined, in a sentence; empty otherwise.
-    """
+    """A quantity computed from the coefficients, and its accuracy."""
 
     name: str
+    #: Value [unit].
     estimate: float
+    #: By the delta method [unit]; NaN where it is not defined.
     standard_error: float
+    #: Confidence interval [unit]; NaN where it is not defined.
     low: float
     high: float
     unit: str
@@ -56,30 +43,7 @@ class DerivedParameter:
         quantile: float,
         reason: str = "",
     ) -> DerivedParameter:
-        """A quantity and its accuracy from its gradient: ``var g = (dg/dtheta) C (dg/dtheta)'``.
-
-        Parameters
-        ----------
-        name : str
-            Name of the quantity.
-        estimate : float
-            Value [unit].
-        gradient : ndarray, shape (p,)
-            Its derivatives with respect to the parameters.
-        covariance : ndarray, shape (p, p)
-            Covariance C of the parameters.
-        unit : str
-            Unit of the quantity.
-        quantile : float
-            Standard errors from the estimate to either end of the interval [-].
-        reason : str, default ""
-            Why the accuracy is not defined, where that is known already.
-
-        Returns
-        -------
-        DerivedParameter
-            With NaN for the accuracy, and a reason, where it is not defined.
-        """
+        """A quantity and its accuracy from its gradient: ``var g = (dg/dtheta) C (dg/dtheta)'``."""
         variance = float(gradient @ covariance @ gradient) if np.isfinite(gradient).all() else NAN
         error = float(np.sqrt(variance)) if variance >= 0 and not reason else NAN
         if not reason and not np.isfinite(error):
@@ -97,45 +61,11 @@ def derived_parameters(
 ) -> tuple[DerivedParameter, ...]:
     r"""What users read off a model, with standard errors by the delta method.
 
-    Parameters
-    ----------
-    model : TransferFunction
-        The estimate.
-    covariance : array_like, shape (n + m + 1, n + m + 1)
-        Covariance of ``a_1 … a_n, b_0 … b_m``: the first rows and columns of that of all parameters.
-    level : float, default 0.95
-        Confidence level of the intervals [-].
-    gain_unit : str, default "output unit/input unit"
-        Unit of the static gain.
-
-    Returns
-    -------
-    tuple of DerivedParameter
-        For each real pole ``pole_k`` [rad/s] and ``time_constant_k`` [s]; for each complex pair ``pole_k_real``,
-        ``pole_k_imag`` [rad/s], ``natural_frequency_k`` [rad/s], ``natural_frequency_k_hz`` [Hz], ``damping_k`` [-];
-        and ``static_gain``.
-
-    Raises
-    ------
-    ValueError
-        If the covariance does not fit the model.
-
-    Notes
-    -----
     ``var g = (dg/dtheta) C (dg/dtheta)'`` with analytic derivatives, those of the poles from :func:`pole_jacobian`, and
     ``g +- z se``. The linearisation only holds where a pole moves little compared with its distance to the others. A
     pole whose ``z`` standard errors, ``sqrt(var Re p + var Im p)``, reach another pole is called undetermined: its
     accuracy is NaN and the reason is given. Natural frequency and damping of a pair only need it to be far
     from the *other* poles: they are regular where the pair meets on the real axis.
-
-    Examples
-    --------
-    >>> model = TransferFunction([2.0], [1.0, 0.5])
-    >>> for row in derived_parameters(model, np.diag([0.05, 0.1]) ** 2):
-    ...     print(row.name, row.estimate, round(row.standard_error, 3), row.unit)
-    pole_1 -0.5 0.05 rad/s
-    time_constant_1 2.0 0.2 s
-    static_gain 4.0 0.447 output unit/input unit
     """
     C = np.asarray(covariance, dtype=float)
     n = model.order
@@ -164,26 +94,7 @@ def derived_parameters(
 def pole_rows(
     poles: ComplexArray, jacobian: ComplexArray, covariance: Array, quantile: float, *, number_lone: bool = True
 ) -> list[DerivedParameter]:
-    """Poles, time constants, natural frequencies and damping, for whatever parameters the poles depend on.
-
-    Parameters
-    ----------
-    poles : ndarray, shape (n,)
-        Poles [rad/s], conjugates included.
-    jacobian : ndarray, shape (n, p)
-        Their derivatives with respect to the parameters.
-    covariance : ndarray, shape (p, p)
-        Covariance of the parameters.
-    quantile : float
-        Standard errors from the estimate to either end of the interval [-].
-    number_lone : bool, default True
-        Whether the only real pole or pair carries the number 1 in its name.
-
-    Returns
-    -------
-    list of DerivedParameter
-        As :func:`derived_parameters`, without the gain.
-    """
+    """Poles, time constants, natural frequencies and damping, for whatever parameters the poles depend on."""
     rows: list[DerivedParameter] = []
 
     def row(name: str, estimate: float, gradient: Array, unit: str, reason: str) -> None:

@@ -30,36 +30,12 @@ def fit_percent(y: ArrayLike, x: ArrayLike) -> float:
 
 
 def percent_from_r_squared(r2: float) -> float:
-    """Fit that belongs to a coefficient of determination: ``100 (1 - sqrt(1 - R^2))``.
-
-    Parameters
-    ----------
-    r2 : float
-        R squared, at most 1 up to rounding [-].
-
-    Returns
-    -------
-    float
-        Fit [%].
-    """
+    """Fit that belongs to a coefficient of determination: ``100 (1 - sqrt(1 - R^2))``."""
     return 100.0 * (1.0 - float(np.sqrt(max(1.0 - r2, 0.0))))
 
 
 def r_squared(y: ArrayLike, x: ArrayLike) -> float:
-    """Coefficient of determination of a simulated output: ``1 - ||y - x||^2 / ||y - mean y||^2``.
-
-    Parameters
-    ----------
-    y : array_like, shape (N,)
-        Measured output; NaN marks a missing sample and is left out.
-    x : array_like, shape (N,)
-        Simulated output.
-
-    Returns
-    -------
-    float
-        R squared [-]; NaN where the measured output is constant.
-    """
+    """Coefficient of determination of a simulated output: ``1 - ||y - x||^2 / ||y - mean y||^2``."""
     measured = np.asarray(y, dtype=float)
     error = measured - np.asarray(x, dtype=float)
     valid = np.isfinite(measured)

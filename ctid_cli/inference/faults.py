@@ -14,18 +14,7 @@ OUTLIER = 10.0
 
 
 def outliers(y: Array) -> NDArray[np.int64]:
-    """Single samples, or pairs, far from the median of the five about them.
-
-    Parameters
-    ----------
-    y : ndarray, shape (N,)
-        Samples [output unit].
-
-    Returns
-    -------
-    ndarray of int
-        Their places.
-    """
+    """Single samples, or pairs, far from the median of the five about them."""
     if y.size < 20:
         return np.empty(0, dtype=np.int64)
     padded = np.pad(y, 2, mode="edge")
@@ -39,18 +28,7 @@ def outliers(y: Array) -> NDArray[np.int64]:
 
 
 def saturated(y: Array) -> float:
-    """Fraction of the samples that a limit seems to have cut off.
-
-    Parameters
-    ----------
-    y : ndarray, shape (N,)
-        Samples [output unit].
-
-    Returns
-    -------
-    float
-        Fraction in runs of five or more at the least or greatest value, where that value stands out [-].
-    """
+    """Fraction of the samples that a limit seems to have cut off."""
     values, counts = np.unique(y, return_counts=True)
     if values.size < 10:
         return 0.0
@@ -66,23 +44,7 @@ def saturated(y: Array) -> float:
 
 
 def quantum(y: Array) -> float:
-    """Step of a coarsely quantised signal.
-
-    Parameters
-    ----------
-    y : ndarray, shape (N,)
-        Samples [output unit].
-
-    Returns
-    -------
-    float
-        The step [output unit]; nan where there is none, or one below 1 % of the standard deviation of the samples.
-
-    Examples
-    --------
-    >>> quantum(0.25 * np.round(4 * np.sin(np.arange(100.0))))
-    0.25
-    """
+    """Step of a coarsely quantised signal."""
     values = np.unique(y)
     gaps = np.diff(values)
     gaps = gaps[gaps > 1e-6 * np.ptp(y)] if gaps.size else gaps

@@ -20,22 +20,6 @@ Array = NDArray[np.float64]
 def additive_sensitivities(model: AdditiveModel, signal: HeldSignal, times: ArrayLike) -> NDArray[np.float64]:
     r"""Derivatives of the output of an additive model with respect to its parameters.
 
-    Parameters
-    ----------
-    model : AdditiveModel
-        The model, at rest before the first break of its input.
-    signal : HeldSignal
-        The input; for the instruments of a closed loop the input of the noise-free loop.
-    times : array_like, shape (N,)
-        Instants [s], strictly increasing, on any clock.
-
-    Returns
-    -------
-    ndarray, shape (N, p)
-        ``dx/d theta`` in the order of the model's ``names`` [output unit per parameter unit].
-
-    Notes
-    -----
     Each is the exact response of a transfer function: ``-p^k B/(p^l A^2)`` for ``a_k`` and ``p^k/(p^l A)`` for
     ``b_k``.
     """
@@ -60,31 +44,7 @@ def unfactored_sensitivities(
     *,
     estimate_delay: bool = False,
 ) -> NDArray[np.float64]:
-    """Derivatives of the output of a transfer function with respect to its coefficients and its delay.
-
-    Parameters
-    ----------
-    model : TransferFunction
-        The strictly proper model, at rest before the first break of its input.
-    signal : HeldSignal
-        The input; for the instruments of a closed loop the input of the noise-free loop.
-    times : array_like, shape (N,)
-        Instants [s], strictly increasing, on any clock.
-    zeros : int, optional
-        Degree of the estimated numerator, if more than the model's own.
-    estimate_delay : bool, default False
-        Whether the delay is a parameter too.
-
-    Returns
-    -------
-    ndarray, shape (N, p)
-        ``dx/d(a_1 … a_n, b_0 … b_m[, delay])`` [output unit per parameter unit].
-
-    Raises
-    ------
-    ValueError
-        If the estimated numerator has no lower degree than the denominator, or a lower one than the model's.
-    """
+    """Derivatives of the output of a transfer function with respect to its coefficients and its delay."""
     own = model.numerator.size - 1
     degree = own if zeros is None else zeros
     if not own <= degree < model.order:
@@ -99,31 +59,9 @@ def unfactored_sensitivities(
 def finite_record_covariance(psi: ArrayLike, autocovariances: ArrayLike) -> NDArray[np.float64]:
     r"""Covariance of an unweighted output-error estimate from one record with noise of known autocovariances.
 
-    Parameters
-    ----------
-    psi : array_like, shape (N, p)
-        Sensitivities of the output to the parameters [output unit per parameter unit].
-    autocovariances : array_like, shape (q,)
-        ``R_v(0) … R_v(q - 1)`` of the noise at lags of whole samples [output unit^2], zero at larger ones: the variance
-        alone for white noise.
-
-    Returns
-    -------
-    ndarray, shape (p, p)
-        Covariance of the parameters; NaN where the sensitivities do not determine them.
-
-    Notes
-    -----
     With ``M = psi' psi`` and the covariance matrix R of the noise, ``M^-1 psi' R psi M^-1``, to first order in the
     noise: ``sigma^2 M^-1`` for white noise. Unlike the limit of long records it knows the start from rest, which counts
     as long as the memory of the system or of its loop is not short against the record.
-
-    Examples
-    --------
-    A mean of 4 samples, each correlated by 0.5 with its neighbours:
-
-    >>> finite_record_covariance(np.ones((4, 1)), [1.0, 0.5])
-    array([[0.4375]])
     """
     from scipy.linalg import matmul_toeplitz
 

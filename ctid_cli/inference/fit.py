@@ -14,25 +14,13 @@ from ctid_cli.models.transfer_function import TransferFunction
 
 @dataclass(frozen=True)
 class IterationRecord:
-    """One accepted iteration.
-
-    Parameters
-    ----------
-    stage : str
-        Part of the algorithm, for example ``search`` (on low-pass-filtered data) or ``refine``.
-    iteration : int
-        Counted from 0, the start, within the stage.
-    delay : float
-        Delay [s].
-    cost : float
-        Mean squared output error [output unit^2] on the data of this stage.
-    denominator, numerator : tuple of float
-        Coefficients in descending powers.
-    """
+    """One accepted iteration."""
 
     stage: str
     iteration: int
+    #: Delay [s].
     delay: float
+    #: Mean squared output error [output unit^2] on the data of this stage.
     cost: float
     denominator: tuple[float, ...]
     numerator: tuple[float, ...]

@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
 
 Array = NDArray[np.float64]
 
@@ -23,25 +24,14 @@ LEVEL_SHARE = 0.02
 
 @dataclass(frozen=True)
 class InputMoves:
-    """What the input does over the time of a record.
-
-    Parameters
-    ----------
-    kind : {"constant", "steps", "levels", "continuous"}
-        ``steps`` changes at most three times, ``levels`` more often, and keeps or returns to its values.
-    levels : tuple of float
-        The values it returns to [input unit], at most 20 of them; empty where there are more.
-    changes : ndarray, shape (n,)
-        Instants of the changes after the beginning of the record [s]; empty for a continuous input.
-    shortest_hold : float
-        Shortest time between two changes [s]; nan with fewer than two.
-    noisy : bool
-        Whether the values scatter about their levels, as those of a measured input do.
-    """
+    """What the input does over the time of a record."""
 
     kind: Literal["constant", "steps", "levels", "continuous"]
+    #: The values it returns to [input unit], at most 20 of them; empty where there are more.
     levels: tuple[float, ...]
+    #: Instants of the changes after the beginning of the record [s]; empty for a continuous input, shape (n,).
     changes: Array
+    #: Shortest time between two changes [s]; nan with fewer than two.
     shortest_hold: float
     noisy: bool = False
 
@@ -49,18 +39,6 @@ class InputMoves:
 def input_moves(record: Record) -> InputMoves:
     """How the input moves between the first and the last output sample.
 
-    Parameters
-    ----------
-    record : Record
-        The record.
-
-    Returns
-    -------
-    InputMoves
-        Its kind, its levels and its changes.
-
-    Notes
-    -----
     A measured input counts as moving between levels when nine samples in ten lie in a few narrow heaps; its
     changes are then those between heaps. An input known at the instants of the output only is taken to change there.
     """

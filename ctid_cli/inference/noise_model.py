@@ -15,20 +15,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    r"""``v(k) + c_1 v(k-1) + ... + c_r v(k-r) = e(k)``, e white.
+    r"""``v(k) + c_1 v(k-1) + ... + c_r v(k-r) = e(k)``, e white."""
 
-    Parameters
-    ----------
-    coefficients : ndarray, shape (order + 1,)
-        ``(1, c_1 ... c_r)`` [-].
-    first_autocovariances : ndarray, shape (order + 1,)
-        ``R_v(0) ... R_v(r)`` [output unit^2]; they determine the coefficients, and all later autocovariances.
-    innovation_variance : float
-        Variance of e [output unit^2].
-    """
-
+    #: ``(1, c_1 ... c_r)`` [-], shape (order + 1,).
     coefficients: Array
+    #: ``R_v(0) ... R_v(r)`` [output unit^2]; they determine the coefficients, and all later autocovariances, shape
+    #: (order + 1,).
     first_autocovariances: Array
+    #: Variance of e [output unit^2].
     innovation_variance: float
 
     @property
@@ -37,18 +31,7 @@ class NoiseModel:
         return int(self.coefficients.size - 1)
 
     def autocovariance(self, count: int) -> Array:
-        """Autocovariances at the lags 0, 1 … count - 1 intervals.
-
-        Parameters
-        ----------
-        count : int
-            How many.
-
-        Returns
-        -------
-        ndarray, shape (count,)
-            ``R_v`` [output unit^2].
-        """
+        """Autocovariances at the lags 0, 1 … count - 1 intervals."""
         result = np.zeros(max(count, self.order + 1))
         result[: self.order + 1] = self.first_autocovariances
         if self.order:
@@ -59,18 +42,7 @@ class NoiseModel:
         return result[:count]
 
     def covariance_times(self, columns: Array) -> Array:
-        """Product of the covariance matrix of successive samples, ``R_v(t - s)``, and given columns.
-
-        Parameters
-        ----------
-        columns : ndarray, shape (N, q)
-            The columns.
-
-        Returns
-        -------
-        ndarray, shape (N, q)
-            ``R columns`` [output unit^2 times that of the columns].
-        """
+        """Product of the covariance matrix of successive samples, ``R_v(t - s)``, and given columns."""
         count = columns.shape[0]
         covariances = self.autocovariance(count)
         length = next_fast_len(2 * count - 1, real=True)
@@ -84,20 +56,6 @@ class NoiseModel:
 def fit_noise_model(residuals: Array | Sequence[Array], max_order: int | None = None) -> NoiseModel:
     """Yule-Walker model of the noise, of the order that Akaike's criterion chooses.
 
-    Parameters
-    ----------
-    residuals : ndarray, shape (N,), or a sequence of them
-        Residuals of one or several experiments with the same kind of noise [output unit], equally spaced in time.
-    max_order : int, optional
-        Largest order tried; ``min(10 log10 N, N/4)`` by default.
-
-    Returns
-    -------
-    NoiseModel
-        The stable model with the smallest ``N ln(innovation variance) + 2 order``.
-
-    Notes
-    -----
     The autocovariances are ``sum v(t) v(t - lag) / N``, about a mean of zero; no product reaches from one experiment
     into another. An ARMA noise is approximated: the order grows with the record.
     """

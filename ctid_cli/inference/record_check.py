@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ctid_cli.inference.answer import Answer, analyse_answer, output_bandwidth, regular_grid
 from ctid_cli.inference.faults import outliers, quantum, saturated
 from ctid_cli.inference.input_moves import InputMoves, input_moves
-from ctid_cli.signals import Record
+from ctid_cli.signals.record import Record
 
 __all__ = ["Finding", "Gap", "RecordReport", "check_record_quality", "output_bandwidth"]
 
@@ -41,17 +41,7 @@ SIGNIFICANT = 4.0
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a user should know of a record.
-
-    Parameters
-    ----------
-    level : {"ok", "note", "warning", "problem"}
-        How much it matters: a ``problem`` prevents identification, a ``warning`` spoils it unless something is done.
-    topic : str
-        A word or two, for example ``delay``.
-    sentence : str
-        What was found and what to do.
-    """
+    """One thing that a user should know of a record."""
 
     level: Level
     topic: str
@@ -60,127 +50,77 @@ class Finding:
 
 @dataclass(frozen=True)
 class Gap:
-    """An interval without samples.
+    """An interval without samples."""
 
-    Parameters
-    ----------
-    start : float
-        Last instant before it [s].
-    length : float
-        Time to the next sample [s].
-    """
-
+    #: Last instant before it [s].
     start: float
+    #: Time to the next sample [s].
     length: float
 
 
 @dataclass(frozen=True)
 class RecordReport:
-    """Numbers and findings of one record; nan stands for what the record does not show.
-
-    Parameters
-    ----------
-    name : str
-        Where the record comes from.
-    n_samples, n_masked : int
-        Output samples, and those of them that are missing.
-    start, duration : float
-        First instant, and time to the last one [s].
-    interval, interval_min, interval_max, interval_deviation : float
-        Median, shortest and longest sampling interval, and the standard deviation of all but the gaps [s].
-    regular : bool
-        Whether the clock is regular.
-    gaps : tuple of Gap
-        Intervals longer than three median intervals.
-    nyquist : float
-        Half the sampling frequency at the median interval [rad/s].
-    input_kind : {"constant", "steps", "levels", "continuous"}
-        How the input moves.
-    input_mean, input_deviation, input_low, input_high : float
-        Mean, standard deviation, least and greatest value of the input during the record [input unit].
-    input_levels : tuple of float
-        Values that the input returns to [input unit]; empty where there are many.
-    input_changes : int
-        How often it changes between them.
-    shortest_hold : float
-        Shortest time between two changes [s].
-    input_period : float
-        Time after which the input repeats itself [s].
-    excitation_order : int
-        Order of persistent excitation, counted up to 50 [-].
-    input_band : tuple of float
-        Frequencies between which 95 % of the power of the input lies [rad/s].
-    output_mean, output_deviation, output_low, output_high : float
-        Mean, standard deviation, least and greatest value of the output [output unit].
-    output_trend, output_trend_error : float
-        Slope of the straight line through the output and its standard error [output unit/s].
-    output_quantum : float
-        Step in which the output was recorded [output unit]; nan where it is too fine to matter.
-    outliers : tuple of float
-        Instants of single output samples far from their neighbours [s].
-    saturated : float
-        Fraction of the output samples that sit exactly at its least or greatest value in runs [-]; 0 for none.
-    explained : float
-        Fraction of the output's variance that follows the input linearly [-].
-    snr_db : float
-        The same as a signal-to-noise ratio [dB].
-    output_bandwidth : float
-        Frequency below which 95 % of the answer to the input lies [rad/s].
-    visible_up_to : float
-        Highest frequency at which the answer is seen [rad/s].
-    delay_early, delay_late : float
-        The output begins to answer between these times after a change of the input [s].
-    starts : {"flat", "moving", "unknown"}
-        What the output does before it can answer to the beginning of the record.
-    suggested_delay : tuple of float or None
-        Range to search for the delay [s].
-    suggested_offset : {"none", "remove", "estimate"}
-        What to do about the mean of the output.
-    suggested_initial_state : {"rest", "estimate"}
-        What to assume of the state at the first sample.
-    findings : tuple of Finding
-        The worst first.
-    """
+    """Numbers and findings of one record; nan stands for what the record does not show."""
 
     name: str
     n_samples: int
     n_masked: int
+    #: First instant, and time to the last one [s].
     start: float
     duration: float
+    #: Median, shortest and longest sampling interval, and the standard deviation of all but the gaps [s].
     interval: float
     interval_min: float
     interval_max: float
     interval_deviation: float
     regular: bool
     gaps: tuple[Gap, ...]
+    #: Half the sampling frequency at the median interval [rad/s].
     nyquist: float
     input_kind: str
+    #: Mean, standard deviation, least and greatest value of the input during the record [input unit].
     input_mean: float
     input_deviation: float
     input_low: float
     input_high: float
+    #: Values that the input returns to [input unit]; empty where there are many.
     input_levels: tuple[float, ...]
     input_changes: int
+    #: Shortest time between two changes [s].
     shortest_hold: float
+    #: Time after which the input repeats itself [s].
     input_period: float
+    #: Order of persistent excitation, counted up to 50 [-].
     excitation_order: int
+    #: Frequencies between which 95 % of the power of the input lies [rad/s].
     input_band: tuple[float, float]
+    #: Mean, standard deviation, least and greatest value of the output [output unit].
     output_mean: float
     output_deviation: float
     output_low: float
     output_high: float
+    #: Slope of the straight line through the output and its standard error [output unit/s].
     output_trend: float
     output_trend_error: float
+    #: Step in which the output was recorded [output unit]; nan where it is too fine to matter.
     output_quantum: float
+    #: Instants of single output samples far from their neighbours [s].
     outliers: tuple[float, ...]
+    #: Fraction of the output samples that sit exactly at its least or greatest value in runs [-]; 0 for none.
     saturated: float
+    #: Fraction of the output's variance that follows the input linearly [-].
     explained: float
+    #: The same as a signal-to-noise ratio [dB].
     snr_db: float
+    #: Frequency below which 95 % of the answer to the input lies [rad/s].
     output_bandwidth: float
+    #: Highest frequency at which the answer is seen [rad/s].
     visible_up_to: float
+    #: The output begins to answer between these times after a change of the input [s].
     delay_early: float
     delay_late: float
     starts: Literal["flat", "moving", "unknown"]
+    #: Range to search for the delay [s].
     suggested_delay: tuple[float, float] | None
     suggested_offset: Literal["none", "remove", "estimate"]
     suggested_initial_state: Literal["rest", "estimate"]
@@ -197,33 +137,8 @@ def check_record_quality(
 ) -> RecordReport:
     """Look for everything in a record that helps or hinders identification.
 
-    Parameters
-    ----------
-    record : Record
-        The record.
-    time_unit, input_unit, output_unit : str, default "s", "", ""
-        Units as they shall stand in the sentences; numbers are not converted.
-
-    Returns
-    -------
-    RecordReport
-        Its numbers, and findings with the worst first.
-
-    Notes
-    -----
     The findings rest on spectra, correlations and order statistics, never on a model, so they hold whatever model
     is fitted later; a hint is not an estimate.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from ctid_cli import HeldSignal, Record, TransferFunction, simulate
-    >>> t = 0.05 * np.arange(4000)
-    >>> u = HeldSignal(t, np.random.default_rng(0).choice([-1.0, 1.0], t.size))
-    >>> y = simulate(TransferFunction([2], [0.25, 0.7, 1], delay=8.0), u, t)
-    >>> report = check_record_quality(Record(t, y + 3, u))
-    >>> report.worst, report.suggested_delay, report.findings[0].topic
-    ('warning', (0.0, 20.0), 'offset')
     """
     moves = input_moves(record)
     answer = analyse_answer(record, moves)

@@ -19,59 +19,33 @@ NEGLIGIBLE_VARIANCE = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class ResidualTests:
-    """Correlations of the residuals with themselves and with the input, with what they mean.
-
-    Parameters
-    ----------
-    count : int
-        Number of samples N.
-    lags : int
-        Largest lag L [samples].
-    level : float
-        Confidence level of both tests and of the bands [-].
-    autocorrelation : ndarray, shape (L,)
-        Of the residuals, at the lags 1 … L [-].
-    autocorrelation_band : float
-        A white sequence stays within plus or minus this at each single lag, with probability ``level`` [-].
-    whiteness_statistic : float
-        Ljung and Box's portmanteau statistic [-].
-    whiteness_degrees_of_freedom : int
-        Of its chi-square distribution.
-    whiteness_p_value : float
-        Probability of a larger statistic if the residuals are white [-]; NaN where it cannot be computed.
-    white : bool
-        Whether whiteness is not rejected at ``level``.
-    cross_correlation : ndarray, shape (2 L + 1,)
-        Between ``residual(t)`` and ``input(t - k)``, k = -L … L [-].
-    cross_correlation_band : float
-        Residuals of their colour that are independent of the input stay within plus or minus this at each single
-        lag, with probability ``level`` [-].
-    cross_statistic : float
-        Portmanteau statistic of all these lags [-].
-    cross_degrees_of_freedom : int
-        Of its chi-square distribution.
-    cross_p_value : float
-        Probability of a larger statistic if the residuals are independent of the input [-]; NaN where it cannot be
-        computed.
-    uncorrelated : bool
-        Whether independence is not rejected at ``level``.
-    sentence : str
-        The outcome in words.
-    """
+    """Correlations of the residuals with themselves and with the input, with what they mean."""
 
     count: int
+    #: Largest lag L [samples].
     lags: int
+    #: Confidence level of both tests and of the bands [-].
     level: float
+    #: Of the residuals, at the lags 1 … L [-], shape (L,).
     autocorrelation: Array = field(repr=False)
+    #: A white sequence stays within plus or minus this at each single lag, with probability ``level`` [-].
     autocorrelation_band: float
+    #: Ljung and Box's portmanteau statistic [-].
     whiteness_statistic: float
     whiteness_degrees_of_freedom: int
+    #: Probability of a larger statistic if the residuals are white [-]; NaN where it cannot be computed.
     whiteness_p_value: float
     white: bool
+    #: Between ``residual(t)`` and ``input(t - k)``, k = -L … L [-], shape (2 L + 1,).
     cross_correlation: Array = field(repr=False)
+    #: Residuals of their colour that are independent of the input stay within plus or minus this at each single lag,
+    #: with probability ``level`` [-].
     cross_correlation_band: float
+    #: Portmanteau statistic of all these lags [-].
     cross_statistic: float
     cross_degrees_of_freedom: int
+    #: Probability of a larger statistic if the residuals are independent of the input [-]; NaN where it cannot be
+    #: computed.
     cross_p_value: float
     uncorrelated: bool
     sentence: str
@@ -87,34 +61,6 @@ def residual_tests(
 ) -> ResidualTests:
     r"""Test the residuals of an output-error model for whiteness and for correlation with the input.
 
-    Parameters
-    ----------
-    residuals : array_like, shape (N,)
-        Measured minus simulated output [output unit], missing samples left out.
-    inputs : array_like, shape (N,)
-        Input at the same instants [input unit]. Pass the delayed input ``u(t - delay)`` for a model with a delay: only
-        then do the lags 0 … L lie where its response begins.
-    level : float, default 0.95
-        Confidence level [-]; a sound model fails each test with probability ``1 - level``.
-    lags : int, optional
-        Largest lag L [samples]; ``min(25, N // 4)`` by default.
-    sensitivities : array_like, shape (N, p), optional
-        Sensitivities psi of the simulated output to the parameters estimated from this record [output unit per
-        parameter unit], in the order of the residuals. Without them the model counts as known beforehand: the level
-        is then not right for its own estimation data.
-
-    Returns
-    -------
-    ResidualTests
-        The outcome.
-
-    Raises
-    ------
-    ValueError
-        If the arrays differ in length, or the lags do not fit into the record.
-
-    Notes
-    -----
     Whiteness: ``r(k) = sum e(t) e(t-k) / sum e(t)^2``, not centred, so that a constant error is not white; the band is
     ``z / sqrt(N)``; ``Q = N (N + 2) sum_k r(k)^2 / (N - k)`` is chi-square with L degrees of freedom [1]_. The
     parameters of an output-error model take none away, as its sensitivities do not depend on the noise.
@@ -130,26 +76,6 @@ def residual_tests(
     beside psi, on which that has no effect.
 
     Samples are taken as equally spaced; with an irregular clock the lags count samples.
-
-    References
-    ----------
-    .. [1] G. M. Ljung and G. E. P. Box, On a measure of lack of fit in time series models, Biometrika 65 (1978)
-       297-303. https://doi.org/10.1093/biomet/65.2.297
-    .. [2] L. Ljung, *System Identification: Theory for the User*, 2nd ed., Prentice Hall, 1999, section 16.6.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(1)
-    >>> u = rng.choice([-1.0, 1.0], 500)
-    >>> noise = rng.standard_normal(500)
-    >>> tests = residual_tests(noise, u)
-    >>> tests.white, tests.uncorrelated
-    (True, True)
-
-    A model that misses a part of the response:
-
-    >>> residual_tests(noise + 0.5 * np.roll(u, 3), u).uncorrelated
-    False
     """
     e = np.asarray(residuals, dtype=float)
     u = np.asarray(inputs, dtype=float)

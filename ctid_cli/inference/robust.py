@@ -19,23 +19,6 @@ def sandwich_covariance(
 ) -> NDArray[np.float64]:
     r"""Covariance ``M^-1 Sigma M^-1`` of an unweighted output-error estimate under coloured output noise.
 
-    Parameters
-    ----------
-    psi : ndarray, shape (N, p), or a sequence of them
-        Sensitivities of the simulated output to the parameters [output unit per parameter unit]; one array for each
-        of several experiments with independent noise.
-    residuals : ndarray, shape (N,), or a sequence of them
-        Measured minus simulated output at the estimate [output unit]. Missing samples are left out, or NaN.
-    regular : bool
-        Whether the samples of each experiment are equally spaced in time, but for missing ones.
-
-    Returns
-    -------
-    ndarray, shape (p, p)
-        Covariance of the parameters; NaN where M is singular or there are too few samples.
-
-    Notes
-    -----
     With noise v independent of the input (open loop) and ``M = sum psi psi'`` [1]_,
 
     .. math:: \Sigma = \operatorname{cov} \sum_t \psi_t v_t
@@ -54,21 +37,6 @@ def sandwich_covariance(
     2000 samples give standard errors right to within 30 %, more often too large than too small.
 
     With feedback from the output to the input the noise is not independent of psi, and neither form holds.
-
-    References
-    ----------
-    .. [1] L. Ljung, *System Identification: Theory for the User*, 2nd ed., Prentice Hall, 1999, section 9.4.
-    .. [2] W. J. den Haan and A. T. Levin, A practitioner's guide to robust covariance matrix estimation, Handbook of
-       Statistics 15 (1997) 299-342. https://doi.org/10.1016/S0169-7161(97)15014-3
-
-    Examples
-    --------
-    The mean of 4000 samples ``v(k) = 0.9 v(k-1) + e(k)`` has the standard error ``1/(1 - 0.9)/sqrt(4000) = 0.158``:
-
-    >>> v = lfilter([1.0], [1.0, -0.9], np.random.default_rng(1).standard_normal(4000))
-    >>> covariance = sandwich_covariance(np.ones((4000, 1)), v - v.mean(), regular=True)
-    >>> bool(0.13 < covariance.item() ** 0.5 < 0.19)
-    True
     """
     sensitivities = [psi] if isinstance(psi, np.ndarray) else list(psi)
     errors = [residuals] if isinstance(residuals, np.ndarray) else list(residuals)

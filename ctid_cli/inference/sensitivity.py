@@ -19,17 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Structure:
-    """Degrees of a transfer function and whether its delay is a parameter.
-
-    Parameters
-    ----------
-    poles : int
-        Degree n of A.
-    zeros : int
-        Degree m of B.
-    delay : bool
-        Whether the delay is estimated along with the coefficients.
-    """
+    """Degrees of a transfer function and whether its delay is a parameter."""
 
     poles: int
     zeros: int
@@ -95,83 +85,26 @@ class Structure:
         return np.outer(self.signs, self.signs)
 
     def hessian(self, moments: Array) -> Array:
-        """Gauss-Newton matrix ``sum psi psi'`` of half the squared output error.
-
-        Parameters
-        ----------
-        moments : ndarray, shape (3 n + 3, 3 n + 3)
-            Second moments of the standard rows.
-
-        Returns
-        -------
-        ndarray, shape (size, size)
-            The matrix.
-        """
+        """Gauss-Newton matrix ``sum psi psi'`` of half the squared output error."""
         product: Array = moments.take(self._hessian_index) * self._sign_products
         return product
 
     def instrument_regressor(self, moments: Array) -> Array:
-        """Instrumental-variable matrix ``sum psi phi'``.
-
-        Parameters
-        ----------
-        moments : ndarray, shape (3 n + 3, 3 n + 3)
-            Second moments of the standard rows.
-
-        Returns
-        -------
-        ndarray, shape (size, size)
-            The matrix.
-        """
+        """Instrumental-variable matrix ``sum psi phi'``."""
         product: Array = moments.take(self._mixed_index) * self._sign_products
         return product
 
     def instrument_error(self, moments: Array) -> Array:
-        """``sum psi eps``, minus the gradient of half the squared output error.
-
-        Parameters
-        ----------
-        moments : ndarray, shape (3 n + 3, 3 n + 3)
-            Second moments of the standard rows.
-
-        Returns
-        -------
-        ndarray, shape (size,)
-            The vector.
-        """
+        """``sum psi eps``, minus the gradient of half the squared output error."""
         product: Array = moments.take(self._error_index) * self.signs
         return product
 
     def squared_error(self, moments: Array) -> float:
-        """Sum of squared output errors [output unit^2].
-
-        Parameters
-        ----------
-        moments : ndarray, shape (3 n + 3, 3 n + 3)
-            Second moments of the standard rows.
-
-        Returns
-        -------
-        float
-            ``sum eps^2``.
-        """
+        """Sum of squared output errors [output unit^2]."""
         return float(moments[self.error_row, self.error_row])
 
     def output_power(self, moments: Array, b: Array) -> float:
-        """Sum of squares of the simulated output.
-
-        Parameters
-        ----------
-        moments : ndarray, shape (3 n + 3, 3 n + 3)
-            Second moments of the standard rows.
-        b : ndarray, shape (m + 1,)
-            Numerator.
-
-        Returns
-        -------
-        float
-            ``sum x^2`` [output unit^2].
-        """
+        """Sum of squares of the simulated output."""
         rows = slice(0, self.zeros + 1)
         rising = b[::-1]
         return float(rising @ moments[rows, rows] @ rising)

@@ -25,23 +25,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class DiscreteSystem:
-    """``s(k+1) = A s(k) + B w(k)``, ``o(k) = C s(k) + D w(k)``.
+    """``s(k+1) = A s(k) + B w(k)``, ``o(k) = C s(k) + D w(k)``."""
 
-    Parameters
-    ----------
-    A : ndarray, shape (n, n)
-        Transition of the state over one sampling interval [-].
-    B : ndarray, shape (n, i)
-        Effect of the inputs held over it.
-    C : ndarray, shape (o, n)
-        Outputs from the state.
-    D : ndarray, shape (o, i)
-        Outputs from the inputs at the same instant.
-    """
-
+    #: Transition of the state over one sampling interval [-], shape (n, n).
     A: Array
+    #: Effect of the inputs held over it, shape (n, i).
     B: Array
+    #: Outputs from the state, shape (o, n).
     C: Array
+    #: Outputs from the inputs at the same instant, shape (o, i).
     D: Array
 
     @property
@@ -50,18 +42,7 @@ class DiscreteSystem:
         return float(np.abs(np.linalg.eigvals(self.A)).max(initial=0.0))
 
     def after(self, first: DiscreteSystem) -> DiscreteSystem:
-        """The series of another system and this one.
-
-        Parameters
-        ----------
-        first : DiscreteSystem
-            The one before, with as many outputs as this one has inputs.
-
-        Returns
-        -------
-        DiscreteSystem
-            From the inputs of the one before to the outputs of this one.
-        """
+        """The series of another system and this one."""
         n, m = first.A.shape[0], self.A.shape[0]
         A = np.block([[first.A, np.zeros((n, m))], [self.B @ first.C, self.A]])
         B = np.vstack([first.B, self.B @ first.D])
@@ -73,24 +54,6 @@ def sensitivity_system(
 ) -> DiscreteSystem:
     r"""System from the held input to the model's output and its sensitivities.
 
-    Parameters
-    ----------
-    model : AdditiveModel or TransferFunction
-        The model; its type chooses the parameters.
-    interval : float
-        Sampling interval, at which the input changes too [s].
-    zeros : int, optional
-        Degree of the estimated numerator of a transfer function, if more than the model's own.
-
-    Returns
-    -------
-    DiscreteSystem
-        One input, the samples of the input. The first output is the model's x; those after it are
-        ``dx/d theta``, for an additive model in the order of its ``names``, for a transfer function
-        ``a_1 ... a_n, b_0 ... b_m``.
-
-    Notes
-    -----
     Exact for an input held between samples, for any delay: a delay of a broken number of intervals is read off between
     the samples. For a submodel with the coefficient of ``p^k`` in A and B as the parameter of index k,
 

@@ -366,35 +366,13 @@ class AdditiveModel:
 
 
 def same_pole(one: ArrayLike, other: ArrayLike) -> NDArray[np.bool_]:
-    """Whether two poles are too close to be told apart in double precision.
-
-    Parameters
-    ----------
-    one, other : array_like
-        Poles [rad/s], of shapes that broadcast.
-
-    Returns
-    -------
-    ndarray of bool
-        Whether their distance is at most 1e-7 of the larger magnitude.
-    """
+    """Whether two poles are too close to be told apart in double precision."""
     p, q = np.asarray(one, dtype=complex), np.asarray(other, dtype=complex)
     return np.asarray(np.abs(p - q) <= SAME_POLE * np.maximum(np.abs(p), np.abs(q)))
 
 
 def pole_text(pole: complex) -> str:
-    """Where a pole lies, for a message.
-
-    Parameters
-    ----------
-    pole : complex
-        The pole [rad/s].
-
-    Returns
-    -------
-    str
-        Such as ``at -2 rad/s`` or ``at the origin``.
-    """
+    """Where a pole lies, for a message."""
     if pole == 0:
         return "at the origin"
     return f"at {pole.real:g}{f'{pole.imag:+g}j' if pole.imag else ''} rad/s"

@@ -30,25 +30,7 @@ class FactoringError(DataError):
 
 
 def unfactored(model: AdditiveModel) -> TransferFunction:
-    r"""The sum of all submodels over their common denominator.
-
-    Parameters
-    ----------
-    model : AdditiveModel
-        The sum.
-
-    Returns
-    -------
-    TransferFunction
-        Monic, with the delay of the sum.
-
-    Examples
-    --------
-    >>> one, two = Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])
-    >>> fraction = unfactored(AdditiveModel([one, two]))
-    >>> (fraction.numerator * 0.00625).round(6)
-    array([0.325, 0.28 , 4.   ])
-    """
+    r"""The sum of all submodels over their common denominator."""
     numerator, denominator = _joined(model.submodels)
     return TransferFunction(numerator[::-1], denominator[::-1], model.delay)
 
@@ -56,19 +38,6 @@ def unfactored(model: AdditiveModel) -> TransferFunction:
 def unfactored_jacobian(model: AdditiveModel) -> Array:
     r"""Derivatives of the coefficients of :func:`unfactored` with respect to the parameters of the sum.
 
-    Parameters
-    ----------
-    model : AdditiveModel
-        The sum, of order n and with p parameters.
-
-    Returns
-    -------
-    ndarray, shape (2 n, p) or (2 n + 1, p)
-        Rows: ``a_1 … a_n`` of the monic denominator, then the numerator at full length, in descending powers from n - 1
-        or, if a submodel is biproper, from n. Columns: as ``model.theta``.
-
-    Notes
-    -----
     With ``Q_i`` and ``R_i`` the denominator and numerator of the sum of all other submodels, the fraction
     ``(B_i Q_i + p^l A_i R_i) / (p^l A_i Q_i)`` is linear in the coefficients of ``A_i`` and ``B_i``; making it monic
     adds the quotient rule.
@@ -94,35 +63,7 @@ def unfactored_jacobian(model: AdditiveModel) -> Array:
 
 
 def factored(model: TransferFunction, terms: Sequence[Term] | None = None) -> AdditiveModel:
-    r"""Partial fractions of a transfer function, collected into submodels.
-
-    Parameters
-    ----------
-    model : TransferFunction
-        Proper, its poles distinct except at the origin.
-    terms : sequence of Term, optional
-        How many poles and integrators each submodel takes; its ``zeros`` only say which one takes a direct feedthrough.
-        Complex pairs fill the terms in the order given, slowest first, as far as they fit; real poles fill what is
-        left, so that those of one submodel are neighbours. By default each complex pair and each real pole has a
-        submodel of its own, and so have the integrators together and a direct feedthrough.
-
-    Returns
-    -------
-    AdditiveModel
-        The same transfer function, sorted by natural frequency. Numerators have the full length that a partial fraction
-        needs: a complex pair has ``b_0`` and ``b_1``, of which the latter tends to zero where the truth has none.
-
-    Raises
-    ------
-    FactoringError
-        If a pole other than the origin is repeated, the terms do not fit the poles, or there are more zeros than poles.
-
-    Examples
-    --------
-    >>> sum_of_two = factored(TransferFunction([3.0, 5.0], [1.0, 3.0, 2.0]))
-    >>> [(s.numerator.round(6).tolist(), s.denominator.round(6).tolist()) for s in sum_of_two.submodels]
-    [([2.0], [1.0, 1.0]), ([0.5], [0.5, 1.0])]
-    """
+    r"""Partial fractions of a transfer function, collected into submodels."""
     fractions = _partial_fractions(model)
     submodels = []
     for group in _groups(fractions, terms):
@@ -134,26 +75,6 @@ def factored(model: TransferFunction, terms: Sequence[Term] | None = None) -> Ad
 def factored_jacobian(model: TransferFunction, terms: Sequence[Term] | None = None) -> Array:
     r"""Derivatives of the parameters of :func:`factored` with respect to the coefficients of the transfer function.
 
-    Parameters
-    ----------
-    model : TransferFunction
-        As for :func:`factored`, with n poles and m zeros.
-    terms : sequence of Term, optional
-        As for :func:`factored`.
-
-    Returns
-    -------
-    ndarray, shape (p, n + m + 1)
-        Rows: as ``factored(model, terms).theta``. Columns: ``a_1 … a_n, b_0 … b_m``, descending powers. Poles at the
-        origin stay there: the columns of the zero coefficients that put them there are zero.
-
-    Raises
-    ------
-    FactoringError
-        As :func:`factored`.
-
-    Notes
-    -----
     From ``A(p) = 0`` and ``r = B(p)/A'(p)``,
 
     .. math:: dp = -\frac{dA(p)}{A'(p)}, \qquad
@@ -170,20 +91,7 @@ def factored_jacobian(model: TransferFunction, terms: Sequence[Term] | None = No
 
 
 def pole_jacobian(denominator: ArrayLike, poles: ArrayLike) -> ComplexArray:
-    """Derivatives of the poles with respect to the denominator coefficients: ``dp/da_i = -p^(n-i) / A'(p)``.
-
-    Parameters
-    ----------
-    denominator : array_like, shape (n + 1,)
-        Monic A in descending powers.
-    poles : array_like, shape (n,)
-        Its roots [rad/s].
-
-    Returns
-    -------
-    ndarray, shape (n, n)
-        Row: pole; column: ``a_1 … a_n``; not finite for repeated poles.
-    """
+    """Derivatives of the poles with respect to the denominator coefficients: ``dp/da_i = -p^(n-i) / A'(p)``."""
     a = np.asarray(denominator, dtype=float)
     p = np.asarray(poles, dtype=complex)
     n = a.size - 1

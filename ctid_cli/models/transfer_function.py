@@ -109,17 +109,6 @@ class TransferFunction:
 
 
 def sorted_roots(coefficients: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Roots of a polynomial, largest magnitude first.
-
-    Parameters
-    ----------
-    coefficients : ndarray, shape (n + 1,)
-        Coefficients in descending powers.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        The roots.
-    """
+    """Roots of a polynomial, largest magnitude first."""
     roots = np.asarray(np.roots(coefficients), dtype=complex)
     return roots[np.lexsort((roots.imag, -np.abs(roots)))]

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.errors import DataError, UsageError
-from ctid_cli.experiment.dataset import SimulatedSource
-from ctid_cli.experiment.plan import DataCell, EstimatorCell, Plan
 from ctid_cli.reporting.expected_accuracy import expected_accuracy
 from ctid_cli.reporting.layout import count, number, text_table
 from ctid_cli.reporting.tables import setting_text, setting_title
+from ctid_cli.running.plan import DataCell, EstimatorCell, Plan
+from ctid_cli.simulation.dataset import SimulatedSource
 
 #: Lines of text are no longer than this.
 WIDTH = 100
@@ -25,28 +25,7 @@ QUANTILE = 1.959964
 
 
 def accuracy_object(plan: Plan) -> dict[str, Any]:
-    """Expected accuracy of every estimator of an experiment as JSON-able content.
-
-    Parameters
-    ----------
-    plan : Plan
-        The experiment.
-
-    Returns
-    -------
-    dict
-        ``experiment``; ``left_out``, how many data cells are not shown; ``estimates``, one entry for each data cell
-        that is shown and each estimator: ``settings`` of the data and ``options`` of the estimator (swept ones by
-        name), ``samples``, ``estimator``, ``kind``, ``scales`` (whether the standard errors fall with the square root
-        of the number of samples), ``formula``, a sentence, and ``parameters``, each with ``name``, ``value``,
-        ``standard_error``, ``relative_percent`` of the value and ``half_width_95`` of an interval. Where theory has no
-        answer, ``reason`` says why in place of ``formula``, and ``parameters`` is empty.
-
-    Raises
-    ------
-    UsageError
-        If the experiment is about a measured record.
-    """
+    """Expected accuracy of every estimator of an experiment as JSON-able content."""
     cells = [(cell, cell.source) for cell in plan.data_cells if isinstance(cell.source, SimulatedSource)]
     if not cells:
         raise UsageError(
@@ -109,18 +88,7 @@ def _entry(cell: DataCell, source: SimulatedSource, estimator: EstimatorCell, pl
 
 
 def accuracy_text(content: dict[str, Any]) -> str:
-    """Expected accuracy of every estimator of an experiment for people.
-
-    Parameters
-    ----------
-    content : dict
-        From :func:`accuracy_object`.
-
-    Returns
-    -------
-    str
-        Tables, one for estimators that can do the same; the formulas; and what all of them assume.
-    """
+    """Expected accuracy of every estimator of an experiment for people."""
     parts = [
         f"{content['experiment']}: standard errors to expect by theory, before any data are taken. The half width is "
         "that of an interval of 95 %, 1.96 standard errors."

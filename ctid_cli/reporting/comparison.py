@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ctid_cli.errors import UsageError
-from ctid_cli.experiment.plan import RESERVED_COLUMNS
 from ctid_cli.reporting.layout import count, delay_label, markdown_table, number, percent, text_table
 from ctid_cli.reporting.report import build_tables
 from ctid_cli.reporting.results import out_option, shown_path
 from ctid_cli.reporting.study import Study, load_study
 from ctid_cli.reporting.tables import csv_text, setting_text, setting_title
+from ctid_cli.running.plan import RESERVED_COLUMNS
 
 #: Chance that a check reports any difference although nothing has changed.
 LEVEL = 0.01
@@ -30,35 +30,7 @@ _Identity = tuple[str, str, Any, frozenset[tuple[str, Any]]]
 
 @dataclass(frozen=True)
 class ComparedCell:
-    """One table cell, and what it was compared with.
-
-    Parameters
-    ----------
-    against : {"committed", "paper"}
-        Where the reference comes from.
-    decisive : bool
-        Whether a difference can be a mismatch, or is for information only.
-    table : int or str
-        Number of the published table, or name of the experiment.
-    experiment : str
-        Experiment that fills the cell.
-    sampling : str or None
-        ``regular``, ``irregular``; None where the table does not say.
-    settings : mapping
-        Swept fields and their values.
-    initial_delay : float, "random" or None
-        Where the search started [s]; None for an estimator that needs no start.
-    method : str
-        Name of the estimator.
-    n, converged : int
-        Fresh data sets, and how many of them met the success rule.
-    reference_n, reference_converged : int
-        The same of the reference.
-    p_value : float
-        Two-sided p-value of Fisher's exact test that both percentages are equal [-].
-    adjusted_p_value : float
-        The same after Holm's correction for the number of cells: a difference where it is below the level [-].
-    """
+    """One table cell, and what it was compared with."""
 
     against: Against
     decisive: bool
@@ -66,13 +38,16 @@ class ComparedCell:
     experiment: str
     sampling: str | None
     settings: Mapping[str, Any]
+    #: Where the search started [s]; None for an estimator that needs no start.
     initial_delay: float | str | None
     method: str
     n: int
     converged: int
     reference_n: int
     reference_converged: int
+    #: Two-sided p-value of Fisher's exact test that both percentages are equal [-].
     p_value: float
+    #: The same after Holm's correction for the number of cells: a difference where it is below the level [-].
     adjusted_p_value: float
 
     @property
@@ -121,21 +96,7 @@ class ComparedCell:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A finished comparison.
-
-    Parameters
-    ----------
-    cells : tuple of ComparedCell
-        Everything that was compared, in the order of the tables.
-    reference : str or None
-        Name of the file of the committed tables; None where there is none.
-    not_run : int
-        Cells that could have been compared, but have no fresh results.
-    not_in_reference : int
-        Cells with fresh results that the committed tables do not have.
-    notes : tuple of str
-        What a reader must know besides, for example that the fresh results have other settings.
-    """
+    """A finished comparison."""
 
     cells: tuple[ComparedCell, ...]
     reference: str | None
@@ -184,28 +145,7 @@ class Comparison:
 
 
 def check_tables(names: Sequence[str], out: Path, reference: Path | None = None) -> Comparison:
-    """Compare tables of a results folder with committed ones and with the paper.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Tables or experiments as for `ctid_cli.reporting.report.build_tables`.
-    out : Path
-        Results folder.
-    reference : Path, optional
-        Tables to compare with, as ``ctid table --format csv`` writes them; by default the study's committed tables,
-        which a checkout has and an installed package has not.
-
-    Returns
-    -------
-    Comparison
-        At least one of its comparisons is decisive.
-
-    Raises
-    ------
-    UsageError
-        If a name is unknown, the reference cannot be read, or nothing can be compared.
-    """
+    """Compare tables of a results folder with committed ones and with the paper."""
     study = load_study()
     file = committed_tables() if reference is None else reference
     committed = None if file is None else read_tables(file)
@@ -235,35 +175,11 @@ def compare(
 ) -> Comparison:
     """Compare table rows with committed ones and with the paper.
 
-    Parameters
-    ----------
-    rows : iterable of mapping
-        Fresh rows, with the keys of ``ctid table --format json``.
-    committed : iterable of mapping, optional
-        Rows of the reference, as from `read_tables`.
-    study : Study
-        Says how many data sets the published percentages have, and which methods must reach them.
-    reference : str, optional
-        Name of the reference.
-    notes : sequence of str
-        What a reader must know besides.
-
-    Returns
-    -------
-    Comparison
-        The comparison.
-
-    Notes
-    -----
     Cells are the same if experiment, method, initial delay and swept fields are. Each pair of counts is tested with
     Fisher's exact test, conditional on the sum of successes: it holds its level for any number of data sets. Holm's
     correction keeps the chance of any false difference among all decisive cells at 1 %, however they depend on each
     other. Where both sides used the same seed they share their data sets, so they agree even better than the test
     assumes. The comparisons for information are a family of their own.
-
-    References
-    ----------
-    S. Holm, A simple sequentially rejective multiple test procedure, Scandinavian Journal of Statistics 6 (1979) 65-70.
     """
     from scipy.stats import fisher_exact
 
@@ -327,26 +243,8 @@ def compare(
 def holm(p_values: Sequence[float]) -> list[float]:
     """Holm's correction for several tests.
 
-    Parameters
-    ----------
-    p_values : sequence of float
-        One p-value per test [-].
-
-    Returns
-    -------
-    list of float
-        Adjusted p-values in the same order: rejecting those below a level makes any false rejection among all tests
-        at most as likely as the level [-].
-
-    Notes
-    -----
     With ``p_(1) <= ... <= p_(m)``, the adjusted p-value of ``p_(i)`` is the largest ``(m + 1 - j) p_(j)``, j <= i,
     and at most 1.
-
-    Examples
-    --------
-    >>> holm([0.01, 0.04, 0.03])
-    [0.03, 0.06, 0.06]
     """
     adjusted = [0.0] * len(p_values)
     largest = 0.0
@@ -357,35 +255,13 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def committed_tables() -> Path | None:
-    """File of the default study's committed tables.
-
-    Returns
-    -------
-    Path or None
-        None in an installed package, which does not carry them.
-    """
+    """File of the default study's committed tables."""
     file = Path(__file__).resolve().parents[2] / "results" / "published" / "useful_redundancy" / "tables.csv"
     return file if file.is_file() else None
 
 
 def read_tables(file: Path) -> list[dict[str, Any]]:
-    """Read tables that ``ctid table --format csv`` wrote.
-
-    Parameters
-    ----------
-    file : Path
-        Comma-separated file.
-
-    Returns
-    -------
-    list of dict
-        Rows with ``n`` and ``converged`` as counts and numbers as floats; None for an empty field.
-
-    Raises
-    ------
-    UsageError
-        If the file is missing, has other columns, or a count that is none.
-    """
+    """Read tables that ``ctid table --format csv`` wrote."""
     try:
         with file.open(encoding="utf-8-sig", newline="") as stream:
             reader = csv.DictReader(stream)
@@ -414,20 +290,7 @@ def read_tables(file: Path) -> list[dict[str, Any]]:
 
 
 def write_comparison(comparison: Comparison, style: str = "text") -> str:
-    """A comparison in one of the forms of a table.
-
-    Parameters
-    ----------
-    comparison : Comparison
-        The comparison, with one decisive cell at least.
-    style : {"text", "md", "csv", "json"}, default "text"
-        Form. ``csv`` has one row per compared cell.
-
-    Returns
-    -------
-    str
-        Text without a final newline.
-    """
+    """A comparison in one of the forms of a table."""
     if style == "json":
         return json.dumps(comparison.as_dict(), indent=1, allow_nan=False)
     if style == "csv":
@@ -450,18 +313,7 @@ def write_comparison(comparison: Comparison, style: str = "text") -> str:
 
 
 def mismatch_sentence(comparison: Comparison) -> str:
-    """What is wrong, in one sentence.
-
-    Parameters
-    ----------
-    comparison : Comparison
-        A comparison with mismatches.
-
-    Returns
-    -------
-    str
-        Sentence without a full stop.
-    """
+    """What is wrong, in one sentence."""
     wrong, compared = len(comparison.mismatches), len(comparison.decisive)
     verb = "differs" if wrong == 1 else "differ"
     return f"{wrong} of {count(compared, 'comparison')} {verb} by more than sampling error explains"

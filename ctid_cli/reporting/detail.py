@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from ctid_cli.errors import MismatchError
-from ctid_cli.experiment.frequency_measures import MEASURE_UNITS, base_name, measure_names
-from ctid_cli.experiment.frequency_runs import FrequencyFit, SignalDataSet
-from ctid_cli.experiment.plan import build_plan
-from ctid_cli.experiment.spec import spec_from_canonical
-from ctid_cli.experiment.store import FoundEstimate, read_stored, spec_folder
-from ctid_cli.experiment.worker import plain
 from ctid_cli.reporting.estimate import Parameter, as_object, parameter_table, parameters
 from ctid_cli.reporting.layout import delay_label, number, seconds, text_table
 from ctid_cli.reporting.results import out_option
+from ctid_cli.running.plan import build_plan
+from ctid_cli.running.worker import plain
+from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name, measure_names
+from ctid_cli.simulation.frequency_runs import FrequencyFit, SignalDataSet
+from ctid_cli.specification.spec import spec_from_canonical
+from ctid_cli.storage.store import FoundEstimate, read_stored, spec_folder
 
 #: A repeated estimate agrees if no parameter moved by more than this fraction; other processors give other last bits.
 AGREEMENT = 1e-6
@@ -25,16 +25,9 @@ AGREEMENT = 1e-6
 
 @dataclass(frozen=True)
 class Repeated:
-    """An estimate that was computed once more.
+    """An estimate that was computed once more."""
 
-    Parameters
-    ----------
-    history : list of dict
-        Its accepted iterations: stage, iteration, delay [s], cost [output unit^2], coefficients.
-    difference : float or None
-        Largest relative difference between its parameters and the stored ones; None where there are none.
-    """
-
+    #: Its accepted iterations: stage, iteration, delay [s], cost [output unit^2], coefficients.
     history: list[dict[str, Any]]
     difference: float | None
 
@@ -45,39 +38,12 @@ class Repeated:
 
 
 def parameters_of(found: FoundEstimate) -> list[Parameter]:
-    """Parameters of a stored estimate with their uncertainty.
-
-    Parameters
-    ----------
-    found : FoundEstimate
-        The estimate.
-
-    Returns
-    -------
-    list of Parameter
-        See `ctid_cli.reporting.estimate.parameters`.
-    """
+    """Parameters of a stored estimate with their uncertainty."""
     return parameters(found.row, found.estimator.get("delay_bounds"))
 
 
 def detail_object(found: FoundEstimate, again: Repeated | None, out: Path) -> dict[str, Any]:
-    """One estimate for ``ctid show --json``.
-
-    Parameters
-    ----------
-    found : FoundEstimate
-        The estimate.
-    again : Repeated or None
-        The same once more.
-    out : Path
-        Results folder.
-
-    Returns
-    -------
-    dict
-        The keys of every estimate, then ``parameters``, ``data``, ``settings``, ``seed``, ``origins``, ``redo``,
-        and with a repetition ``history`` and ``difference``.
-    """
+    """One estimate for ``ctid show --json``."""
     content = as_object(found.row) | {
         "parameters": [item.as_dict() for item in parameters_of(found)],
         "data": found.data,
@@ -90,22 +56,7 @@ def detail_object(found: FoundEstimate, again: Repeated | None, out: Path) -> di
 
 
 def detail_text(found: FoundEstimate, again: Repeated | None, out: Path) -> str:
-    """One estimate as text.
-
-    Parameters
-    ----------
-    found : FoundEstimate
-        The estimate.
-    again : Repeated or None
-        The same once more.
-    out : Path
-        Results folder.
-
-    Returns
-    -------
-    str
-        Several paragraphs.
-    """
+    """One estimate as text."""
     row = found.row
     lines = [
         f"Estimate {row['id']} of {row['experiment']}",
@@ -170,36 +121,12 @@ def _repeated(found: FoundEstimate, again: Repeated | None, out: Path) -> list[s
 
 
 def redo_command(found: FoundEstimate, out: Path) -> str:
-    """The command that repeats an estimate.
-
-    Parameters
-    ----------
-    found : FoundEstimate
-        The estimate.
-    out : Path
-        Results folder.
-
-    Returns
-    -------
-    str
-        Command line.
-    """
+    """The command that repeats an estimate."""
     return f"ctid show {found.row['id']} --history{out_option(out)}"
 
 
 def repeat(found: FoundEstimate) -> Repeated:
-    """Make the data set of an estimate and the estimate once more.
-
-    Parameters
-    ----------
-    found : FoundEstimate
-        The estimate.
-
-    Returns
-    -------
-    Repeated
-        Its iterations, and how far it is from the stored one.
-    """
+    """Make the data set of an estimate and the estimate once more."""
     row = found.row
     spec = spec_from_canonical(read_stored(found.folder).manifest["spec"], spec_folder(found.folder))
     plan = build_plan(spec)

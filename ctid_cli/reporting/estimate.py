@@ -46,23 +46,7 @@ SECONDS = {
 
 @dataclass(frozen=True)
 class Units:
-    """Units of a record, and those that follow for the parameters of a model.
-
-    Parameters
-    ----------
-    time : str, default "s"
-        Unit of time.
-    input, output : str
-        Units of input and output; ``in`` and ``out`` where they are not known.
-
-    Examples
-    --------
-    >>> units = Units("min", "%", "degC")
-    >>> units.of("b0", poles=2, zeros=1), units.of("a2", poles=2, zeros=1), units.gain
-    ('degC/%/min', '1/min^2', 'degC/%')
-    >>> units.of_submodel("g1_a2"), units.of_submodel("g1_b1"), units.of_submodel("g1_b0", integrators=1)
-    ('min^2', 'degC/%*min', 'degC/%/min')
-    """
+    """Units of a record, and those that follow for the parameters of a model."""
 
     time: str = "s"
     input: str = "in"
@@ -79,20 +63,7 @@ class Units:
         return SECONDS.get(self.time)
 
     def of(self, name: str, poles: int, zeros: int) -> str:
-        """Unit of a parameter.
-
-        Parameters
-        ----------
-        name : str
-            ``b0 …``, ``a1 …``, ``x1 …`` (initial state), ``offset``, ``delay``; a number of the experiment may follow.
-        poles, zeros : int
-            Degrees of the model.
-
-        Returns
-        -------
-        str
-            The unit.
-        """
+        """Unit of a parameter."""
         if name == "delay":
             return self.time
         if name.startswith("offset"):
@@ -103,20 +74,7 @@ class Units:
         return self._over_time(self.gain, poles - zeros + k) if kind == "b" else self._over_time(self.output, k - 1)
 
     def of_submodel(self, name: str, integrators: int = 0) -> str:
-        """Unit of a parameter of a submodel, whose denominator has the constant term 1.
-
-        Parameters
-        ----------
-        name : str
-            ``g1_a1 …``, ``g1_b0 …``; the last number is the power of p.
-        integrators : int, default 0
-            Poles of the submodel at the origin.
-
-        Returns
-        -------
-        str
-            The unit.
-        """
+        """Unit of a parameter of a submodel, whose denominator has the constant term 1."""
         coefficient = name.split("_")[1]
         power = int(coefficient[1:])
         if coefficient[0] == "b":
@@ -135,29 +93,12 @@ class Units:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of an estimate.
-
-    Parameters
-    ----------
-    name : str
-        ``b0``, ``a1``, ..., ``g1_a1``, ... of submodels, or ``delay``.
-    estimate : float or None
-        Its value, in ``unit``.
-    standard_error : float or None
-        Its asymptotic standard error, in ``unit``.
-    relative_percent : float or None
-        Standard error relative to the value [%].
-    low, high : float or None
-        95 % confidence interval, in ``unit``.
-    unit : str
-        Its unit; unknown units of input and output are written ``in`` and ``out``.
-    status : str
-        ``free``, ``fixed``, ``at bound``, or ``undetermined``: the data do not tell its value.
-    """
+    """One parameter of an estimate."""
 
     name: str
     estimate: float | None
     standard_error: float | None
+    #: Standard error relative to the value [%].
     relative_percent: float | None
     low: float | None
     high: float | None
@@ -170,29 +111,7 @@ class Parameter:
 
 
 def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None = None) -> list[Parameter]:
-    """Parameters of an estimate with their uncertainty.
-
-    Parameters
-    ----------
-    estimate : mapping
-        A stored estimate: ``numerator``, ``denominator``, ``delay``, ``standard_errors``, and ``parameters`` of
-        submodels where there are such.
-    delay_bounds : sequence of float, optional
-        Range that the delay was searched in [s]; without one the delay was fixed.
-
-    Returns
-    -------
-    list of Parameter
-        Numerator, denominator (without its leading 1), parameters of submodels, delay; empty if there is no model. What
-        was estimated as a sum of submodels has the latter two only.
-
-    Examples
-    --------
-    >>> fit = {"numerator": [8.0], "denominator": [1.0, 4.0], "delay": 2.0, "standard_errors": {"b0": 0.4, "a1": 0.1}}
-    >>> b0, a1, delay = parameters(fit)
-    >>> b0.unit, b0.relative_percent, a1.unit, delay.status
-    ('out/in/s', 5.0, '1/s', 'fixed')
-    """
+    """Parameters of an estimate with their uncertainty."""
     numerator, denominator = estimate.get("numerator"), estimate.get("denominator")
     if not numerator or not denominator:
         return []
@@ -223,20 +142,7 @@ def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None
 
 
 def parameter_table(found: Iterable[Parameter], style: str = "text") -> str:
-    """Parameters as an aligned or Markdown table.
-
-    Parameters
-    ----------
-    found : iterable of Parameter
-        Parameters.
-    style : {"text", "md"}, default "text"
-        Kind of table.
-
-    Returns
-    -------
-    str
-        The table.
-    """
+    """Parameters as an aligned or Markdown table."""
     header = ["parameter", "estimate", "standard error", "relative %", "95 % low", "95 % high", "unit", "status"]
     rows = [
         [
@@ -255,19 +161,7 @@ def parameter_table(found: Iterable[Parameter], style: str = "text") -> str:
 
 
 def as_object(estimate: Mapping[str, Any]) -> dict[str, Any]:
-    """An estimate for JSON: the documented keys first, then what else is stored.
-
-    Parameters
-    ----------
-    estimate : mapping
-        A stored estimate.
-
-    Returns
-    -------
-    dict
-        ``ESTIMATE_KEYS`` in order, ``parameters`` of submodels before the standard errors where there are such, then
-        the others.
-    """
+    """An estimate for JSON: the documented keys first, then what else is stored."""
     keys = list(ESTIMATE_KEYS)
     if "parameters" in estimate:
         keys.insert(keys.index("standard_errors"), "parameters")

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
-from ctid_cli.experiment.dataset import SimulatedSource
 from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.inference.accuracy import ParameterAccuracy, estimated_parameters
 from ctid_cli.inference.asymptotic import (
@@ -30,6 +29,7 @@ from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.excitation import Gaussian
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.sampling import RegularSampling
+from ctid_cli.simulation.dataset import SimulatedSource
 
 Array = NDArray[np.float64]
 
@@ -45,20 +45,7 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class ExpectedAccuracy:
-    """What theory says of one estimator on one kind of data.
-
-    Parameters
-    ----------
-    parameters : ParameterAccuracy
-        True values, and the covariance of the estimates from that many samples.
-    samples : int
-        Number of samples of the output.
-    limit : bool
-        Whether it is the limit for long records, which falls with the number of samples; else it is that of the first
-        data sets.
-    formula : str
-        The formula, its symbols, and why this one: a sentence without its full stop.
-    """
+    """What theory says of one estimator on one kind of data."""
 
     parameters: ParameterAccuracy
     samples: int
@@ -79,29 +66,7 @@ class _Estimated:
 def expected_accuracy(
     source: SimulatedSource, estimator: Any, terms: tuple[Term, ...] | None = None
 ) -> ExpectedAccuracy:
-    """Accuracy of an estimator on the data sets of a source.
-
-    Parameters
-    ----------
-    source : SimulatedSource
-        Makes the data sets.
-    estimator : Any
-        The option dataclass of the estimator.
-    terms : tuple of Term, optional
-        How many poles each submodel takes into which an estimate of one fraction is factored; None leaves fractions as
-        they are.
-
-    Returns
-    -------
-    ExpectedAccuracy
-        Of the parameters of submodels where there are terms and the system has no integrator; of the estimator's own
-        parameters otherwise.
-
-    Raises
-    ------
-    DataError
-        If there is no theory for this estimator on these data: a sentence that begins with its subject.
-    """
+    """Accuracy of an estimator on the data sets of a source."""
     if source.noise is None:
         raise DataError("the data have no noise, so nothing but rounding limits the accuracy")
     estimated = _estimated(source.system, estimator)

@@ -16,24 +16,7 @@ FAILING_COLUMNS = (
 
 
 def failing_estimates(found: Iterable[Results], methods: Collection[str]) -> list[dict[str, Any]]:
-    """Estimates that did not meet the success rule of their experiment.
-
-    Parameters
-    ----------
-    found : iterable of Results
-        Results of experiments.
-    methods : collection of str
-        Names of the estimators to list.
-
-    Returns
-    -------
-    list of dict
-        One per estimate, in the order of the specifications: ``experiment``, ``sampling``, ``snr_db`` and the other
-        swept fields, ``method``, ``initial_delay`` [s] (``"random"``, or None without one) and ``start_delay``, where
-        the search did start [s], ``replicate`` and ``seed``, which together make the data set, the estimated ``delay``
-        and the ``true_delay`` [s], ``status``, and ``id``, with which ``ctid show ID --history`` makes data set and
-        estimate again.
-    """
+    """Estimates that did not meet the success rule of their experiment."""
     failing = []
     for results in found:
         swept = dict.fromkeys(

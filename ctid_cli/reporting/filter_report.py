@@ -5,8 +5,8 @@ from __future__ import annotations
 import textwrap
 from typing import Any
 
-from ctid_cli.filtering import FilterSet, convergence_region, sufficient_number_of_filters
-from ctid_cli.filtering.filter_set import FilterCheck
+from ctid_cli.filtering.filter_set import FilterCheck, FilterSet, sufficient_number_of_filters
+from ctid_cli.filtering.filter_theory import convergence_region
 from ctid_cli.reporting.layout import count, number, text_table
 
 #: Lines of text are no longer than this.
@@ -14,22 +14,7 @@ WIDTH = 100
 
 
 def filter_object(filters: FilterSet, check: FilterCheck) -> dict[str, Any]:
-    """A check of a filter set as JSON-able content.
-
-    Parameters
-    ----------
-    filters : FilterSet
-        The set.
-    check : FilterCheck
-        What was found for its cut-off frequencies.
-
-    Returns
-    -------
-    dict
-        The verdict, the filters (numbered from 1, the longest period first), the best filter for each interval of delay
-        errors, the gaps, the path from the largest error, and the sufficient number of filters. Times in seconds,
-        frequencies in rad/s.
-    """
+    """A check of a filter set as JSON-able content."""
     return {
         "passes": check.passes,
         "bandwidth": filters.bandwidth,
@@ -65,21 +50,7 @@ def _best(check: FilterCheck) -> list[dict[str, Any]]:
 
 
 def filter_text(filters: FilterSet, check: FilterCheck) -> str:
-    """A check of a filter set for people.
-
-    Parameters
-    ----------
-    filters : FilterSet
-        The set.
-    check : FilterCheck
-        What was found for its cut-off frequencies.
-
-    Returns
-    -------
-    str
-        The verdict; the filters; which of them serves which delay error; the path from the largest error; the
-        sufficient number of filters.
-    """
+    """A check of a filter set for people."""
     content = filter_object(filters, check)
     top = _time(check.largest_error)
     parts = [

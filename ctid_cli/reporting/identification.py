@@ -10,10 +10,10 @@ import numpy as np
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.identification import Identification
-from ctid_cli.experiment.worker import plain
 from ctid_cli.inference.derived import DerivedParameter
 from ctid_cli.reporting.estimate import Parameter, Units, parameter_table
 from ctid_cli.reporting.layout import count, number, text_table, wrapped
+from ctid_cli.running.worker import plain
 from ctid_cli.signals.measurement import Measurement
 
 FIT_DEFINITION = "100 (1 - ||y - x|| / ||y - mean y||)"
@@ -30,23 +30,7 @@ TREATMENTS = {
 
 
 def common_units(measurements: Sequence[Measurement]) -> Units:
-    """Units that all records share.
-
-    Parameters
-    ----------
-    measurements : sequence of Measurement
-        The records.
-
-    Returns
-    -------
-    Units
-        Their units; a record that names none takes those of the others.
-
-    Raises
-    ------
-    DataError
-        If two records name different units.
-    """
+    """Units that all records share."""
     found: dict[str, str] = {}
     for role in ("time", "input", "output"):
         for measurement in measurements:
@@ -60,20 +44,7 @@ def common_units(measurements: Sequence[Measurement]) -> Units:
 
 
 def parameters_of(result: Identification, units: Units) -> list[Parameter]:
-    """Parameters with their uncertainty and units.
-
-    Parameters
-    ----------
-    result : Identification
-        The fit.
-    units : Units
-        Units of the records.
-
-    Returns
-    -------
-    list of Parameter
-        One for each parameter; None where a number is not defined.
-    """
+    """Parameters with their uncertainty and units."""
     found = []
     for item in result.estimates:
         value = item.value
@@ -85,20 +56,7 @@ def parameters_of(result: Identification, units: Units) -> list[Parameter]:
 
 
 def derived_of(result: Identification, units: Units) -> list[DerivedParameter]:
-    """Derived quantities in the units of the records; frequencies that are called Hz are in Hz.
-
-    Parameters
-    ----------
-    result : Identification
-        The fit.
-    units : Units
-        Units of the records.
-
-    Returns
-    -------
-    list of DerivedParameter
-        Those of the fit; without those in Hz where the unit of time is not known.
-    """
+    """Derived quantities in the units of the records; frequencies that are called Hz are in Hz."""
     names = {"s": units.time, "rad/s": f"rad/{units.time}", "output unit/input unit": units.gain}
     found = []
     for row in result.derived:
@@ -114,24 +72,7 @@ def derived_of(result: Identification, units: Units) -> list[DerivedParameter]:
 def identification_object(
     result: Identification, measurements: Sequence[Measurement], units: Units, validation: Measurement | None = None
 ) -> dict[str, Any]:
-    """A fit for ``fit.json`` and ``ctid fit --json``.
-
-    Parameters
-    ----------
-    result : Identification
-        The fit.
-    measurements : sequence of Measurement
-        The records it is from.
-    units : Units
-        Their units.
-    validation : Measurement, optional
-        The validation record.
-
-    Returns
-    -------
-    dict
-        The documented keys; numbers that are not finite are None.
-    """
+    """A fit for ``fit.json`` and ``ctid fit --json``."""
     fit, options, criteria = result.fit, result.options, result.criteria
     interval, profile, judged = result.delay_interval, fit.profile, result.validation
     content = {
@@ -199,22 +140,7 @@ def identification_object(
 
 
 def identification_text(result: Identification, measurements: Sequence[Measurement], units: Units) -> str:
-    """A fit for people, within 100 columns.
-
-    Parameters
-    ----------
-    result : Identification
-        The fit.
-    measurements : sequence of Measurement
-        The records it is from.
-    units : Units
-        Their units.
-
-    Returns
-    -------
-    str
-        Several paragraphs.
-    """
+    """A fit for people, within 100 columns."""
     fit, options, criteria, judged = result.fit, result.options, result.criteria, result.validation
     lines: list[str] = []
     for measurement, use in zip(measurements, fit.used, strict=True):

@@ -22,23 +22,7 @@ MEASURED, SIMULATED, BAND = "#b0b0b0", "#08306b", "#d9d9d9"
 
 
 def identification_svg(result: Identification, measurements: Sequence[Measurement], units: Units) -> bytes:
-    """Figure of a fit; the same fit always gives the same bytes.
-
-    Parameters
-    ----------
-    result : Identification
-        The fit.
-    measurements : sequence of Measurement
-        The records it is from.
-    units : Units
-        Their units.
-
-    Returns
-    -------
-    bytes
-        An SVG file: measured and simulated output, residuals, their autocorrelation with its 95 % band, and the cost
-        against the delay.
-    """
+    """Figure of a fit; the same fit always gives the same bytes."""
     import matplotlib
     from matplotlib.figure import Figure
 

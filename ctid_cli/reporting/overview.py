@@ -7,31 +7,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ctid_cli.experiment.manifest import FAILURES
-from ctid_cli.experiment.store import ExperimentStatus
 from ctid_cli.reporting.estimate import as_object
 from ctid_cli.reporting.layout import number, text_table
 from ctid_cli.reporting.results import out_option
+from ctid_cli.storage.manifest import FAILURES
+from ctid_cli.storage.store import ExperimentStatus
 
 #: Failed estimates that the text lists.
 LISTED = 10
 
 
 def status_object(status: ExperimentStatus, estimates: Sequence[Mapping[str, Any]] | None) -> dict[str, Any]:
-    """Progress of an experiment for ``ctid status --json``.
-
-    Parameters
-    ----------
-    status : ExperimentStatus
-        Its progress.
-    estimates : sequence of mapping or None
-        Its stored estimates; None leaves them out.
-
-    Returns
-    -------
-    dict
-        Counts are numbers of estimates.
-    """
+    """Progress of an experiment for ``ctid status --json``."""
     counts = {
         "experiment": status.experiment,
         "folder": str(status.folder),
@@ -59,18 +46,7 @@ def status_object(status: ExperimentStatus, estimates: Sequence[Mapping[str, Any
 
 
 def overview_text(found: Sequence[ExperimentStatus]) -> str:
-    """One line per experiment.
-
-    Parameters
-    ----------
-    found : sequence of ExperimentStatus
-        Progress of each.
-
-    Returns
-    -------
-    str
-        Aligned text; the counts are estimates.
-    """
+    """One line per experiment."""
     header = ["experiment", "done", "planned", "failed", "left aside", ""]
     rows = [
         [item.experiment, str(item.done), str(item.planned), str(item.failed), number(item.left_aside), _remark(item)]
@@ -80,22 +56,7 @@ def overview_text(found: Sequence[ExperimentStatus]) -> str:
 
 
 def status_text(status: ExperimentStatus, estimates: Sequence[Mapping[str, Any]], out: Path) -> str:
-    """Progress of one experiment: by estimator and data, by outcome, and the first failures.
-
-    Parameters
-    ----------
-    status : ExperimentStatus
-        Its progress.
-    estimates : sequence of mapping
-        Its stored estimates.
-    out : Path
-        Results folder, for the commands that are suggested.
-
-    Returns
-    -------
-    str
-        Several lines.
-    """
+    """Progress of one experiment: by estimator and data, by outcome, and the first failures."""
     lines = [f"{status.experiment} in {status.folder}: {status.done} of {status.planned} estimates done"]
     remark = _remark(status)
     if remark:

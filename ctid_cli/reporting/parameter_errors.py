@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.errors import UsageError
-from ctid_cli.experiment.manifest import FAILURES, true_parameters
-from ctid_cli.experiment.plan import build_plan
-from ctid_cli.experiment.spec import spec_from_canonical
-from ctid_cli.experiment.summary import wilson_interval
 from ctid_cli.reporting.parameter_theory import long_record_variances
 from ctid_cli.reporting.results import Results, lookup
+from ctid_cli.running.plan import build_plan
+from ctid_cli.specification.spec import spec_from_canonical
+from ctid_cli.storage.manifest import FAILURES, true_parameters
+from ctid_cli.storage.summary import wilson_interval
 
 Array = NDArray[np.float64]
 
@@ -32,37 +32,7 @@ QUANTILE = NormalDist().inv_cdf(0.975)
 
 @dataclass(frozen=True, eq=False)
 class ParameterEstimates:
-    """What one estimator found on the data sets of one data cell.
-
-    Parameters
-    ----------
-    experiment : str
-        Name of the experiment.
-    estimator : str
-        Name of the estimator.
-    start : str
-        Label of the start.
-    settings : mapping
-        Swept fields and their values.
-    samples : int
-        Number of samples of each record.
-    names : tuple of str
-        The p parameters of the simulated system.
-    truth : ndarray, shape (p,)
-        Their true values.
-    values : ndarray, shape (R, p)
-        Estimates by replicate; NaN throughout where one of them is missing.
-    standard_errors : ndarray, shape (R, p)
-        Standard errors; NaN where there is none.
-    failed : int
-        How many of the R data sets ended in an error.
-    not_converged : int
-        How many of the others did not end with the status ``CONVERGED``.
-    replicates : tuple of int
-        Numbers of the data sets, R of them.
-    theory : ndarray or None, shape (p,)
-        N times the variance that theory predicts for long records; None where there is no theory.
-    """
+    """What one estimator found on the data sets of one data cell."""
 
     experiment: str
     estimator: str
@@ -70,12 +40,16 @@ class ParameterEstimates:
     settings: Mapping[str, Any]
     samples: int
     names: tuple[str, ...]
+    #: Their true values, shape (p,).
     truth: Array
+    #: Estimates by replicate; NaN throughout where one of them is missing, shape (R, p).
     values: Array
+    #: Standard errors; NaN where there is none, shape (R, p).
     standard_errors: Array
     failed: int
     not_converged: int
     replicates: tuple[int, ...]
+    #: N times the variance that theory predicts for long records; None where there is no theory, shape (p,).
     theory: Array | None
 
     @property
@@ -84,23 +58,7 @@ class ParameterEstimates:
         return len(self.replicates)
 
     def column(self, parameter: str) -> int:
-        """Place of a parameter.
-
-        Parameters
-        ----------
-        parameter : str
-            Its name.
-
-        Returns
-        -------
-        int
-            Column of `values`.
-
-        Raises
-        ------
-        UsageError
-            If the system has no such parameter.
-        """
+        """Place of a parameter."""
         if parameter not in self.names:
             raise UsageError(f"the system has no parameter {parameter!r}; it has {', '.join(self.names)}")
         return self.names.index(parameter)
@@ -108,55 +66,7 @@ class ParameterEstimates:
 
 @dataclass(frozen=True)
 class ParameterErrors:
-    """Errors of one parameter over the data sets of one cell, in the units of the parameter.
-
-    Parameters
-    ----------
-    experiment, estimator, start : str
-        What they belong to.
-    samples : int
-        Number of samples N of each record.
-    settings : mapping
-        Swept fields and their values, the number of samples left out.
-    parameter : str
-        Name of the parameter.
-    true : float
-        Its true value.
-    runs : int
-        Data sets that were computed.
-    failed : int
-        Those that ended in an error.
-    not_converged : int
-        Those of the others whose iterations did not converge.
-    counted : int
-        Those with a value: what the following numbers are made of.
-    mse : float or None
-        Mean square of the errors; None where nothing counts.
-    n_mse : float or None
-        The same times N.
-    theory : float or None
-        What N times the mean square tends to with growing N.
-    ratio : float or None
-        ``n_mse / theory`` [-].
-    ratio_error : float or None
-        Standard error of the ratio for so many data sets [-].
-    bias : float or None
-        Mean of the errors.
-    deviation : float or None
-        Standard deviation of the estimates.
-    bias_per_deviation : float or None
-        ``bias / deviation`` [-]: the bias of one estimate against its scatter.
-    bias_per_error : float or None
-        ``bias / (deviation / sqrt(counted))`` [-]: whether there is one at all.
-    with_error : int
-        Estimates that have a standard error.
-    covered : int
-        Estimates whose 95 % interval contains the true value; without a standard error there is no interval.
-    coverage, low, high : float or None
-        Percentage of the counted ones that are covered, and its 95 % Wilson interval [%].
-    error_ratio : float or None
-        Root mean square of the standard errors over the standard deviation of the estimates [-].
-    """
+    """Errors of one parameter over the data sets of one cell, in the units of the parameter."""
 
     experiment: str
     estimator: str
@@ -172,17 +82,23 @@ class ParameterErrors:
     mse: float | None
     n_mse: float | None
     theory: float | None
+    #: ``n_mse / theory`` [-].
     ratio: float | None
+    #: Standard error of the ratio for so many data sets [-].
     ratio_error: float | None
     bias: float | None
     deviation: float | None
+    #: ``bias / deviation`` [-]: the bias of one estimate against its scatter.
     bias_per_deviation: float | None
+    #: ``bias / (deviation / sqrt(counted))`` [-]: whether there is one at all.
     bias_per_error: float | None
     with_error: int
     covered: int
+    #: Percentage of the counted ones that are covered, and its 95 % Wilson interval [%].
     coverage: float | None
     low: float | None
     high: float | None
+    #: Root mean square of the standard errors over the standard deviation of the estimates [-].
     error_ratio: float | None
 
     def as_dict(self) -> dict[str, Any]:
@@ -194,47 +110,19 @@ class ParameterErrors:
 
 @dataclass(frozen=True)
 class PairedRatio:
-    """Mean-square error of one estimator over that of another on the same data sets.
-
-    Parameters
-    ----------
-    parameter : str
-        Name of the parameter.
-    samples : tuple of int
-        Numbers of samples of the records.
-    ratio : float
-        The ratio [-].
-    standard_error : float
-        Its standard error by the jack-knife [-].
-    pairs : int
-        Data sets on which both have a value.
-    """
+    """Mean-square error of one estimator over that of another on the same data sets."""
 
     parameter: str
     samples: tuple[int, ...]
+    #: The ratio [-].
     ratio: float
+    #: Its standard error by the jack-knife [-].
     standard_error: float
     pairs: int
 
 
 def parameter_estimates(results: Results) -> list[ParameterEstimates]:
-    """Sort the estimates of an experiment by estimator, data cell and start.
-
-    Parameters
-    ----------
-    results : Results
-        An experiment whose system is a sum of submodels.
-
-    Returns
-    -------
-    list of ParameterEstimates
-        In the order of the specification.
-
-    Raises
-    ------
-    UsageError
-        If the system is not such a sum, or the data are measured.
-    """
+    """Sort the estimates of an experiment by estimator, data cell and start."""
     manifest = results.manifest
     cells = {cell["hash"]: cell for cell in manifest["data_cells"]}
     truths = {key: true_parameters(cell) for key, cell in cells.items()}
@@ -282,18 +170,7 @@ def parameter_estimates(results: Results) -> list[ParameterEstimates]:
 
 
 def parameter_errors(estimates: Iterable[ParameterEstimates]) -> list[ParameterErrors]:
-    """Errors of every parameter.
-
-    Parameters
-    ----------
-    estimates : iterable of ParameterEstimates
-        As from `parameter_estimates`.
-
-    Returns
-    -------
-    list of ParameterErrors
-        Parameter by parameter of one group of estimates after the other.
-    """
+    """Errors of every parameter."""
     return [row for group in estimates for row in _errors_of(group)]
 
 
@@ -350,28 +227,6 @@ def _errors_of(group: ParameterEstimates) -> list[ParameterErrors]:
 def mse_ratio(one: Sequence[ParameterEstimates], other: Sequence[ParameterEstimates], parameter: str) -> PairedRatio:
     r"""Mean-square error of one estimator over that of another.
 
-    Parameters
-    ----------
-    one, other : sequence of ParameterEstimates
-        Estimates of both from the same records, at the same numbers of samples N: one number, or several, whose
-        ``N`` times the mean-square errors are added.
-    parameter : str
-        Name of the parameter.
-
-    Returns
-    -------
-    PairedRatio
-        Over the data sets on which both have a value at each number of samples.
-
-    Raises
-    ------
-    UsageError
-        If the system has no such parameter, or there are fewer than two data sets to compare.
-    ValueError
-        If the estimates are of different experiments or lengths.
-
-    Notes
-    -----
     Both estimators see the same noise, so their errors go together, and the ratio is known better than either error.
     Longer records begin with the shorter ones of the same data set, so that their errors go together too: a data set,
     at all its lengths, is what the jack-knife leaves out. With the ratio r of all n data sets and ``r_(i)`` that of all

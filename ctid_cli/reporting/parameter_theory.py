@@ -6,30 +6,17 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError
-from ctid_cli.experiment.canonical import content_hash
-from ctid_cli.experiment.dataset import SimulatedSource
-from ctid_cli.experiment.plan import Plan
 from ctid_cli.reporting.expected_accuracy import LONG, expected_accuracy
-from ctid_cli.signals import RegularSampling
+from ctid_cli.running.plan import Plan
+from ctid_cli.signals.sampling import RegularSampling
+from ctid_cli.simulation.dataset import SimulatedSource
 
 
 def long_record_variances(plan: Plan) -> dict[tuple[int, int], dict[str, float]]:
     """Variances of the parameters of submodels that estimates approach on long records.
 
-    Parameters
-    ----------
-    plan : Plan
-        The experiment.
-
-    Returns
-    -------
-    dict
-        By places of the data cell and of the estimator in the plan: N times the variance by parameter name, for N
-        samples. A pair is missing where `ctid_cli.reporting.expected_accuracy.expected_accuracy` knows no limit.
-
-    Notes
-    -----
     The limit is taken whatever the number of samples of the cell: short records do not reach it.
     """
     found: dict[tuple[int, int], dict[str, float]] = {}

@@ -12,20 +12,7 @@ KEPT = ("started", "stopped", "computed", "failed", "jobs", "processors", "code_
 
 
 def environment(results: Path, experiments: Iterable[str]) -> str:
-    """Sessions of experiments.
-
-    Parameters
-    ----------
-    results : Path
-        Results folder.
-    experiments : iterable of str
-        Names of the experiments; those that were not run are left out.
-
-    Returns
-    -------
-    str
-        JSON: by the last part of the experiment's name, when and with what code and packages it was computed.
-    """
+    """Sessions of experiments."""
     sessions: dict[str, list[dict[str, object]]] = {}
     for name in sorted(experiments):
         for file in sorted((results / name / "provenance").glob("*.json")):
@@ -35,15 +22,7 @@ def environment(results: Path, experiments: Iterable[str]) -> str:
 
 
 def copy_figures(source: Path, target: Path) -> None:
-    """Put figures in place of those of an earlier reproduction; nothing happens where none were drawn.
-
-    Parameters
-    ----------
-    source : Path
-        Folder of the drawn figures.
-    target : Path
-        Folder of the published ones, created if need be.
-    """
+    """Put figures in place of those of an earlier reproduction; nothing happens where none were drawn."""
     figures = sorted(source.glob("*.svg"))
     if not figures:
         return

@@ -11,8 +11,7 @@ from typing import Any
 
 from ctid_cli.inference.record_check import RecordReport
 from ctid_cli.reporting.layout import count, number
-from ctid_cli.signals import Measurement
-from ctid_cli.signals.measurement import ROLES, USUAL_NAMES, split_header
+from ctid_cli.signals.measurement import ROLES, USUAL_NAMES, Measurement, split_header
 
 #: Lines of text are no longer than this.
 WIDTH = 100
@@ -21,20 +20,7 @@ LABELS = {"problem": "PROBLEM", "warning": "warning", "note": "note", "ok": "ok"
 
 
 def record_object(measurement: Measurement, report: RecordReport) -> dict[str, Any]:
-    """A report as JSON-able content.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The record and where it comes from.
-    report : RecordReport
-        What was found.
-
-    Returns
-    -------
-    dict
-        The fields of the report, with the columns and units of the file; None for numbers that are not there.
-    """
+    """A report as JSON-able content."""
     content = asdict(report)
     columns = {
         role: {"column": column, "unit": unit}
@@ -59,20 +45,7 @@ def _finite(value: Any) -> Any:
 
 
 def record_text(measurement: Measurement, report: RecordReport) -> str:
-    """A report for people.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        The record and where it comes from.
-    report : RecordReport
-        What was found.
-
-    Returns
-    -------
-    str
-        Findings, the worst first; the numbers; the command to go on with.
-    """
+    """A report for people."""
     columns = ", ".join(
         f"{role} {column!r}"
         for role, column in (

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from ctid_cli.errors import UsageError
-from ctid_cli.experiment.folder import InUseError
-from ctid_cli.experiment.manifest import is_of_signal
-from ctid_cli.experiment.spec import load_spec
 from ctid_cli.reporting.results import Results, differences, experiments_in, find_results, out_option, shown_path
 from ctid_cli.reporting.rows import Row, experiment_rows, study_rows
 from ctid_cli.reporting.study import DEFAULT_STUDY, Study, data_folder, load_study
 from ctid_cli.reporting.tables import csv_text, experiment_table, frequency_table, record_table, study_table
+from ctid_cli.specification.spec import load_spec
+from ctid_cli.storage.folder import InUseError
+from ctid_cli.storage.manifest import is_of_signal
 
 #: What a measured record's rows carry besides the keys of every table.
 _RECORD_KEYS = (
@@ -27,17 +27,7 @@ _RECORD_KEYS = (
 
 @dataclass(frozen=True)
 class Table:
-    """One table, ready to be written in any form.
-
-    Parameters
-    ----------
-    rows : list of dict
-        Its cells as data.
-    text, markdown : str
-        The table for people.
-    notes : list of str
-        What a reader must know besides: settings that differ, cells that were not run.
-    """
+    """One table, ready to be written in any form."""
 
     rows: list[dict[str, Any]]
     text: str
@@ -46,25 +36,7 @@ class Table:
 
 
 def build_tables(names: Sequence[str], out: Path) -> list[Table]:
-    """The tables that were asked for.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Table numbers (``1``, ``useful-redundancy/3``), studies or experiments; none means the whole default study.
-    out : Path
-        Results folder.
-
-    Returns
-    -------
-    list of Table
-        In the order asked for.
-
-    Raises
-    ------
-    UsageError
-        If a name is neither a table nor an experiment with results.
-    """
+    """The tables that were asked for."""
     tables: list[Table] = []
     for name in names or [DEFAULT_STUDY]:
         study_name, _, number = name.rpartition("/")
@@ -86,20 +58,7 @@ def build_tables(names: Sequence[str], out: Path) -> list[Table]:
 
 
 def write_tables(tables: Sequence[Table], style: str) -> str:
-    """Tables in one of the forms.
-
-    Parameters
-    ----------
-    tables : sequence of Table
-        Tables.
-    style : {"text", "md", "csv", "json"}
-        Form. ``csv`` and ``json`` put the rows of all tables into one list.
-
-    Returns
-    -------
-    str
-        Text without a final newline.
-    """
+    """Tables in one of the forms."""
     rows = [row for table in tables for row in table.rows]
     if style == "json":
         return json.dumps(rows, indent=1, allow_nan=False)
@@ -114,23 +73,7 @@ def write_tables(tables: Sequence[Table], style: str) -> str:
 
 
 def success_sentence(settings: Mapping[str, Any]) -> str:
-    """What the percentages of an experiment count.
-
-    Parameters
-    ----------
-    settings : mapping
-        Canonical specification.
-
-    Returns
-    -------
-    str
-        Sentence without a full stop.
-
-    Examples
-    --------
-    >>> success_sentence({"success": {"delay_relative_error": 0.01}})
-    'percent of the data sets whose delay estimate lies within 1 % of the true delay'
-    """
+    """What the percentages of an experiment count."""
     rule = settings.get("success") or {}
     parts = []
     if rule.get("delay_relative_error") is not None:

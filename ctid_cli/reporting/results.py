@@ -12,23 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from ctid_cli.errors import UsageError
-from ctid_cli.experiment.folder import experiment_folders
-from ctid_cli.experiment.manifest import FAILURES, Manifest
-from ctid_cli.experiment.store import Stored, read_stored
-from ctid_cli.experiment.summary import summarise
+from ctid_cli.storage.folder import experiment_folders
+from ctid_cli.storage.manifest import FAILURES, Manifest
+from ctid_cli.storage.store import Stored, read_stored
+from ctid_cli.storage.summary import summarise
 
 
 @dataclass(frozen=True)
 class Results:
-    """One experiment's results.
-
-    Parameters
-    ----------
-    folder : Path
-        Where they are stored.
-    stored : Stored
-        Plan of the latest run and its estimates.
-    """
+    """One experiment's results."""
 
     folder: Path
     stored: Stored
@@ -78,18 +70,7 @@ class Results:
         return "regular" if kind == "regular" else "irregular"
 
     def summaries(self, by: Sequence[str]) -> list[dict[str, Any]]:
-        """Counts and percentages in groups, as plain Python.
-
-        Parameters
-        ----------
-        by : sequence of str
-            Columns that make the groups.
-
-        Returns
-        -------
-        list of dict
-            See `ctid_cli.experiment.summary.summarise`; None stands for a missing value.
-        """
+        """Counts and percentages in groups, as plain Python."""
         import pandas as pd
 
         frame = pd.DataFrame(self.rows, columns=[*by, "status", "converged", "seconds"])
@@ -102,39 +83,12 @@ class Results:
 
 
 def out_option(out: Path) -> str:
-    """What a suggested command needs to find a results folder again.
-
-    Parameters
-    ----------
-    out : Path
-        Results folder.
-
-    Returns
-    -------
-    str
-        Empty for the default folder.
-
-    Examples
-    --------
-    >>> "ctid table 1" + out_option(Path("elsewhere"))
-    'ctid table 1 --out elsewhere'
-    """
+    """What a suggested command needs to find a results folder again."""
     return "" if out == Path("results") else f" --out {shlex.quote(str(out))}"
 
 
 def shown_path(file: Path) -> str:
-    """A file as a message names it.
-
-    Parameters
-    ----------
-    file : Path
-        Absolute.
-
-    Returns
-    -------
-    str
-        Relative to the working directory where it lies below that.
-    """
+    """A file as a message names it."""
     try:
         return str(file.relative_to(Path.cwd()))
     except ValueError:
@@ -142,25 +96,7 @@ def shown_path(file: Path) -> str:
 
 
 def lookup(settings: Mapping[str, Any], path: str) -> Any:
-    """Value at a key path such as ``noise.snr_db``.
-
-    Parameters
-    ----------
-    settings : mapping
-        Nested settings.
-    path : str
-        Keys joined by dots.
-
-    Returns
-    -------
-    object
-        The value, or None where there is none.
-
-    Examples
-    --------
-    >>> lookup({"noise": {"snr_db": 5.0}}, "noise.snr_db")
-    5.0
-    """
+    """Value at a key path such as ``noise.snr_db``."""
     value: Any = settings
     for key in path.split("."):
         if not isinstance(value, Mapping) or key not in value:
@@ -170,59 +106,17 @@ def lookup(settings: Mapping[str, Any], path: str) -> Any:
 
 
 def experiments_in(out: Path) -> list[str]:
-    """Names of the experiments that have results under a folder.
-
-    Parameters
-    ----------
-    out : Path
-        Results folder.
-
-    Returns
-    -------
-    list of str
-        Sorted; folders that ``--fresh`` moved aside do not count.
-    """
+    """Names of the experiments that have results under a folder."""
     return [folder.relative_to(out).as_posix() for folder in experiment_folders(out) if folder != out]
 
 
 def find_results(out: Path, experiment: str) -> Results | None:
-    """Results of one experiment, or None if it was never run into this folder.
-
-    Parameters
-    ----------
-    out : Path
-        Results folder.
-    experiment : str
-        Name of the experiment.
-
-    Returns
-    -------
-    Results or None
-        The results.
-    """
+    """Results of one experiment, or None if it was never run into this folder."""
     return read_results(out, experiment) if experiment in experiments_in(out) else None
 
 
 def read_results(out: Path, experiment: str) -> Results:
-    """Results of one experiment.
-
-    Parameters
-    ----------
-    out : Path
-        Results folder.
-    experiment : str
-        Name of the experiment.
-
-    Returns
-    -------
-    Results
-        The results.
-
-    Raises
-    ------
-    UsageError
-        If there are none, with the names of those that exist.
-    """
+    """Results of one experiment."""
     known = experiments_in(out)
     if experiment not in known:
         close = difflib.get_close_matches(experiment, known, n=1)
@@ -234,21 +128,7 @@ def read_results(out: Path, experiment: str) -> Results:
 
 
 def differences(settings: Mapping[str, Any], reference: Mapping[str, Any], shown: Collection[str]) -> list[str]:
-    """Settings in which results differ from a reference specification.
-
-    Parameters
-    ----------
-    settings, reference : mapping
-        Canonical specifications.
-    shown : collection of str
-        Key paths that the table shows in its rows; a difference there is visible and needs no note.
-
-    Returns
-    -------
-    list of str
-        For example ``["sampling.samples = 500 (not 4000)"]``. The number of data sets, estimators that only one side
-        has, and further fixed initial delays do not count.
-    """
+    """Settings in which results differ from a reference specification."""
     left, right = _leaves(settings), _leaves(reference)
     common = tuple(f"estimators.{name}." for name in set(settings["estimators"]) & set(reference["estimators"]))
     found = []

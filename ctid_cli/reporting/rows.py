@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import Any
 
-from ctid_cli.experiment.frequency_measures import base_name, measure_names
-from ctid_cli.experiment.manifest import is_of_signal
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.reporting.study import InitialDelay, Study, StudyTable
+from ctid_cli.simulation.frequency_measures import base_name, measure_names
+from ctid_cli.storage.manifest import is_of_signal
 
 #: Settings that are keys of every row, and their key path in a specification.
 ALWAYS = {"snr_db": "noise.snr_db"}
@@ -19,57 +19,30 @@ ALWAYS = {"snr_db": "noise.snr_db"}
 
 @dataclass(frozen=True)
 class Row:
-    """One table cell: a percentage over the data sets of one setting.
-
-    Parameters
-    ----------
-    table : int or str
-        Number of the published table, or name of the experiment.
-    experiment : str
-        Experiment that fills the cell.
-    sampling : str or None
-        ``regular``, ``irregular``; None for a measured record.
-    settings : mapping
-        Swept fields and their values; None where a field belongs to another estimator.
-    initial_delay : float, "random" or None
-        Where the search started [s]; None for an estimator that needs no start.
-    method : str
-        Name of the estimator.
-    n : int
-        Data sets behind the percentage; 0 for a cell that was not run.
-    failed : int
-        How many of them ended in an error; they count as not converged.
-    converged : int or None
-        How many met the success rule; None where there is none.
-    percent, low, high : float or None
-        Percentage converged and its 95 % Wilson interval [%].
-    published_percent : float or None
-        Published percentage [%].
-    median_seconds : float or None
-        Median time of one estimate [s].
-    estimator_settings : tuple of str
-        The fields of ``settings`` that belong to the estimator: they label columns, the others label rows.
-    measures : mapping, optional
-        Of frequencies of a signal: ``median_settling_time`` and ``median_settling_after_step`` of the slowest tone [s],
-        None where half of the data sets or more never settled; ``median_rms_1 …`` [rad/s]; ``false_alarms`` of all data
-        sets together.
-    """
+    """One table cell: a percentage over the data sets of one setting."""
 
     table: int | str
     experiment: str
     sampling: str | None
     settings: Mapping[str, Any]
+    #: Where the search started [s]; None for an estimator that needs no start.
     initial_delay: InitialDelay
     method: str
     n: int = 0
     failed: int = 0
     converged: int | None = 0
+    #: Percentage converged and its 95 % Wilson interval [%].
     percent: float | None = None
     low: float | None = None
     high: float | None = None
+    #: Published percentage [%].
     published_percent: float | None = None
+    #: Median time of one estimate [s].
     median_seconds: float | None = None
     estimator_settings: tuple[str, ...] = field(default=(), compare=False)
+    #: Of frequencies of a signal: ``median_settling_time`` and ``median_settling_after_step`` of the slowest tone [s],
+    #: None where half of the data sets or more never settled; ``median_rms_1 …`` [rad/s]; ``false_alarms`` of all data
+    #: sets together.
     measures: Mapping[str, float | None] | None = None
 
     def as_dict(self) -> dict[str, Any]:
@@ -94,22 +67,7 @@ class Row:
 
 
 def experiment_rows(results: Results, table: int | str, fields: Mapping[str, str] | None = None) -> list[Row]:
-    """Cells of one experiment: every combination of swept fields, estimator and start that was planned.
-
-    Parameters
-    ----------
-    results : Results
-        The experiment's results.
-    table : int or str
-        What the rows carry as their table.
-    fields : mapping of str to str, optional
-        Settings that become keys even where they are not swept, with their key path; default is the SNR.
-
-    Returns
-    -------
-    list of Row
-        In the order of the specification. Cells without an estimate have ``n`` 0.
-    """
+    """Cells of one experiment: every combination of swept fields, estimator and start that was planned."""
     manifest = results.manifest
     down, across = _swept(manifest["data_cells"]), _swept(manifest["estimators"])
     always = {} if is_of_signal(manifest) else ALWAYS
@@ -150,25 +108,7 @@ def experiment_rows(results: Results, table: int | str, fields: Mapping[str, str
 
 
 def study_rows(study: Study, table: StudyTable, found: Mapping[str, Results | None]) -> list[Row]:
-    """Cells of one published table, published or run.
-
-    Parameters
-    ----------
-    study : Study
-        The study.
-    table : StudyTable
-        One of its tables.
-    found : mapping of str to Results or None
-        Results of the study's experiments, None for those that were not run.
-
-    Returns
-    -------
-    list of Row
-        Every published cell appears, run or not, and so does what was run beyond them: further values of a field,
-        further estimators, further starts. In the order of experiments and settings of the table and of the study's
-        methods; what these do not name follows. Estimators that were given no initial delay have one estimate per
-        data set, whatever the initial delays of the table: their cells belong to every table.
-    """
+    """Cells of one published table, published or run."""
     rows: list[Row] = []
     random = table.initial_delays == ("random",)
     for name in dict.fromkeys(row.experiment for row in table.rows):
@@ -213,25 +153,6 @@ def study_rows(study: Study, table: StudyTable, found: Mapping[str, Results | No
 class PooledRow:
     """One method's percentage over all cells of a published table.
 
-    Parameters
-    ----------
-    method : str
-        Name of the estimator.
-    settings : mapping
-        The estimator's swept options and their values.
-    cells, cells_run : int
-        Cells of the table, and how many of them have estimates. A method without initial delays has one cell per row.
-    n, converged : int
-        Estimates in these cells, and how many of them met the success rule.
-    percent : float or None
-        100 converged / n [%].
-    published_percent : float or None
-        Mean of the published percentages of the cells that have estimates, or of all cells where none has [%].
-    least_seconds, greatest_seconds : float or None
-        Range of the cells' median times of one estimate [s].
-
-    Notes
-    -----
     There is no interval: cells of one row share their data sets, so their estimates are not independent trials.
     """
 
@@ -241,29 +162,17 @@ class PooledRow:
     cells_run: int
     n: int
     converged: int
+    #: 100 converged / n [%].
     percent: float | None
+    #: Mean of the published percentages of the cells that have estimates, or of all cells where none has [%].
     published_percent: float | None
+    #: Range of the cells' median times of one estimate [s].
     least_seconds: float | None
     greatest_seconds: float | None
 
 
 def pooled_rows(study: Study, table: StudyTable, rows: Sequence[Row]) -> list[PooledRow]:
-    """Each method over all cells of a published table.
-
-    Parameters
-    ----------
-    study : Study
-        The study.
-    table : StudyTable
-        One of its tables.
-    rows : sequence of Row
-        Its cells, as from `study_rows`. Those with settings or initial delays that the table has not do not count.
-
-    Returns
-    -------
-    list of PooledRow
-        In the order of the cells.
-    """
+    """Each method over all cells of a published table."""
     places = {(row.experiment, *(row.settings[field] for field in study.fields)) for row in table.rows}
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:

@@ -40,20 +40,7 @@ _SHORT = {"snr_db": ("SNR", " dB")}
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
-    """Rows as CSV; an empty field where a row lacks a column.
-
-    Parameters
-    ----------
-    rows : sequence of mapping
-        Rows.
-    columns : sequence of str, optional
-        Columns; all keys in their first order otherwise.
-
-    Returns
-    -------
-    str
-        CSV with a header line.
-    """
+    """Rows as CSV; an empty field where a row lacks a column."""
     names = list(columns if columns is not None else dict.fromkeys(key for row in rows for key in row))
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, names, restval="", lineterminator="\n", extrasaction="ignore")
@@ -63,68 +50,17 @@ def csv_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = 
 
 
 def setting_title(key: str) -> str:
-    """A swept field as a column title.
-
-    Parameters
-    ----------
-    key : str
-        Name of the field.
-
-    Returns
-    -------
-    str
-        Text.
-
-    Examples
-    --------
-    >>> setting_title("snr_db"), setting_title("cutoff")
-    ('SNR', 'cutoff')
-    """
+    """A swept field as a column title."""
     return _SHORT.get(key, (key, ""))[0]
 
 
 def setting_text(key: str, value: Any) -> str:
-    """The value of a swept field, with its unit where the title does not say it.
-
-    Parameters
-    ----------
-    key : str
-        Name of the field.
-    value : object
-        Its value; None where it has none.
-
-    Returns
-    -------
-    str
-        Text.
-
-    Examples
-    --------
-    >>> setting_text("snr_db", 5.0), setting_text("cutoff", 0.2), setting_text("snr_db", None)
-    ('5 dB', '0.2', '-')
-    """
+    """The value of a swept field, with its unit where the title does not say it."""
     return number(value) + (_SHORT.get(key, ("", ""))[1] if value is not None else "")
 
 
 def study_table(study: Study, table: StudyTable, rows: Sequence[Row], style: str = "text") -> str:
-    """A published table with our percentages in it.
-
-    Parameters
-    ----------
-    study : Study
-        The study.
-    table : StudyTable
-        The table.
-    rows : sequence of Row
-        Its cells.
-    style : {"text", "md"}, default "text"
-        Kind of table.
-
-    Returns
-    -------
-    str
-        Heading, table, percentages over the whole table, and footnote.
-    """
+    """A published table with our percentages in it."""
     delays = _delays(rows)
     heading = [f"Table {table.number}. {table.title}", f"Counted: {study.success}."]
     groups = _group(
@@ -154,24 +90,7 @@ def study_table(study: Study, table: StudyTable, rows: Sequence[Row], style: str
 
 
 def experiment_table(name: str, rows: Sequence[Row], success: str, style: str = "text") -> str:
-    """Percentages of one experiment: swept data and starts down, estimators across.
-
-    Parameters
-    ----------
-    name : str
-        Name of the experiment.
-    rows : sequence of Row
-        Its cells.
-    success : str
-        What its percentages count.
-    style : {"text", "md"}, default "text"
-        Kind of table.
-
-    Returns
-    -------
-    str
-        Heading, tables and footnote.
-    """
+    """Percentages of one experiment: swept data and starts down, estimators across."""
     keys = dict.fromkeys(key for row in rows for key, value in row.settings.items() if value is not None)
     down = [key for key in keys if not any(key in row.estimator_settings for row in rows)]
 
@@ -213,24 +132,7 @@ def experiment_table(name: str, rows: Sequence[Row], success: str, style: str = 
 
 
 def frequency_table(name: str, rows: Sequence[Row], success: str, style: str = "text") -> str:
-    """Frequencies of a signal: swept fields and estimators down, percentages and measures across.
-
-    Parameters
-    ----------
-    name : str
-        Name of the experiment.
-    rows : sequence of Row
-        Its cells, with measures.
-    success : str
-        What its percentages count.
-    style : {"text", "md"}, default "text"
-        Kind of table.
-
-    Returns
-    -------
-    str
-        Heading, table and footnote.
-    """
+    """Frequencies of a signal: swept fields and estimators down, percentages and measures across."""
     keys = list(dict.fromkeys(key for row in rows for key in row.settings))
     measures = list(dict.fromkeys(key for row in rows for key in row.measures or {}))
     header = [*(setting_title(key) for key in keys), "estimator", "%", "95 %", "n"]
@@ -262,24 +164,7 @@ def record_table(
     bounds: Mapping[str, Sequence[float] | None],
     style: str = "text",
 ) -> str:
-    """Estimates on a measured record: parameters with standard errors, and how well the models fit.
-
-    Parameters
-    ----------
-    name : str
-        Name of the experiment.
-    estimates : sequence of mapping
-        Stored estimates.
-    bounds : mapping
-        Delay bounds [s] of each estimator, None where the delay is fixed.
-    style : {"text", "md"}, default "text"
-        Kind of table.
-
-    Returns
-    -------
-    str
-        Heading, tables and footnote.
-    """
+    """Estimates on a measured record: parameters with standard errors, and how well the models fit."""
     draw = text_table if style == "text" else markdown_table
     blocks = []
     for first in range(0, len(estimates), ESTIMATES_PER_BLOCK):

@@ -25,24 +25,7 @@ LOGARITHMIC = 10.0
 
 
 def track_svg(track: RecordTrack, start: float, unit: str | None, title: str) -> bytes:
-    """Figure of a track; the same track always gives the same bytes.
-
-    Parameters
-    ----------
-    track : RecordTrack
-        The track.
-    start : float
-        Instant of the record's first sample [s].
-    unit : str or None
-        Unit of the signal.
-    title : str
-        Title of the figure.
-
-    Returns
-    -------
-    bytes
-        An SVG file: the frequency of each tone [Hz], stretches that are not valid shaded, and the amplitudes below.
-    """
+    """Figure of a track; the same track always gives the same bytes."""
     tones = track.omega.shape[1]
     panels = tones if tones <= MOST_PANELS else 1
     height = 1.1 + (1.15 * panels if panels > 1 else 2.6) + 1.7

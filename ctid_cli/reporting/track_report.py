@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctid_cli.experiment.worker import plain
 from ctid_cli.frequency.automatic import Settings
 from ctid_cli.frequency.flags import MEANINGS, Flag
 from ctid_cli.frequency.record_track import RecordTrack
 from ctid_cli.reporting.layout import count, number, text_table, wrapped
+from ctid_cli.running.worker import plain
 from ctid_cli.signals.sampled_signal import SampledSignal
 
 Array = NDArray[np.float64]
@@ -29,43 +29,22 @@ MOST_REASONS = 3
 
 @dataclass(frozen=True)
 class ToneSummary:
-    """One tone over the valid rows of a track; None where there are none.
-
-    Parameters
-    ----------
-    tone : int
-        Number, from 1 by rising frequency.
-    frequency_hz, omega : float or None
-        Median frequency [Hz], [rad/s].
-    spread_hz : float or None
-        Half the width of the central 68 % [Hz].
-    amplitude : float or None
-        Median amplitude [signal unit].
-    valid_percent : float
-        Share of the rows that are valid [%].
-    """
+    """One tone over the valid rows of a track; None where there are none."""
 
     tone: int
+    #: Median frequency [Hz], [rad/s].
     frequency_hz: float | None
     omega: float | None
+    #: Half the width of the central 68 % [Hz].
     spread_hz: float | None
+    #: Median amplitude [signal unit].
     amplitude: float | None
+    #: Share of the rows that are valid [%].
     valid_percent: float
 
 
 def summarise(track: RecordTrack) -> list[ToneSummary]:
-    """One line for each tone.
-
-    Parameters
-    ----------
-    track : RecordTrack
-        The track.
-
-    Returns
-    -------
-    list of ToneSummary
-        By rising frequency.
-    """
+    """One line for each tone."""
     valid = track.valid
     share = 100.0 * float(valid.mean()) if valid.size else 0.0
     found = []
@@ -85,20 +64,7 @@ def summarise(track: RecordTrack) -> list[ToneSummary]:
 
 
 def track_warnings(track: RecordTrack, settings: Settings) -> list[str]:
-    """What a reader must know before believing the numbers.
-
-    Parameters
-    ----------
-    track : RecordTrack
-        The track.
-    settings : Settings
-        How it was found.
-
-    Returns
-    -------
-    list of str
-        Sentences.
-    """
+    """What a reader must know before believing the numbers."""
     found = list(settings.warnings)
     share = float(track.valid.mean()) if track.valid.size else 0.0
     if share < MOSTLY_VALID:
@@ -116,24 +82,7 @@ def track_warnings(track: RecordTrack, settings: Settings) -> list[str]:
 
 
 def track_object(signal: SampledSignal, settings: Settings, track: RecordTrack, files: list[Path]) -> dict[str, Any]:
-    """A track for ``ctid track --json``.
-
-    Parameters
-    ----------
-    signal : SampledSignal
-        The record, times in seconds.
-    settings : Settings
-        How the frequencies were found.
-    track : RecordTrack
-        The track.
-    files : list of Path
-        What was written.
-
-    Returns
-    -------
-    dict
-        The documented keys; None for numbers that are not there.
-    """
+    """A track for ``ctid track --json``."""
     kind = settings.estimator.kind
     content = {
         "file": signal.file,
@@ -166,22 +115,7 @@ def track_object(signal: SampledSignal, settings: Settings, track: RecordTrack, 
 
 
 def track_text(signal: SampledSignal, settings: Settings, track: RecordTrack) -> str:
-    """A track for people, within 100 columns.
-
-    Parameters
-    ----------
-    signal : SampledSignal
-        The record, times in seconds.
-    settings : Settings
-        How the frequencies were found.
-    track : RecordTrack
-        The track.
-
-    Returns
-    -------
-    str
-        The record, what was chosen, one line for each tone, warnings.
-    """
+    """A track for people, within 100 columns."""
     end = signal.start + (signal.samples.size - 1) * signal.interval
     gaps = f", {count(signal.missing, 'sample')} missing" if signal.missing else ""
     lines = wrapped(
@@ -221,41 +155,12 @@ def track_text(signal: SampledSignal, settings: Settings, track: RecordTrack) ->
 
 
 def flag_words(flags: int) -> str:
-    """Names of flags.
-
-    Parameters
-    ----------
-    flags : int
-        Bit field.
-
-    Returns
-    -------
-    str
-        In lower case, separated by blanks; empty for none.
-
-    Examples
-    --------
-    >>> flag_words(0), flag_words(18)
-    ('', 'gap uncertain')
-    """
+    """Names of flags."""
     return " ".join(str(flag.name).lower() for flag in Flag if flags & flag)
 
 
 def track_table(track: RecordTrack, start: float) -> dict[str, NDArray[Any]]:
-    """Columns of the file of a track.
-
-    Parameters
-    ----------
-    track : RecordTrack
-        The track.
-    start : float
-        Instant of the record's first sample [s].
-
-    Returns
-    -------
-    dict of ndarray
-        ``t`` [s], ``omega_1`` ... [rad/s], ``frequency_1_hz`` ..., ``amplitude_1`` ..., ``valid``, ``flags``.
-    """
+    """Columns of the file of a track."""
     tones = range(track.omega.shape[1])
     return {
         "t": start + track.t,
@@ -268,22 +173,7 @@ def track_table(track: RecordTrack, start: float) -> dict[str, NDArray[Any]]:
 
 
 def track_bytes(table: dict[str, NDArray[Any]], extension: str, unit: str | None = None) -> bytes:
-    """The file of a track.
-
-    Parameters
-    ----------
-    table : dict of ndarray
-        What :func:`track_table` returns.
-    extension : {".csv", ".h5"}
-        Kind of the file. An HDF5 file has one data set for each column, with its unit as an attribute.
-    unit : str, optional
-        Unit of the signal.
-
-    Returns
-    -------
-    bytes
-        Its content.
-    """
+    """The file of a track."""
     if extension == ".csv":
         lines = [",".join(table)]
         for row in zip(*table.values(), strict=True):

@@ -50,7 +50,7 @@ class ArmaNoise:
 
     Examples
     --------
-    >>> from ctid_cli.signals import ArmaNoise
+    >>> from ctid_cli.signals.arma_noise import ArmaNoise
     >>> noise = ArmaNoise(numerator=(1.0, 0.5), denominator=(1.0, -0.85), innovation_variance=0.02)
     >>> round(noise.variance_of(), 6)
     0.151351

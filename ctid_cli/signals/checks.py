@@ -7,87 +7,25 @@ from numbers import Integral, Real
 
 
 def require_positive(name: str, value: float, unit: str) -> None:
-    """Refuse anything but a positive finite number.
-
-    Parameters
-    ----------
-    name : str
-        The option as the user writes it.
-    value : float
-        What was given.
-    unit : str
-        Unit of the option, for the message.
-
-    Raises
-    ------
-    ValueError
-        If `value` is not a positive finite number.
-    """
+    """Refuse anything but a positive finite number."""
     if not _is_number(value) or not value > 0:
         raise ValueError(f"{name} must be a positive number [{unit}], not {value!r}.")
 
 
 def require_not_negative(name: str, value: float, unit: str) -> None:
-    """Refuse anything but zero or a positive finite number.
-
-    Parameters
-    ----------
-    name : str
-        The option as the user writes it.
-    value : float
-        What was given.
-    unit : str
-        Unit of the option, for the message.
-
-    Raises
-    ------
-    ValueError
-        If `value` is negative or not a finite number.
-    """
+    """Refuse anything but zero or a positive finite number."""
     if not _is_number(value) or value < 0:
         raise ValueError(f"{name} must be zero or a positive number [{unit}], not {value!r}.")
 
 
 def require_finite(name: str, value: float, unit: str) -> None:
-    """Refuse anything but a finite number.
-
-    Parameters
-    ----------
-    name : str
-        The option as the user writes it.
-    value : float
-        What was given.
-    unit : str
-        Unit of the option, for the message.
-
-    Raises
-    ------
-    ValueError
-        If `value` is not a finite number.
-    """
+    """Refuse anything but a finite number."""
     if not _is_number(value):
         raise ValueError(f"{name} must be a finite number [{unit}], not {value!r}.")
 
 
 def require_integer(name: str, value: int, lowest: int, highest: int | None = None) -> None:
-    """Refuse anything but an integer within bounds.
-
-    Parameters
-    ----------
-    name : str
-        The option as the user writes it.
-    value : int
-        What was given.
-    lowest : int
-        Smallest allowed value.
-    highest : int, optional
-        Largest allowed value; None for no bound.
-
-    Raises
-    ------
-    ValueError
-        If `value` is not an integer or lies outside the bounds.
-    """
+    """Refuse anything but an integer within bounds."""
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not whole or value < lowest or (highest is not None and value > highest):
         allowed = f"of at least {lowest}" if highest is None else f"from {lowest} to {highest}"
@@ -95,22 +33,7 @@ def require_integer(name: str, value: int, lowest: int, highest: int | None = No
 
 
 def require_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
-    """Refuse anything but one of some words.
-
-    Parameters
-    ----------
-    name : str
-        The option as the user writes it.
-    value : str
-        What was given.
-    allowed : tuple of str
-        The words.
-
-    Raises
-    ------
-    ValueError
-        If `value` is none of them.
-    """
+    """Refuse anything but one of some words."""
     if value not in allowed:
         raise ValueError(f"{name} must be {' or '.join(map(repr, allowed))}, not {value!r}.")
 

@@ -76,29 +76,7 @@ def read_record(
 def read_held_signal(
     path: str | os.PathLike[str], *, time: str = "t", input: str = "u", hold: Hold = "zoh"
 ) -> HeldSignal:
-    """Input signal from a file with one line per break.
-
-    Parameters
-    ----------
-    path : str or path-like
-        A comma-separated file whose first line names the columns.
-    time : str, default "t"
-        Column of the break times [s], strictly increasing.
-    input : str, default "u"
-        Column of the values [input unit].
-    hold : {"zoh", "foh"}, default "zoh"
-        How the input behaves between its breaks.
-
-    Returns
-    -------
-    HeldSignal
-        The signal on the file's own times.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be used; the message names the file, the line and what to do.
-    """
+    """Input signal from a file with one line per break."""
     table = read_csv_table(path)
     for column in (time, input):
         table.require(column)
@@ -106,23 +84,7 @@ def read_held_signal(
 
 
 def read_csv_table(path: str | os.PathLike[str]) -> Table:
-    """Columns of a comma-separated file.
-
-    Parameters
-    ----------
-    path : str or path-like
-        A file whose first line names the columns. Columns that nobody asks for may hold anything.
-
-    Returns
-    -------
-    Table
-        The columns; a number is missing where a field is empty, ``NaN`` or ``NA``.
-
-    Raises
-    ------
-    DataError
-        If the file is missing, unreadable or empty.
-    """
+    """Columns of a comma-separated file."""
     import pandas as pd  # a second of start-up time that only a command that reads a file should pay
 
     file = require_file(path)
@@ -167,23 +129,7 @@ def read_csv_table(path: str | os.PathLike[str]) -> Table:
 
 
 def require_file(path: str | os.PathLike[str]) -> str:
-    """Refuse a path that names no file.
-
-    Parameters
-    ----------
-    path : str or path-like
-        Name of a file.
-
-    Returns
-    -------
-    str
-        The same name.
-
-    Raises
-    ------
-    DataError
-        If there is no such file.
-    """
+    """Refuse a path that names no file."""
     file = os.fspath(path)
     if not Path(path).is_file():
         kind = "is not a file" if Path(path).exists() else "does not exist"

@@ -52,31 +52,9 @@ _CLOCK_DOC = "time for which each value is held; null: a new value at every samp
 def maximal_length_sequence(stages: int, length: int, state: int) -> NDArray[np.uint8]:
     """Output of a maximal-length feedback shift register.
 
-    Parameters
-    ----------
-    stages : int
-        Number of stages n, 2 to 20.
-    length : int
-        Number of bits to generate; they repeat after 2^n - 1.
-    state : int
-        Initial state, 1 to 2^n - 1; its binary digits, least significant first, are the first n bits.
-
-    Returns
-    -------
-    ndarray of uint8, shape (length,)
-        Bits, 0 or 1.
-
-    Notes
-    -----
     Over GF(2) the square of the feedback polynomial has the same coefficients at twice the exponents, so a
     sequence that obeys the recurrence at lags ``l`` obeys it at ``2 l``, ``4 l``, … too. Doubling the lags as
     soon as the history reaches back far enough yields ever longer blocks at once.
-
-    Examples
-    --------
-    >>> from ctid_cli.signals import maximal_length_sequence
-    >>> maximal_length_sequence(stages=3, length=9, state=1).tolist()
-    [1, 0, 0, 1, 0, 1, 1, 1, 0]
     """
     bits = np.empty(max(length, stages), dtype=np.uint8)
     bits[:stages] = [(state >> k) & 1 for k in range(stages)]
@@ -113,7 +91,7 @@ class Prbs:
     Examples
     --------
     >>> import numpy as np
-    >>> from ctid_cli.signals import Prbs
+    >>> from ctid_cli.signals.excitation import Prbs
     >>> sample_times = np.array([0.0, 0.3, 1.4])
     >>> signal = Prbs(stages=4, clock_period=0.5).generate(sample_times, np.random.default_rng(0))
     >>> signal.t

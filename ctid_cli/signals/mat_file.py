@@ -22,25 +22,6 @@ NUMERIC = ("double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", 
 def read_mat_table(path: str | os.PathLike[str]) -> Table:
     """Variables of a MATLAB file.
 
-    Parameters
-    ----------
-    path : str or path-like
-        A ``.mat`` file of any version from 4 to 7.3.
-
-    Returns
-    -------
-    Table
-        The variables that are arrays, and the fields of structs as ``struct.field``. Objects such as ``iddata`` are
-        stored in a form that only MATLAB reads; where there are any, the hint of the table says how to export them.
-
-    Raises
-    ------
-    DataError
-        If the file is missing or is no MATLAB file. A variable that is not a vector of real numbers is refused when
-        it is asked for.
-
-    Notes
-    -----
     MATLAB writes version 7.3 as HDF5, where strings, structs and objects are told apart by attributes.
     """
     import scipy.io

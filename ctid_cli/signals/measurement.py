@@ -36,22 +36,7 @@ TEXT_EXTENSIONS = (".csv", ".txt", ".dat", "")
 
 @dataclass(frozen=True)
 class Measurement:
-    """A record and what is known of the file that it comes from.
-
-    Parameters
-    ----------
-    record : Record
-        Times, output and held input, in the units of the file.
-    time_unit, input_unit, output_unit : str or None
-        Units as labels; None where the file names none. Nothing is ever converted: a record in ms gives delays in ms
-        and coefficients in powers of 1/ms.
-    time, input, output : str
-        The columns that were read, as they stand in the file.
-    start, stop : float or None
-        The window that was asked for [time unit].
-    notes : tuple of str
-        What was assumed, one sentence each.
-    """
+    """A record and what is known of the file that it comes from."""
 
     record: Record
     time_unit: str | None
@@ -60,6 +45,7 @@ class Measurement:
     time: str
     input: str
     output: str
+    #: The window that was asked for [time unit].
     start: float | None = None
     stop: float | None = None
     notes: tuple[str, ...] = ()
@@ -78,34 +64,6 @@ def read_measurement(
 ) -> Measurement:
     """Record from a comma-separated or MATLAB file, with its units.
 
-    Parameters
-    ----------
-    path : str or path-like
-        A text file (``.csv``, ``.txt``, ``.dat``) whose first line names its comma-separated columns, or a ``.mat``
-        file with vectors, which may be fields of a struct.
-    time, input, output : str, optional
-        Columns, by the whole text of their header or without its unit. One that is not given is recognised by its
-        usual name (``t``, ``time``; ``u``, ``input``; ``y``, ``output``), and in a text file of three columns by
-        its position; the notes say so. A MATLAB file may give the sampling interval in the place of the times.
-    hold : {"zoh", "foh"}, default "zoh"
-        How the input behaves between its samples.
-    start, stop : float, optional
-        First and last instant that is used [time unit], in the record's own time, which is not shifted.
-    units : mapping of str to str, optional
-        Units of ``time``, ``input`` and ``output`` in place of those in the header, such as ``t [ms]`` or ``u (V)``.
-
-    Returns
-    -------
-    Measurement
-        The record; a missing output sample (an empty field or NaN) is masked.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be used; the message names the file, the line and what to do.
-
-    Notes
-    -----
     A window is read as if the file had no other lines: the input before it is not used, since the state that it
     left behind is estimated with the model where that is asked for.
     """
@@ -237,25 +195,7 @@ def _leaf(table: Table, name: str) -> str:
 
 
 def split_header(header: str) -> tuple[str, str | None]:
-    """Name and unit in the header of a column.
-
-    Parameters
-    ----------
-    header : str
-        Text such as ``t [s]`` or ``flow (l/min)``.
-
-    Returns
-    -------
-    name : str
-        The text without the unit.
-    unit : str or None
-        The unit; None where there is none.
-
-    Examples
-    --------
-    >>> split_header("t [ms]"), split_header("level")
-    (('t', 'ms'), ('level', None))
-    """
+    """Name and unit in the header of a column."""
     found = re.fullmatch(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))", header)
     if found is None:
         return header, None

@@ -20,15 +20,7 @@ PhaseAtSteps = Literal["jump", "continuous"]
 
 @dataclass(frozen=True)
 class Piece:
-    """A constant value up to an instant.
-
-    Parameters
-    ----------
-    value : float
-        Value, in the unit of what it belongs to.
-    until : float, optional
-        Instant at which the next piece begins [s]; the last piece has none.
-    """
+    """A constant value up to an instant."""
 
     value: float = field(metadata={"doc": "value, in the unit of what it belongs to"})
     until: float | None = field(
@@ -38,22 +30,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class Tone:
-    """One sinusoid.
-
-    Parameters
-    ----------
-    frequency : float or tuple of Piece
-        Frequency [rad/s], positive.
-    amplitude : float or tuple of Piece, default 1.0
-        Amplitude [signal unit], positive.
-    phase : float, default 0.0
-        Phase at time 0 [rad].
-
-    Raises
-    ------
-    ValueError
-        If a value is not positive, or the pieces do not follow one another.
-    """
+    """One sinusoid."""
 
     frequency: float | tuple[Piece, ...] = field(metadata={"doc": "frequency", "unit": "rad/s"})
     amplitude: float | tuple[Piece, ...] = field(default=1.0, metadata={"doc": "amplitude", "unit": "signal unit"})
@@ -69,35 +46,8 @@ class Tone:
 class MultiSine:
     r"""A sum of sinusoids and a constant.
 
-    Parameters
-    ----------
-    tones : tuple of Tone
-        The sinusoids.
-    bias : float, default 0.0
-        The constant [signal unit].
-    phase_at_steps : {"continuous", "jump"}, default "continuous"
-        What a step of a frequency does to the phase.
-
-    Raises
-    ------
-    ValueError
-        If there is no tone, or two of them have the same frequency at the same time.
-
-    Notes
-    -----
     Each tone is ``A(t) sin(int_0^t w + phase)``; with ``jump`` it is ``A(t) sin(w(t) t + phase)``, whose phase jumps
     when the frequency w steps. A piece begins at the very instant that the one before it names.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from ctid_cli.signals import MultiSine, Piece, Tone
-    >>> signal = MultiSine((Tone(3.0), Tone((Piece(1.0, until=5.0), Piece(2.0)))))
-    >>> signal.frequencies_at([0.0, 5.0])
-    array([[1., 3.],
-           [2., 3.]])
-    >>> signal.frequency_steps
-    (5.0,)
     """
 
     tones: tuple[Tone, ...] = field(metadata={"doc": "the sinusoids"})
@@ -134,34 +84,12 @@ class MultiSine:
         return float(max(_values(tone.frequency).max() for tone in self.tones))
 
     def frequencies_at(self, times: ArrayLike) -> Array:
-        """Frequencies at some instants.
-
-        Parameters
-        ----------
-        times : array_like, shape (N,)
-            Instants [s].
-
-        Returns
-        -------
-        ndarray, shape (N, n)
-            Frequencies [rad/s], ascending in each row.
-        """
+        """Frequencies at some instants."""
         t = np.asarray(times, dtype=float)
         return np.sort(np.column_stack([_course_at(tone.frequency, t) for tone in self.tones]), axis=1)
 
     def generate(self, times: ArrayLike) -> Array:
-        """The signal.
-
-        Parameters
-        ----------
-        times : array_like, shape (N,)
-            Instants [s].
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Signal [signal unit].
-        """
+        """The signal."""
         t = np.asarray(times, dtype=float)
         total = np.full(t.size, float(self.bias))
         for tone in self.tones:
@@ -268,29 +196,7 @@ DISTURBANCES: dict[str, type[Disturbance]] = {
 
 
 def disturb(signal: Array, times: Array, disturbance: Disturbance | None, rng: np.random.Generator) -> Array:
-    """Add a disturbance to a signal.
-
-    Parameters
-    ----------
-    signal : ndarray, shape (N,)
-        The signal [signal unit].
-    times : ndarray, shape (N,)
-        Its instants [s].
-    disturbance : Disturbance or None
-        What is added; None for nothing.
-    rng : numpy.random.Generator
-        Source of the random ones.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        Disturbed signal [signal unit].
-
-    Raises
-    ------
-    DataError
-        If a signal-to-noise ratio is asked for and the signal is zero throughout.
-    """
+    """Add a disturbance to a signal."""
     if disturbance is None:
         return signal
     if isinstance(disturbance, SineDisturbance):

@@ -34,7 +34,7 @@ class WhiteNoise:
     Examples
     --------
     >>> import numpy as np
-    >>> from ctid_cli.signals import WhiteNoise
+    >>> from ctid_cli.signals.noise import WhiteNoise
     >>> output = np.sin(np.arange(10_000))
     >>> noise = WhiteNoise(snr_db=20.0).generate(output, np.random.default_rng(0))
     >>> round(10 * np.log10(np.mean(output**2) / np.mean(noise**2)), 1)

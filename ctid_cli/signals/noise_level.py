@@ -20,18 +20,7 @@ LEVEL_UNITS = {
 
 
 def require_one_level(levels: Mapping[str, float | None]) -> None:
-    """Refuse anything but exactly one level, a signal-to-noise ratio or a number that is not negative.
-
-    Parameters
-    ----------
-    levels : mapping of str to float or None
-        What was given for each of the options, among those of `LEVEL_UNITS`.
-
-    Raises
-    ------
-    ValueError
-        If none or several are given, or the one that is given is out of range.
-    """
+    """Refuse anything but exactly one level, a signal-to-noise ratio or a number that is not negative."""
     given = [name for name, value in levels.items() if value is not None]
     if len(given) != 1:
         choices = [f"{name} [{LEVEL_UNITS[name]}]" for name in levels]
@@ -45,25 +34,7 @@ def require_one_level(levels: Mapping[str, float | None]) -> None:
 
 
 def variance_at(snr_db: float, noise_free: NDArray[np.float64] | None) -> float:
-    """Variance of noise with a signal-to-noise ratio.
-
-    Parameters
-    ----------
-    snr_db : float
-        Ten times the decimal logarithm of the mean square of the noise-free output over the variance [dB].
-    noise_free : ndarray, shape (N,), or None
-        The output without noise [output unit].
-
-    Returns
-    -------
-    float
-        The variance [output unit^2].
-
-    Raises
-    ------
-    DataError
-        If the noise-free output is not given, or zero throughout.
-    """
+    """Variance of noise with a signal-to-noise ratio."""
     if noise_free is None:
         raise DataError("a signal-to-noise ratio says how strong noise is only beside a noise-free output; give that")
     power = float(np.mean(noise_free**2))

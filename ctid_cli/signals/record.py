@@ -208,18 +208,7 @@ class Record:
 
 
 def regular_interval(t: NDArray[np.float64]) -> float | None:
-    """Interval of a regular clock.
-
-    Parameters
-    ----------
-    t : ndarray, shape (N,)
-        Instants [s], strictly increasing.
-
-    Returns
-    -------
-    float or None
-        The interval [s], or None where the instants stray from an equidistant grid.
-    """
+    """Interval of a regular clock."""
     if t.size < 2:
         return None
     interval = float((t[-1] - t[0]) / (t.size - 1))

@@ -44,30 +44,13 @@ MOST_FILLED = 20
 
 @dataclass(frozen=True, eq=False)
 class SampledSignal:
-    """A signal on a regular clock and what is known of the file that it comes from.
+    """A signal on a regular clock and what is known of the file that it comes from."""
 
-    Parameters
-    ----------
-    samples : ndarray, shape (N,)
-        Signal [signal unit]; NaN where a sample is missing.
-    interval : float
-        Sampling interval [time unit].
-    start : float
-        Instant of the first sample [time unit].
-    file : str
-        Name of the file.
-    column : str
-        Column of the signal.
-    time : str or None
-        Column of the times; None if they were not used.
-    time_unit, unit : str or None
-        Units as labels; None where the file names none.
-    notes : tuple of str
-        What was assumed, one sentence each.
-    """
-
+    #: Signal [signal unit]; NaN where a sample is missing, shape (N,).
     samples: Array
+    #: Sampling interval [time unit].
     interval: float
+    #: Instant of the first sample [time unit].
     start: float
     file: str
     column: str
@@ -82,20 +65,7 @@ class SampledSignal:
         return int(np.count_nonzero(~np.isfinite(self.samples)))
 
     def rescaled(self, factor: float, unit: str) -> SampledSignal:
-        """The same signal in another unit of time.
-
-        Parameters
-        ----------
-        factor : float
-            New units in an old one.
-        unit : str
-            Label of the new unit.
-
-        Returns
-        -------
-        SampledSignal
-            With times in the new unit.
-        """
+        """The same signal in another unit of time."""
         return replace(self, interval=factor * self.interval, start=factor * self.start, time_unit=unit)
 
 
@@ -108,33 +78,7 @@ def read_sampled_signal(
     start: float | None = None,
     stop: float | None = None,
 ) -> SampledSignal:
-    """Signal from a comma-separated, MATLAB or sound file.
-
-    Parameters
-    ----------
-    path : str or path-like
-        A text file (``.csv``, ``.txt``, ``.dat``) whose first line names its comma-separated columns, a ``.mat`` file
-        with vectors, or a ``.wav`` file.
-    time, signal : str, optional
-        Columns; one that is not given is recognised by its usual name, and the signal as the only other column. The
-        channels of a sound file are called ``channel 1``, ``channel 2`` ...
-    interval : float, optional
-        Sampling interval [s] in place of the times of the file.
-    start, stop : float, optional
-        First and last instant that is used [time unit].
-
-    Returns
-    -------
-    SampledSignal
-        The signal; instants that the file leaves out are missing samples.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be used, or its clock is not regular; the message says what to do.
-    ValueError
-        If the interval is not positive.
-    """
+    """Signal from a comma-separated, MATLAB or sound file."""
     if interval is not None:
         require_positive("interval", interval, "s")
     extension = Path(path).suffix.lower()

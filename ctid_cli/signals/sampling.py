@@ -14,31 +14,7 @@ InputRecord = Literal["sampled", "exact"]
 
 
 def geometric_sizes(first: int, last: int, count: int) -> list[int]:
-    """Whole numbers spaced geometrically, such as the record lengths of a study of how accuracy grows with them.
-
-    Parameters
-    ----------
-    first, last : int
-        Least and greatest of them, positive.
-    count : int
-        How many, at least 2.
-
-    Returns
-    -------
-    list of int
-        ``first (last / first)^(k / (count - 1))`` for k = 0, 1, …, rounded to the nearest whole number.
-
-    Raises
-    ------
-    ValueError
-        If they do not increase strictly.
-
-    Examples
-    --------
-    >>> from ctid_cli.signals import geometric_sizes
-    >>> geometric_sizes(100, 10_000, 5)
-    [100, 316, 1000, 3162, 10000]
-    """
+    """Whole numbers spaced geometrically, such as the record lengths of a study of how accuracy grows with them."""
     require_integer("the first size", first, 1)
     require_integer("the last size", last, 1)
     require_integer("the count", count, 2)
@@ -71,7 +47,7 @@ class RegularSampling:
     Examples
     --------
     >>> import numpy as np
-    >>> from ctid_cli.signals import RegularSampling
+    >>> from ctid_cli.signals.sampling import RegularSampling
     >>> RegularSampling(interval=0.5, samples=4).times(np.random.default_rng(0))
     array([0. , 0.5, 1. , 1.5])
     """

@@ -19,14 +19,16 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from ctid_cli.estimators.measured import DelayProfile, MeasuredFit
-from ctid_cli.experiment.dataset import SimulatedSource
-from ctid_cli.experiment.provenance import now
-from ctid_cli.experiment.summary import wilson_interval
-from ctid_cli.experiment.version import code_version, numeric_platform, package_versions
-from ctid_cli.inference import sandwich_covariance
-from ctid_cli.models import TransferFunction
-from ctid_cli.signals import Prbs, RegularSampling, UniformIntervals, WhiteNoise
+from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.inference.robust import sandwich_covariance
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.excitation import Prbs
+from ctid_cli.signals.noise import WhiteNoise
+from ctid_cli.signals.sampling import RegularSampling, UniformIntervals
+from ctid_cli.simulation.dataset import SimulatedSource
+from ctid_cli.storage.provenance import now
+from ctid_cli.storage.summary import wilson_interval
+from ctid_cli.storage.version import code_version, numeric_platform, package_versions
 
 Array = NDArray[np.float64]
 

@@ -18,18 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctid_cli.frequency import (
-    AdaptiveObserver,
-    DremFiniteTime,
-    DremGradient,
-    DremWindow,
-    Esprit,
-    FilterRegression,
-    Flag,
-    FrequencyTrack,
-    NonlinearLeastSquares,
-    RestartingLeastSquares,
-)
+from ctid_cli.frequency.adaptive_observer import AdaptiveObserver
+from ctid_cli.frequency.drem_finite_time import DremFiniteTime
+from ctid_cli.frequency.drem_gradient import DremGradient
+from ctid_cli.frequency.drem_window import DremWindow
+from ctid_cli.frequency.esprit import Esprit
+from ctid_cli.frequency.filter_regression import FilterRegression
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.nonlinear_least_squares import NonlinearLeastSquares
+from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
+from ctid_cli.frequency.tracking import FrequencyTrack
 from experiments.additive import acceptance as checked
 
 Array = NDArray[np.float64]

@@ -12,7 +12,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ctid_cli.frequency import DremFiniteTime, DremGradient
+from ctid_cli.frequency.drem_finite_time import DremFiniteTime
+from ctid_cli.frequency.drem_gradient import DremGradient
 from ctid_cli.frequency.regression import determinant_from_tones, theta_of
 from ctid_cli.reporting.layout import markdown_table, number
 from experiments.finite_time_frequency.acceptance import SIGMA, TRUTH, TUNING, clock, drem, settle, signal, stepped

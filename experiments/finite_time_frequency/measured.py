@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctid_cli.experiment.frequency_runs import SignalSource
-from ctid_cli.experiment.plan import Plan, build_plan
-from ctid_cli.experiment.spec import spec_from_canonical
-from ctid_cli.experiment.store import read_tracks
-from ctid_cli.frequency import FrequencyTrack
+from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.reporting.figures.finite_time_frequency import CONFIGS, DERIVED, GROUPS
 from ctid_cli.reporting.results import Results, find_results
+from ctid_cli.running.plan import Plan, build_plan
+from ctid_cli.simulation.frequency_runs import SignalSource
+from ctid_cli.specification.spec import spec_from_canonical
+from ctid_cli.storage.store import read_tracks
 from experiments.finite_time_frequency.acceptance import Check, at_most, cramer_rao, settle
 
 Array = NDArray[np.float64]

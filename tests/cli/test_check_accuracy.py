@@ -6,12 +6,14 @@ import re
 import numpy as np
 import pytest
 
-from ctid_cli.experiment.plan import build_plan
-from ctid_cli.experiment.spec import load_spec
-from ctid_cli.inference import cramer_rao_bound
 from ctid_cli.inference.asymptotic import closed_loop_accuracy
-from ctid_cli.models import AdditiveModel, DiscreteController, Submodel, TransferFunction
-from ctid_cli.signals import ArmaNoise
+from ctid_cli.inference.cramer_rao import cramer_rao_bound
+from ctid_cli.models.additive import AdditiveModel, Submodel
+from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.running.plan import build_plan
+from ctid_cli.signals.arma_noise import ArmaNoise
+from ctid_cli.specification.spec import load_spec
 
 # The simulation examples of Gonzalez, Classens, Rojas, Welsh and Oomen, sections 6.1 and 6.2.
 OPEN = """\

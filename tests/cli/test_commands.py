@@ -70,7 +70,7 @@ def test_run_tells_what_it_does_and_what_to_do_next(ctid, tiny, tmp_path):
 
 
 def test_an_experiment_that_fails_wholly_does_not_stop_the_next_one(ctid, tiny, measured, tmp_path, monkeypatch):
-    from ctid_cli.experiment import engine
+    from ctid_cli.running import engine
 
     ran = []
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.io import wavfile
 
 from ctid_cli.cli.track import MethodOption
-from ctid_cli.frequency import FREQUENCY_ESTIMATORS
+from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
 
 T = 0.002 * np.arange(3000)
 

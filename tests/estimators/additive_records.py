@@ -3,9 +3,12 @@
 import numpy as np
 from scipy.signal import lfilter
 
-from ctid_cli.filtering import simulate_additive, simulate_loop
-from ctid_cli.models import AdditiveModel, DiscreteController, Submodel, Term
-from ctid_cli.signals import HeldSignal, Loop, Record
+from ctid_cli.filtering.loop import simulate_loop
+from ctid_cli.filtering.sampled import simulate_additive
+from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.models.controller import DiscreteController
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Loop, Record
 
 INTERVAL = 0.05
 MODE = Term(2, 0)

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from ctid_cli.estimators import Start, TdSrivc
-from ctid_cli.inference import Status, cramer_rao_bound
+from ctid_cli.estimation.common import Start
+from ctid_cli.estimators.td_srivc import TdSrivc
+from ctid_cli.inference.cramer_rao import cramer_rao_bound
+from ctid_cli.inference.status import Status
 from tests.estimators.records import CASE_1, make_record
 
 RUNS = 200

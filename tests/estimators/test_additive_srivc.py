@@ -7,13 +7,20 @@ import pytest
 from scipy.signal import lfilter
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators import AdditiveSrivc, Srivc, Start
-from ctid_cli.estimators.additive_problem import AdditiveProblem
-from ctid_cli.estimators.refined_iv import iterate
-from ctid_cli.filtering import filter_data, simulate, simulate_additive
-from ctid_cli.inference import Status
-from ctid_cli.models import AdditiveModel, Submodel, Term, TransferFunction, factored, unfactored
-from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.estimation.additive_problem import AdditiveProblem
+from ctid_cli.estimation.common import Start
+from ctid_cli.estimation.refined_iv import iterate
+from ctid_cli.estimators.additive_srivc import AdditiveSrivc
+from ctid_cli.estimators.srivc import Srivc
+from ctid_cli.filtering.bank import filter_data
+from ctid_cli.filtering.sampled import simulate_additive
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.inference.status import Status
+from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.models.factoring import factored, unfactored
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
 from tests.estimators.additive_records import (
     BEAM,
     BEAM_START,

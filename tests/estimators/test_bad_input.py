@@ -4,8 +4,13 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators import Lowpass, Srivc, Svf, TdSrivc, UsefulRedundancy
-from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.estimators.srivc import Srivc
+from ctid_cli.estimators.svf import Svf
+from ctid_cli.estimators.td_srivc import TdSrivc
+from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
+from ctid_cli.filtering.lowpass import Lowpass
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
 from tests.estimators.records import make_record
 
 TD = {"delay_bounds": (0, 2)}

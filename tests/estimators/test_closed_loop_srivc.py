@@ -7,14 +7,19 @@ import pytest
 from scipy.signal import cont2discrete, lfilter
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators import AdditiveSrivc, Srivc, Start
-from ctid_cli.estimators.additive_problem import AdditiveProblem, loop_data
-from ctid_cli.estimators.refined_iv import iterate
-from ctid_cli.filtering import filter_data, simulate_loop
-from ctid_cli.filtering.loop import loop_radius
-from ctid_cli.inference import Status
-from ctid_cli.models import AdditiveModel, DiscreteController, Submodel, Term, factored, factored_jacobian, unfactored
-from ctid_cli.signals import HeldSignal, Loop, Record
+from ctid_cli.estimation.additive_problem import AdditiveProblem, loop_data
+from ctid_cli.estimation.common import Start
+from ctid_cli.estimation.refined_iv import iterate
+from ctid_cli.estimators.additive_srivc import AdditiveSrivc
+from ctid_cli.estimators.srivc import Srivc
+from ctid_cli.filtering.bank import filter_data
+from ctid_cli.filtering.loop import loop_radius, simulate_loop
+from ctid_cli.inference.status import Status
+from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.factoring import factored, factored_jacobian, unfactored
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Loop, Record
 from tests.estimators.additive_records import (
     INTERVAL,
     MODE,

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
+from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import identify
-from ctid_cli.estimators.measured import DelayProfile
-from ctid_cli.filtering import simulate
+from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.robust import sandwich_covariance
 from ctid_cli.inference.status import Status
-from ctid_cli.models import TransferFunction
-from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
 
 FIRST_ORDER = TransferFunction([1.0], [1.0, 2.0], 0.55)
 OPTIONS = DelayProfile(1, 0, (0, 3))

@@ -4,8 +4,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctid_cli.estimators import Srivc, Start, TdSrivc
-from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.estimation.common import Start
+from ctid_cli.estimators.srivc import Srivc
+from ctid_cli.estimators.td_srivc import TdSrivc
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
 from tests.estimators.records import CASE_1, CASE_2, make_record
 
 RECORDS = {

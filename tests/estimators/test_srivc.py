@@ -4,11 +4,20 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators import ESTIMATORS, AdditiveSrivc, DelayProfile, Srivc, Start, Svf, TdSrivc, UsefulRedundancy
-from ctid_cli.filtering import simulate
-from ctid_cli.inference import Status, fit_percent, r_squared
-from ctid_cli.models import TransferFunction
-from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.estimation.common import Start
+from ctid_cli.estimators.additive_srivc import AdditiveSrivc
+from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.estimators.registry import ESTIMATORS
+from ctid_cli.estimators.srivc import Srivc
+from ctid_cli.estimators.svf import Svf
+from ctid_cli.estimators.td_srivc import TdSrivc
+from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.inference.diagnostics import fit_percent, r_squared
+from ctid_cli.inference.status import Status
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
 from tests.estimators.records import CASE_1, CASE_2, SVF_CUTOFF, assert_same_model, make_record
 
 

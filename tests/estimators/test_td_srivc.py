@@ -4,11 +4,16 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators import Lowpass, Srivc, Start, TdSrivc
-from ctid_cli.filtering import simulate
-from ctid_cli.inference import Status, cramer_rao_bound
-from ctid_cli.models import TransferFunction
-from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.estimation.common import Start
+from ctid_cli.estimators.srivc import Srivc
+from ctid_cli.estimators.td_srivc import TdSrivc
+from ctid_cli.filtering.lowpass import Lowpass
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.inference.cramer_rao import cramer_rao_bound
+from ctid_cli.inference.status import Status
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
 from tests.estimators.records import CASE_1, CASE_2, SVF_CUTOFF, assert_same_model, make_record
 
 

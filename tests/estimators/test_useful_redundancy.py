@@ -6,14 +6,18 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimators import Lowpass, Start, TdSrivc, UsefulRedundancy
-from ctid_cli.estimators.problems import CoefficientProblem
-from ctid_cli.estimators.redundancy import SearchStatus
-from ctid_cli.estimators.useful_redundancy import LATTICE
-from ctid_cli.filtering import FilterSet
-from ctid_cli.inference import Status, Structure
-from ctid_cli.models import TransferFunction
-from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.estimation.common import Start
+from ctid_cli.estimation.problems import CoefficientProblem
+from ctid_cli.estimation.redundancy import SearchStatus
+from ctid_cli.estimators.td_srivc import TdSrivc
+from ctid_cli.estimators.useful_redundancy import LATTICE, UsefulRedundancy
+from ctid_cli.filtering.filter_set import FilterSet
+from ctid_cli.filtering.lowpass import Lowpass
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.status import Status
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
 from tests.estimators.records import CASE_1, CASE_2, SVF_CUTOFF, assert_same_model, make_record
 
 BOUNDS = (0.0, 15.0)

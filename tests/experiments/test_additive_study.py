@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctid_cli.experiment.plan import build_plan
-from ctid_cli.experiment.sealed import seal_image
-from ctid_cli.experiment.spec import load_spec
 from ctid_cli.reporting.figures.additive import CONFIGS
 from ctid_cli.reporting.parameter_errors import parameter_errors
 from ctid_cli.reporting.study import data_folder
+from ctid_cli.running.plan import build_plan
+from ctid_cli.specification.spec import load_spec
+from ctid_cli.storage.sealed import seal_image
 from experiments.additive import acceptance, publish
 from tests.reporting.ideal_results import ideal_results
 

@@ -6,11 +6,11 @@ import json
 import numpy as np
 import pytest
 
-from ctid_cli.experiment.plan import build_plan
-from ctid_cli.experiment.spec import load_spec
-from ctid_cli.experiment.store import read_tracks
 from ctid_cli.reporting.figures.finite_time_frequency import CONFIGS, DERIVED
 from ctid_cli.reporting.study import data_folder
+from ctid_cli.running.plan import build_plan
+from ctid_cli.specification.spec import load_spec
+from ctid_cli.storage.store import read_tracks
 from experiments.finite_time_frequency import acceptance, as_printed, measured, publish
 from experiments.finite_time_frequency.acceptance import Check
 from tests.reporting.frequency_results import config, run_here

@@ -7,10 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.filtering import filter_data, second_moments, simulate, standard_rows
-from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, modal_map, split_delay
-from ctid_cli.models import TransferFunction
-from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.filtering.bank import (
+    MODAL_CONDITION_LIMIT,
+    filter_data,
+    modal_map,
+    second_moments,
+    split_delay,
+    standard_rows,
+)
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
 
 CASE_1 = (np.array([1.0, 2.8, 4.0]), np.array([8.0]))
 CASE_2 = (np.array([1.0, 5.0, 408.0, 416.0, 1600.0]), np.array([-6400.0, 1600.0]))

@@ -7,18 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import integrate, linalg, signal
 
-from ctid_cli.filtering import (
-    FilterSet,
-    Lowpass,
-    check_filters,
-    convergence_region,
-    extrema,
-    filtered_cost,
-    ideal_cost,
-    sufficient_number_of_filters,
-)
-from ctid_cli.filtering.filter_set import LEAST_BETA
-from ctid_cli.models import TransferFunction
+from ctid_cli.filtering.filter_set import LEAST_BETA, FilterSet, check_filters, sufficient_number_of_filters
+from ctid_cli.filtering.filter_theory import convergence_region, extrema, filtered_cost, ideal_cost
+from ctid_cli.filtering.lowpass import Lowpass
+from ctid_cli.models.transfer_function import TransferFunction
 
 CASE_1 = TransferFunction([2], [0.25, 0.7, 1], delay=8.0)
 CASE_2 = TransferFunction([-6400, 1600], [1, 5, 408, 416, 1600], delay=8.0)

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import companion, expm
 
 from ctid_cli.filtering.free_response import free_response, free_response_size
-from ctid_cli.models import AdditiveModel, Term
+from ctid_cli.models.additive import AdditiveModel, Term
 
 #: Degrees, then a_1 … a_n, b_0 … b_m of each submodel in turn.
 SUMS = {

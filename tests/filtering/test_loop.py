@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.filtering import simulate_additive, simulate_loop
-from ctid_cli.filtering.loop import input_sensitivity, loop_radius, loop_state_space
-from ctid_cli.filtering.sampled import sampled_state_space, state_space_response
-from ctid_cli.models import AdditiveModel, DiscreteController, Submodel, TransferFunction
-from ctid_cli.signals import HeldSignal
+from ctid_cli.filtering.loop import input_sensitivity, loop_radius, loop_state_space, simulate_loop
+from ctid_cli.filtering.sampled import sampled_state_space, simulate_additive, state_space_response
+from ctid_cli.models.additive import AdditiveModel, Submodel
+from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
 
 INTERVAL = 0.05
 TWO_MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ctid_cli.filtering import Lowpass, simulate
-from ctid_cli.models import TransferFunction
-from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.filtering.lowpass import Lowpass
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
 
 CASE_1 = TransferFunction([2.0], [0.25, 0.7, 1.0], 0.33)
 

@@ -7,10 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.filtering import simulate, simulate_additive
-from ctid_cli.filtering.sampled import sampled_model, sampled_state_space, state_space_response
-from ctid_cli.models import AdditiveModel, Submodel, TransferFunction, unfactored
-from ctid_cli.signals import HeldSignal
+from ctid_cli.filtering.sampled import sampled_model, sampled_state_space, simulate_additive, state_space_response
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.models.additive import AdditiveModel, Submodel
+from ctid_cli.models.factoring import unfactored
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
 
 INTERVAL = 0.05
 FLEXIBLE = Submodel([1.0], [0.025, 0.01, 1.0])

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from ctid_cli.errors import DataError
-from ctid_cli.filtering import simulate
-from ctid_cli.models import TransferFunction
-from ctid_cli.signals import HeldSignal
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
 
 STEP = 0.01
 SYSTEMS = {

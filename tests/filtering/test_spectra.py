@@ -6,7 +6,8 @@ import pytest
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.spectra import lowpass_weight, record_spectra
-from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(16)
 

@@ -7,11 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.filtering import filter_data, simulate, simulate_additive, simulate_loop
+from ctid_cli.filtering.bank import filter_data
 from ctid_cli.filtering.kernels import BLOCK
+from ctid_cli.filtering.loop import simulate_loop
+from ctid_cli.filtering.sampled import simulate_additive
+from ctid_cli.filtering.simulate import simulate
 from ctid_cli.filtering.submodels import OPEN_LOOP, LoopData, SubmodelFilter
-from ctid_cli.models import AdditiveModel, DiscreteController, Term, TransferFunction
-from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.models.additive import AdditiveModel, Term
+from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
 
 INTERVAL = 0.1
 #: Sums of every kind of submodel; the numbers are a_1 … a_n, b_0 … b_m of each in turn.

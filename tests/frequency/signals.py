@@ -2,14 +2,12 @@
 
 import numpy as np
 
-from ctid_cli.frequency import (
-    AdaptiveObserver,
-    DremFiniteTime,
-    DremGradient,
-    DremWindow,
-    FilterRegression,
-    RestartingLeastSquares,
-)
+from ctid_cli.frequency.adaptive_observer import AdaptiveObserver
+from ctid_cli.frequency.drem_finite_time import DremFiniteTime
+from ctid_cli.frequency.drem_gradient import DremGradient
+from ctid_cli.frequency.drem_window import DremWindow
+from ctid_cli.frequency.filter_regression import FilterRegression
+from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 
 INTERVAL = 0.01
 #: Well-separated frequencies [rad/s] for any number of tones up to five.

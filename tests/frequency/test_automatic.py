@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.frequency import FREQUENCY_ESTIMATORS
 from ctid_cli.frequency.automatic import choose_settings
 from ctid_cli.frequency.record_track import track_record
+from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
 
 
 def plucked(rate=8000.0, seconds=1.5, hum=0.003, noise=0.0005, seed=0):

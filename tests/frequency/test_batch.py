@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.frequency import Esprit, Flag, NonlinearLeastSquares, fit_sinusoids
-from ctid_cli.frequency.amplitudes import frequency_errors
+from ctid_cli.frequency.amplitudes import fit_sinusoids, frequency_errors
+from ctid_cli.frequency.esprit import Esprit
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.nonlinear_least_squares import NonlinearLeastSquares
 from tests.frequency.signals import AMPLITUDES, INTERVAL, OMEGA, PHASES, tones
 
 COUNT = 1500

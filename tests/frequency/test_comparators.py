@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ctid_cli.frequency import AdaptiveObserver, FilterRegression, Flag
-from ctid_cli.frequency.adaptive_observer import observer_slope, place_poles
-from ctid_cli.frequency.filter_regression import derivative_rows
+from ctid_cli.frequency.adaptive_observer import AdaptiveObserver, observer_slope, place_poles
+from ctid_cli.frequency.filter_regression import FilterRegression, derivative_rows
+from ctid_cli.frequency.flags import Flag
 from tests.frequency.signals import INTERVAL, OMEGA, tones
 
 

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from ctid_cli.frequency import Flag
 from ctid_cli.frequency.decoding import (
     cosine_sensitivities,
     flag_uncertain,
@@ -15,6 +14,7 @@ from ctid_cli.frequency.decoding import (
     root_real_parts,
     still_doubtful,
 )
+from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.regression import theta_of
 
 FREQUENCIES = st.lists(st.floats(0.05, 3.0), min_size=1, max_size=8).map(sorted)

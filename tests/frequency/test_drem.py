@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from ctid_cli.frequency import DremFiniteTime, DremGradient, DremWindow, Flag
 from ctid_cli.frequency.decoding import frequencies_of
-from ctid_cli.frequency.drem_window import slide
+from ctid_cli.frequency.drem_finite_time import DremFiniteTime
+from ctid_cli.frequency.drem_gradient import DremGradient
+from ctid_cli.frequency.drem_window import DremWindow, slide
+from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.regression import regression_rows, theta_of
 from tests.frequency.signals import INTERVAL, OMEGA, tones
 

@@ -3,16 +3,14 @@
 import numpy as np
 import pytest
 
-from ctid_cli.frequency import (
-    DremFiniteTime,
-    DremGradient,
-    DremWindow,
-    Esprit,
-    FilterRegression,
-    Flag,
-    NonlinearLeastSquares,
-    RestartingLeastSquares,
-)
+from ctid_cli.frequency.drem_finite_time import DremFiniteTime
+from ctid_cli.frequency.drem_gradient import DremGradient
+from ctid_cli.frequency.drem_window import DremWindow
+from ctid_cli.frequency.esprit import Esprit
+from ctid_cli.frequency.filter_regression import FilterRegression
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.nonlinear_least_squares import NonlinearLeastSquares
+from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 
 INTERVAL = 0.01
 T = INTERVAL * np.arange(4000)

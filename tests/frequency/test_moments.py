@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.frequency import Flag
 from ctid_cli.frequency.consistency import check_consistency, second_lag
+from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.moments import (
     accumulate_row,
     factorise,

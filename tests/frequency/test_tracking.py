@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.frequency import (
-    FREQUENCY_ESTIMATORS,
-    DremFiniteTime,
-    Flag,
-    FrequencyEstimate,
-    RestartingLeastSquares,
-)
+from ctid_cli.frequency.drem_finite_time import DremFiniteTime
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
+from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
+from ctid_cli.frequency.tracking import FrequencyEstimate
 from tests.frequency.signals import INTERVAL, OMEGA, online_estimators, tones
 
 ESTIMATORS = online_estimators()

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from ctid_cli.frequency import Esprit, Flag, FrequencyEstimate, NonlinearLeastSquares
+from ctid_cli.frequency.esprit import Esprit
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.nonlinear_least_squares import NonlinearLeastSquares
+from ctid_cli.frequency.tracking import FrequencyEstimate
 from ctid_cli.frequency.windows import amplitudes_of, belonging, estimate_window, wanted_tones
 
 T = 0.05 * np.arange(300)

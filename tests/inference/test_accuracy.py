@@ -4,17 +4,9 @@ import numpy as np
 import pytest
 
 from ctid_cli.inference.accuracy import ParameterAccuracy, estimated_parameters
-from ctid_cli.models import (
-    AdditiveModel,
-    FactoringError,
-    Submodel,
-    Term,
-    TransferFunction,
-    factored,
-    factored_jacobian,
-    unfactored,
-    unfactored_jacobian,
-)
+from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.models.factoring import FactoringError, factored, factored_jacobian, unfactored, unfactored_jacobian
+from ctid_cli.models.transfer_function import TransferFunction
 
 MODEL = AdditiveModel([Submodel([0.3, 3.0], [0.25, 0.25, 1.0]), Submodel([0.5], [0.2, 1.0])], 0.4)
 

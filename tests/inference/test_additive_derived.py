@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from ctid_cli.inference import derived_parameters
 from ctid_cli.inference.additive_derived import additive_derived
-from ctid_cli.models import AdditiveModel, Submodel, factored, factored_jacobian, unfactored, unfactored_jacobian
+from ctid_cli.inference.derived import derived_parameters
+from ctid_cli.models.additive import AdditiveModel, Submodel
+from ctid_cli.models.factoring import factored, factored_jacobian, unfactored, unfactored_jacobian
 
 TWO_MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
 MIXED = AdditiveModel(

@@ -5,14 +5,14 @@ import pytest
 from scipy.signal import cont2discrete, lfilter, tf2ss
 
 from ctid_cli.errors import DataError
-from ctid_cli.filtering import simulate_loop
+from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.inference.asymptotic import closed_loop_accuracy, open_loop_accuracy, output_variance
 from ctid_cli.inference.finite_record import additive_sensitivities, unfactored_sensitivities
-from ctid_cli.models import TransferFunction
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import factored, factored_jacobian, unfactored
-from ctid_cli.signals import HeldSignal
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
 
 INTERVAL = 0.05
 

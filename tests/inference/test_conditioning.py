@@ -2,11 +2,15 @@
 
 import numpy as np
 
-from ctid_cli.filtering import simulate
 from ctid_cli.filtering.bank import filter_data, second_moments
-from ctid_cli.inference import Structure, condition_number, describe_conditioning, white_noise_covariance
-from ctid_cli.models import TransferFunction
-from ctid_cli.signals import Prbs, Record, stream
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.inference.conditioning import describe_conditioning
+from ctid_cli.inference.covariance import condition_number, white_noise_covariance
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.excitation import Prbs
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.streams import stream
 
 NAMES = ("a1", "b0", "delay")
 

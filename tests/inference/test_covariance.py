@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.inference import condition_number, white_noise_covariance
+from ctid_cli.inference.covariance import condition_number, white_noise_covariance
 
 
 def sensitivities(seed, scales):

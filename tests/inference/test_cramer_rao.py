@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 
-from ctid_cli.filtering import simulate
-from ctid_cli.inference import cramer_rao_bound
-from ctid_cli.models import TransferFunction
-from ctid_cli.signals import HeldSignal, Prbs, Record, stream
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.inference.cramer_rao import cramer_rao_bound
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.excitation import Prbs
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.streams import stream
 
 CASE_1 = TransferFunction([2.0], [0.25, 0.7, 1.0], 8.0)
 CASE_2 = TransferFunction([-6400.0, 1600.0], [1.0, 5.0, 408.0, 416.0, 1600.0], 8.0)

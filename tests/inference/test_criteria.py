@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from ctid_cli.inference import information_criteria, r_squared, r_t_squared, young_information_criterion
+from ctid_cli.inference.criteria import information_criteria, r_t_squared, young_information_criterion
+from ctid_cli.inference.diagnostics import r_squared
 
 
 def test_information_criteria_by_hand():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import f, t
 
-from ctid_cli.inference import profile_likelihood_interval, quadratic_is_doubtful
+from ctid_cli.inference.delay_interval import profile_likelihood_interval, quadratic_is_doubtful
 
 
 def parabola(estimate=2.0, curvature=50.0, smallest=8.0):

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.inference import derived_parameters, pole_jacobian
-from ctid_cli.models import TransferFunction
+from ctid_cli.inference.derived import derived_parameters
+from ctid_cli.models.factoring import pole_jacobian
+from ctid_cli.models.transfer_function import TransferFunction
 
 FOURTH = TransferFunction([-6400.0, 1600.0], [1.0, 5.0, 408.0, 416.0, 1600.0])
 MIXED = TransferFunction([3.0], np.poly([-0.2, -5.0, -1 + 2j, -1 - 2j]).real)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import toeplitz
 
-from ctid_cli.filtering import simulate_additive
+from ctid_cli.filtering.sampled import simulate_additive
 from ctid_cli.inference.asymptotic import open_loop_accuracy
 from ctid_cli.inference.covariance import white_noise_covariance
 from ctid_cli.inference.cramer_rao import cramer_rao_bound
@@ -13,10 +13,12 @@ from ctid_cli.inference.finite_record import (
     finite_record_covariance,
     unfactored_sensitivities,
 )
-from ctid_cli.models import TransferFunction
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
-from ctid_cli.signals import ArmaNoise, HeldSignal, Record
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.arma_noise import ArmaNoise
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
 
 MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([0.1, 1.0], [0.025, 0.01, 1.0])], 0.13)
 BODY = AdditiveModel([Submodel([0.2, 0.4], [0.3, 1.0], integrators=1), Submodel([0.1], [0.01, 0.1, 1.0])])

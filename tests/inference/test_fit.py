@@ -5,8 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.inference import Fit, Status, Structure, fit_percent, r_squared
-from ctid_cli.models import TransferFunction
+from ctid_cli.inference.diagnostics import fit_percent, r_squared
+from ctid_cli.inference.fit import Fit
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.status import Status
+from ctid_cli.models.transfer_function import TransferFunction
 
 VALUES = st.lists(st.floats(-100, 100), min_size=3, max_size=20).filter(lambda v: np.ptp(v) > 1e-3)
 

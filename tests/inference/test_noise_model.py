@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import solve_toeplitz, toeplitz
 from scipy.signal import lfilter
 
-from ctid_cli.inference import NoiseModel, fit_noise_model
+from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
 
 
 def ar2(count, seed=0):

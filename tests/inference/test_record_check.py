@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from ctid_cli import HeldSignal, Record, TransferFunction, simulate
 from ctid_cli.inference.input_moves import input_moves
 from ctid_cli.inference.record_check import check_record_quality, output_bandwidth
-from ctid_cli.signals import Prbs
+from ctid_cli.signals.excitation import Prbs
 
 SECOND_ORDER = TransferFunction([2], [0.25, 0.7, 1], delay=8.0)
 RESONANT = TransferFunction([-6400, 1600], [1, 5, 408, 416, 1600], delay=8.0)

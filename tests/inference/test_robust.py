@@ -5,7 +5,9 @@ import pytest
 from scipy.linalg import block_diag, toeplitz
 from scipy.signal import lfilter
 
-from ctid_cli.inference import fit_noise_model, sandwich_covariance, white_noise_covariance
+from ctid_cli.inference.covariance import white_noise_covariance
+from ctid_cli.inference.noise_model import fit_noise_model
+from ctid_cli.inference.robust import sandwich_covariance
 
 
 def regressors(count, seed=0, pole=0.95):

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.models import AdditiveModel, Submodel, Term, TransferFunction
+from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.models.transfer_function import TransferFunction
 
 SLOW = Submodel([3.0], [0.25, 0.25, 1.0])
 FAST = Submodel([1.0], [0.025, 0.01, 1.0])

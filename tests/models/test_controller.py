@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.models import DiscreteController
+from ctid_cli.models.controller import DiscreteController
 
 PID = DiscreteController([0.02329, -0.02058, 0.00454], [1.0, -1.0, 0.0])
 CONTROLLERS = {

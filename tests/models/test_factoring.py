@@ -6,17 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.models import (
-    AdditiveModel,
-    FactoringError,
-    Submodel,
-    Term,
-    TransferFunction,
-    factored,
-    factored_jacobian,
-    unfactored,
-    unfactored_jacobian,
-)
+from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.models.factoring import FactoringError, factored, factored_jacobian, unfactored, unfactored_jacobian
+from ctid_cli.models.transfer_function import TransferFunction
 
 TWO_MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])], delay=0.3)
 FOUR_MODES = AdditiveModel(

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.models import TransferFunction
+from ctid_cli.models.transfer_function import TransferFunction
 
 COEFFICIENT = st.floats(0.1, 10.0)
 

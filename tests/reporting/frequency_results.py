@@ -1,13 +1,13 @@
 """Results of the study of finite-time frequency estimation from short records, computed in this process."""
 
-from ctid_cli.experiment.manifest import build_manifest
-from ctid_cli.experiment.plan import build_plan
-from ctid_cli.experiment.sealed import seal_image
-from ctid_cli.experiment.spec import load_spec
-from ctid_cli.experiment.version import Origin
-from ctid_cli.experiment.worker import Job, run_job
 from ctid_cli.reporting.figures.finite_time_frequency import CONFIGS
 from ctid_cli.reporting.study import data_folder
+from ctid_cli.running.plan import build_plan
+from ctid_cli.running.worker import Job, run_job
+from ctid_cli.specification.spec import load_spec
+from ctid_cli.storage.manifest import build_manifest
+from ctid_cli.storage.sealed import seal_image
+from ctid_cli.storage.version import Origin
 
 
 def config(name):

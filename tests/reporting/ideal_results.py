@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from ctid_cli.experiment.manifest import Key, build_manifest, true_parameters
-from ctid_cli.experiment.plan import build_plan
-from ctid_cli.experiment.spec import load_spec
-from ctid_cli.experiment.store import Stored
-from ctid_cli.experiment.version import Origin
 from ctid_cli.reporting.parameter_theory import long_record_variances
 from ctid_cli.reporting.results import Results
+from ctid_cli.running.plan import build_plan
+from ctid_cli.specification.spec import load_spec
+from ctid_cli.storage.manifest import Key, build_manifest, true_parameters
+from ctid_cli.storage.store import Stored
+from ctid_cli.storage.version import Origin
 
 #: Two modes, two numbers of samples, and an estimator of each form.
 TWO_MODES = """\

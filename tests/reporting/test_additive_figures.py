@@ -7,17 +7,19 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.experiment.plan import build_plan
-from ctid_cli.experiment.spec import load_spec
-from ctid_cli.filtering import simulate
-from ctid_cli.models import TransferFunction, unfactored
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.models.factoring import unfactored
+from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.reporting.figures import additive, frequency_plot, parameter_plot
 from ctid_cli.reporting.figures.from_results import FromResults
 from ctid_cli.reporting.figures.parameter_plot import Method, bias_svg, coverage_svg, labelled, mse_svg, symbol
 from ctid_cli.reporting.figures.registry import STUDIES, find_figures, require_results
 from ctid_cli.reporting.parameter_errors import parameter_errors, parameter_estimates
 from ctid_cli.reporting.study import data_folder
-from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.running.plan import build_plan
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
+from ctid_cli.specification.spec import load_spec
 from tests.reporting.ideal_results import TWO_MODES, ideal_results, plan_of
 
 METHODS = (Method("additive", "the sum"), Method("srivc", "the fraction"))

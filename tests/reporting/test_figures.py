@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.filtering import FilterSet, check_filters, extrema, ideal_cost
+from ctid_cli.filtering.filter_set import FilterSet, check_filters
+from ctid_cli.filtering.filter_theory import extrema, ideal_cost
 from ctid_cli.reporting.figures import specification, useful_redundancy
 from ctid_cli.reporting.figures.redundant_search import landscape, published_search
 from ctid_cli.reporting.figures.registry import STUDIES, find_figures

@@ -7,9 +7,6 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.experiment.plan import build_plan
-from ctid_cli.experiment.spec import load_spec
-from ctid_cli.experiment.store import read_tracks
 from ctid_cli.reporting.figures import error_plot, finite_time_frequency
 from ctid_cli.reporting.figures.error_plot import Curve, Group, Row, errors_svg
 from ctid_cli.reporting.figures.finite_time_frequency import CONFIGS, DERIVED, FIGURES, GROUPS
@@ -17,6 +14,9 @@ from ctid_cli.reporting.figures.from_results import FromResults
 from ctid_cli.reporting.figures.registry import find_figures, require_results
 from ctid_cli.reporting.results import read_results
 from ctid_cli.reporting.study import data_folder
+from ctid_cli.running.plan import build_plan
+from ctid_cli.specification.spec import load_spec
+from ctid_cli.storage.store import read_tracks
 from tests.reporting.frequency_results import config, run_here
 
 NAMES = ("two-tones", "harmonic", "random", "step")

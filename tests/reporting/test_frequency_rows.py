@@ -2,16 +2,16 @@
 
 import pytest
 
-from ctid_cli.experiment.manifest import build_manifest, slots
-from ctid_cli.experiment.plan import build_plan
-from ctid_cli.experiment.spec import load_spec
-from ctid_cli.experiment.store import Stored
-from ctid_cli.experiment.version import Origin
-from ctid_cli.experiment.worker import failed
 from ctid_cli.reporting.report import success_sentence
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.rows import experiment_rows
 from ctid_cli.reporting.tables import frequency_table
+from ctid_cli.running.plan import build_plan
+from ctid_cli.running.worker import failed
+from ctid_cli.specification.spec import load_spec
+from ctid_cli.storage.manifest import build_manifest, slots
+from ctid_cli.storage.store import Stored
+from ctid_cli.storage.version import Origin
 
 SPEC = """\
 experiment: made

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
+from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import identify
-from ctid_cli.estimators.measured import DelayProfile
-from ctid_cli.filtering import simulate
-from ctid_cli.models import TransferFunction
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.identification import (
     common_units,
@@ -21,8 +21,9 @@ from ctid_cli.reporting.identification import (
     parameters_of,
 )
 from ctid_cli.reporting.identification_plot import identification_svg
-from ctid_cli.signals import HeldSignal, Record
+from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.measurement import Measurement
+from ctid_cli.signals.record import Record
 
 SYSTEM = TransferFunction([3.0], [1.0, 1.2, 4.0], 0.73)
 UNITS = Units("ms", "V", "mA")

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.experiment.plan import build_plan
-from ctid_cli.experiment.spec import load_spec
-from ctid_cli.experiment.summary import wilson_interval
 from ctid_cli.inference.asymptotic import open_loop_accuracy
-from ctid_cli.models import unfactored
+from ctid_cli.models.factoring import unfactored
 from ctid_cli.reporting.parameter_errors import mse_ratio, parameter_errors, parameter_estimates
 from ctid_cli.reporting.parameter_theory import long_record_variances
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.study import data_folder
+from ctid_cli.running.plan import build_plan
+from ctid_cli.specification.spec import load_spec
+from ctid_cli.storage.summary import wilson_interval
 from tests.reporting.ideal_results import TWO_MODES, estimate, ideal_results, plan_of, results_of
 
 NAMES = ("g1_a1", "g1_a2", "g1_b0", "g2_a1", "g2_a2", "g2_b0")
@@ -206,8 +206,8 @@ def test_ratios_that_make_no_sense_are_refused(plan, tmp_path):
 
 
 def test_results_on_disk_give_the_same_errors(plan, tmp_path):
-    from ctid_cli.experiment.sealed import seal_image
     from ctid_cli.reporting.results import read_results
+    from ctid_cli.storage.sealed import seal_image
 
     results = ideal_results(plan, tmp_path)
     folder = tmp_path / "two-modes"

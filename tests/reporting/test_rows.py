@@ -2,12 +2,12 @@ import json
 
 import pytest
 
-from ctid_cli.experiment.summary import wilson_interval
 from ctid_cli.reporting.report import write_tables
 from ctid_cli.reporting.results import differences
 from ctid_cli.reporting.rows import experiment_rows, study_rows
 from ctid_cli.reporting.study import load_study
 from ctid_cli.reporting.tables import csv_text, experiment_table, study_table
+from ctid_cli.storage.summary import wilson_interval
 
 RANDOM = "uniform(0, 9)"
 

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ctid_cli.frequency import Flag
 from ctid_cli.frequency.automatic import choose_settings
+from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.record_track import RecordTrack
 from ctid_cli.reporting.track_plot import track_svg
 from ctid_cli.reporting.track_report import (

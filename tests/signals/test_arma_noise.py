@@ -6,7 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals import ArmaNoise, WhiteNoise, stream
+from ctid_cli.signals.arma_noise import ArmaNoise
+from ctid_cli.signals.noise import WhiteNoise
+from ctid_cli.signals.streams import stream
 
 ZEROS = np.zeros(500)
 #: The noise of the first example of González, Classens, Rojas, Welsh and Oomen.

@@ -6,19 +6,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals import (
+from ctid_cli.signals.excitation import (
     EXCITATIONS,
     TAPS,
     Gaussian,
     InputFile,
     Multisine,
     Prbs,
-    RegularSampling,
     Step,
-    UniformIntervals,
     maximal_length_sequence,
-    stream,
 )
+from ctid_cli.signals.sampling import RegularSampling, UniformIntervals
+from ctid_cli.signals.streams import stream
 
 
 def rng(replicate=0):

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals import HeldSignal
+from ctid_cli.signals.held import HeldSignal
 
 BREAKS = st.lists(st.integers(-1000, 1000), min_size=1, max_size=30, unique=True).map(
     lambda ticks: 0.05 * np.sort(np.array(ticks, dtype=float))

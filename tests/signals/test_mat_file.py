@@ -11,7 +11,7 @@ import scipy.io
 from scipy.io.matlab import MatlabObject
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals import read_measurement
+from ctid_cli.signals.measurement import read_measurement
 
 T = 0.1 * np.arange(5)
 U = np.array([1.0, -1.0, 1.0, 1.0, -1.0])

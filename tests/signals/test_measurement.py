@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals import read_measurement, read_record
+from ctid_cli.signals.csv_file import read_record
+from ctid_cli.signals.measurement import read_measurement
 
 
 @pytest.fixture

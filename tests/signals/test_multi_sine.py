@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from ctid_cli.signals import MultiSine, Piece, SineDisturbance, Tone, UniformDisturbance, WhiteNoise, disturb
+from ctid_cli.signals.multi_sine import MultiSine, Piece, SineDisturbance, Tone, UniformDisturbance, disturb
+from ctid_cli.signals.noise import WhiteNoise
 
 T = 0.001 * np.arange(60_000)
 STEPPED = (

@@ -6,7 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals import NOISES, ArmaNoise, WhiteNoise, stream
+from ctid_cli.signals.arma_noise import ArmaNoise
+from ctid_cli.signals.noise import NOISES, WhiteNoise
+from ctid_cli.signals.streams import stream
 
 
 def rng(replicate=0):

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals import HeldSignal, Loop, Record, regular_interval
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Loop, Record, regular_interval
 
 ONE = HeldSignal([0.0], [1.0])
 

@@ -5,15 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.signals import (
-    ROLES,
-    SAMPLINGS,
-    RegularSampling,
-    UniformIntervals,
-    geometric_sizes,
-    regular_interval,
-    stream,
-)
+from ctid_cli.signals.record import regular_interval
+from ctid_cli.signals.sampling import SAMPLINGS, RegularSampling, UniformIntervals, geometric_sizes
+from ctid_cli.signals.streams import ROLES, stream
 
 
 def rng(replicate=0):

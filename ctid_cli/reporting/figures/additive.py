@@ -11,8 +11,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from ctid_cli.experiment.dataset import SimulatedSource
-from ctid_cli.models import AdditiveModel
+from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.figures.frequency_plot import Response, dense_frequencies, response_svg
 from ctid_cli.reporting.figures.from_results import FromResults
 from ctid_cli.reporting.figures.parameter_plot import Method, bias_svg, coverage_svg, mse_svg
@@ -20,7 +19,8 @@ from ctid_cli.reporting.figures.specification import published_plan
 from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, ramp
 from ctid_cli.reporting.parameter_errors import ParameterErrors, parameter_errors, parameter_estimates
 from ctid_cli.reporting.results import Results
-from ctid_cli.signals import Record
+from ctid_cli.signals.record import Record
+from ctid_cli.simulation.dataset import SimulatedSource
 
 #: Experiments of the study and their specifications.
 CONFIGS: Mapping[str, str] = {
@@ -54,13 +54,7 @@ COVERAGE_CLOSED_LOOP = (Method("white", "white formula"),)
 
 
 def figure_2() -> bytes:
-    """Frequency response of the eighth-order system.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Frequency response of the eighth-order system."""
     model = _system("additive/open-loop")
     frequencies = np.geomspace(0.1, 50.0, 1200)
     submodels = [
@@ -76,49 +70,21 @@ def figure_2() -> bytes:
 
 
 def figure_3(results: Results) -> bytes:
-    """Mean-square errors of the static gains in open loop.
-
-    Parameters
-    ----------
-    results : Results
-        The open-loop experiment.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Mean-square errors of the static gains in open loop."""
     gains = [f"g{k}_b0" for k in range(1, 5)]
     title = "Section 6.1, open loop, coloured noise: mean-square errors of the static gains"
     return mse_svg(_errors(results), OPEN_LOOP, gains, 2, title)
 
 
 def figure_4(results: Results) -> bytes:
-    """Mean-square errors of all parameters in closed loop.
-
-    Parameters
-    ----------
-    results : Results
-        The closed-loop experiment.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Mean-square errors of all parameters in closed loop."""
     rows = _errors(results)
     title = "Section 6.2, closed loop, white noise: mean-square errors of the parameters"
     return mse_svg(rows, CLOSED_LOOP, _parameters(rows), 3, title)
 
 
 def figure_6() -> bytes:
-    """Frequency response of a simulated beam: true, estimated, and where the estimation started.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Frequency response of a simulated beam: true, estimated, and where the estimation started."""
     plan = published_plan(CONFIGS["additive/flexible-beam"])
     cell = plan.data_cells[0]
     true, data = _system("additive/flexible-beam"), cell.dataset(0)
@@ -154,18 +120,7 @@ def figure_6() -> bytes:
 
 
 def figure_coloured(results: Results) -> bytes:
-    """Biases under coloured noise in closed loop.
-
-    Parameters
-    ----------
-    results : Results
-        The closed-loop experiment with coloured noise.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Biases under coloured noise in closed loop."""
     rows = _errors(results)
     title = (
         r"Biases in the loop of section 6.2 with noise $v = e/(1 - 0.9 q^{-1})$ of variance 0.01, "
@@ -175,18 +130,7 @@ def figure_coloured(results: Results) -> bytes:
 
 
 def figure_coverage(open_loop: Results, closed_loop: Results) -> bytes:
-    """How often 95 % intervals contain the true parameters.
-
-    Parameters
-    ----------
-    open_loop, closed_loop : Results
-        The two experiments on coverage.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """How often 95 % intervals contain the true parameters."""
     ours, theirs = _errors(open_loop), _errors(closed_loop)
     return coverage_svg(
         [
@@ -202,22 +146,6 @@ def empirical_response(
 ) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
     r"""Frequency response as the quotient of windowed spectra, without a model.
 
-    Parameters
-    ----------
-    record : Record
-        Regular samples of the output, and an input that is held between them.
-    lowest, highest : float
-        Ends of the range [rad/s].
-
-    Returns
-    -------
-    frequencies : ndarray, shape (K,)
-        Multiples of ``2 pi/(N h)`` in the range [rad/s].
-    response : ndarray of complex, shape (K,)
-        Response [output unit/input unit].
-
-    Notes
-    -----
     The system does not repeat itself within the record, least of all from rest: the Hann window takes the ends of the
     record out. The spectrum of the held input is that of its samples times ``(1 - exp(-jwh))/(jwh)``.
     """

@@ -36,24 +36,15 @@ ROUNDING = 1e-16
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Frequencies as one estimator found them.
-
-    Parameters
-    ----------
-    label : str
-        What the estimator is called.
-    t : ndarray, shape (N,)
-        Instants [s].
-    omega, true : ndarray, shape (N, n)
-        Estimated and true frequencies [rad/s].
-    valid : ndarray of bool, shape (N,)
-        Whether the estimator itself calls them valid.
-    """
+    """Frequencies as one estimator found them."""
 
     label: str
+    #: Instants [s], shape (N,).
     t: Array
+    #: Estimated and true frequencies [rad/s], shape (N, n).
     omega: Array
     true: Array
+    #: Whether the estimator itself calls them valid, shape (N,).
     valid: NDArray[np.bool_]
 
     @property
@@ -64,15 +55,7 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Estimators that share a column.
-
-    Parameters
-    ----------
-    title : str
-        What they have in common.
-    curves : sequence of Curve
-        Up to three of them, in every row of panels the same.
-    """
+    """Estimators that share a column."""
 
     title: str
     curves: Sequence[Curve]
@@ -80,46 +63,20 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """The same experiment seen by all groups: a row of panels with frequencies, and one with errors.
-
-    Parameters
-    ----------
-    title : str
-        What was observed; empty if there is only one.
-    groups : sequence of Group
-        The columns.
-    duration : float
-        Length of the record [s].
-    exact_from : float
-        From here on a finite-time estimator can be exact [s].
-    reference : float or None
-        Error of an estimate from the whole record [rad/s]; None draws none.
-    """
+    """The same experiment seen by all groups: a row of panels with frequencies, and one with errors."""
 
     title: str
     groups: Sequence[Group]
+    #: Length of the record [s].
     duration: float
+    #: From here on a finite-time estimator can be exact [s].
     exact_from: float
+    #: Error of an estimate from the whole record [rad/s]; None draws none.
     reference: float | None = None
 
 
 def errors_svg(rows: Sequence[Row], frequencies: tuple[float, float], errors: tuple[float, float], title: str) -> bytes:
-    """Frequencies and errors over time.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        What was observed, each a row of frequencies and one of errors.
-    frequencies, errors : tuple of float
-        Range of the axes of frequencies and of errors [rad/s].
-    title : str
-        What is shown.
-
-    Returns
-    -------
-    bytes
-        An SVG file: lines are thin where the estimator itself calls its estimate invalid.
-    """
+    """Frequencies and errors over time."""
 
     def draw(figure: Figure) -> None:
         from matplotlib.ticker import MaxNLocator

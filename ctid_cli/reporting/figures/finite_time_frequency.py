@@ -12,13 +12,13 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from ctid_cli.errors import UsageError
-from ctid_cli.experiment.frequency_runs import SignalSource
-from ctid_cli.experiment.plan import build_plan
-from ctid_cli.experiment.spec import spec_from_canonical
-from ctid_cli.experiment.store import read_tracks
 from ctid_cli.reporting.figures.error_plot import Curve, Group, Row, errors_svg
 from ctid_cli.reporting.figures.from_results import FromResults
 from ctid_cli.reporting.results import Results
+from ctid_cli.running.plan import build_plan
+from ctid_cli.simulation.frequency_runs import SignalSource
+from ctid_cli.specification.spec import spec_from_canonical
+from ctid_cli.storage.store import read_tracks
 
 #: Experiments of the study and their specifications.
 CONFIGS: Mapping[str, str] = {
@@ -46,69 +46,25 @@ DRAWN_INTERVAL = 0.1
 
 
 def figure_1(results: Results) -> bytes:
-    """Two tones without noise.
-
-    Parameters
-    ----------
-    results : Results
-        The experiment.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Two tones without noise."""
     title = r"Section VI-A: $\sin 2t + \cos 3t$, no noise"
     return errors_svg([_row(results)], (1.0, 5.5), (1e-17, 20.0), title)
 
 
 def figure_2(results: Results) -> bytes:
-    """Two tones and a third one that the estimators do not know of.
-
-    Parameters
-    ----------
-    results : Results
-        The experiment.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Two tones and a third one that the estimators do not know of."""
     title = r"Section VI-B: $\sin 2t + \sin 3t$ disturbed by $0.25 \sin 15t$"
     return errors_svg([_row(results, reference=True)], (0.5, 5.5), (5e-8, 20.0), title)
 
 
 def figure_3(results: Results) -> bytes:
-    """Two tones in random noise.
-
-    Parameters
-    ----------
-    results : Results
-        The experiment; its first data set is drawn.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Two tones in random noise."""
     title = r"Section VI-B: $\sin 2t + \sin 3t$, noise uniform in $\pm 0.2$, first data set"
     return errors_svg([_row(results, reference=True)], (0.5, 5.5), (2e-6, 20.0), title)
 
 
 def figure_4(results: Results) -> bytes:
-    """A step of both frequencies, with the phase as printed, and with one that goes on.
-
-    Parameters
-    ----------
-    results : Results
-        The experiment.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """A step of both frequencies, with the phase as printed, and with one that goes on."""
     rows = [
         _row(results, "phase jumps", phase_at_steps="jump"),
         _row(results, "phase goes on", phase_at_steps="continuous"),

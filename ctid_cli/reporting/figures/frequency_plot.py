@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctid_cli.models import AdditiveModel
+from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.figures.style import svg
 
 if TYPE_CHECKING:
@@ -20,48 +20,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """One curve.
-
-    Parameters
-    ----------
-    label : str
-        What it is.
-    frequencies : ndarray, shape (K,)
-        Frequencies, in the unit of the figure, rising.
-    values : ndarray of complex, shape (K,)
-        Response [output unit/input unit].
-    style : mapping
-        Keywords of ``Axes.plot``.
-    phase : bool
-        Whether its phase is drawn too.
-    """
+    """One curve."""
 
     label: str
+    #: Frequencies, in the unit of the figure, rising, shape (K,).
     frequencies: Array
+    #: Response [output unit/input unit], shape (K,).
     values: NDArray[np.complex128]
     style: Mapping[str, Any] = field(default_factory=dict)
     phase: bool = True
 
 
 def response_svg(curves: Sequence[Response], title: str, unit: str, *, unwrap: bool = True) -> bytes:
-    """Magnitude and phase of frequency responses.
-
-    Parameters
-    ----------
-    curves : sequence of Response
-        The curves, drawn in this order.
-    title : str
-        What they belong to.
-    unit : str
-        Unit of their frequencies, ``rad/s`` or ``Hz``.
-    unwrap : bool, default True
-        Whether phases are followed beyond 180 degrees; otherwise they are drawn between -180 and 180.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Magnitude and phase of frequency responses."""
 
     def draw(figure: Figure) -> None:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1.7, 1])
@@ -92,20 +63,7 @@ def _phase(values: NDArray[np.complex128], unwrap: bool) -> Array:
 
 
 def dense_frequencies(model: AdditiveModel, lowest: float, highest: float) -> Array:
-    """Frequencies that show every resonance of a model, however narrow.
-
-    Parameters
-    ----------
-    model : AdditiveModel
-        The model.
-    lowest, highest : float
-        Ends of the range [rad/s].
-
-    Returns
-    -------
-    ndarray
-        Frequencies [rad/s], rising: evenly on a logarithmic axis, and closer and closer around the natural frequencies.
-    """
+    """Frequencies that show every resonance of a model, however narrow."""
     distances = np.geomspace(1e-6, 0.1, 60)
     near = [
         model.natural_frequency * np.concatenate([1 - distances, [1.0], 1 + distances]) for model in model.submodels

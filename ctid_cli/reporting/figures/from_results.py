@@ -12,53 +12,18 @@ from ctid_cli.reporting.results import Results, experiments_in, out_option, read
 
 @dataclass(frozen=True)
 class FromResults:
-    """A figure of results.
-
-    Parameters
-    ----------
-    configs : mapping of str to str
-        Experiments that it shows, and their specifications, relative to the folder of specifications.
-    draw : callable
-        Takes their results, in this order, and returns an SVG file.
-    """
+    """A figure of results."""
 
     configs: Mapping[str, str]
     draw: Callable[..., bytes]
 
     def missing(self, out: Path) -> list[str]:
-        """Specifications that were not run yet.
-
-        Parameters
-        ----------
-        out : Path
-            Results folder.
-
-        Returns
-        -------
-        list of str
-            Relative to the folder of specifications.
-        """
+        """Specifications that were not run yet."""
         known = experiments_in(out)
         return [config for experiment, config in self.configs.items() if experiment not in known]
 
     def svg(self, out: Path) -> bytes:
-        """Draw it.
-
-        Parameters
-        ----------
-        out : Path
-            Results folder.
-
-        Returns
-        -------
-        bytes
-            An SVG file.
-
-        Raises
-        ------
-        UsageError
-            If there are no results.
-        """
+        """Draw it."""
         if self.missing(out):
             raise not_run(self.missing(out), out)
         found: list[Results] = [read_results(out, experiment) for experiment in self.configs]
@@ -66,19 +31,6 @@ class FromResults:
 
 
 def not_run(configs: list[str], out: Path) -> UsageError:
-    """The error for a figure of experiments that were not run.
-
-    Parameters
-    ----------
-    configs : list of str
-        Their specifications, relative to the folder of specifications.
-    out : Path
-        Results folder.
-
-    Returns
-    -------
-    UsageError
-        To be raised.
-    """
+    """The error for a figure of experiments that were not run."""
     command = " ".join(["ctid run", *(f"configs/{config}" for config in configs)]) + out_option(out)
     return UsageError(f"there are no results in {out} to draw this from; run first: {command}")

@@ -28,64 +28,21 @@ UNBIASED = 3.3
 
 @dataclass(frozen=True)
 class Method:
-    """An estimator as figures show it.
-
-    Parameters
-    ----------
-    name : str
-        Its name in the specification.
-    label : str
-        What it is called in the figure.
-    """
+    """An estimator as figures show it."""
 
     name: str
     label: str
 
 
 def symbol(parameter: str) -> str:
-    """A parameter of a submodel as a formula.
-
-    Parameters
-    ----------
-    parameter : str
-        Its name.
-
-    Returns
-    -------
-    str
-        Text for matplotlib.
-
-    Examples
-    --------
-    >>> symbol("g2_b0")
-    '$b_{2,0}$'
-    """
+    """A parameter of a submodel as a formula."""
     return re.sub(r"^g(\d+)_([ab])(\d+)$", r"$\2_{\1,\3}$", parameter)
 
 
 def mse_svg(
     rows: Sequence[ParameterErrors], methods: Sequence[Method], parameters: Sequence[str], columns: int, title: str
 ) -> bytes:
-    """Mean-square errors over the number of samples, one panel for each parameter.
-
-    Parameters
-    ----------
-    rows : sequence of ParameterErrors
-        Errors of one experiment.
-    methods : sequence of Method
-        Estimators to draw, four at most.
-    parameters : sequence of str
-        Parameters to draw.
-    columns : int
-        Panels side by side.
-    title : str
-        What is shown; the number of data sets is added.
-
-    Returns
-    -------
-    bytes
-        An SVG file: markers are simulated, lines are what theory predicts for long records.
-    """
+    """Mean-square errors over the number of samples, one panel for each parameter."""
     lines = -(-len(parameters) // columns)
 
     def draw(figure: Figure) -> None:
@@ -124,24 +81,7 @@ def mse_svg(
 def bias_svg(
     rows: Sequence[ParameterErrors], methods: Sequence[Method], parameters: Sequence[str], title: str
 ) -> bytes:
-    """Biases in standard deviations of one estimate, one line for each parameter.
-
-    Parameters
-    ----------
-    rows : sequence of ParameterErrors
-        Errors of one experiment at one number of samples.
-    methods : sequence of Method
-        Estimators to draw, four at most.
-    parameters : sequence of str
-        Parameters to draw, from the top.
-    title : str
-        What is shown.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Biases in standard deviations of one estimate, one line for each parameter."""
     counted = min((row.counted for row in rows), default=0)
     band = UNBIASED / np.sqrt(counted) if counted else 0.0
 
@@ -167,20 +107,7 @@ def bias_svg(
 
 
 def coverage_svg(panels: Sequence[tuple[str, Sequence[ParameterErrors], Sequence[Method]]], title: str) -> bytes:
-    """Percentages of 95 % intervals that contain the true parameter.
-
-    Parameters
-    ----------
-    panels : sequence of (str, sequence of ParameterErrors, sequence of Method)
-        What each panel shows, the errors of one experiment at one number of samples, and the estimators to draw.
-    title : str
-        What is shown.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Percentages of 95 % intervals that contain the true parameter."""
     widths = [len({row.parameter for row in rows}) for _, rows, _ in panels]
 
     def draw(figure: Figure) -> None:
@@ -221,20 +148,7 @@ def coverage_svg(panels: Sequence[tuple[str, Sequence[ParameterErrors], Sequence
 
 
 def labelled(method: Method, rows: Sequence[ParameterErrors]) -> str:
-    """What an estimator is called, and how many of its estimates are not as they should be.
-
-    Parameters
-    ----------
-    method : Method
-        The estimator.
-    rows : sequence of ParameterErrors
-        Errors of one experiment.
-
-    Returns
-    -------
-    str
-        For example ``SRIVC (3 of 9000 not converged)``: these count; those without a value cannot.
-    """
+    """What an estimator is called, and how many of its estimates are not as they should be."""
     # Every parameter of a group carries the same counts.
     own = {(row.samples, row.start): row for row in rows if row.estimator == method.name}.values()
     runs, counted = sum(row.runs for row in own), sum(row.counted for row in own)

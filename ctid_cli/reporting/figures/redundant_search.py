@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.errors import UsageError
-from ctid_cli.estimators import Start
-from ctid_cli.estimators.delay_search import Minimum
-from ctid_cli.estimators.filtered_costs import FilteredCost
+from ctid_cli.estimation.common import Start
+from ctid_cli.estimation.delay_search import Minimum
+from ctid_cli.estimation.filtered_costs import FilteredCost
 from ctid_cli.estimators.useful_redundancy import NOTHING, PreparedUsefulRedundancy, RedundantFit, UsefulRedundancy
-from ctid_cli.experiment.dataset import DataSet
 from ctid_cli.reporting.figures.specification import published_plan
 from ctid_cli.reporting.study import load_study
 from ctid_cli.signals.record import Record
+from ctid_cli.simulation.dataset import DataSet
 
 Array = NDArray[np.float64]
 
@@ -26,49 +26,27 @@ SWEEPS = 2
 
 @dataclass(frozen=True, eq=False)
 class Leg:
-    """An accepted solver path: from one incumbent to the next.
-
-    Parameters
-    ----------
-    filter : int
-        Index of its filter, 0 for that of the longest period.
-    delays : ndarray, shape (K,)
-        Gauss-Newton steps [s], the incumbent it started from first.
-    costs : ndarray, shape (K,)
-        J0 there, as the search evaluates it [%].
-    switched : bool
-        Whether the leg before used another filter.
-    """
+    """An accepted solver path: from one incumbent to the next."""
 
     filter: int
+    #: Gauss-Newton steps [s], the incumbent it started from first, shape (K,).
     delays: Array
+    #: J0 there, as the search evaluates it [%], shape (K,).
     costs: Array
     switched: bool
 
 
 @dataclass(frozen=True, eq=False)
 class Landscape:
-    """Costs over the delay and a search through them.
+    """Costs over the delay and a search through them."""
 
-    Parameters
-    ----------
-    delays : ndarray, shape (N,)
-        Delays [s], rising.
-    members : ndarray, shape (N, filters)
-        Least costs over the coefficients that were found [%], of the filter of longest period first.
-    evaluated : ndarray, shape (N,)
-        J0 as the search evaluates it [%].
-    true_delay : float
-        True delay [s].
-    fit : RedundantFit
-        The estimate.
-    legs : tuple of Leg
-        The way to it.
-    """
-
+    #: Delays [s], rising, shape (N,).
     delays: Array
+    #: Least costs over the coefficients that were found [%], of the filter of longest period first, shape (N, filters).
     members: Array
+    #: J0 as the search evaluates it [%], shape (N,).
     evaluated: Array
+    #: True delay [s].
     true_delay: float
     fit: RedundantFit
     legs: tuple[Leg, ...]
@@ -88,29 +66,7 @@ class Landscape:
 def published_search(
     experiment: str, snr_db: float, noise: bool, otherwise: UsefulRedundancy
 ) -> tuple[UsefulRedundancy, DataSet]:
-    """Estimator and first data set of an experiment of the useful-redundancy study.
-
-    Parameters
-    ----------
-    experiment : str
-        Name of the experiment.
-    snr_db : float
-        Its SNR [dB].
-    noise : bool
-        Whether to keep the noise.
-    otherwise : UsefulRedundancy
-        The estimator where the experiment names no ``proposed`` one.
-
-    Returns
-    -------
-    (UsefulRedundancy, DataSet)
-        The estimator, and the data set, made anew from its seed.
-
-    Raises
-    ------
-    UsageError
-        If there is no specification of the experiment to be found, or none with this SNR.
-    """
+    """Estimator and first data set of an experiment of the useful-redundancy study."""
     config = load_study().experiments[experiment].config
     plan = published_plan(config)
     cells = [cell for cell in plan.data_cells if cell.swept.get("snr_db") == snr_db]
@@ -130,26 +86,6 @@ def landscape(
 ) -> Landscape:
     """Costs over the delay, and the search from one initial delay.
 
-    Parameters
-    ----------
-    estimator : UsefulRedundancy
-        The estimator.
-    data_set : DataSet
-        The record and its true delay.
-    delays : array_like, shape (N,)
-        Delays [s], rising.
-    initial_delay : float
-        Where the search starts [s].
-    sweeps : int, optional
-        How often to go through the delays for the least costs.
-
-    Returns
-    -------
-    Landscape
-        The costs and the search.
-
-    Notes
-    -----
     Far from the true delay the costs have local minima over the coefficients, and which one the search ends in changes
     from delay to delay. The least costs come from a continuation: coefficients that are good at one delay and for one
     filter are tried at the next one and for its neighbours.

@@ -22,15 +22,7 @@ STUDIES: Mapping[str, Mapping[str, Callable[[], bytes] | FromResults]] = {
 
 @dataclass(frozen=True)
 class StudyFigure:
-    """A figure that can be drawn.
-
-    Parameters
-    ----------
-    study : str
-        Its study.
-    number : str
-        Its number or name there.
-    """
+    """A figure that can be drawn."""
 
     study: str
     number: str
@@ -41,50 +33,13 @@ class StudyFigure:
         return Path(f"{self.study.replace('-', '_')}_figures") / f"figure_{self.number}.svg"
 
     def svg(self, out: Path) -> bytes:
-        """Draw it.
-
-        Parameters
-        ----------
-        out : Path
-            Results folder, for figures that are drawn from results.
-
-        Returns
-        -------
-        bytes
-            An SVG file.
-
-        Raises
-        ------
-        UsageError
-            If these results or a specification are missing.
-        """
+        """Draw it."""
         drawn = STUDIES[self.study][self.number]
         return drawn.svg(out) if isinstance(drawn, FromResults) else drawn()
 
 
 def find_figures(names: Sequence[str]) -> list[StudyFigure]:
-    """The figures that were asked for.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Figures (``2``, ``useful-redundancy/2``) or studies; none means the whole default study.
-
-    Returns
-    -------
-    list of StudyFigure
-        In the order asked for, none twice.
-
-    Raises
-    ------
-    UsageError
-        If a name is neither a figure nor a study with figures.
-
-    Examples
-    --------
-    >>> [str(figure.place) for figure in find_figures(["2"])]
-    ['useful_redundancy_figures/figure_2.svg']
-    """
+    """The figures that were asked for."""
     found: list[StudyFigure] = []
     for name in names or [DEFAULT_STUDY]:
         study, _, number = name.rpartition("/")
@@ -101,20 +56,7 @@ def find_figures(names: Sequence[str]) -> list[StudyFigure]:
 
 
 def require_results(figures: Iterable[StudyFigure], out: Path) -> None:
-    """Refuse figures whose results are missing, before any is drawn.
-
-    Parameters
-    ----------
-    figures : iterable of StudyFigure
-        The figures.
-    out : Path
-        Results folder.
-
-    Raises
-    ------
-    UsageError
-        If some are missing, with the command that makes them.
-    """
+    """Refuse figures whose results are missing, before any is drawn."""
     drawn = [STUDIES[figure.study][figure.number] for figure in figures]
     missing = [config for item in drawn if isinstance(item, FromResults) for config in item.missing(out)]
     if missing:

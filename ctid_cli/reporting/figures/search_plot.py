@@ -18,20 +18,7 @@ Array = NDArray[np.float64]
 
 
 def costs_svg(result: Landscape, title: str) -> bytes:
-    """Costs of all filters over the delay.
-
-    Parameters
-    ----------
-    result : Landscape
-        The costs.
-    title : str
-        What they belong to.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Costs of all filters over the delay."""
     delays, members = result.delays, result.members
     lines = ramp(members.shape[1])
     top = 1.03 * float(members.max())
@@ -64,22 +51,7 @@ def costs_svg(result: Landscape, title: str) -> bytes:
 
 
 def trajectory_svg(result: Landscape, title: str, detail: tuple[float, float]) -> bytes:
-    """J0 over the delay, and the way of the delay estimate with the filters that it used.
-
-    Parameters
-    ----------
-    result : Landscape
-        Costs and search.
-    title : str
-        What it shows.
-    detail : (float, float)
-        Delays [s] that are drawn again in detail.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """J0 over the delay, and the way of the delay estimate with the filters that it used."""
     whole = (float(result.delays[0]) - 0.2, float(result.delays[-1]))
 
     def draw(figure: Figure) -> None:

@@ -3,29 +3,13 @@
 from __future__ import annotations
 
 from ctid_cli.errors import UsageError
-from ctid_cli.experiment.plan import Plan, build_plan
-from ctid_cli.experiment.spec import load_spec
 from ctid_cli.reporting.study import data_folder
+from ctid_cli.running.plan import Plan, build_plan
+from ctid_cli.specification.spec import load_spec
 
 
 def published_plan(config: str) -> Plan:
-    """Plan of a published experiment.
-
-    Parameters
-    ----------
-    config : str
-        Its specification, relative to the folder of specifications.
-
-    Returns
-    -------
-    Plan
-        Nothing is simulated yet.
-
-    Raises
-    ------
-    UsageError
-        If there is no such specification to be found.
-    """
+    """Plan of a published experiment."""
     file = data_folder("configs") / config
     if not file.is_file():
         raise UsageError(

@@ -33,20 +33,7 @@ _STYLE: dict[Any, Any] = {
 
 
 def svg(width: float, height: float, draw: Callable[[Figure], None]) -> bytes:
-    """Draw a figure; the same drawing always gives the same bytes.
-
-    Parameters
-    ----------
-    width, height : float
-        Size [inch].
-    draw : callable
-        Draws into an empty figure, whose layout keeps labels apart.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Draw a figure; the same drawing always gives the same bytes."""
     import matplotlib.style
     from matplotlib.figure import Figure
 
@@ -60,23 +47,7 @@ def svg(width: float, height: float, draw: Callable[[Figure], None]) -> bytes:
 
 
 def ramp(count: int) -> list[dict[str, Any]]:
-    """Line properties of a family of curves, from light to dark, neighbours with different dashes.
-
-    Parameters
-    ----------
-    count : int
-        How many curves.
-
-    Returns
-    -------
-    list of dict
-        Keywords of ``Axes.plot``.
-
-    Examples
-    --------
-    >>> [line["linestyle"] for line in ramp(2)]
-    ['-', '--']
-    """
+    """Line properties of a family of curves, from light to dark, neighbours with different dashes."""
     light, dark = np.array([0.52, 0.68, 0.84]), np.array([0.03, 0.12, 0.30])
     shares = np.linspace(0.0, 1.0, count) if count > 1 else np.ones(1)
     return [
@@ -86,25 +57,7 @@ def ramp(count: int) -> list[dict[str, Any]]:
 
 
 def spread(values: ArrayLike, distance: float) -> Array:
-    """Places of labels: as close to their values as a least distance allows, in the same order.
-
-    Parameters
-    ----------
-    values : array_like, shape (n,)
-        Where the labels belong.
-    distance : float
-        Least distance of two labels, in the units of the values.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Where they go. Labels that would touch form a group around the mean of their values.
-
-    Examples
-    --------
-    >>> spread([0.0, 10.0, 10.5], 2.0)
-    array([ 0.  ,  9.25, 11.25])
-    """
+    """Places of labels: as close to their values as a least distance allows, in the same order."""
     values = np.asarray(values, dtype=float)
     groups: list[list[int]] = []
 

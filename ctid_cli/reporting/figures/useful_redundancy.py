@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
-from ctid_cli.filtering import FilterSet, check_filters, convergence_region, extrema, ideal_cost
+from ctid_cli.filtering.filter_set import FilterSet, check_filters
+from ctid_cli.filtering.filter_theory import convergence_region, extrema, ideal_cost
 from ctid_cli.reporting.figures.redundant_search import Landscape, landscape, published_search
 from ctid_cli.reporting.figures.search_plot import costs_svg, trajectory_svg
 from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, ramp, spread, svg
@@ -33,28 +34,14 @@ SNR = 15.0
 
 @dataclass(frozen=True)
 class Case:
-    """One of the two simulated systems of the study.
-
-    Parameters
-    ----------
-    number : int
-        Its number in the paper.
-    experiment : str
-        The experiment with regular sampling.
-    published : UsefulRedundancy
-        The published settings.
-    interval : float
-        Distance of the delays at which costs are drawn [s].
-    detail : (float, float)
-        Delays [s] that are drawn again in detail.
-    sweeps : int
-        How often to go through the delays for the least costs.
-    """
+    """One of the two simulated systems of the study."""
 
     number: int
     experiment: str
     published: UsefulRedundancy
+    #: Distance of the delays at which costs are drawn [s].
     interval: float
+    #: Delays [s] that are drawn again in detail.
     detail: tuple[float, float]
     sweeps: int
 
@@ -85,13 +72,7 @@ CASE_2 = Case(
 
 
 def figure_1() -> bytes:
-    """Cost of a delay error behind an ideal low-pass filter, its extrema and its convergence region.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Cost of a delay error behind an ideal low-pass filter, its extrema and its convergence region."""
     cutoff, largest = 2 * np.pi, 4.0
     errors = np.linspace(-largest, largest, 1601)
     places = extrema(cutoff, 16, exact=True)
@@ -129,13 +110,7 @@ def figure_1() -> bytes:
 
 
 def figure_2() -> bytes:
-    """Six ideal costs, which of them serves which delay error, and the minimum path from one of these.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Six ideal costs, which of them serves which delay error, and the minimum path from one of these."""
     filters = FilterSet(bandwidth=2 * np.pi, count=6, beta=2.0)
     largest, start, shown = 15.0, 14.0, 5.25
     check = check_filters(filters.cutoffs, largest)
@@ -221,13 +196,7 @@ def _joined(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def figure_3() -> bytes:
-    """Ten filtered costs of case 1 with the model error, without noise.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Ten filtered costs of case 1 with the model error, without noise."""
     return costs_svg(
         _computed(CASE_1, noise=False),
         "Case 1 without noise: costs of the ten filters, normalised as in (45), "
@@ -236,25 +205,13 @@ def figure_3() -> bytes:
 
 
 def figure_4() -> bytes:
-    """J0 of case 1 without noise, and the minimum path.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """J0 of case 1 without noise, and the minimum path."""
     title = "Case 1 without noise: $J_0$ and the minimum path"
     return trajectory_svg(_computed(CASE_1, noise=False), title, CASE_1.detail)
 
 
 def figure_5() -> bytes:
-    """Costs of the ten filters on one data set of case 1.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """Costs of the ten filters on one data set of case 1."""
     return costs_svg(
         _computed(CASE_1, noise=True),
         f"Case 1, one data set, regular sampling, SNR {SNR:g} dB: costs of the ten filters, normalised as in (45)",
@@ -262,24 +219,12 @@ def figure_5() -> bytes:
 
 
 def figure_6() -> bytes:
-    """J0 and the trajectory of the delay estimate on one data set of case 1.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """J0 and the trajectory of the delay estimate on one data set of case 1."""
     return _data_set(CASE_1)
 
 
 def figure_7() -> bytes:
-    """J0 and the trajectory of the delay estimate on one data set of case 2.
-
-    Returns
-    -------
-    bytes
-        An SVG file.
-    """
+    """J0 and the trajectory of the delay estimate on one data set of case 2."""
     return _data_set(CASE_2)
 
 

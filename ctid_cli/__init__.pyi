@@ -1,0 +1,65 @@
+# The public names of ctid, by topic. Everything else is internal and may change without notice.
+
+# ruff: noqa: I001  the topics are the order
+
+__version__: str
+
+# Records and the signals that excite and disturb them
+from .signals.held import HeldSignal as HeldSignal
+from .signals.record import Loop as Loop, Record as Record
+from .signals.csv_file import read_record as read_record
+from .signals.excitation import Gaussian as Gaussian, Multisine as Multisine, Prbs as Prbs, Step as Step
+from .signals.sampling import RegularSampling as RegularSampling, UniformIntervals as UniformIntervals
+from .signals.noise import WhiteNoise as WhiteNoise
+from .signals.arma_noise import ArmaNoise as ArmaNoise
+
+# Models
+from .models.transfer_function import TransferFunction as TransferFunction
+from .models.additive import AdditiveModel as AdditiveModel, Submodel as Submodel, Term as Term
+from .models.controller import DiscreteController as DiscreteController
+
+# Exact simulation
+from .filtering.simulate import simulate as simulate
+from .filtering.sampled import simulate_additive as simulate_additive
+from .filtering.loop import simulate_loop as simulate_loop
+
+# Estimators of systems: options with ``fit(record, start)``
+from .estimation.common import Start as Start
+from .estimators.svf import Svf as Svf
+from .estimators.srivc import Srivc as Srivc
+from .estimators.td_srivc import TdSrivc as TdSrivc
+from .estimators.useful_redundancy import UsefulRedundancy as UsefulRedundancy
+from .estimators.delay_profile import DelayProfile as DelayProfile
+from .estimators.additive_srivc import AdditiveSrivc as AdditiveSrivc
+from .estimators.identification import Identification as Identification, identify as identify
+
+# Results
+from .inference.fit import Fit as Fit
+from .estimators.additive_srivc import AdditiveFit as AdditiveFit
+from .estimators.delay_profile import MeasuredFit as MeasuredFit
+from .estimators.useful_redundancy import RedundantFit as RedundantFit
+from .inference.status import Status as Status
+from .inference.diagnostics import fit_percent as fit_percent
+from .inference.cramer_rao import cramer_rao_bound as cramer_rao_bound
+
+# Useful redundancy for a cost of one's own
+from .filtering.lowpass import Lowpass as Lowpass
+from .filtering.filter_set import FilterSet as FilterSet, check_filters as check_filters
+from .estimation.redundancy import RedundantMinimum as RedundantMinimum, minimise_redundantly as minimise_redundantly
+
+# Frequencies of signals
+from .frequency.drem_gradient import DremGradient as DremGradient
+from .frequency.drem_finite_time import DremFiniteTime as DremFiniteTime
+from .frequency.drem_window import DremWindow as DremWindow
+from .frequency.restarting_least_squares import RestartingLeastSquares as RestartingLeastSquares
+from .frequency.adaptive_observer import AdaptiveObserver as AdaptiveObserver
+from .frequency.filter_regression import FilterRegression as FilterRegression
+from .frequency.esprit import Esprit as Esprit
+from .frequency.nonlinear_least_squares import NonlinearLeastSquares as NonlinearLeastSquares
+from .frequency.amplitudes import Sinusoids as Sinusoids, fit_sinusoids as fit_sinusoids
+from .frequency.tracking import FrequencyEstimate as FrequencyEstimate, FrequencyTrack as FrequencyTrack
+from .frequency.tracking import Tracker as Tracker
+from .frequency.flags import Flag as Flag
+
+# Errors
+from .errors import CtidError as CtidError, DataError as DataError, SpecError as SpecError

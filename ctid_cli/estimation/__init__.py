@@ -1,0 +1,1 @@
+"""What the estimators share: problems, iterations, searches over the delay, starts."""

@@ -1,0 +1,157 @@
+"""The estimation problem of a sum of submodels, in open or closed loop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimation.problems import is_hurwitz, reflect_unstable
+from ctid_cli.estimation.refined_iv import Equations
+from ctid_cli.filtering.bank import FilterData, plain_array
+from ctid_cli.filtering.submodels import OPEN_LOOP, InitialState, LoopData, SubmodelFilter
+from ctid_cli.models.additive import AdditiveModel, Term
+from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.factoring import unfactored
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.record import Record
+
+Array = NDArray[np.float64]
+
+#: Where instruments come from: the measured input, or the noise-free loop of the model.
+Instruments = Literal["open_loop", "closed_loop"]
+
+
+def check_closed_loop(instruments: Instruments, variant: str) -> None:
+    """Refuse to guard a cost that the solution does not minimise."""
+    if instruments == "closed_loop" and variant == "guarded":
+        raise ValueError(
+            "variant guarded is for open-loop instruments: in closed loop the solution is not the minimum of the "
+            "output-error cost; use relaxed or plain"
+        )
+
+
+def loop_data(record: Record, instruments: Instruments) -> LoopData:
+    """The feedback that instruments are simulated with."""
+    if instruments == "open_loop":
+        return OPEN_LOOP
+    where = f"{record.name}: " if record.name else ""
+    if record.loop is None:
+        raise DataError(
+            f"{where}closed-loop instruments need the reference and the controller, and this record has neither; give "
+            "them with the record, or use instruments 'open_loop'"
+        )
+    if not record.input_on_grid or record.input.hold != "zoh":
+        raise DataError(
+            f"{where}closed-loop instruments need an input that is held from sample to sample of a regular clock: the "
+            "controller is discrete"
+        )
+    controller = DiscreteController(record.loop.controller.numerator, record.loop.controller.denominator)
+    order = controller.denominator.size
+    numerator = np.zeros(order)
+    numerator[order - controller.numerator.size :] = controller.numerator
+    return LoopData(
+        plain_array(record.loop.reference),
+        numerator,
+        plain_array(controller.denominator),
+        record.loop.enters == "controller",
+    )
+
+
+class AdditiveProblem:
+    """Parameters of a sum of submodels: ``theta = (a_1 … a_n, b_0 … b_m)`` of each submodel in turn."""
+
+    def __init__(
+        self,
+        data: FilterData,
+        terms: Sequence[Term],
+        delay: float,
+        loop: LoopData = OPEN_LOOP,
+        initial_state: InitialState = "rest",
+    ) -> None:
+        self.data = data
+        self.terms = tuple(terms)
+        self.delay = delay
+        self.initial_state: InitialState = initial_state
+        self.filter = SubmodelFilter(data, terms, delay, loop, initial_state)
+
+    def with_other_hold(self) -> AdditiveProblem:
+        """The same problem with the other interpolation of the output in the regressors."""
+        data = replace(self.data, y_foh=not self.data.y_foh)
+        return AdditiveProblem(data, self.terms, self.delay, self.filter.loop, self.initial_state)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters of the model, those of a free response not counted."""
+        return sum(term.size for term in self.terms)
+
+    def model(self, theta: Array) -> AdditiveModel:
+        """The model that parameters describe."""
+        return AdditiveModel.from_theta(theta[: self.size], self.terms, self.delay)
+
+    def split(self, theta: Array) -> tuple[Array, Array, float]:
+        """Unfactored denominator, numerator and delay [s] of a parameter vector."""
+        try:
+            whole = unfactored(self.model(theta))
+        except DataError:
+            whole = TransferFunction([np.nan_to_num(theta[self.size - 1])], [1.0], self.delay)
+        return whole.denominator, whole.numerator, whole.delay
+
+    def admissible(self, theta: Array) -> Array:
+        """Reflect unstable submodels.
+
+        A real pole that changes sides changes the sign of the response either below its frequency or above it. What the
+        record shows must keep its sign: a pole in the lower half of the record's frequencies (in octaves, from one
+        period in the record to two samples) keeps the gain above itself, any other the static gain.
+        """
+        if not np.isfinite(theta).all():
+            return theta
+        result = theta
+        offset = 0
+        for term in self.terms:
+            n = term.poles
+            rising = theta[offset : offset + n]
+            if n and rising[-1] != 0.0:
+                monic = np.append(rising[::-1], 1.0) / rising[-1]
+                if not is_hurwitz(monic):
+                    stable = reflect_unstable(monic)
+                    result = result.copy() if result is theta else result
+                    result[offset : offset + n] = stable[-2::-1] / stable[-1]
+                    if self._changes_sign(monic):
+                        result[offset + n : offset + term.size] *= -1.0
+            offset += term.size
+        return result
+
+    def _changes_sign(self, denominator: Array) -> bool:
+        """Whether the gain above an odd number of slow poles is to be kept by changing the sign of the numerator."""
+        roots = np.roots(denominator)
+        slow = (roots.imag == 0.0) & (roots.real > 0.0) & (np.abs(roots) < self._middle_frequency)
+        return bool(np.count_nonzero(slow) % 2)
+
+    @cached_property
+    def _middle_frequency(self) -> float:
+        """Geometric mean of the lowest and the highest frequency of the record [rad/s]."""
+        t = self.data.t
+        duration = float(t[-1] - t[0])
+        return math.pi * math.sqrt(2.0 * (t.size - 1)) / duration
+
+    def equations(self, theta: Array) -> Equations | None:
+        """Second moments of the iteration."""
+        if not np.isfinite(theta).all():
+            return None
+        moments = self.filter.moments(theta)
+        if moments is None:
+            return None
+        return Equations(
+            moments.instrument_regressor,
+            moments.instrument_error,
+            moments.hessian,
+            moments.squared_error,
+            moments.output_power,
+        )

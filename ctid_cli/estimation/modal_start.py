@@ -1,0 +1,402 @@
+r"""A start for the estimation of a sum of submodels, from the record alone.
+
+Several sets of poles are found in two ways: mode by mode in the spectra of the record
+(:mod:`ctid_cli.estimation.pole_relocation`), and as those of one transfer function with some poles to spare. Each set
+is shared out among the terms. For given poles the output is linear in the numerators, which least squares on the output
+error supplies; the set whose output errors are least, each band of frequencies compared with its own noise level, wins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations, islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimation.common import check_record
+from ctid_cli.estimation.pole_relocation import (
+    Lines,
+    find_poles,
+    local_weights,
+    relocate,
+    residual_weights,
+    spectral_lines,
+)
+from ctid_cli.estimation.problems import CoefficientProblem, least_squares_start, refit_numerator
+from ctid_cli.estimation.refined_iv import iterate, scaled_solve
+from ctid_cli.filtering.bank import FilterData, filter_data
+from ctid_cli.filtering.free_response import free_response, free_response_size
+from ctid_cli.filtering.submodels import SubmodelFilter
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.signals.record import Record
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+#: Noise levels within this factor of each other are not worth a second search with other weights.
+NEARLY_WHITE = 2.0
+#: Moves of the poles found, with the noise levels of what they leave.
+WEIGHTED_MOVES = 6
+#: Poles of the transfer function beyond those of the terms, for noise and modes that were not asked for.
+SPARE_POLES = 2
+#: The greatest order of a transfer function that is fitted.
+HIGHEST_ORDER = 12
+#: Cut-offs of the state-variable filter, how many of their estimates are refined, and steps of the refinement.
+CUTOFFS = 6
+REFINED = 3
+REFINEMENT_STEPS = 10
+REFINEMENT_HALVINGS = 4
+REFINEMENT_TOLERANCE = 1e-4
+#: Ways of sharing poles out among terms of different structure that are tried.
+MOST_ARRANGEMENTS = 24
+#: Frequencies of a periodogram that share one noise level.
+BAND = 16
+#: A free response must lower the criterion by this many times what its parameters cost in Schwarz's criterion.
+DECISIVE = 2.0
+#: A complex pair that must give two real poles gives them this factor below and above its magnitude.
+SPLIT = 1.25
+
+
+@dataclass(frozen=True, eq=False)
+class ModalStart:
+    """Where the estimation of a sum of submodels may start."""
+
+    model: AdditiveModel
+    method: str
+
+
+def automatic_start(record: Record, terms: Sequence[Term], delay: float = 0.0) -> ModalStart:
+    r"""Find a start for a sum of submodels.
+
+    Sets of poles are compared by
+
+    .. math:: J = 2 \sum_b n_b \log \frac{1}{n_b} \sum_{k \in b} |E_k|^2,
+
+    where E is the discrete Fourier transform of the output error and b runs over bands of :math:`n_b` neighbouring
+    frequencies: twice the negative logarithm of the likelihood for noise of an unknown level in each band. The plain
+    output error would prefer a mode that follows a few lines of strong coloured noise to a weak one where noise is low.
+
+    Where the record clearly does not start at rest the numerators are fitted together with a free response. In closed
+    loop the measured input is taken as it is: that biases the numbers a little, which a start may be.
+
+    It fails for modes slower than the record or hidden in the noise, and for two modes that no frequency separates.
+    """
+    structure = tuple(terms)
+    if not structure:
+        raise ValueError("terms must list at least one submodel, for example (Term(poles=2, zeros=0),)")
+    # Any distinct poles: a structure that determines no parameters is refused before the search.
+    _with_poles(
+        [[complex(-k - j / 100) for j in range(1, term.poles + 1)] for k, term in enumerate(structure)],
+        structure,
+        delay,
+    )
+    data = filter_data(record, delay)
+    check_record(record, data, sum(term.size for term in structure))
+    fitter = _NumeratorFit(data, structure, delay)
+    best: _Fitted | None = None
+    method = ""
+    sets = list(_pole_sets(record, fitter))
+    for way, poles in sets:
+        for groups in islice(_arrangements(poles, structure), MOST_ARRANGEMENTS):
+            fitted = fitter.fit(groups)
+            if fitted is not None and (best is None or fitted.criterion < best.criterion):
+                best, method = fitted, way
+    if best is None:
+        where = f"{record.name}: " if record.name else ""
+        raise DataError(
+            f"{where}no start was found: {data.count} samples show no modes of the structure asked for; take a longer "
+            "record, fewer poles, or give the start"
+        )
+    text = f"{method}; numerators by least squares on the output error; the best of {len(sets)} sets of poles."
+    if best.free:
+        text += " The record does not start at rest: a free response was fitted along with the numerators."
+    return ModalStart(best.model, text)
+
+
+def _pole_sets(record: Record, fitter: _NumeratorFit) -> Iterator[tuple[str, list[complex]]]:
+    """Candidates for all poles but the integrators, one of each conjugate pair, and how they were found."""
+    terms, delay = fitter.terms, fitter.delay
+    pairs, reals = sum(term.poles // 2 for term in terms), sum(term.poles % 2 for term in terms)
+    integrators = sum(term.integrators for term in terms)
+    n = 2 * pairs + reals
+    if n == 0:
+        yield "No poles to be found", []
+        return
+    lines = spectral_lines(record, delay, integrators, any(term.zeros == term.order for term in terms))
+    # Real and imaginary part of each line for numerators, transients and poles.
+    if lines is not None and 2 * lines.frequencies.size > 3 * n + 2 * integrators + 1:
+        yield "Poles from the spectra of the record, mode by mode", _spectral_poles(lines, pairs, reals)
+        weights = local_weights(lines)
+        if weights.max() > NEARLY_WHITE * weights.min():
+            poles = _spectral_poles(lines.weighted(weights), pairs, reals)
+            yield "Poles from the spectra of the record, mode by mode, weighted by local noise levels", poles
+    order = min(n + integrators + SPARE_POLES, HIGHEST_ORDER)
+    if order >= n + integrators:
+        found = _transfer_function_poles(fitter.data, order, delay)
+        if found is not None:
+            yield f"Poles from a transfer function of order {order}", fitter.reduced(found, n)
+
+
+def _spectral_poles(lines: Lines, pairs: int, reals: int) -> list[complex]:
+    """Poles found with the weights of the lines, then moved with those that their residual asks for."""
+    poles = find_poles(lines, pairs, reals)
+    return relocate(lines.weighted(residual_weights(lines, poles)), poles, WEIGHTED_MOVES)
+
+
+# --- poles of one transfer function ----------------------------------------------------------------
+
+
+def _transfer_function_poles(data: FilterData, order: int, delay: float) -> list[complex] | None:
+    """Poles of the best of a few refined fits; None if there are too few samples or all equations are singular."""
+    structure = Structure(order, order - 1)
+    if data.count <= structure.size:
+        return None
+    problem = CoefficientProblem(data, structure, delay)
+    duration = float(data.t[-1] - data.t[0])
+    fastest = 0.5 * np.pi / float(np.median(np.diff(data.t)))
+    starts: list[tuple[float, Array]] = []
+    for cutoff in np.geomspace(min(4.0 * np.pi / duration, fastest), fastest, CUTOFFS):
+        theta = least_squares_start(data, structure, delay, float(cutoff))
+        if theta is None:
+            continue
+        theta = refit_numerator(data, structure, theta, delay)
+        equations = problem.equations(theta)
+        if equations is not None:
+            starts.append((equations.squared_error, theta))
+    refined: list[tuple[float, Array]] = []
+    for _, theta in sorted(starts, key=lambda start: start[0])[:REFINED]:
+        result = iterate(
+            problem,
+            theta,
+            max_iterations=REFINEMENT_STEPS,
+            tolerance=REFINEMENT_TOLERANCE,
+            variant="guarded",
+            halvings=REFINEMENT_HALVINGS,
+        )
+        if result is not None:
+            refined.append((result.equations.squared_error, result.theta))
+    if not refined:
+        return None
+    theta = min(refined, key=lambda found: found[0])[1]
+    roots = np.roots(np.concatenate(([1.0], theta[:order])))
+    return [complex(root) for root in roots if root.imag >= 0 and root.real < 0]
+
+
+# --- poles to terms --------------------------------------------------------------------------------
+
+
+def _size(poles: Sequence[complex]) -> int:
+    """Number of poles, conjugates counted."""
+    return sum(2 if pole.imag else 1 for pole in poles)
+
+
+def _arrangements(poles: Sequence[complex], terms: Sequence[Term]) -> Iterator[list[list[complex]]]:
+    """Ways of giving each term its poles, conjugates not listed.
+
+    Complex pairs beyond the room of the terms become real poles, and real poles that are left over fill pairs as
+    neighbours. Groups go to the terms by rising frequency, in every order of the different structures.
+    """
+    pairs = sorted((pole for pole in poles if pole.imag), key=abs)
+    reals = sorted((pole for pole in poles if not pole.imag), key=abs)
+    single = sum(term.poles % 2 for term in terms)
+    room = sum(term.poles // 2 for term in terms)
+    while len(pairs) > room:
+        # The best damped pair is nearest to two real poles.
+        pole = pairs.pop(int(np.argmax([-pole.real / abs(pole) for pole in pairs])))
+        reals = sorted([*reals, complex(-abs(pole) / SPLIT), complex(-abs(pole) * SPLIT)], key=abs)
+    if len(reals) < single or len(reals) != single + 2 * (room - len(pairs)):
+        return
+    tried: list[list[list[complex]]] = []
+    for alone in combinations(range(len(reals)), single):
+        rest = [pole for k, pole in enumerate(reals) if k not in alone]
+        doubles = [[pole] for pole in pairs] + [rest[k : k + 2] for k in range(0, len(rest), 2)]
+        doubles.sort(key=lambda group: abs(group[0]))
+        for order in _distinct_orders(terms):
+            two, one = iter(doubles), iter([reals[k] for k in alone])
+            groups: list[list[complex]] = [[] for _ in terms]
+            for k in order:
+                for _ in range(terms[k].poles // 2):
+                    groups[k] += next(two)
+                if terms[k].poles % 2:
+                    groups[k].append(next(one))
+            # Exchanging a term of one pole with one of two changes nothing.
+            if groups not in tried:
+                tried.append(groups)
+                yield groups
+
+
+def _distinct_orders(terms: Sequence[Term]) -> Iterator[list[int]]:
+    """Orders of the terms that differ in structure; equal terms keep theirs."""
+    if not terms:
+        yield []
+        return
+
+    def extended(left: list[int]) -> Iterator[list[int]]:
+        if not left:
+            yield []
+        used: set[Term] = set()
+        for k in left:
+            if terms[k] not in used:
+                used.add(terms[k])
+                for rest in extended([j for j in left if j != k]):
+                    yield [k, *rest]
+
+    yield from extended(list(range(len(terms))))
+
+
+# --- numerators ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """A model with fitted numerators, what it is judged by, and whether a free response was fitted too."""
+
+    model: AdditiveModel
+    criterion: float
+    free: bool
+
+
+class _NumeratorFit:
+    """Numerators for given poles, by linear least squares on the output error."""
+
+    def __init__(self, data: FilterData, terms: tuple[Term, ...], delay: float) -> None:
+        self.data, self.terms, self.delay = data, terms, delay
+
+    def fit(self, groups: Sequence[Sequence[complex]]) -> _Fitted | None:
+        """Fit with given poles of each term; None where they give no valid model or no finite response."""
+        try:
+            model = _with_poles(groups, self.terms, self.delay)
+        except DataError:
+            return None
+        responses = _responses(self.data, model)
+        found = None if responses is None else responses.fit(self.data.y_used)
+        if found is None:
+            return None
+        theta = model.theta
+        theta[_numerator_places(self.terms)] = found.gains
+        return _Fitted(AdditiveModel.from_theta(theta, self.terms, self.delay), found.criterion, found.free)
+
+    def reduced(self, poles: Sequence[complex], count: int) -> list[complex]:
+        """The poles without which the output error would rise most, in all ``count``, conjugates counted."""
+        kept = list(poles)
+        terms = [Term(2, 1) if pole.imag else Term(1, 0) for pole in kept]
+        integrators = sum(term.integrators for term in self.terms)
+        if integrators:
+            terms.append(Term(0, integrators - 1, integrators))
+        if any(term.zeros == term.order for term in self.terms):
+            terms.append(Term(0, 0))
+        groups = [[pole] for pole in kept] + [[] for _ in terms[len(kept) :]]
+        try:
+            responses = _responses(self.data, _with_poles(groups, terms, self.delay))
+        except DataError:
+            responses = None
+        places = list(range(len(kept)))
+
+        def squared_error(left_out: int) -> float:
+            used = [k for k in range(len(terms)) if k >= len(kept) or (k in places and k != left_out)]
+            found = None if responses is None else responses.of(used).fit(self.data.y_used)
+            return np.inf if found is None else found.squared_error
+
+        while (size := _size([kept[k] for k in places])) > count:
+            possible = [k for k in places if size - _size([kept[k]]) >= count]
+            if not possible:
+                # One pole too many and only pairs: the best damped one makes room for a real pole.
+                k = max(places, key=lambda k: -kept[k].real / abs(kept[k]))
+                kept[k] = complex(-abs(kept[k]))
+                continue
+            places.remove(min(possible, key=squared_error))
+        return [kept[k] for k in places]
+
+
+@dataclass(frozen=True, eq=False)
+class _Responses:
+    """What each numerator coefficient and each initial condition contributes to the output, and whose they are."""
+
+    forced: Array
+    free: Array
+    forced_owner: NDArray[np.intp]
+    free_owner: NDArray[np.intp]
+
+    def of(self, owners: Sequence[int]) -> _Responses:
+        """Those of some submodels."""
+        forced, free = np.isin(self.forced_owner, owners), np.isin(self.free_owner, owners)
+        return _Responses(self.forced[:, forced], self.free[:, free], self.forced_owner[forced], self.free_owner[free])
+
+    def fit(self, y: Array) -> _Gains | None:
+        """Numerators, with free responses where they are worth their parameters; None if all is singular."""
+        best: _Gains | None = None
+        for free, columns in ((False, self.forced), (True, np.hstack((self.forced, self.free)))):
+            gram = columns.T @ columns
+            scales = np.diag(gram)
+            solution = scaled_solve(gram, columns.T @ y, scales, scales) if y.size > scales.size else None
+            if solution is None:
+                continue
+            error = y - columns @ solution
+            criterion = _criterion(error) + DECISIVE * free * self.free.shape[1] * np.log(y.size)
+            if best is None or criterion < best.criterion:
+                best = _Gains(solution[: self.forced.shape[1]], criterion, float(error @ error), free)
+        return best
+
+
+@dataclass(frozen=True, eq=False)
+class _Gains:
+    """Numerators in the order of the terms, what they leave, and whether free responses were fitted too."""
+
+    gains: Array
+    criterion: float
+    squared_error: float
+    free: bool
+
+
+def _responses(data: FilterData, model: AdditiveModel) -> _Responses | None:
+    """Responses of a model's submodels; None where one is not finite."""
+    terms = model.terms
+    rows = SubmodelFilter(data, terms, model.delay).rows(model.theta)
+    if rows is None or not np.isfinite(rows[0]).all():
+        return None
+    # Before the delayed input begins, which is where used samples do, nothing is known of the state.
+    elapsed = np.maximum(data.t - data.t[data.use][0], 0.0)
+    response = free_response(model.theta, np.zeros(free_response_size(terms)), terms, elapsed)
+    if response is None:
+        return None
+    return _Responses(
+        rows[0][:, _numerator_places(terms)],
+        response[2][data.use],
+        np.repeat(np.arange(len(terms)), [term.zeros + 1 for term in terms]),
+        np.repeat(np.arange(len(terms)), [term.order for term in terms]),
+    )
+
+
+def _with_poles(groups: Sequence[Sequence[complex]], terms: Sequence[Term], delay: float) -> AdditiveModel:
+    """Model with given poles and numerators 1; DataError if two terms share a pole."""
+    submodels = []
+    for poles, term in zip(groups, terms, strict=True):
+        conjugates = [pole.conjugate() for pole in poles if pole.imag]
+        denominator = np.real(np.poly([*poles, *conjugates])) if poles else np.ones(1)
+        numerator = np.zeros(term.zeros + 1)
+        numerator[-1] = denominator[-1]
+        submodels.append(Submodel(numerator, denominator, term.integrators))
+    return AdditiveModel(submodels, delay)
+
+
+def _numerator_places(terms: Sequence[Term]) -> NDArray[np.intp]:
+    """Places of the numerators' coefficients in theta."""
+    flags = [k >= term.poles for term in terms for k in range(term.size)]
+    return np.flatnonzero(flags)
+
+
+def _criterion(error: Array) -> float:
+    """The criterion J of :func:`automatic_start`."""
+    power = np.abs(np.fft.rfft(error)) ** 2
+    edges = BAND * np.arange(max(power.size // BAND, 1))
+    counts = np.diff(np.append(edges, power.size))
+    means = np.add.reduceat(power, edges) / counts
+    floor = np.finfo(float).tiny
+    return float(2.0 * counts @ np.log(np.maximum(means, floor)))
+
+
+__all__ = ["ModalStart", "automatic_start"]

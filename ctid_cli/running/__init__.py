@@ -1,0 +1,1 @@
+"""From a specification to its estimates: plan, engine, pool and workers."""

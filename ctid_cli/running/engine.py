@@ -1,0 +1,328 @@
+"""Running an experiment: compute what is missing, store it as it comes, seal it at the end.
+
+The same call starts, resumes and re-verifies an experiment. Only this process writes; workers return results. An
+estimate is reported as done after the journal has it safely.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+import warnings
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ctid_cli.errors import DataError, RefusedError, StorageError
+from ctid_cli.running import events
+from ctid_cli.running.stopping import StopRequest
+from ctid_cli.running.worker import Job, Outcome
+from ctid_cli.storage import folder as place
+from ctid_cli.storage import journal
+from ctid_cli.storage.manifest import FAILURES, Key, Manifest, Slot, assemble, build_manifest, slots
+from ctid_cli.storage.provenance import now, session_info
+from ctid_cli.storage.store import seal
+from ctid_cli.storage.version import Origin, current_origin
+
+if TYPE_CHECKING:
+    from ctid_cli.running.plan import Plan
+
+#: Finished data sets are committed after this time [s], or when there are this many of them.
+COMMIT_SECONDS = 0.2
+COMMIT_DATA_SETS = 50
+
+_EXIT_CODES = {None: 0, "SIGINT": 130, "SIGTERM": 143, "stop": 5}
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """How a run ended."""
+
+    experiment: str
+    folder: Path
+    planned: int
+    reused: int
+    computed: int
+    failed: int
+    left_aside: int
+    mixed: bool
+    moved_aside: Path | None
+    #: Duration [s].
+    seconds: float
+    stopped_by: str | None
+
+    @property
+    def missing(self) -> int:
+        """Estimates that are still to be computed."""
+        return self.planned - self.reused - self.computed
+
+    @property
+    def exit_code(self) -> int:
+        """What a command should answer: 0 if everything is stored, 130 or 143 after a signal, 5 after another stop."""
+        return _EXIT_CODES[self.stopped_by]
+
+
+def run_experiment(
+    plan: Plan,
+    folder: Path,
+    *,
+    jobs: int | None = None,
+    on_event: events.OnEvent = events.ignore,
+    fresh: bool = False,
+    allow_mixed: bool = False,
+    stop: threading.Event | None = None,
+    warm: Callable[[], float] | None = None,
+) -> RunSummary:
+    """Compute the missing estimates of a plan and seal all of them."""
+    begun = time.monotonic()
+    origin = current_origin()
+    with StopRequest(stop) as stopping, ExitStack() as stack:
+        peek = _look(plan, folder, origin, fresh=fresh, allow_mixed=allow_mixed)
+        todo = _jobs(plan, peek)
+        if todo:
+            on_event(events.KernelsCompiling())
+            on_event(events.KernelsCompiled(warm() if warm else _compile_kernels(plan)))
+            _check_first_records(todo)
+        moved = place.move_aside(folder) if fresh else None
+        _make(folder)
+        stack.enter_context(place.lock(folder))
+        # Another run may have come between.
+        place.check_free(folder, plan.experiment, origin, allow_mixed=allow_mixed)
+        try:
+            log = journal.open_journal(folder / journal.FILE_NAME)
+        except StorageError as error:
+            raise StorageError(f"{error}. {place.what_is_safe(folder)}") from error
+        stack.callback(log.close)
+        run = _Run(plan, folder, log, origin, on_event, jobs or usable_processors())
+        stack.callback(run.cleanup)
+        run.start()
+        run.compute(stopping)
+        run.finish(stopping.reason)
+        return run.summary(stopping.reason if run.missing else None, moved, time.monotonic() - begun)
+
+
+def usable_processors() -> int:
+    """Number of processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+class _Run:
+    """One run, from the first entry in the journal to the sealed file."""
+
+    def __init__(
+        self, plan: Plan, folder: Path, log: journal.Journal, origin: Origin, on_event: events.OnEvent, jobs: int
+    ) -> None:
+        self.plan, self.folder, self.log, self.origin = plan, folder, log, origin
+        self.on_event, self.workers = on_event, jobs
+        self.manifest: Manifest = build_manifest(plan)
+        self.slots: dict[Key, list[Slot]] = defaultdict(list)
+        for slot in slots(self.manifest):
+            self.slots[slot.key].append(slot)
+        stored = log.keys()
+        self.reused = len(self.slots.keys() & stored)
+        self.left_aside = len(stored - self.slots.keys())
+        self.jobs = _jobs(plan, stored)
+        self.computed = self.done = self.failed = 0
+        self.mixed = False
+        self.started = now()
+        self.info: dict[str, Any] = {}
+        self.session = 0
+
+    @property
+    def missing(self) -> int:
+        return len(self.slots) - self.reused - self.computed
+
+    def start(self) -> None:
+        spec = self.plan.spec
+        try:
+            _write_if_new(self.folder / place.SPEC, spec.text.encode())
+            canonical = json.dumps(spec.canonical(), sort_keys=True, indent=2, allow_nan=False, ensure_ascii=False)
+            _write_if_new(self.folder / place.CANONICAL, f"{canonical}\n".encode())
+            (self.folder / place.PROVENANCE).mkdir(exist_ok=True)
+        except OSError as error:
+            raise _cannot_write(self.folder, error) from error
+        self.info = session_info(spec.text, spec.folder, self.origin, self.workers)
+        self.session = self.log.begin(self.manifest, self.origin, self.started, self.info)
+        self._announce()
+        self.on_event(
+            events.PlanReady(
+                self.plan.experiment, self.folder, len(self.jobs), self.missing, self.reused, self.left_aside
+            )
+        )
+
+    def compute(self, stopping: StopRequest) -> None:
+        from ctid_cli.running.pool import Died, Finished, kill_workers, run_jobs
+
+        unfinished = {(job.cell.hash, job.replicate): len(job.wanted) for job in self.jobs}
+        batch: list[Finished] = []
+        since = time.monotonic()
+        told = False
+        try:
+            for item in run_jobs(self.jobs, self.workers, stopping):
+                if stopping() and not told:
+                    told = True
+                    self.on_event(events.Stopping(stopping.reason or ""))
+                if isinstance(item, Died):
+                    self.on_event(events.WorkerDied(item.jobs, item.reason))
+                elif isinstance(item, Finished):
+                    batch.append(item)
+                late = time.monotonic() - since >= COMMIT_SECONDS
+                if batch and (late or len(batch) >= COMMIT_DATA_SETS):
+                    self._commit(batch, unfinished)
+                    batch = []
+                if late:
+                    since = time.monotonic()
+            if batch:
+                self._commit(batch, unfinished)
+        except BaseException:
+            kill_workers()
+            raise
+
+    def _commit(self, batch: list[Any], unfinished: dict[tuple[str, int], int]) -> None:
+        self.log.add([outcome for item in batch for outcome in item.outcomes], self.session)
+        for item in batch:
+            data_set = (item.job.cell.hash, item.job.replicate)
+            unfinished[data_set] -= len(item.outcomes)
+            self.done += unfinished[data_set] == 0
+            self.computed += len(item.outcomes)
+            rows = tuple(row for outcome in item.outcomes for row in self._rows(outcome))
+            self.on_event(events.DataSetDone(self.done, len(self.jobs), rows))
+        self._announce()
+
+    def _rows(self, outcome: Outcome) -> list[Mapping[str, Any]]:
+        return [assemble(slot, self.manifest, outcome.result, outcome.seconds) for slot in self.slots[outcome.key]]
+
+    def _announce(self) -> None:
+        place.announce(self.folder, self.plan.experiment, self.started, self.done, len(self.jobs))
+
+    def finish(self, reason: str | None) -> None:
+        self.on_event(seal(self.folder, self.log))
+        statuses = self.log.statuses()
+        self.failed = sum(statuses.get(key) in FAILURES for key in self.slots)
+        self.mixed = len(self.log.origins()) > 1
+        stopped = now()
+        ended = "finished" if not self.missing else reason or "unfinished"
+        self.log.end(self.session, stopped, ended)
+        counts = {"planned": len(self.slots), "reused": self.reused, "computed": self.computed, "failed": self.failed}
+        about = {"session": self.session, "started": self.started, "stopped": stopped, "reason": ended, **counts}
+        text = json.dumps(about | self.info, indent=2, ensure_ascii=False)
+        name = f"{self.session:04d}-{self.started.replace(':', '').replace('-', '')}.json"
+        try:
+            place.write_safely(self.folder / place.PROVENANCE / name, f"{text}\n".encode())
+        except OSError as error:
+            raise _cannot_write(self.folder, error) from error
+
+    def cleanup(self) -> None:
+        with suppress(OSError):
+            (self.folder / place.RUNNING).unlink(missing_ok=True)
+
+    def summary(self, stopped_by: str | None, moved: Path | None, seconds: float) -> RunSummary:
+        return RunSummary(
+            self.plan.experiment,
+            self.folder,
+            len(self.slots),
+            self.reused,
+            self.computed,
+            self.failed,
+            self.left_aside,
+            self.mixed,
+            moved,
+            seconds,
+            stopped_by,
+        )
+
+
+def preview(plan: Plan, folder: Path, *, fresh: bool = False, allow_mixed: bool = False) -> events.PlanReady:
+    """What a run would do, without doing or writing anything."""
+    stored = _look(plan, folder, current_origin(), fresh=fresh, allow_mixed=allow_mixed)
+    planned = {slot.key for slot in slots(build_manifest(plan))}
+    reused = len(planned & stored)
+    return events.PlanReady(
+        plan.experiment, folder, len(_jobs(plan, stored)), len(planned) - reused, reused, len(stored - planned)
+    )
+
+
+def _look(plan: Plan, folder: Path, origin: Origin, *, fresh: bool, allow_mixed: bool) -> set[Key]:
+    """Which estimates are stored in a folder that this plan may be run into."""
+    if fresh or not folder.exists():
+        return set()
+    with place.lock(folder, shared=True):
+        place.check_free(folder, plan.experiment, origin, allow_mixed=allow_mixed)
+        with place.reading_journal(folder) as log:
+            return set() if log is None else log.keys()
+
+
+def _jobs(plan: Plan, stored: set[Key]) -> list[Job]:
+    """The data sets of which estimates are missing, in the order of the plan."""
+    seed = (plan.spec.canonical().get("monte_carlo") or {}).get("seed")
+    terms = plan.terms
+    jobs = []
+    for task in plan.tasks():
+        wanted = {}
+        for key, estimator, start in plan.keys(task):
+            # Two names for the same estimator share their estimates.
+            if key not in stored and key not in wanted:
+                wanted[key] = (key, estimator, start)
+        if wanted:
+            jobs.append(Job(plan.data_cells[task.cell], task.replicate, seed, tuple(wanted.values()), terms))
+    return jobs
+
+
+def _check_first_records(jobs: list[Job]) -> None:
+    """Refuse a plan whose first data sets no estimator can use, before anything is written.
+
+    One record in a thousand that cannot be used is a result; the very first one is a mistake in the specification.
+    """
+    for job in jobs:
+        if job.replicate:
+            continue
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                data = job.cell.dataset(job.replicate)
+                for estimator in {id(cell): cell for _, cell, _ in job.wanted}.values():
+                    estimator.estimator.prepare(data.record)
+        except DataError:
+            raise
+        except Exception:
+            # Any other failure is for the worker to record, with its place in the code.
+            continue
+
+
+def _compile_kernels(plan: Plan) -> float:
+    from ctid_cli.estimation.compilation import compile_kernels
+    from ctid_cli.simulation.frequency_runs import FrequencyEstimation, SignalSource
+
+    source = plan.data_cells[0].source
+    if not isinstance(source, SignalSource):
+        return compile_kernels(cell.estimator for cell in plan.estimators)
+    begun = time.perf_counter()
+    for cell in plan.estimators:
+        if isinstance(cell.estimator, FrequencyEstimation):
+            cell.estimator.compile(source.sampling.interval)
+    return time.perf_counter() - begun
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _cannot_write(folder, error) from error
+    if not folder.is_dir():
+        raise RefusedError(f"{folder} is a file, not a folder")
+
+
+def _write_if_new(path: Path, data: bytes) -> None:
+    if not path.exists() or path.read_bytes() != data:
+        place.write_safely(path, data)
+
+
+def _cannot_write(folder: Path, error: OSError) -> StorageError:
+    return StorageError(f"{folder} cannot be written ({error.strerror or error}); stored estimates are untouched")

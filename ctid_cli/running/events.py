@@ -1,0 +1,77 @@
+"""What a run reports while it goes on; whoever started it decides how to show it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+#: One estimate as plain data, with the keys documented in `ctid_cli.storage.manifest`.
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class PlanReady:
+    """The run is about to start."""
+
+    experiment: str
+    folder: Path
+    data_sets: int
+    estimates: int
+    reused: int
+    left_aside: int
+
+
+@dataclass(frozen=True)
+class KernelsCompiling:
+    """The compiled kernels are being made, or loaded from the cache on disk; the first time takes a while."""
+
+
+@dataclass(frozen=True)
+class KernelsCompiled:
+    """The compiled kernels are ready."""
+
+    #: How long that took [s].
+    seconds: float
+
+
+@dataclass(frozen=True)
+class DataSetDone:
+    """The estimates of one data set are safely stored."""
+
+    done: int
+    total: int
+    rows: tuple[Row, ...]
+
+
+@dataclass(frozen=True)
+class WorkerDied:
+    """A worker process died; its data sets are repeated one at a time to find out which of them did it."""
+
+    data_sets: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """The run was asked to stop; what is finished is being stored."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Sealed:
+    """The estimates were written to one file, which was read back and compared."""
+
+    file: Path
+    estimates: int
+    checksum: str
+
+
+Event = PlanReady | KernelsCompiling | KernelsCompiled | DataSetDone | WorkerDied | Stopping | Sealed
+OnEvent = Callable[[Event], None]
+
+
+def ignore(event: Event) -> None:
+    """Take no notice of an event."""

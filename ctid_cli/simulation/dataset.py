@@ -1,0 +1,199 @@
+"""Data sets: the record that estimators are given, and what is known besides."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.errors import DataError
+from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.csv_file import Offset, read_held_signal, read_record
+from ctid_cli.signals.excitation import Excitation, InputFile
+from ctid_cli.signals.held import HeldSignal, Hold
+from ctid_cli.signals.noise import Noise
+from ctid_cli.signals.record import Enters, Loop, Record, regular_interval
+from ctid_cli.signals.sampling import Sampling
+from ctid_cli.signals.streams import stream
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """What closes a loop around a system."""
+
+    controller: DiscreteController
+    reference: Excitation | None = None
+    enters: Enters = "controller"
+
+
+@dataclass(frozen=True, eq=False)
+class DataSet:
+    """A record and what is known of its origin."""
+
+    record: Record
+    true_model: TransferFunction | AdditiveModel | None = None
+    validation: Record | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedSource:
+    """Data sets from a simulated system."""
+
+    system: TransferFunction | AdditiveModel
+    excitation: Excitation | None
+    sampling: Sampling
+    noise: Noise | None
+    seed: int
+    input_sha256: str | None = None
+    loop: LoopOptions | None = None
+
+    def dataset(self, replicate: int) -> DataSet:
+        """One realisation."""
+        generator = self.excitation if self.loop is None else self.loop.reference
+        if isinstance(generator, InputFile) and self.input_sha256 is not None:
+            require_content(generator.file, self.input_sha256)
+        assert generator is not None
+        times = self.sampling.times(stream(self.seed, "sampling", replicate))
+        applied = generator.generate(times, stream(self.seed, "input", replicate))
+        if self.loop is not None:
+            return DataSet(self._record_in(self.loop, times, applied.at(times), replicate), true_model=self.system)
+        output = self._simulated(applied, times)
+        known = applied
+        if self.sampling.input_record == "sampled":
+            known = HeldSignal(times, applied.at(times), applied.hold)
+        record = Record(times, output + self._drawn(output, replicate), known, noise_free=output)
+        return DataSet(record, true_model=self.system)
+
+    def _simulated(self, applied: HeldSignal, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        from ctid_cli.filtering.sampled import simulate_additive
+        from ctid_cli.filtering.simulate import simulate
+
+        if isinstance(self.system, AdditiveModel):
+            return simulate_additive(self.system, applied, times)
+        return simulate(self.system, applied, times)
+
+    def _record_in(
+        self, loop: LoopOptions, times: NDArray[np.float64], reference: NDArray[np.float64], replicate: int
+    ) -> Record:
+        from ctid_cli.filtering.loop import simulate_loop
+
+        interval = regular_interval(times)
+        if interval is None:
+            raise DataError("a closed loop needs a regular clock, since its controller acts at every sample")
+        # The noise comes before the output, because the output answers to it.
+        noise = self._drawn(np.zeros(times.size), replicate)
+        u, x = simulate_loop(self.system, loop.controller, reference, noise, interval, loop.enters)
+        closed = Loop(reference, loop.controller, loop.enters)
+        return Record(times, x + noise, HeldSignal(times, u), noise_free=x, loop=closed)
+
+    def _drawn(self, output: NDArray[np.float64], replicate: int) -> NDArray[np.float64]:
+        if self.noise is None:
+            return np.zeros(output.size)
+        return self.noise.generate(output, stream(self.seed, "noise", replicate))
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredSource:
+    """The data set of a measured record."""
+
+    file: str
+    sha256: str
+    #: Columns of the instants [s], the input [input unit] and the output [output unit].
+    time: str = "t"
+    input: str = "u"
+    output: str = "y"
+    hold: Hold = "zoh"
+    offset: Offset = "none"
+    estimation_samples: int | None = None
+    reference: str | None = None
+    loop: LoopOptions | None = None
+
+    def dataset(self, replicate: int) -> DataSet:
+        """The record."""
+        if replicate != 0:
+            raise ValueError(f"a measured record has replicate 0 only, not {replicate}")
+        require_content(self.file, self.sha256)
+        whole = read_record(self.file, time=self.time, input=self.input, output=self.output, hold=self.hold)
+        t, u, y = whole.t, whole.input.values, whole.y
+        count = t.size if self.estimation_samples is None else self.estimation_samples
+        if count > t.size:
+            raise DataError(f"{self.file}: {count} samples are asked for and the file has {t.size}")
+        if not np.isfinite(y[:count]).any():
+            raise DataError(f"{self.file}: none of the {count} output samples used for estimation is a finite number")
+        if np.ptp(u[:count]) == 0.0:
+            raise DataError(
+                f"{self.file}: the input {self.input!r} is constant ({u[0]:g}) over the {count} samples used for "
+                "estimation; it excites nothing to identify"
+            )
+        r = self._reference()
+        if self.offset == "remove":
+            # The remaining samples must not have a say in what the model is made of.
+            u = u - u[:count].mean()
+            y = y - np.nanmean(y[:count])
+            r = None if r is None else r - r[:count].mean()
+        # Without its folder: what an estimator says about the record is part of the results.
+        name = Path(self.file).name
+        loop = None
+        if r is not None and self.loop is not None:
+            loop = Loop(r[:count], self.loop.controller, self.loop.enters)
+        record = Record(t[:count], y[:count], HeldSignal(t[:count], u[:count], self.hold), name=name, loop=loop)
+        if count == t.size:
+            return DataSet(record)
+        rest = np.where(np.arange(t.size) < count, np.nan, y)
+        if not np.isfinite(rest).any():
+            return DataSet(record)
+        return DataSet(record, validation=Record(t, rest, HeldSignal(t, u, self.hold), name=name))
+
+    def _reference(self) -> NDArray[np.float64] | None:
+        if self.reference is None:
+            return None
+        return read_held_signal(self.file, time=self.time, input=self.reference).values
+
+
+Source = SimulatedSource | MeasuredSource
+
+
+def joined(folder: Path, file: str) -> str:
+    """Name of a file as seen from the working directory."""
+    return Path(os.path.normpath(folder / file)).as_posix()
+
+
+def located(options: Any, folder: Path) -> Any:
+    """An excitation with the name of its file, if it reads one, as seen from the working directory."""
+    if not isinstance(options, InputFile):
+        return options
+    return dataclasses.replace(options, file=joined(folder, options.file))
+
+
+def file_sha256(path: str) -> str:
+    """Content hash of a file."""
+    try:
+        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    except FileNotFoundError:
+        message = f"{path}: there is no such file; names are relative to the folder of the specification"
+        raise DataError(message) from None
+    except OSError as error:
+        raise DataError(f"{path}: the file cannot be read: {error.strerror or error}") from None
+
+
+def require_content(path: str, sha256: str) -> None:
+    """Refuse a file that is not the one that an experiment was planned with."""
+    found = file_sha256(path)
+    if found != sha256:
+        raise DataError(
+            f"{path}: the content (SHA-256 {found[:12]}…) is not that which the experiment was planned with "
+            f"({sha256[:12]}…); restore the file, or run the changed one as an experiment of its own"
+        )
+
+
+def check_input_file(options: Any) -> None:
+    """Refuse the file of an excitation if it cannot be read."""
+    read_held_signal(options.file, time=options.time, input=options.input, hold=options.hold)

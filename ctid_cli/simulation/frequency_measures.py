@@ -1,0 +1,194 @@
+"""What is measured of frequencies over time against the true ones, and how tracks are stored.
+
+Names of the measures, each with the number of the tone behind it where it is one number per tone, by rising frequency:
+
+- ``omega_1``: last estimate [rad/s];
+- ``valid_from``: first instant of a valid estimate [s];
+- ``settling_time_1``: when the error came into the band to stay there to the end, or to the first step of a frequency
+  [s]; ``settling_after_step_1``: the same from the last step of a frequency to the end, counted from the step [s].
+  They have no value if that never happened. Flags do not matter; an estimate that begins at the truth has settled at 0;
+- ``rms_1``, ``bias_1``: root mean square and mean of the error over the window [rad/s];
+- ``false_alarms``: alarms with no step of a frequency or an amplitude in the last two periods of the lowest frequency,
+  of trackers that raise any;
+- ``valid_share``: share of the record with a valid estimate [%].
+
+An estimate of a whole record has ``omega``, ``rms`` and ``bias`` of this one error, and ``valid_share`` 0 or 100.
+"""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.signals.multi_sine import Disturbance, MultiSine, SineDisturbance
+
+if TYPE_CHECKING:
+    from ctid_cli.frequency.tracking import FrequencyEstimate, FrequencyTrack
+
+Array = NDArray[np.float64]
+
+#: Units of the measures, in the order of columns.
+MEASURE_UNITS = {
+    "omega": "rad/s",
+    "valid_from": "s",
+    "settling_time": "s",
+    "settling_after_step": "s",
+    "rms": "rad/s",
+    "bias": "rad/s",
+    "false_alarms": "-",
+    "valid_share": "%",
+}
+#: An alarm within so many periods of the lowest frequency after a step answers to it.
+ALARM_PERIODS = 2.0
+#: Length of the window of rms and bias, before the end of the record, if none is given [s].
+USUAL_WINDOW = 10.0
+#: Kinds of trackers that raise alarms.
+_ALARMING = ("restarting_least_squares",)
+
+
+@dataclass(frozen=True)
+class Measuring:
+    """What is measured of every estimate, and which tracks are stored."""
+
+    #: Largest error of a settled frequency [rad/s]; without it no settling times are measured.
+    band: float | None = None
+    #: First and last instant of the window of rms and bias [s]; the last 10 s if not given.
+    window: tuple[float, float] | None = None
+    #: Time from one row of a stored track to the next [s]; None stores none.
+    interval: float | None = None
+    runs: int = 0
+
+
+def true_frequencies(signal: MultiSine, disturbance: Disturbance | None, tones: int, times: Array) -> Array:
+    """The frequencies that an estimator of so many tones should find."""
+    true = signal.frequencies_at(times)
+    if tones == true.shape[1] + 1 and isinstance(disturbance, SineDisturbance):
+        true = np.sort(np.column_stack((true, np.full(true.shape[0], disturbance.frequency))), axis=1)
+    if tones != true.shape[1]:
+        raise ValueError(f"tones must be {true.shape[1]}, as many as the signal has, not {tones}.")
+    return true
+
+
+def measure_track(
+    track: FrequencyTrack, true: Array, signal: MultiSine, measuring: Measuring, options: Any
+) -> dict[str, float | None]:
+    """Measure the estimates of an online estimator."""
+    t, errors, valid = track.t, track.omega - true, track.valid
+    count = errors.shape[1]
+    found: dict[str, float | None] = _numbered("omega", track.omega[-1])
+    found["valid_from"] = float(t[np.argmax(valid)]) if valid.any() else None
+    if measuring.band is not None:
+        steps = [float(step) for step in signal.frequency_steps]
+        # The first sample of a piece may come before the instant of the step by a rounding error.
+        places = [0, *(int(np.searchsorted(t, step * (1.0 - 1e-9))) for step in steps), t.size]
+        inside = np.abs(errors) <= measuring.band
+        for k in range(count):
+            found[f"settling_time_{k + 1}"] = _settling(inside[:, k], t, 0, places[1], 0.0)
+            if steps:
+                after = _settling(inside[:, k], t, places[-2], places[-1], steps[-1])
+                found[f"settling_after_step_{k + 1}"] = after
+    chosen = errors[_in_window(t, measuring.window)]
+    found |= _numbered("rms", np.sqrt(np.mean(chosen**2, axis=0)))
+    found |= _numbered("bias", np.mean(chosen, axis=0))
+    if options.kind in _ALARMING:
+        found["false_alarms"] = float(_false_alarms(track, signal))
+    found["valid_share"] = 100.0 * float(np.mean(valid))
+    return {name: found[name] for name in measure_names([found])}
+
+
+def measure_estimate(estimate: FrequencyEstimate, true: Array, window: tuple[float, float] | None, times: Array) -> Any:
+    """Measure the estimate of a whole record."""
+    error = estimate.omega - true[_in_window(times, window)].mean(axis=0)
+    found: dict[str, float | None] = _numbered("omega", estimate.omega)
+    found |= _numbered("rms", np.abs(error)) | _numbered("bias", error)
+    return found | {"valid_share": 100.0 if estimate.valid else 0.0}
+
+
+def measure_names(rows: Iterable[Mapping[str, Any] | None]) -> list[str]:
+    """Names of the measures that any estimate has, in the order of columns."""
+    order = list(MEASURE_UNITS)
+
+    def place(name: str) -> tuple[int, int]:
+        base, tone = base_name(name)
+        return order.index(base), tone
+
+    return sorted({name for row in rows if row for name in row}, key=place)
+
+
+def base_name(name: str) -> tuple[str, int]:
+    """A measure without the number of its tone, and that number."""
+    base, _, tone = name.rpartition("_")
+    return (base, int(tone)) if tone.isdigit() else (name, 0)
+
+
+def is_settled(measures: Mapping[str, float | None] | None, band: float, by: float | None) -> bool:
+    """Whether all frequencies came into the band in time and stayed there."""
+    if not measures:
+        return False
+    times = [value for name, value in measures.items() if name.startswith("settling_")]
+    if times:
+        return all(time is not None and (by is None or time <= by) for time in times)
+    errors = [value for name, value in measures.items() if base_name(name)[0] == "rms"]
+    return all(error is not None and error <= band for error in errors)
+
+
+def thinned(track: FrequencyTrack, interval: float, sampling_interval: float) -> FrequencyTrack:
+    """Every so many rows of a track."""
+    every = max(1, round(interval / sampling_interval))
+    return type(track)(track.t[::every], track.omega[::every], track.flags[::every], track.uncertainty[::every])
+
+
+def pack_track(track: FrequencyTrack) -> dict[str, Any]:
+    """A track as plain data."""
+    columns = {"t": track.t, "omega": track.omega, "flags": track.flags, "uncertainty": track.uncertainty}
+    kinds = {"t": "<f8", "omega": "<f8", "flags": "<u2", "uncertainty": "<f4"}
+    packed = {}
+    for name, values in columns.items():
+        array = np.ascontiguousarray(values, dtype=kinds[name])
+        data = base64.b64encode(zlib.compress(array.tobytes())).decode("ascii")
+        packed[name] = {"kind": kinds[name], "shape": list(array.shape), "data": data}
+    return packed
+
+
+def unpack_track(packed: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """The columns of a packed track."""
+    return {
+        name: np.frombuffer(zlib.decompress(base64.b64decode(part["data"])), part["kind"]).reshape(part["shape"])
+        for name, part in packed.items()
+    }
+
+
+def _numbered(name: str, values: Array) -> dict[str, float | None]:
+    return {f"{name}_{k + 1}": float(value) if np.isfinite(value) else None for k, value in enumerate(values)}
+
+
+def _settling(inside: NDArray[np.bool_], t: Array, first: int, last: int, since: float) -> float | None:
+    outside = np.flatnonzero(~inside[first:last])
+    if not outside.size:
+        place = first
+    else:
+        place = first + int(outside[-1]) + 1
+    # A difference of instants, without the last digits of either.
+    return None if place == last else max(0.0, round(float(t[place] - since), 9))
+
+
+def _in_window(t: Array, window: tuple[float, float] | None) -> NDArray[np.bool_]:
+    low, high = (t[-1] - USUAL_WINDOW, t[-1]) if window is None else window
+    slack = 1e-9 * max(1.0, abs(high))
+    return np.asarray((t >= low - slack) & (t <= high + slack))
+
+
+def _false_alarms(track: FrequencyTrack, signal: MultiSine) -> int:
+    from ctid_cli.frequency.flags import Flag
+
+    alarm = (track.flags & int(Flag.CHANGED)) != 0
+    begins = track.t[np.flatnonzero(alarm & ~np.concatenate(([False], alarm[:-1])))]
+    steps = np.array(signal.steps)
+    graces = ALARM_PERIODS * 2.0 * np.pi / signal.frequencies_at(steps)[:, 0]
+    return sum(not ((steps <= begin + 1e-9) & (begin <= steps + graces)).any() for begin in begins)

@@ -1,0 +1,313 @@
+"""YAML read without its traps, and with the place of every key and value.
+
+The composer of PyYAML does the syntax; the values are built here, because the tree of nodes is the only thing that
+knows lines and columns. A plain scalar is
+
+- ``null`` if it is empty, ``~`` or ``null``,
+- a boolean if it is exactly ``true`` or ``false`` (``no``, ``on``, ``True`` are text),
+- a whole number if it is decimal digits with an optional sign (``010`` is ten),
+- a number if it looks like one, exponents without a point included (``1e-3``), and ``.inf`` or ``.nan``,
+- text otherwise: dates, ``1:30``, ``0x1F`` and ``1_000`` too.
+
+Merge keys (``<<``) are refused: which of two places a merged key comes from is a riddle for the reader, and a plain
+alias (``b: *a``) says the same openly.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ctid_cli.errors import Problem, SpecError, UsageError
+
+#: Keys and list indices that lead from the top of a file to a value.
+KeyPath = tuple[str | int, ...]
+
+#: A specification is written by hand; anything larger is some other file, or an alias that multiplies itself.
+MAX_BYTES = 1_000_000
+MAX_VALUES = 100_000
+
+#: What stands for the name of the file in problems with a ``--set`` option.
+OVERRIDE_FILE = "--set"
+
+_TAG = "tag:yaml.org,2002:"
+_SCALARS: dict[str, re.Pattern[str]] = {
+    "null": re.compile(r"(?:~|null|Null|NULL|)\Z"),
+    "bool": re.compile(r"(?:true|false)\Z"),
+    "int": re.compile(r"[-+]?[0-9]+\Z"),
+    "float": re.compile(
+        r"(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))\Z"
+    ),
+}
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader with our own table of plain scalars instead of YAML 1.1's."""
+
+    # A fresh table: add_implicit_resolver would copy, and so keep, the parent's rules.
+    yaml_implicit_resolvers: dict[str | None, list[tuple[str, re.Pattern[str]]]] = {  # noqa: RUF012
+        None: [(_TAG + name, pattern) for name, pattern in _SCALARS.items()]
+    }
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a key or value stands."""
+
+    file: str
+    line: int
+    column: int
+
+
+@dataclass
+class YamlSource:
+    """The values of a YAML text and where each of them stands."""
+
+    file: str
+    tree: Any = None
+    keys: dict[KeyPath, Place] = field(default_factory=dict)
+    values: dict[KeyPath, Place] = field(default_factory=dict)
+
+    def place(self, path: KeyPath, *, key: bool = False) -> Place:
+        """Where a problem with a key path is to be reported."""
+        while path and path not in self.values:
+            path, key = path[:-1], True
+        if path in self.keys and (key or isinstance(self.value(path), dict)):
+            return self.keys[path]
+        return self.values.get(path, Place(self.file, 1, 1))
+
+    def value(self, path: KeyPath) -> Any:
+        """The value at a key path, or None where there is none."""
+        node = self.tree
+        for part in path:
+            try:
+                node = node[part]
+            except (KeyError, IndexError, TypeError):
+                return None
+        return node
+
+    def problem(self, path: KeyPath, message: str, *, key: bool = False) -> Problem:
+        """A problem at a key path."""
+        place = self.place(path, key=key)
+        return Problem(place.file, place.line, place.column, path_text(path), message)
+
+
+def path_text(path: KeyPath) -> str:
+    """A key path as users write it."""
+    text = ""
+    for part in path:
+        text += f"[{part}]" if isinstance(part, int) else f"{'.' if text else ''}{part}"
+    return text
+
+
+def did_you_mean(word: str, allowed: Iterable[str]) -> str:
+    """A hint at the allowed word that was probably meant."""
+    close = difflib.get_close_matches(word, list(allowed), n=1, cutoff=0.6)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def read_yaml(path: Path) -> YamlSource:
+    """Read a YAML file."""
+    if path.is_dir():
+        raise UsageError(f"{path}: this is a folder; name the YAML file in it")
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise UsageError(f"{path}: there is no such file") from None
+    except OSError as error:
+        raise UsageError(f"{path}: the file cannot be read: {error.strerror or error}") from None
+    if len(data) > MAX_BYTES:
+        raise UsageError(f"{path}: {len(data)} bytes are too many for a specification (at most {MAX_BYTES})")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        column = error.start - (data.rfind(b"\n", 0, error.start) + 1) + 1
+        problem = Problem(str(path), line, column, "", "the file is not UTF-8 text; save it as UTF-8")
+        raise SpecError([problem]) from None
+    return parse_yaml(text, str(path))
+
+
+def parse_yaml(text: str, file: str, *, line: int = 1, column: int = 1) -> YamlSource:
+    """Values and places of a YAML text."""
+    builder = _Builder(file, line - 1, column - 1)
+    try:
+        root = yaml.compose(text, Loader=_Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        if error.context_mark is not None and "end" in (error.problem or "") and "stream" in (error.problem or ""):
+            mark = error.context_mark  # what was never closed is of more use than the end of the file
+        raise SpecError([builder.problem(mark, (), _syntax_message(error))]) from None
+    except yaml.reader.ReaderError as error:
+        before = text[: error.position]
+        place = Place(file, line + before.count("\n"), error.position - (before.rfind("\n") + 1) + 1)
+        message = f"the character {_character(error.character)} is not allowed in YAML"
+        raise SpecError([Problem(file, place.line, place.column, "", message)]) from None
+    except RecursionError:
+        raise SpecError([Problem(file, line, column, "", "lists or mappings are nested too deeply")]) from None
+    if root is not None:
+        builder.source.tree = builder.build(root, (), ())
+    if builder.problems:
+        raise SpecError(builder.problems)
+    return builder.source
+
+
+def apply_overrides(source: YamlSource, overrides: Iterable[str]) -> None:
+    """Change values of a tree as ``--set a.b=value`` asks."""
+    problems: list[Problem] = []
+    for number, override in enumerate(overrides, start=1):
+        try:
+            _apply_override(source, override, number)
+        except SpecError as error:
+            problems += error.problems
+    if problems:
+        raise SpecError(problems)
+
+
+def _apply_override(source: YamlSource, override: str, number: int) -> None:
+    key, equals, text = override.partition("=")
+    path: KeyPath = tuple(part.strip() for part in key.split("."))
+
+    def refuse(message: str) -> SpecError:
+        return SpecError([Problem(OVERRIDE_FILE, number, 1, key.strip(), f"{message} (in --set {override!r})")])
+
+    if not equals or not all(path):
+        raise refuse("an override is written key.path=value, for example noise.snr_db=[5,15]")
+    column = len(key) + 2
+    value = parse_yaml(text, OVERRIDE_FILE, line=number, column=column)
+    if not isinstance(source.tree, dict):
+        raise refuse("there is no mapping in the file to set this in")
+    node = source.tree
+    for depth, part in enumerate(path[:-1], start=1):
+        if part not in node and path[0] == "estimators" and depth == 2:
+            known = ", ".join(sorted(node)) or "none"
+            raise refuse(f"there is no estimator {part!r}{did_you_mean(str(part), node)} Estimators here: {known}")
+        if node.setdefault(part, {}) is None:
+            node[part] = {}
+        node = node[part]
+        if not isinstance(node, dict):
+            raise refuse(f"{path_text(path[:depth])} is not a mapping, so nothing can be set inside it")
+        source.keys.setdefault(path[:depth], Place(OVERRIDE_FILE, number, 1))
+        source.values.setdefault(path[:depth], Place(OVERRIDE_FILE, number, 1))
+    node[path[-1]] = value.tree
+    for places in (source.keys, source.values):
+        for old in [p for p in places if p[: len(path)] == path]:
+            del places[old]
+    source.keys[path] = Place(OVERRIDE_FILE, number, 1)
+    source.values[path] = Place(OVERRIDE_FILE, number, column)
+    source.keys.update({path + p: place for p, place in value.keys.items()})
+    source.values.update({path + p: place for p, place in value.values.items()})
+
+
+class _Builder:
+    """Builds values from nodes and remembers where they stand."""
+
+    def __init__(self, file: str, line_offset: int, column_offset: int) -> None:
+        self.source = YamlSource(file)
+        self.problems: list[Problem] = []
+        self._line_offset = line_offset
+        self._column_offset = column_offset
+        self._count = 0
+
+    def place(self, mark: Any) -> Place:
+        if mark is None:
+            return Place(self.source.file, 1 + self._line_offset, 1 + self._column_offset)
+        column = mark.column + 1 + (self._column_offset if mark.line == 0 else 0)
+        return Place(self.source.file, mark.line + 1 + self._line_offset, column)
+
+    def problem(self, mark: Any, path: KeyPath, message: str) -> Problem:
+        place = self.place(mark)
+        return Problem(place.file, place.line, place.column, path_text(path), message)
+
+    def build(self, node: Any, path: KeyPath, parents: tuple[Any, ...]) -> Any:
+        self._count += 1
+        if self._count > MAX_VALUES:
+            message = f"more than {MAX_VALUES} values, aliases counted as often as they are used"
+            raise SpecError([*self.problems, self.problem(node.start_mark, path, message)])
+        if any(node is parent for parent in parents):
+            raise SpecError([*self.problems, self.problem(node.start_mark, path, "an alias refers to its own parent")])
+        self.source.values[path] = self.place(node.start_mark)
+        if isinstance(node, yaml.ScalarNode):
+            return self._scalar(node, path)
+        if isinstance(node, yaml.SequenceNode):
+            self._refuse_tag(node, path, "seq")
+            return [self.build(item, (*path, k), (*parents, node)) for k, item in enumerate(node.value)]
+        self._refuse_tag(node, path, "map")
+        return self._mapping(node, path, (*parents, node))
+
+    def _mapping(self, node: Any, path: KeyPath, parents: tuple[Any, ...]) -> dict[str, Any]:
+        mapping: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            if not isinstance(key_node, yaml.ScalarNode):
+                self.problems.append(self.problem(key_node.start_mark, path, "a key must be a plain word"))
+                continue
+            key = key_node.value
+            here = (*path, key)
+            place = self.place(key_node.start_mark)
+            if key == "<<":
+                message = "merge keys (<<) are not supported; write the keys out, or use an alias for a whole value"
+                self.problems.append(self.problem(key_node.start_mark, here, message))
+                continue
+            if key in mapping:
+                first = self.source.keys[here]
+                message = f"the key {key!r} is given twice, on line {first.line} and on line {place.line}; keep one"
+                self.problems.append(self.problem(key_node.start_mark, here, message))
+                continue
+            self.source.keys[here] = place
+            mapping[key] = self.build(value_node, here, parents)
+        return mapping
+
+    def _scalar(self, node: Any, path: KeyPath) -> Any:
+        text: str = node.value
+        tag: str = node.tag.removeprefix(_TAG)
+        if tag == "str":
+            return text
+        # An explicit tag (!!float abc) may contradict its text, so the pattern is asked again.
+        if tag not in _SCALARS or not _SCALARS[tag].match(text):
+            message = f"the tag {node.tag.replace(_TAG, '!!')} cannot be used here; write the plain value"
+            self.problems.append(self.problem(node.start_mark, path, message))
+            return None
+        if tag == "null":
+            return None
+        if tag == "bool":
+            return text == "true"
+        if tag == "int":
+            # Python refuses very long digit strings; beyond any use as a whole number they are still a number.
+            return int(text) if len(text) < 400 else float(text)
+        return float(re.sub(r"\.(?=[a-zA-Z])", "", text))  # Python writes .inf and .nan without their point
+
+    def _refuse_tag(self, node: Any, path: KeyPath, name: str) -> None:
+        if node.tag != _TAG + name:
+            message = f"the tag {node.tag.replace(_TAG, '!!')} cannot be used here; write a plain list or mapping"
+            self.problems.append(self.problem(node.start_mark, path, message))
+
+
+def _character(code: int | str) -> str:
+    return f"U+{ord(code) if isinstance(code, str) else code:04X}"
+
+
+def _syntax_message(error: yaml.MarkedYAMLError) -> str:
+    """PyYAML's complaint as a sentence, with the usual cause where it is known."""
+    problem = (error.problem or "the text is not valid YAML").strip()
+    if "'\\t'" in problem:
+        return "a tab is not allowed here; indent with spaces"
+    if "but found another document" in problem:
+        return "the file holds more than one YAML document ('---'); keep one experiment per file"
+    context = f" ({error.context.strip()})" if error.context else ""
+    hints: Mapping[str, str] = {
+        "mapping values are not allowed": "; text with a colon needs quotes, keys of a mapping the same indentation",
+        "could not find expected ':'": "; a key needs a colon and a space after it",
+        "did not find expected ',' or '}'": "; separate the entries by commas and close the brace",
+        "expected ',' or '}'": "; separate the entries by commas and close the brace",
+        "expected ',' or ']'": "; separate the items by commas and close the bracket",
+        "expected <block end>": "; check the indentation of this line",
+        "found undefined alias": "; define it before with &name",
+    }
+    hint = next((text for start, text in hints.items() if start in problem), "")
+    return f"this is not valid YAML: {problem}{context}{hint}"

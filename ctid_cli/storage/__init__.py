@@ -1,0 +1,1 @@
+"""Estimates on disk: journal, sealed file, manifest and their readers."""

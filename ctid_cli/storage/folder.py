@@ -1,0 +1,223 @@
+"""The folder of one experiment: what lies in it, who may write to it, and when it must be left alone.
+
+``spec.yaml`` (the user's text), ``spec.canonical.json``, ``journal.sqlite`` (the live log), ``runs.h5`` (the sealed
+results), ``timings.csv`` and ``provenance/`` (times, hosts, versions).
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import platform
+import re
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from ctid_cli.errors import RefusedError, StorageError, UsageError
+from ctid_cli.storage import journal
+from ctid_cli.storage.version import Origin
+
+SPEC = "spec.yaml"
+CANONICAL = "spec.canonical.json"
+SEALED = "runs.h5"
+TIMINGS = "timings.csv"
+PROVENANCE = "provenance"
+#: Present while a run goes on; says who runs.
+RUNNING = "running.json"
+
+#: How long to wait for a command that only reads to let go of the folder [s].
+PATIENCE = 2.0
+
+
+class InUseError(RefusedError):
+    """Another process holds the folder's lock."""
+
+
+_ASIDE = re.compile(r"\.aside-\d{8}T\d{6}(-\d+)?$")
+
+
+@contextmanager
+def lock(folder: Path, *, shared: bool = False, patience: float = PATIENCE) -> Iterator[None]:
+    """Hold the folder's lock; the operating system lets go of it when the process ends, however it ends."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise StorageError(f"{folder} cannot be opened: {error.strerror}") from error
+    try:
+        deadline = time.monotonic() + patience
+        while True:
+            try:
+                fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+                if not _is_open(folder, descriptor):
+                    raise InUseError(f"{folder} was moved by another process just now; run the command again")
+                break
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    raise InUseError(f"{folder} is in use by {_owner(folder)}; wait until it ends") from None
+                time.sleep(0.05)
+            except OSError as error:
+                raise StorageError(f"{folder} cannot be locked: {error.strerror}") from error
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _is_open(folder: Path, descriptor: int) -> bool:
+    try:
+        return os.path.samestat(os.stat(folder), os.fstat(descriptor))
+    except OSError:
+        return False
+
+
+def _owner(folder: Path) -> str:
+    running = who_runs(folder)
+    return f"process {running['pid']} on {running['host']}" if running else "another process"
+
+
+def who_runs(folder: Path) -> dict[str, Any] | None:
+    """What the run that writes to a folder says about itself."""
+    try:
+        running = json.loads((folder / RUNNING).read_text(encoding="utf-8"))
+        return running if isinstance(running, dict) and {"pid", "host"} <= running.keys() else None
+    except (OSError, ValueError):
+        return None
+
+
+def announce(folder: Path, experiment: str, started: str, done: int, total: int) -> None:
+    """Say who runs, for those who find the folder locked."""
+    running = {"experiment": experiment, "pid": os.getpid(), "host": platform.node()}
+    running |= {"started": started, "done": done, "total": total}
+    # A courtesy to readers, written over and over: neither worth a synchronisation nor worth failing for.
+    with suppress(OSError):
+        temporary = folder / f"{RUNNING}.tmp"
+        temporary.write_text(json.dumps(running), encoding="utf-8")
+        temporary.replace(folder / RUNNING)
+
+
+def write_safely(path: Path, data: bytes) -> None:
+    """Replace a file in one go: readers, and a crash at any moment, find the old or the new content."""
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+    descriptor = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def check_free(folder: Path, experiment: str, origin: Origin, *, allow_mixed: bool) -> None:
+    """Refuse a folder whose results this run must not add to."""
+    with reading_journal(folder) as log:
+        if log is None:
+            if (folder / SEALED).exists():
+                raise RefusedError(
+                    f"{folder} holds {SEALED} without the {journal.FILE_NAME} it was made from, so nothing can be added"
+                    " to it; choose another results folder (--out), or --fresh to move it aside"
+                )
+            return
+        log.check()
+        if log.experiment() != experiment:
+            raise RefusedError(
+                f"{folder} holds the experiment {log.experiment()!r}, not {experiment!r}; choose another results folder"
+                " (--out), or --fresh to move the old results aside"
+            )
+        others = [other for other in log.origins().values() if other != origin]
+        if others and not allow_mixed:
+            raise RefusedError(_other_origin(folder, others[-1], origin))
+
+
+def _other_origin(folder: Path, other: Origin, origin: Origin) -> str:
+    differences = []
+    if other.code_version != origin.code_version:
+        versions = dict(other.packages)
+        differences.append(f"code version {other.code_version} then, {origin.code_version} now")
+        pairs = [(name, versions.get(name), now) for name, now in origin.packages]
+        differences += [f"{name} {then} then, {now} now" for name, then, now in pairs if then != now]
+    if other.platform != origin.platform:
+        differences.append(f"numeric platform {other.platform!r} then, {origin.platform!r} now")
+    if not differences:
+        differences.append(f"packages {dict(other.packages)} then, {dict(origin.packages)} now")
+    return (
+        f"{folder} holds results of other code or arithmetic ({'; '.join(differences)}); use --fresh to move them aside"
+        " and compute all anew, or --allow-mixed to add to them, which is recorded"
+    )
+
+
+@contextmanager
+def reading_journal(folder: Path) -> Iterator[journal.Journal | None]:
+    """Read the folder's journal; if it is damaged, say what is safe."""
+    try:
+        with journal.read_journal(folder / journal.FILE_NAME) as log:
+            yield log
+    except StorageError as error:
+        raise StorageError(f"{error}. {what_is_safe(folder)}") from error
+
+
+def what_is_safe(folder: Path) -> str:
+    """A sentence about the results that can still be read although the journal cannot."""
+    from ctid_cli.storage.sealed import read_sealed
+
+    advice = "Move the folder away or use --fresh to compute anew."
+    try:
+        results = read_sealed(folder / SEALED)
+    except (StorageError, RefusedError):
+        return f"There is no intact {SEALED} either. {advice}"
+    count = len(results.results)
+    return f"{SEALED} is intact and holds {count} estimates of the last finished or interrupted run. {advice}"
+
+
+def move_aside(folder: Path) -> Path | None:
+    """Move a folder out of the way, without deleting anything."""
+    if not folder.exists():
+        return None
+    inside = [path for path in experiment_folders(folder) if path != folder]
+    if inside:
+        names = ", ".join(str(path) for path in inside)
+        raise RefusedError(f"{folder} cannot be moved aside, because other experiments lie inside it: {names}")
+    with lock(folder):
+        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S")
+        target = folder.with_name(f"{folder.name}.aside-{stamp}")
+        number = 1
+        while target.exists():
+            number += 1
+            target = folder.with_name(f"{folder.name}.aside-{stamp}-{number}")
+        try:
+            folder.rename(target)
+        except OSError as error:
+            raise StorageError(f"{folder} cannot be moved aside: {error.strerror}") from error
+    return target
+
+
+def experiment_folders(results: Path) -> list[Path]:
+    """Folders of experiments, in a results folder or anywhere below."""
+    found = []
+    for path, folders, files in os.walk(results):
+        folders[:] = sorted(name for name in folders if not _ASIDE.search(name) and name != PROVENANCE)
+        if journal.FILE_NAME in files or SEALED in files:
+            found.append(Path(path))
+    return sorted(found)
+
+
+def no_results(folder: Path) -> UsageError:
+    """The error for a folder that no experiment was run into."""
+    return UsageError(f"there are no results in {folder}; 'ctid run' writes them")
+
+
+def require_experiment(folder: Path) -> None:
+    """Refuse a folder that no experiment was run into."""
+    if not (folder / journal.FILE_NAME).exists() and not (folder / SEALED).exists():
+        raise no_results(folder)

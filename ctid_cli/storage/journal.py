@@ -1,0 +1,293 @@
+"""The live log of an experiment: an SQLite file that only the process of the run writes.
+
+What a commit has acknowledged survives the death of the process and of the machine (write-ahead log, full
+synchronisation). The file holds every estimate ever computed in the folder, also those that later plans leave aside,
+and one line for each run with everything that does not belong among the results: times, host, command.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ctid_cli.errors import RefusedError, StorageError
+from ctid_cli.running.worker import Outcome
+from ctid_cli.storage.manifest import Key, Manifest
+from ctid_cli.storage.version import Origin
+
+FILE_NAME = "journal.sqlite"
+#: Raised by one whenever an older ctid could misread the file.
+FORMAT = 1
+#: Marks an SQLite file as a journal of ctid ("ctid" in ASCII).
+APPLICATION = 0x63746964
+
+_SCHEMA = (
+    "CREATE TABLE meta (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID",
+    "CREATE TABLE origins (number INTEGER PRIMARY KEY, code_version TEXT, platform TEXT, packages TEXT)",
+    """CREATE TABLE sessions (
+        number INTEGER PRIMARY KEY, origin INTEGER, started TEXT, stopped TEXT, reason TEXT, info TEXT)""",
+    """CREATE TABLE estimates (
+        data_hash TEXT, replicate INTEGER, estimator_hash TEXT, start TEXT,
+        result TEXT NOT NULL, checksum TEXT NOT NULL, seconds REAL, session INTEGER NOT NULL,
+        PRIMARY KEY (data_hash, replicate, estimator_hash, start)) WITHOUT ROWID""",
+)
+_SEALED = "sealed"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A stored estimate."""
+
+    result: dict[str, Any]
+    #: Time it took [s].
+    seconds: float | None
+    session: int
+    origin: int
+
+
+class Journal:
+    """An open journal."""
+
+    def __init__(self, connection: sqlite3.Connection, path: Path) -> None:
+        self._connection = connection
+        self.path = path
+
+    def experiment(self) -> str:
+        """Name of the experiment."""
+        return str(self.manifest()["experiment"])
+
+    def manifest(self) -> Manifest:
+        """The plan of the latest run."""
+        with self._guard("read"):
+            manifest: Manifest = json.loads(self._meta("manifest") or "")
+        return manifest
+
+    def sealed(self) -> str | None:
+        """Checksum of the sealed file, or None if estimates came after it."""
+        return self._meta(_SEALED)
+
+    def origins(self) -> dict[int, Origin]:
+        """Code and platform of the runs that have written here, by number."""
+        with self._guard("read"):
+            rows = self._connection.execute("SELECT * FROM origins ORDER BY number").fetchall()
+            return {
+                number: Origin(code, platform, tuple((name, version) for name, version in json.loads(packages)))
+                for number, code, platform, packages in rows
+            }
+
+    def sessions(self) -> list[dict[str, Any]]:
+        """Every run that has written here, the oldest first."""
+        with self._guard("read"):
+            rows = self._connection.execute(
+                "SELECT number, started, stopped, reason, info FROM sessions ORDER BY number"
+            )
+            return [
+                {"session": number, "started": started, "stopped": stopped, "reason": reason, **json.loads(info)}
+                for number, started, stopped, reason, info in rows
+            ]
+
+    def keys(self) -> set[Key]:
+        """Which estimates are stored."""
+        with self._guard("read"):
+            rows = self._connection.execute("SELECT data_hash, replicate, estimator_hash, start FROM estimates")
+            return {Key(*row) for row in rows}
+
+    def statuses(self) -> dict[Key, str]:
+        """Status of every stored estimate."""
+        with self._guard("read"):
+            rows = self._connection.execute(
+                "SELECT data_hash, replicate, estimator_hash, start, json_extract(result, '$.status') FROM estimates"
+            )
+            return {Key(*row[:4]): row[4] for row in rows}
+
+    def entries(self) -> dict[Key, Entry]:
+        """Every stored estimate, each compared with its checksum."""
+        found = {}
+        with self._guard("read"):
+            rows = self._connection.execute(
+                "SELECT data_hash, replicate, estimator_hash, start, result, checksum, seconds, session, origin"
+                " FROM estimates JOIN sessions ON session = number"
+            )
+            for *parts, result, checksum, seconds, session, origin in rows:
+                key = Key(*parts)
+                if _checksum(key, result) != checksum:
+                    raise StorageError(f"{self.path} is damaged: estimate {key.id} has changed since it was written")
+                found[key] = Entry(json.loads(result), seconds, session, origin)
+        return found
+
+    def check(self) -> None:
+        """Refuse a file that SQLite finds damaged."""
+        with self._guard("read"):
+            found = self._connection.execute("PRAGMA quick_check(1)").fetchone()
+        if found != ("ok",):
+            raise StorageError(f"{self.path} is damaged: {found[0] if found else 'no answer'}")
+
+    def begin(self, manifest: Manifest, origin: Origin, started: str, info: dict[str, Any]) -> int:
+        """Note that a run begins."""
+        with self._transaction() as connection:
+            # Not sorted: the order of swept fields and starts is that of the specification.
+            text = json.dumps(manifest, allow_nan=False)
+            if self._meta("manifest") != text:
+                self._set_meta("manifest", text)
+                connection.execute("DELETE FROM meta WHERE name = ?", (_SEALED,))
+            known = {value: number for number, value in self.origins().items()}
+            number = known.get(origin)
+            if number is None:
+                row = (origin.code_version, origin.platform, _json(origin.packages))
+                number = connection.execute(
+                    "INSERT INTO origins (code_version, platform, packages) VALUES (?, ?, ?)", row
+                ).lastrowid
+            cursor = connection.execute(
+                "INSERT INTO sessions (origin, started, info) VALUES (?, ?, ?)", (number, started, _json(info))
+            )
+            return int(cursor.lastrowid or 0)
+
+    def add(self, outcomes: Iterable[Outcome], session: int) -> None:
+        """Store estimates; when this returns, they are safe."""
+        rows = []
+        for key, result, seconds in outcomes:
+            text = _json(result)
+            rows.append((*key, text, _checksum(key, text), seconds, session))
+        with self._transaction() as connection:
+            connection.executemany("INSERT INTO estimates VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
+            connection.execute("DELETE FROM meta WHERE name = ?", (_SEALED,))
+
+    def mark_sealed(self, checksum: str) -> None:
+        """Note that the sealed file holds the present estimates of the present plan."""
+        with self._transaction():
+            self._set_meta(_SEALED, checksum)
+
+    def end(self, session: int, stopped: str, reason: str) -> None:
+        """Note that a run ends."""
+        with self._transaction() as connection:
+            connection.execute(
+                "UPDATE sessions SET stopped = ?, reason = ? WHERE number = ?", (stopped, reason, session)
+            )
+
+    def close(self) -> None:
+        """Close the file; closing cannot lose what was acknowledged, so it does not complain."""
+        with suppress(sqlite3.Error):
+            self._connection.close()
+
+    def _meta(self, name: str) -> str | None:
+        with self._guard("read"):
+            row = self._connection.execute("SELECT value FROM meta WHERE name = ?", (name,)).fetchone()
+        return None if row is None else str(row[0])
+
+    def _set_meta(self, name: str, value: str) -> None:
+        self._connection.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (name, value))
+
+    @contextmanager
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
+        with self._guard("write"):
+            self._connection.execute("BEGIN IMMEDIATE")
+            try:
+                yield self._connection
+                self._connection.execute("COMMIT")
+            except BaseException:
+                # SQLite has rolled back by itself if the disk is full.
+                with suppress(sqlite3.Error):
+                    self._connection.execute("ROLLBACK")
+                raise
+
+    @contextmanager
+    def _guard(self, action: str) -> Iterator[None]:
+        try:
+            yield
+        except (sqlite3.Error, ValueError) as error:
+            if action == "write":
+                message = f"{self.path} could not be written ({error}); all that was reported as done is safe in it"
+            else:
+                message = f"{self.path} is damaged or not a journal ({error})"
+            raise StorageError(message) from error
+
+
+def open_journal(path: Path) -> Journal:
+    """Open a journal for writing, and make it if there is none."""
+    try:
+        connection = sqlite3.connect(path, isolation_level=None, timeout=0.0)
+    except sqlite3.Error as error:
+        raise StorageError(f"{path} cannot be opened ({error})") from error
+    try:
+        connection.execute("PRAGMA locking_mode=EXCLUSIVE")
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute("PRAGMA synchronous=FULL")
+        if not connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone():
+            connection.execute("BEGIN IMMEDIATE")
+            for statement in _SCHEMA:
+                connection.execute(statement)
+            connection.execute(f"PRAGMA application_id={APPLICATION}")
+            connection.execute(f"PRAGMA user_version={FORMAT}")
+            connection.execute("COMMIT")
+        _refuse_foreign(connection, path)
+    except sqlite3.Error as error:
+        connection.close()
+        raise StorageError(f"{path} is damaged or cannot be written ({error})") from error
+    except BaseException:
+        connection.close()
+        raise
+    return Journal(connection, path)
+
+
+@contextmanager
+def read_journal(path: Path) -> Iterator[Journal | None]:
+    """Open a journal for reading without touching its file.
+
+    After a kill, acknowledged estimates stand in the write-ahead log beside the file. Reading them in place would make
+    SQLite move them, so in that case a copy is read; refusing a folder must not change it.
+    """
+    if not path.exists():
+        yield None
+        return
+    log = path.with_name(path.name + "-wal")
+    with tempfile.TemporaryDirectory(prefix="ctid-") as scratch:
+        try:
+            if log.exists() and log.stat().st_size:
+                copy = Path(scratch) / FILE_NAME
+                shutil.copyfile(path, copy)
+                shutil.copyfile(log, copy.with_name(copy.name + "-wal"))
+                connection = sqlite3.connect(copy, isolation_level=None)
+            else:
+                address = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
+                connection = sqlite3.connect(address, uri=True, isolation_level=None)
+        except (sqlite3.Error, OSError) as error:
+            raise StorageError(f"{path} cannot be read ({error})") from error
+        try:
+            try:
+                empty = not connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone()
+                if not empty:
+                    _refuse_foreign(connection, path)
+                    empty = not connection.execute("SELECT 1 FROM meta WHERE name = 'manifest'").fetchone()
+            except sqlite3.Error as error:
+                raise StorageError(f"{path} is damaged or not a journal ({error})") from error
+            yield None if empty else Journal(connection, path)
+        finally:
+            connection.close()
+
+
+def _refuse_foreign(connection: sqlite3.Connection, path: Path) -> None:
+    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    (written_by,) = connection.execute("PRAGMA user_version").fetchone()
+    if application != APPLICATION:
+        raise StorageError(f"{path} is an SQLite file, but not a journal of ctid")
+    if written_by > FORMAT:
+        raise RefusedError(
+            f"{path} has format {written_by}; this ctid reads formats up to {FORMAT}. Use the newer ctid that wrote it,"
+            " another results folder (--out), or --fresh to move the old results aside"
+        )
+
+
+def _checksum(key: Key, result: str) -> str:
+    return hashlib.sha256("\n".join([*map(str, key), result]).encode()).hexdigest()[:32]
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, allow_nan=False, separators=(",", ":"), ensure_ascii=False)

@@ -1,0 +1,58 @@
+"""What is worth knowing about a run that does not belong among its results: command, host, versions."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from ctid_cli.storage.version import Origin, package_versions
+
+
+def now() -> str:
+    """The present time in UTC, for example ``2026-11-21T04:00:00Z``."""
+    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def session_info(spec_text: str, spec_folder: Path, origin: Origin, jobs: int) -> dict[str, Any]:
+    """Describe the run that is about to start."""
+    return {
+        "argv": sys.argv,
+        "pid": os.getpid(),
+        "host": platform.node(),
+        "system": platform.platform(),
+        "processors": os.cpu_count(),
+        "jobs": jobs,
+        "code_version": origin.code_version,
+        "numeric_platform": origin.platform,
+        "packages": {"python": platform.python_version(), **package_versions()},
+        "git_commit": git_commit(Path(__file__).resolve().parents[2]),
+        "spec_folder": str(spec_folder.resolve()),
+        "spec": spec_text,
+    }
+
+
+def git_commit(root: Path) -> str | None:
+    """Commit of a checkout, read without git, which need not be installed."""
+    try:
+        folder = root / ".git"
+        if folder.is_file():
+            folder = (root / folder.read_text(encoding="utf-8").removeprefix("gitdir:").strip()).resolve()
+        head = (folder / "HEAD").read_text(encoding="utf-8").strip()
+        if not head.startswith("ref: "):
+            return head
+        name = head.removeprefix("ref: ")
+        shared = folder / "commondir"
+        common = (folder / shared.read_text(encoding="utf-8").strip()).resolve() if shared.exists() else folder
+        for place in (folder, common):
+            if (place / name).exists():
+                return (place / name).read_text(encoding="utf-8").strip()
+        for line in (common / "packed-refs").read_text(encoding="utf-8").splitlines():
+            if line.endswith(f" {name}"):
+                return line.split()[0]
+    except (OSError, UnicodeError):
+        pass
+    return None

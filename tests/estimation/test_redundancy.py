@@ -1,0 +1,304 @@
+"""Escape from local minima by the paths of several costs, its record, and its end."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctid_cli.estimation.redundancy import SearchStatus, local_paths, minimise_redundantly
+
+CHOICES = ["first", "best"]
+
+# Saw teeth on the integers: a descent that tries the lower neighbour first stops at the next multiple of the period
+# below, since the cost just beyond is higher by period - 1 - 1/2. The one global minimum is 0; each period traps in
+# places of its own, and all of them at once only in multiples of their least common multiple, 1001 for 7, 11 and 13.
+
+
+def saw(period):
+    return lambda n: n % period + 0.5 * (n // period) if n >= 0 else math.inf
+
+
+def descend(cost, n):
+    while lower := [neighbour for neighbour in (n - 1, n + 1) if cost(neighbour) < cost(n)]:
+        n = lower[0]
+    return n
+
+
+def recorded(paths):
+    """The same paths, and the list of (path, point) in which they write down their calls."""
+    calls = []
+
+    def path_of(index):
+        def path(point):
+            calls.append((index, point))
+            return paths[index](point)
+
+        return path
+
+    return [path_of(index) for index in range(len(paths))], calls
+
+
+def to(*points):
+    return lambda _: list(points)
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+@pytest.mark.parametrize("start", [1, 8, 77, 500, 1000])
+def test_escapes_where_every_single_cost_is_trapped(choice, start):
+    costs = [saw(period) for period in (7, 11, 13)]
+    for period, cost in zip((7, 11, 13), costs, strict=True):
+        assert descend(cost, start) == start - start % period
+        if start >= 13:
+            assert cost(start - start % period) > cost(0) == 0
+    paths = local_paths(costs, descend)
+    found = minimise_redundantly(start, float, paths, choice=choice, improvement=1e-4, max_rounds=1000)
+    assert (found.point, found.cost, found.status) == (0, 0.0, SearchStatus.EXHAUSTED)
+    assert found.status.succeeded
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_a_minimum_common_to_all_costs_traps(choice):
+    paths = local_paths([saw(period) for period in (7, 11, 13)], descend)
+    found = minimise_redundantly(1500, float, paths, choice=choice, improvement=0)
+    assert (found.point, found.status) == (1001, SearchStatus.EXHAUSTED)
+
+
+def test_safely_redundant_family_converges_from_everywhere():
+    # J_k(x) = x^2 + 10 (1 - cos(w_k x)); a gradient step of 1/L never passes a stationary point of a function whose
+    # gradient is L-Lipschitz: the descent ends at the next one downhill, whatever lies beyond.
+    frequencies = (0.5, 1.0, 2.0)
+
+    def member(w):
+        return lambda x: x**2 + 10 * (1 - math.cos(w * x))
+
+    def path_of(w):
+        def path(x):
+            for _ in range(400):
+                x -= (2 * x + 10 * w * math.sin(w * x)) / (2 + 10 * w**2)
+            return [x]
+
+        return path
+
+    costs, paths = [member(w) for w in frequencies], [path_of(w) for w in frequencies]
+
+    def mean(x):
+        return sum(cost(x) for cost in costs) / len(costs)
+
+    starts = np.linspace(-15, 15, 31)
+    # The definition itself: from everywhere at least one path leads to less than a tenth of the reference cost.
+    assert all(min(mean(path(x)[0]) for path in paths) <= 0.1 * mean(x) for x in starts)
+    (trapped,) = paths[2](9.0)
+    assert trapped > 8
+    assert mean(trapped) > 50
+    for choice in CHOICES:
+        for x in starts:
+            assert minimise_redundantly(x, mean, paths, choice=choice).point == pytest.approx(0, abs=1e-3)
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+@pytest.mark.parametrize("start", [0, 5, 30])
+def test_one_cost_alone_is_the_local_solver(choice, start):
+    cost = saw(7)
+    found = minimise_redundantly(start, cost, local_paths([cost], descend), choice=choice, improvement=0)
+    assert found.point == descend(cost, start)
+    assert found.cost == cost(found.point)
+    assert found.switches == ()
+
+
+def test_first_ends_after_one_full_cycle_without_improvement():
+    paths, calls = recorded([to(5.0), to(3.0), to(4.0)])
+    found = minimise_redundantly(10.0, float, paths)
+    assert calls == [(0, 10.0), (0, 5.0), (1, 5.0), (1, 3.0), (2, 3.0), (0, 3.0)]
+    assert (found.point, found.rounds, found.status) == (3.0, 3, SearchStatus.EXHAUSTED)
+
+
+def test_first_stays_on_a_path_that_improves_and_goes_on_cyclically():
+    halve, stuck = (lambda x: [x / 2] if x > 30 else [x]), (lambda x: [x])
+    step = lambda x: [x - 1] if x in (25.0, 24.0) else [x]  # noqa: E731
+    paths, calls = recorded([stuck, halve, step])
+    found = minimise_redundantly(100.0, float, paths)
+    order = [0, 1, 1, 1, 2, 2, 2, 0, 1]
+    assert [path for path, _ in calls] == order
+    assert [visit.path for visit in found.visits] == [-1, *order]
+    assert [visit.point for visit in found.trajectory] == [100.0, 50.0, 25.0, 24.0, 23.0]
+    assert [visit.path for visit in found.trajectory] == [-1, 1, 1, 2, 2]
+    assert [visit.point for visit in found.switches] == [24.0]
+
+
+def test_best_takes_the_least_candidate_of_all_paths():
+    paths, calls = recorded([lambda x: [x - 1], lambda x: [x - 3, x - 2], lambda x: [x + 5]])
+    found = minimise_redundantly(6.0, lambda x: abs(x) + 0.25, paths, choice="best")
+    # The incumbent, 0, beats the candidates -1, -3, -2 and 5 of the last round, and stays.
+    assert [visit.point for visit in found.trajectory] == [6.0, 3.0, 0.0]
+    assert [path for path, _ in calls] == [0, 1, 2] * 3
+    assert (found.rounds, found.status, found.cost) == (3, SearchStatus.EXHAUSTED, 0.25)
+    rounds = [visit.round for visit in found.visits]
+    assert rounds == [0] + [1] * 4 + [2] * 4 + [3] * 4
+    assert found.switches == ()
+
+
+def test_best_is_content_with_any_decrease_and_first_is_not():
+    paths = [to(0.9999)]
+    assert minimise_redundantly(1.0, float, paths, choice="best").point == 0.9999
+    assert minimise_redundantly(1.0, float, paths, choice="first").point == 1.0
+    assert minimise_redundantly(1.0, float, paths, choice="first", improvement=1e-5).point == 0.9999
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_settled_and_max_rounds_end_the_search(choice):
+    halve = [lambda x: [x / 2]]
+    steps = []
+
+    def settled(previous, new):
+        steps.append((previous, new))
+        return abs(new - previous) < 1.5
+
+    found = minimise_redundantly(8.0, float, halve, choice=choice, settled=settled)
+    assert steps == [(8.0, 4.0), (4.0, 2.0), (2.0, 1.0)]
+    assert (found.point, found.rounds, found.status) == (1.0, 3, SearchStatus.SETTLED)
+    assert found.status.succeeded
+    found = minimise_redundantly(8.0, float, halve, choice=choice, max_rounds=2)
+    assert (found.point, found.rounds, found.status) == (2.0, 2, SearchStatus.MAX_ROUNDS)
+    assert not found.status.succeeded
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_cost_that_is_not_finite_is_infinitely_bad(choice, bad):
+    reference = {"start": bad, "bad": bad, "good": 1e300, "better": 2.0}.__getitem__
+    paths = [to("bad"), to(), to("bad", "good"), to("better", "bad")]
+    found = minimise_redundantly("start", reference, paths, choice=choice)
+    assert (found.point, found.cost) == ("better", 2.0)
+    assert {visit.cost for visit in found.visits if visit.point in ("start", "bad")} == {math.inf}
+    found = minimise_redundantly("start", reference, paths[:2], choice=choice)
+    assert (found.point, found.cost, found.rounds) == ("start", math.inf, 1)
+    assert found.status is SearchStatus.NO_FINITE_COST
+    assert not found.status.succeeded
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_no_decrease_at_zero_or_below_goes_round_for_ever(choice):
+    # (1 - improvement) J0 is J0 itself at zero, and above J0 where that is negative.
+    for floor in (0.0, -5.0):
+        found = minimise_redundantly(3.0, lambda x, floor=floor: x + floor, [to(0.0), to(0.004)], choice=choice)
+        assert (found.point, found.rounds, found.status) == (0.0, 2, SearchStatus.EXHAUSTED)
+
+
+@pytest.mark.parametrize(("candidate", "accepted"), [(-5.004, False), (-5.006, True)])
+def test_share_of_a_negative_cost_is_a_share_of_its_size(candidate, accepted):
+    found = minimise_redundantly(-5.0, float, [to(candidate)], improvement=1e-3)
+    assert found.visits[1].accepted is accepted
+
+
+def test_reference_is_asked_once_for_each_visit():
+    asked = []
+
+    def reference(x):
+        asked.append(x)
+        return x
+
+    found = minimise_redundantly(9.0, reference, [to(5.0, 4.0), to(), to(3.0)], choice="best")
+    assert asked == [visit.point for visit in found.visits] == [9.0, 5.0, 4.0, 3.0, 5.0, 4.0, 3.0]
+    assert [visit.accepted for visit in found.visits] == [True, False, False, True, False, False, False]
+
+
+def test_arrays_are_points():
+    # Two valleys: each path moves along one coordinate only, so that neither reaches the minimum alone.
+    target = np.array([1.0, -2.0])
+    paths = [lambda x: [np.array([target[0], x[1]])], lambda x: [np.array([x[0], target[1]])]]
+    found = minimise_redundantly(np.zeros(2), lambda x: float(np.sum((x - target) ** 2)), paths)
+    np.testing.assert_array_equal(found.point, target)
+    assert [visit.path for visit in found.trajectory] == [-1, 0, 1]
+    assert found.switches == (found.trajectory[-1],)
+
+
+def test_switch_needs_two_accepted_visits_on_paths():
+    found = minimise_redundantly(9.0, float, [to(9.5), to(1.0)])
+    assert [visit.path for visit in found.trajectory] == [-1, 1]
+    assert found.switches == ()
+
+
+def test_errors_of_a_path_are_the_callers():
+    def path(_):
+        raise ZeroDivisionError("mine")
+
+    with pytest.raises(ZeroDivisionError, match="mine"):
+        minimise_redundantly(1.0, float, [path])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"choice": "any"}, "choice"),
+        ({"improvement": -0.1}, "improvement"),
+        ({"improvement": 1.0}, "improvement"),
+        ({"improvement": math.nan}, "improvement"),
+        ({"max_rounds": 0}, "max_rounds"),
+        ({"max_rounds": 2.5}, "max_rounds"),
+    ],
+)
+def test_options_out_of_range_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        minimise_redundantly(1.0, float, [to(0.0)], **options)
+
+
+def test_no_path_is_refused():
+    with pytest.raises(ValueError, match="paths"):
+        minimise_redundantly(1.0, float, [])
+
+
+# Random families: points are the indices of a table of reference costs, path i leads from n to tables[i][n].
+COSTS = st.lists(st.integers(0, 1000) | st.sampled_from([math.inf, math.nan]), min_size=1, max_size=12)
+
+
+@st.composite
+def families(draw):
+    costs = draw(COSTS)
+    leads = st.lists(st.integers(0, len(costs) - 1), max_size=2)
+    table = st.lists(leads, min_size=len(costs), max_size=len(costs))
+    return costs, draw(st.lists(table, min_size=1, max_size=4))
+
+
+def as_printed(start, cost, tables, epsilon):
+    """Algorithm III in its own words, with the path kept and the end added; infinities as they are."""
+    point, i, failures = start, 0, 0
+    while failures < len(tables):
+        minima = tables[i][point]
+        xi = min(minima, key=cost) if minima else point
+        failure = cost(xi) == math.inf or cost(xi) > (1 - epsilon) * cost(point) or cost(xi) == cost(point)
+        if failure:
+            i, failures = (i + 1) % len(tables), failures + 1
+        else:
+            point, failures = xi, 0
+    return point
+
+
+@given(families(), st.sampled_from([0.0, 2.0**-10, 0.25]))
+def test_first_is_algorithm_iii(family, epsilon):
+    costs, tables = family
+    cost = lambda n: costs[n] if math.isfinite(costs[n]) else math.inf  # noqa: E731
+    paths = [table.__getitem__ for table in tables]
+    found = minimise_redundantly(0, costs.__getitem__, paths, improvement=epsilon)
+    assert found.point == as_printed(0, cost, tables, epsilon)
+    accepted = [visit.cost for visit in found.trajectory]
+    for before, after in pairwise(accepted):
+        assert after < before
+        assert after <= (1 - epsilon) * before
+    assert found.cost == accepted[-1] == cost(found.point)
+    assert len(found.trajectory) == found.rounds
+
+
+@given(families())
+def test_best_takes_the_steepest_way(family):
+    costs, tables = family
+    cost = lambda n: costs[n] if math.isfinite(costs[n]) else math.inf  # noqa: E731
+    point, expected = 0, [cost(0)]
+    while (least := min((cost(n) for table in tables for n in table[point]), default=math.inf)) < cost(point):
+        point = next(n for table in tables for n in table[point] if cost(n) == least)
+        expected.append(least)
+    found = minimise_redundantly(0, costs.__getitem__, [table.__getitem__ for table in tables], choice="best")
+    assert [visit.cost for visit in found.trajectory] == expected
+    assert found.point == point

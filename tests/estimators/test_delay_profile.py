@@ -1,0 +1,328 @@
+"""The global search over the delay, and what belongs to measured records: states, offsets, gaps, experiments, units."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimation.output_error import Layout, OutputErrorProblem
+from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.filtering.bank import filter_data
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.inference.diagnostics import r_squared
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.status import Status
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
+from tests.estimators.records import CASE_1, CASE_2, assert_same_model, make_record
+
+SYSTEM = TransferFunction([3.0], [1.0, 1.2, 4.0], 0.73)
+
+
+def random_input(rng, t, every=7):
+    values = np.repeat(rng.choice([-1.0, 1.0], t.size // every + 1), every)[: t.size]
+    return HeldSignal(t, values)
+
+
+def record_of(model=SYSTEM, *, n=600, seed=0, noise=0.0, irregular=False, offset=0.0, past=0):
+    """A record; ``past`` samples of its beginning are cut off, with what their input left behind."""
+    rng = np.random.default_rng(seed)
+    t = np.cumsum(rng.uniform(0.05, 0.15, n)) if irregular else 0.1 * np.arange(n)
+    signal = random_input(rng, t)
+    y = simulate(model, signal, t) + offset + noise * rng.standard_normal(n)
+    return Record(t[past:], y[past:], HeldSignal(signal.t[past:], signal.values[past:]))
+
+
+# --- sensitivities ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("irregular", [False, True])
+@pytest.mark.parametrize(
+    ("structure", "delay"),
+    [(Structure(2, 1, delay=True), 0.73), (Structure(2, 2), 0.3), (Structure(1, 1), 0.0), (Structure(3, 0), 0.2)],
+)
+def test_sensitivities_are_the_derivatives_of_the_output(structure, delay, irregular):
+    rng = np.random.default_rng(3)
+    data = [filter_data(record_of(n=80, seed=k, noise=0.1, irregular=irregular), 1.0) for k in range(2)]
+    layout = Layout(structure, 2, initial_state=True, offset=True)
+    problem = OutputErrorProblem(data, layout, delay)
+    n, m = structure.poles, structure.zeros
+    a = np.poly(-rng.uniform(0.5, 3.0, n))[1:]
+    theta = np.concatenate((a, rng.standard_normal(m + 1), [delay] * structure.delay))
+    theta = np.concatenate((theta, rng.standard_normal(layout.size - theta.size)))
+    parts = problem.sensitivities(theta)
+    for k in range(layout.size):
+        step = 1e-5 * max(abs(theta[k]), 1.0)
+        moved = [problem.sensitivities(theta + sign * step * np.eye(layout.size)[k]) for sign in (1, -1)]
+        for (psi, _), (_, above), (_, below) in zip(parts, *moved, strict=True):
+            # The error falls where the simulated output rises.
+            slope = (below - above) / (2 * step)
+            np.testing.assert_allclose(psi[:, k], slope, atol=2e-8 * max(1.0, np.abs(slope).max()))
+
+
+def test_a_free_response_is_what_the_cut_off_past_leaves_behind():
+    record = record_of(past=150)
+    data = filter_data(record, SYSTEM.delay)
+    layout = Layout(Structure(2, 0), initial_state=True)
+    problem = OutputErrorProblem([data], layout, SYSTEM.delay)
+    theta = problem.linear_start(SYSTEM.denominator, SYSTEM.delay)
+    assert problem.equations(theta).squared_error < 1e-18 * np.sum(data.y_used**2)
+    assert np.abs(theta[3:]).max() > 0.1
+
+
+# --- what is estimated with the model --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("irregular", [False, True])
+def test_initial_state_and_offset_of_a_noise_free_record_are_found(irregular):
+    record = record_of(past=150, offset=21.5, irregular=irregular)
+    fit = DelayProfile(2, 0, (0, 3), initial_state="estimate", offset="estimate").fit(record)
+    assert fit.status is Status.CONVERGED
+    assert_same_model(fit.model, SYSTEM, 1e-6)
+    assert fit.offsets == pytest.approx([21.5])
+    assert fit.parameters["offset"] == fit.offsets[0]
+    # From rest and without an offset the same record gives another model.
+    wrong = DelayProfile(2, 0, (0, 3)).fit(record)
+    assert abs(wrong.model.dc_gain / SYSTEM.dc_gain - 1) > 0.01
+
+
+def test_removed_means_are_reported_and_the_record_is_left_alone():
+    record = record_of(offset=5.0, noise=0.01, n=2000)
+    y, u = record.y.copy(), record.input.values.copy()
+    fit = DelayProfile(2, 0, (0, 3), offset="remove", initial_state="estimate").fit(record)
+    np.testing.assert_array_equal((record.y, record.input.values), (y, u))
+    assert fit.offsets == pytest.approx([y.mean()])
+    assert fit.input_offsets == pytest.approx([u.mean()])
+    assert_same_model(fit.model, SYSTEM, 0.02)
+
+
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+def test_a_periodic_record_is_fitted_exactly(hold):
+    t = 0.1 * np.arange(2000)
+    one = np.random.default_rng(5).standard_normal(200)
+    signal = HeldSignal(t, np.tile(one, 10), hold)
+    y = simulate(SYSTEM, signal, t)
+    last = Record(t[-200:] - t[-200], y[-200:], HeldSignal(t[-200:] - t[-200], one, hold))
+    fit = DelayProfile(2, 0, (0, 3), initial_state="periodic").fit(last)
+    assert_same_model(fit.model, SYSTEM, 1e-6)
+    assert fit.count == 200
+    assert fit.cost < 1e-12 * np.var(y)
+    assert DelayProfile(2, 0, (0, 3)).fit(last).cost > 1e-4 * np.var(y)
+
+
+def test_as_many_zeros_as_poles_with_a_known_delay():
+    model = TransferFunction([0.5, -1.0, 2.0], [1.0, 1.2, 4.0], 0.73)
+    fit = DelayProfile(2, 2, (0.73, 0.73)).fit(record_of(model))
+    assert_same_model(fit.model, model, 1e-6)
+    assert fit.parameter_names == ("a1", "a2", "b0", "b1", "b2")
+    with pytest.raises(ValueError, match="zeros must be at most 1"):
+        DelayProfile(2, 2, (0, 1))
+
+
+def test_masked_samples_and_gaps_do_not_bias():
+    whole = record_of(n=1500)
+    y = whole.y.copy()
+    y[::7] = np.nan
+    y[400:520] = np.nan
+    fit = DelayProfile(2, 0, (0, 3)).fit(Record(whole.t, y, whole.input))
+    assert_same_model(fit.model, SYSTEM, 1e-6)
+    np.testing.assert_array_equal(fit.used[0], np.isfinite(y))
+    assert fit.count == fit.residuals[0].size == np.isfinite(y).sum()
+
+
+# --- several experiments ---------------------------------------------------------------------------
+
+
+def test_one_experiment_twice_gives_the_same_model_and_half_the_variance():
+    record = record_of(noise=0.1)
+    options = DelayProfile(2, 0, (0, 3), offset="estimate")
+    one, two = options.fit(record), options.fit([record, record])
+    assert_same_model(two.model, one.model, 1e-6)
+    assert two.parameter_names[-2:] == ("offset_1", "offset_2")
+    assert two.cost == pytest.approx(one.cost, rel=1e-9)
+    n = record.n_samples
+    expected = (n - 5) / (2 * n - 6)
+    ratio = two.standard_errors["delay"] ** 2 / one.standard_errors["delay"] ** 2
+    assert ratio == pytest.approx(expected, rel=1e-4)
+
+
+def test_moments_of_several_experiments_are_the_sums():
+    records = [record_of(seed=k, noise=0.1, n=200 + 50 * k, irregular=k == 1) for k in range(3)]
+    data = [filter_data(record, 1.0) for record in records]
+    theta = np.array([1.0, 3.0, 2.5, 0.5])
+    together = OutputErrorProblem(data, Layout(Structure(2, 0, delay=True), 3)).equations(theta)
+    apart = [OutputErrorProblem([item], Layout(Structure(2, 0, delay=True))).equations(theta) for item in data]
+    np.testing.assert_allclose(together.hessian, sum(item.hessian for item in apart), rtol=1e-12)
+    np.testing.assert_allclose(together.instrument_error, sum(item.instrument_error for item in apart), rtol=1e-12)
+    assert together.squared_error == pytest.approx(sum(item.squared_error for item in apart))
+
+
+# --- the search ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("replicate", range(3))
+@pytest.mark.parametrize("regular", [True, False])
+def test_finds_the_delay_of_case_1_in_heavy_noise(regular, replicate):
+    record = make_record(snr_db=5, regular=regular, replicate=replicate)
+    fit = DelayProfile(2, 0, (0, 15)).fit(record)
+    assert fit.status is Status.CONVERGED
+    assert abs(fit.model.delay - 8.0) < 0.08
+    # At least as low as the cost of the truth.
+    assert fit.cost <= np.mean((record.y - record.noise_free) ** 2)
+
+
+@pytest.mark.parametrize("replicate", range(2))
+def test_finds_the_delay_of_case_2_in_heavy_noise(replicate):
+    record = make_record(CASE_2, snr_db=5, replicate=replicate)
+    fit = DelayProfile(4, 1, (0, 15)).fit(record)
+    assert abs(fit.model.delay - 8.0) < 0.08
+    assert fit.cost <= np.mean((record.y - record.noise_free) ** 2)
+
+
+def test_the_profile_is_lowest_next_to_the_estimate():
+    fit = DelayProfile(2, 0, (0, 15), search="samples").fit(make_record(snr_db=15))
+    profile = fit.profile
+    assert profile.cutoff is None
+    spacing = np.diff(profile.delays).max()
+    assert spacing <= 0.5 * np.pi / profile.bandwidth * (1 + 1e-12)
+    assert abs(profile.delays[np.nanargmin(profile.costs)] - fit.model.delay) <= spacing
+    assert fit.cost <= np.nanmin(profile.costs)
+
+
+@pytest.mark.parametrize("search", ["time", "spectral"])
+@pytest.mark.parametrize(("model", "poles", "zeros"), [(CASE_1, 2, 0), (CASE_2, 4, 1)])
+@pytest.mark.parametrize("regular", [True, False])
+def test_searches_behind_filters_find_what_every_sample_finds(search, model, poles, zeros, regular):
+    record = make_record(model, seed=7, snr_db=5, regular=regular)
+    fit = DelayProfile(poles, zeros, (0, 15), search=search).fit(record)
+    assert fit.status is Status.CONVERGED
+    # From the neighbourhood of the truth, on every sample.
+    local = DelayProfile(poles, zeros, (7.8, 8.2), search="samples").fit(record)
+    assert fit.cost <= local.cost * (1 + 1e-9)
+    assert fit.model.delay == pytest.approx(local.model.delay, abs=1e-5)
+    profile = fit.profile
+    assert profile.cutoff is not None
+    assert profile.cutoff <= profile.bandwidth
+    spacing = np.diff(profile.delays).max()
+    assert spacing <= 0.5 * np.pi / profile.cutoff * (1 + 1e-12)
+    assert abs(profile.delays[np.nanargmin(profile.costs)] - fit.model.delay) <= 1.5 * spacing
+
+
+@pytest.mark.parametrize("search", ["time", "spectral"])
+def test_where_filters_would_see_more_than_the_answer_every_sample_is_searched(search):
+    record = record_of(noise=0.02)
+    for options in ({"offset": "estimate"}, {"initial_state": "estimate"}):
+        fast = DelayProfile(2, 0, (0, 3), search=search, **options).fit(record)
+        slow = DelayProfile(2, 0, (0, 3), search="samples", **options).fit(record)
+        assert fast.profile.cutoff is None
+        assert np.array_equal(fast.theta, slow.theta)
+
+
+def test_a_delay_outside_the_range_stops_at_the_bound():
+    fit = DelayProfile(2, 0, (0, 0.5)).fit(record_of(noise=0.02))
+    assert fit.status is Status.DELAY_AT_BOUND
+    assert fit.model.delay == 0.5
+    assert np.isnan(fit.standard_errors["delay"])
+    assert np.isfinite(fit.standard_errors["a1"])
+
+
+# --- invariances -----------------------------------------------------------------------------------
+
+OPTIONS = DelayProfile(2, 0, (0, 3), initial_state="estimate", offset="estimate")
+
+
+@pytest.mark.parametrize("irregular", [False, True])
+@pytest.mark.parametrize("factor", [1 / 86400, 1e6, 1e3], ids=["days", "microseconds", "milliseconds"])
+def test_the_unit_of_time_does_not_matter(factor, irregular):
+    record = record_of(noise=0.1, offset=2.0, past=50, irregular=irregular)
+    fit = OPTIONS.fit(record)
+    scaled = Record(record.t * factor, record.y, HeldSignal(record.input.t * factor, record.input.values))
+    other = replace(OPTIONS, delay_bounds=(0, 3 * factor)).fit(scaled).model
+    powers = factor ** np.arange(3)
+    back = TransferFunction(other.numerator * factor**2, other.denominator * powers, other.delay / factor)
+    assert_same_model(back, fit.model, 1e-8)
+
+
+@pytest.mark.parametrize(("gain_u", "gain_y"), [(1e6, 1.0), (1e-6, 1e6), (1.0, 1e-6), (1e6, 1e6)])
+def test_the_units_of_input_and_output_do_not_matter(gain_u, gain_y):
+    record = record_of(noise=0.1, offset=2.0, past=50)
+    fit = OPTIONS.fit(record)
+    scaled = Record(record.t, record.y * gain_y, HeldSignal(record.input.t, record.input.values * gain_u))
+    other = OPTIONS.fit(scaled)
+    back = TransferFunction(other.model.numerator * gain_u / gain_y, other.model.denominator, other.model.delay)
+    assert_same_model(back, fit.model, 1e-8)
+    assert other.offsets[0] == pytest.approx(fit.offsets[0] * gain_y, rel=1e-7)
+    assert other.standard_errors["a1"] == pytest.approx(fit.standard_errors["a1"], rel=1e-5)
+
+
+def test_a_shift_of_the_clock_does_not_matter():
+    record = record_of(noise=0.1, past=50)
+    later = Record(record.t + 1024.0, record.y, HeldSignal(record.input.t + 1024.0, record.input.values))
+    assert_same_model(OPTIONS.fit(later).model, OPTIONS.fit(record).model, 1e-8)
+
+
+# --- a given model on other records ----------------------------------------------------------------
+
+
+def test_errors_of_a_model_from_rest_are_those_of_its_simulation():
+    record, other = record_of(noise=0.1), record_of(noise=0.1, seed=1, irregular=True)
+    options = DelayProfile(2, 0, (0, 3))
+    fit = options.fit(record)
+    applied = options.prepare(other).errors_of(fit.model)
+    expected = other.y - simulate(fit.model, other.input, other.t)
+    np.testing.assert_allclose(applied.residuals[0], expected, atol=1e-9)
+    again = options.prepare(record).errors_of(fit.model)
+    np.testing.assert_allclose(again.residuals[0], fit.residuals[0], atol=1e-9)
+    assert r_squared(record.y, record.y - again.residuals[0]) == pytest.approx(fit.r2)
+
+
+@pytest.mark.parametrize("initial_state", ["estimate", "periodic"])
+def test_errors_of_a_model_with_its_own_state_and_offset(initial_state):
+    record = record_of(noise=0.05, offset=4.0, past=100)
+    options = DelayProfile(2, 0, (0, 3), initial_state=initial_state, offset="estimate")
+    fit = options.fit(record)
+    applied = options.prepare(record).errors_of(fit.model)
+    # The model's own record: its state and offset are the best already.
+    np.testing.assert_allclose(applied.residuals[0], fit.residuals[0], atol=1e-6)
+    assert applied.offsets == pytest.approx(fit.offsets, abs=1e-6)
+
+
+def test_squared_errors_around_the_estimate():
+    options = DelayProfile(2, 0, (0, 3))
+    prepared = options.prepare(record_of(noise=0.1, offset=0.4))
+    fit = prepared.fit()
+    lowest = fit.cost * fit.count
+    assert prepared.squared_error_at(fit.theta, fit.model.delay) == pytest.approx(lowest)
+    known = replace(options, delay_bounds=(0.6, 0.6)).fit(prepared.records)
+    assert prepared.squared_error_at(fit.theta, 0.6) == pytest.approx(known.cost * known.count, rel=1e-6)
+    better = replace(options, offset="estimate").fit(prepared.records)
+    assert prepared.squared_error_with(fit, offset=True) == pytest.approx(better.cost * better.count, rel=1e-6)
+
+
+# --- refusals --------------------------------------------------------------------------------------
+
+
+def test_a_constant_input():
+    t = np.arange(50.0)
+    record = Record.from_arrays(t, np.full(50, 3.0), 2.0 + np.exp(-0.1 * t))
+    with pytest.raises(DataError, match="constant"):
+        DelayProfile(1, 0, (0, 5)).fit(record)
+    with pytest.raises(DataError, match="initial_state"):
+        DelayProfile(1, 0, (0, 0)).fit(record)
+    fit = DelayProfile(1, 0, (0, 0), initial_state="estimate").fit(record)
+    assert fit.model.denominator[1] == pytest.approx(0.1)
+    assert fit.model.dc_gain == pytest.approx(2 / 3)
+
+
+def test_a_range_beyond_the_record_and_no_record():
+    with pytest.raises(DataError, match="not shorter than the record"):
+        DelayProfile(2, 0, (0, 100)).fit(record_of())
+    with pytest.raises(DataError, match="no record"):
+        DelayProfile(2, 0, (0, 1)).fit([])
+
+
+def test_case_1_without_noise_is_exact():
+    fit = DelayProfile(2, 0, (0, 15)).fit(make_record(CASE_1, n=1500))
+    assert_same_model(fit.model, CASE_1, 1e-7)

@@ -1,0 +1,47 @@
+"""A run in a process of its own, to be interrupted; it prints the ids of estimates as they are reported done."""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import sys
+from pathlib import Path
+
+from ctid_cli.errors import CtidError
+from ctid_cli.running import events
+from ctid_cli.running.engine import run_experiment
+from tests.running.fakes import FakePlan, Toy
+
+
+def plan(seconds: float = 0.02, runs: int = 20) -> FakePlan:
+    return FakePlan(Toy(seconds=seconds), Toy(order=3, mischief="raise", at=4), runs=runs)
+
+
+def report(event: events.Event) -> None:
+    if isinstance(event, events.DataSetDone):
+        print(*[row["id"] for row in event.rows], flush=True)
+    elif isinstance(event, events.PlanReady):
+        print("ready", flush=True)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("jobs", type=int)
+    parser.add_argument("--file-size", type=int, help="largest file that may be written, as on a full disk")
+    parser.add_argument("--runs", type=int, default=20)
+    parser.add_argument("--seconds", type=float, default=0.02)
+    options = parser.parse_args()
+    if options.file_size:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (options.file_size, options.file_size))
+    toys = plan(options.seconds, options.runs)
+    try:
+        summary = run_experiment(toys, options.folder, jobs=options.jobs, on_event=report, warm=lambda: 0.0)
+    except CtidError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    return summary.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,181 @@
+"""Data sets of sums of submodels, in open and closed loop: the equations that their records satisfy."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from ctid_cli.errors import DataError
+from ctid_cli.filtering.sampled import simulate_additive
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.models.additive import AdditiveModel, Submodel
+from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.running.plan import build_plan
+from ctid_cli.signals.arma_noise import ArmaNoise
+from ctid_cli.signals.excitation import Gaussian, InputFile
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.noise import WhiteNoise
+from ctid_cli.signals.sampling import RegularSampling, UniformIntervals
+from ctid_cli.signals.streams import stream
+from ctid_cli.simulation.dataset import LoopOptions, MeasuredSource, SimulatedSource, file_sha256
+from ctid_cli.specification.spec import load_spec
+
+MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
+SYSTEMS = {
+    "modes": MODES,
+    "delayed modes": AdditiveModel(MODES.submodels, 0.12),
+    "rigid body and mode": AdditiveModel([Submodel([0.05], [1.0], 2), MODES.submodels[0]]),
+    "fraction": TransferFunction([2.0], [0.25, 0.7, 1.0], 0.1),
+}
+PID = DiscreteController.from_pid(0.0115, 0.00725, 0.00454)
+#: Stabilises every one of the systems.
+LEAD = DiscreteController([0.5, -0.48], [1.0, -0.8])
+RECORD = RegularSampling(0.05, 400)
+
+
+def source(system=MODES, controller=PID, enters="controller", noise=WhiteNoise(variance=0.01), sampling=RECORD, **more):  # noqa: B008
+    loop = LoopOptions(controller, more.pop("reference", Gaussian()), enters)
+    return SimulatedSource(system, None, sampling, noise, 5, loop=loop, **more)
+
+
+def filtered(controller, signal):
+    """Response of a controller from rest, by its difference equation."""
+    b, a = controller.numerator, controller.denominator
+    b = np.concatenate((np.zeros(a.size - b.size), b))
+    output = np.zeros(signal.size)
+    for k in range(signal.size):
+        past = range(min(k, a.size - 1) + 1)
+        output[k] = sum(b[j] * signal[k - j] for j in past) - sum(a[j] * output[k - j] for j in past if j)
+    return output
+
+
+@pytest.mark.parametrize("enters", ["controller", "input"])
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_every_signal_of_a_loop_satisfies_its_equation(name, enters):
+    system = SYSTEMS[name]
+    data = source(system, LEAD, enters).dataset(3)
+    record = data.record
+    assert data.true_model is system
+    # The reference and the noise are those of their streams,
+    reference = stream(5, "input", 3).standard_normal(400)
+    np.testing.assert_array_equal(record.loop.reference, reference)
+    np.testing.assert_allclose(
+        record.y - record.noise_free, 0.1 * stream(5, "noise", 3).standard_normal(400), atol=1e-14
+    )
+    # the input is what the controller makes of reference and noisy output,
+    u = filtered(LEAD, reference - record.y) if enters == "controller" else reference - filtered(LEAD, record.y)
+    np.testing.assert_allclose(record.input.values, u, atol=1e-12)
+    # and the output is what the system makes of the held input.
+    respond = simulate_additive if isinstance(system, AdditiveModel) else simulate
+    np.testing.assert_allclose(record.noise_free, respond(system, record.input, record.t), atol=1e-10)
+    assert record.input_on_grid
+    assert record.input.hold == "zoh"
+    assert (record.loop.controller, record.loop.enters) == (LEAD, enters)
+
+
+def test_noise_feeds_back():
+    quiet, loud = (source(noise=noise).dataset(0).record for noise in (None, WhiteNoise(variance=1.0)))
+    np.testing.assert_array_equal(quiet.y, quiet.noise_free)
+    np.testing.assert_array_equal(quiet.loop.reference, loud.loop.reference)
+    assert np.abs(loud.input.values - quiet.input.values).max() > 0.01
+    # Linear: the loop's answer to half the noise is in the middle.
+    half = source(noise=WhiteNoise(variance=0.25)).dataset(0).record
+    np.testing.assert_allclose(half.y, 0.5 * (quiet.y + loud.y), atol=1e-12)
+
+
+def test_coloured_noise_in_a_loop():
+    noise = ArmaNoise((1.0, 0.5), (1.0, -0.85), innovation_variance=0.02)
+    record = source(noise=noise).dataset(1).record
+    np.testing.assert_allclose(
+        record.y - record.noise_free, noise.generate(np.zeros(400), stream(5, "noise", 1)), atol=1e-14
+    )
+
+
+def test_a_loop_without_gain_is_an_open_loop():
+    closed = source(controller=DiscreteController([0.0], [1.0]), enters="input").dataset(2).record
+    opened = SimulatedSource(MODES, Gaussian(), RECORD, WhiteNoise(variance=0.01), 5).dataset(2).record
+    np.testing.assert_allclose(closed.y, opened.y, atol=1e-12)
+    np.testing.assert_array_equal(closed.input.values, opened.input.values)
+    assert opened.loop is None
+
+
+def test_longer_records_begin_with_the_shorter_ones_and_data_sets_repeat():
+    short, long = (source(sampling=RegularSampling(0.05, count)) for count in (200, 400))
+    np.testing.assert_allclose(long.dataset(0).record.y[:200], short.dataset(0).record.y, atol=1e-13)
+    sent = pickle.loads(pickle.dumps(long))
+    np.testing.assert_array_equal(sent.dataset(0).record.y, long.dataset(0).record.y)
+    assert not np.array_equal(long.dataset(1).record.y, long.dataset(0).record.y)
+
+
+def test_a_reference_is_sampled(tmp_path):
+    file = tmp_path / "reference.csv"
+    file.write_text("t,u\n0,0\n10,10\n")
+    ramp = source(reference=InputFile(str(file), hold="foh"), input_sha256=file_sha256(str(file)))
+    np.testing.assert_allclose(ramp.dataset(0).record.loop.reference[:200], 0.05 * np.arange(200), atol=1e-12)
+    file.write_text("t,u\n0,0\n10,11\n")
+    with pytest.raises(DataError, match="not that which the experiment was planned with"):
+        ramp.dataset(0)
+
+
+def test_an_irregular_loop_is_refused():
+    with pytest.raises(DataError, match="a closed loop needs a regular clock"):
+        source(sampling=UniformIntervals(0.04, 0.06, 50)).dataset(0)
+
+
+@pytest.mark.parametrize("name", ["modes", "delayed modes", "rigid body and mode"])
+def test_open_loop_data_sets_of_submodels(name):
+    system = SYSTEMS[name]
+    sampling = UniformIntervals(0.04, 0.06, 300, input_record="exact")
+    record = SimulatedSource(system, Gaussian(clock_period=0.5), sampling, None, 5).dataset(0).record
+    total = np.zeros(300)
+    for submodel in system.submodels:
+        part = submodel.transfer_function()
+        total += simulate(TransferFunction(part.numerator, part.denominator, system.delay), record.input, record.t)
+    np.testing.assert_allclose(record.y, total, atol=1e-9)
+
+
+def test_a_measured_loop(tmp_path):
+    simulated = source().dataset(0).record
+    file = tmp_path / "record.csv"
+    columns = (simulated.t, simulated.input.values, simulated.y, simulated.loop.reference)
+    file.write_text("t,u,y,r\n" + "\n".join(",".join(map(repr, row)) for row in np.array(columns).T.tolist()))
+    options = {"file": str(file), "sha256": file_sha256(str(file)), "reference": "r"}
+    record = MeasuredSource(**options, loop=LoopOptions(PID, enters="controller")).dataset(0).record
+    np.testing.assert_array_equal(record.loop.reference, simulated.loop.reference)
+    np.testing.assert_allclose(record.input.values, filtered(PID, record.loop.reference - record.y), atol=1e-12)
+    assert MeasuredSource(**options).dataset(0).record.loop is None
+    part = MeasuredSource(**options, loop=LoopOptions(PID), estimation_samples=100, offset="remove").dataset(0)
+    shift = simulated.loop.reference[:100].mean()
+    np.testing.assert_allclose(part.record.loop.reference, simulated.loop.reference[:100] - shift, atol=1e-15)
+    assert part.validation.loop is None
+
+
+def test_a_reference_file_has_no_say_in_the_identity_by_its_place(tmp_path):
+    text = """\
+experiment: loop
+system: {additive: [{numerator: [3], denominator: [0.25, 0.25, 1]}]}
+loop: {controller: {pid: {kp: 0.01}}, reference: {kind: file, file: reference.csv}}
+sampling: {kind: regular, interval: 0.05, samples: 100}
+estimators: {one: {kind: srivc, poles: 2, zeros: 0}}
+monte_carlo: {runs: 1, seed: 1}
+"""
+    cells = []
+    for place in (tmp_path, tmp_path / "elsewhere"):
+        place.mkdir(exist_ok=True)
+        (place / "reference.csv").write_text("t,u\n0,1\n2,-1\n")
+        (place / "spec.yaml").write_text(text)
+        (cell,) = build_plan(load_spec(place / "spec.yaml")).data_cells
+        assert cell.source.input_sha256 == file_sha256(str(place / "reference.csv"))
+        assert "file" not in cell.content["loop"]["reference"]
+        assert cell.dataset(0).record.loop.reference[[0, 39, 40]].tolist() == [1.0, 1.0, -1.0]
+        cells.append(cell)
+    assert cells[0].hash == cells[1].hash
+    (tmp_path / "reference.csv").write_text("t,u\n0,1\n2,-2\n")
+    assert build_plan(load_spec(tmp_path / "spec.yaml")).data_cells[0].hash != cells[0].hash
+
+
+def test_held_input_of_a_loop_is_known_at_its_samples():
+    record = source().dataset(0).record
+    assert isinstance(record.input, HeldSignal)
+    np.testing.assert_array_equal(record.input.t, record.t)

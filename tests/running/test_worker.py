@@ -1,0 +1,155 @@
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ctid_cli.models.additive import Term
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.running.worker import Job, failure, plain, run_job
+from ctid_cli.storage.manifest import RESULT_FIELDS, Key
+from tests.running.fakes import (
+    STARTS,
+    FakeCell,
+    FakeData,
+    FakeEstimatorCell,
+    FakeFit,
+    FakeRecord,
+    FakeStart,
+    Prepared,
+    Toy,
+)
+
+
+@dataclass(frozen=True)
+class Counting(Toy):
+    """Counts how often records are prepared."""
+
+    def prepare(self, record: FakeRecord) -> Prepared:
+        PREPARED.append(record.replicate)
+        return super().prepare(record)
+
+
+PREPARED: list[int] = []
+
+
+class Broken(FakeCell):
+    def dataset(self, replicate: int) -> Any:
+        raise MemoryError("no room")
+
+
+def job(*toys: Toy, cell: FakeCell | None = None, replicate: int = 2) -> Job:
+    data = cell or FakeCell({"seed": 1, "level": 2.0}, {})
+    cells = [FakeEstimatorCell(f"toy{k}", toy, ()) for k, toy in enumerate(toys)]
+    wanted = tuple(
+        (Key("data", replicate, c.name, label), c, STARTS[label]) for c in cells for label in ("3", "uniform(0, 9)")
+    )
+    return Job(data, replicate, 7, wanted)  # type: ignore[arg-type]
+
+
+def test_a_record_is_prepared_once_for_all_starts() -> None:
+    PREPARED.clear()
+    outcomes = run_job(job(Counting(), Counting(order=3), replicate=4))
+    assert PREPARED == [4, 4]
+    assert [outcome.key.estimator_hash for outcome in outcomes] == ["toy0", "toy0", "toy1", "toy1"]
+
+
+def test_results_do_not_depend_on_what_else_is_wanted() -> None:
+    together = run_job(job(Toy(), Toy(order=3)))
+    alone = run_job(job(Toy()))
+    assert [(o.key, o.result) for o in alone] == [(o.key, o.result) for o in together[:2]]
+
+
+def test_results_are_plain_and_complete() -> None:
+    for outcome in run_job(job(Toy(at=2))):
+        assert tuple(outcome.result) == RESULT_FIELDS
+        assert json.loads(json.dumps(outcome.result, allow_nan=False)) == outcome.result
+        assert outcome.result["standard_errors"] == {"b0": 0.1, "delay": None}
+        assert outcome.seconds is not None
+        assert outcome.seconds > 0
+
+
+def test_one_failing_estimator_leaves_the_others_alone() -> None:
+    outcomes = run_job(job(Toy("raise", at=2), Toy("unusable"), Toy()))
+    assert [outcome.result["status"] for outcome in outcomes] == ["FAILED"] * 4 + ["CONVERGED"] * 2
+    assert outcomes[2].result["message"].startswith("DataError: the input is constant")
+
+
+def test_a_data_set_that_cannot_be_made_fails_every_estimate() -> None:
+    outcomes = run_job(job(Toy(), cell=Broken({}, {})))
+    assert [outcome.result["status"] for outcome in outcomes] == ["FAILED", "FAILED"]
+    assert outcomes[0].result["message"].startswith("MemoryError: no room\n  worker.py:")
+
+
+def test_messages_are_the_same_in_every_process() -> None:
+    def fail() -> None:
+        raise ValueError(f"{object()!r} in {[object()]}")
+
+    def message() -> str:
+        try:
+            fail()
+        except ValueError as error:
+            return str(failure(error)["message"])
+        return ""
+
+    kept = [object() for _ in range(10)]
+    assert message() == message()
+    assert "0x…" in message()
+    assert kept
+
+
+def test_plain_values() -> None:
+    value = {"a": np.array([1.0, np.nan]), "b": (np.float64(np.inf), np.int64(3)), 4: [None, True, "x"]}
+    assert plain(value) == {"a": [1.0, None], "b": [None, 3], "4": [None, True, "x"]}
+
+
+@dataclass(frozen=True)
+class FractionFit(FakeFit):
+    """A fit with what the conversion to submodels needs."""
+
+    parameter_names: tuple[str, ...] = ("a1", "a2", "b0")
+    covariance: np.ndarray[Any, Any] = field(default_factory=lambda: np.diag([0.01, 0.04, 0.09]))
+
+
+@dataclass(frozen=True)
+class Fraction(Toy):
+    """Estimates a second-order fraction, and keeps what it was told to start from."""
+
+    def prepare(self, record: FakeRecord) -> Any:
+        return self
+
+    def fit(self, start: Any) -> FractionFit:
+        assert start.delay is None
+        return FractionFit(TransferFunction([2.0], [1.0, 3.0, 4.0]), {"b0": 0.3, "a1": 0.1, "a2": 0.2}, 1.0)
+
+
+def test_starts_are_told_the_true_system_and_fractions_the_submodels_to_find() -> None:
+    told: list[Any] = []
+
+    @dataclass(frozen=True)
+    class Start:
+        label: str = "near"
+
+        def draw(self, seed: int, replicate: int, true_model: Any) -> FakeStart:
+            told.append((seed, replicate, true_model))
+            return FakeStart(None)
+
+    class Source(FakeCell):
+        def dataset(self, replicate: int) -> Any:
+            return FakeData(FakeRecord(np.ones(3), replicate), true_model="the truth")  # type: ignore[arg-type]
+
+    cell = FakeEstimatorCell("fraction", Fraction(), ())
+    wanted = ((Key("data", 3, "fraction", "near"), cell, Start()),)
+    (untouched,) = run_job(Job(Source({}, {}), 3, 7, wanted))  # type: ignore[arg-type]
+    assert told == [(7, 3, "the truth")]
+    assert untouched.result["parameters"] is None
+    assert untouched.result["standard_errors"].keys() == {"b0", "a1", "a2"}
+    (factored,) = run_job(Job(Source({}, {}), 3, 7, wanted, (Term(2, 0),)))  # type: ignore[arg-type]
+    assert factored.result["parameters"] == pytest.approx({"g1_a1": 0.75, "g1_a2": 0.25, "g1_b0": 0.5, "g1_b1": 0.0})
+    # a_1 = a1/a2: the relative variances of both add up.
+    assert factored.result["standard_errors"]["g1_a1"] == pytest.approx(0.75 * np.hypot(0.1 / 3, 0.2 / 4))
+    assert factored.result["standard_errors"].keys() == {"b0", "a1", "a2", *factored.result["parameters"]}
+    assert json.loads(json.dumps(factored.result, allow_nan=False)) == factored.result

@@ -1,0 +1,182 @@
+from __future__ import annotations
+
+import hashlib
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from ctid_cli.errors import RefusedError, StorageError
+from ctid_cli.running.worker import Outcome
+from ctid_cli.storage.journal import Journal, open_journal, read_journal
+from ctid_cli.storage.manifest import Key
+from ctid_cli.storage.version import Origin
+
+ORIGIN = Origin("c0de", "a platform", (("python", "3.11.7"), ("numpy", "2.4")))
+MANIFEST = {"experiment": "toys", "data_cells": [], "estimators": [], "starts": {}}
+
+
+def outcome(replicate: int, delay: float = 8.0) -> Outcome:
+    return Outcome(Key("data", replicate, "estimator", "3"), {"status": "CONVERGED", "delay": delay}, 0.25)
+
+
+def filled(path: Path, count: int = 3) -> Journal:
+    log = open_journal(path)
+    session = log.begin(MANIFEST, ORIGIN, "2026-11-21T04:00:00Z", {"host": "here"})
+    log.add([outcome(k, 8.0 + k / 3) for k in range(count)], session)
+    return log
+
+
+def files(folder: Path) -> dict[str, str]:
+    return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.iterdir()}
+
+
+def test_what_was_added_is_read_back_exactly(tmp_path: Path) -> None:
+    path = tmp_path / "journal.sqlite"
+    log = filled(path)
+    log.end(1, "2026-11-21T05:00:00Z", "finished")
+    log.close()
+    with read_journal(path) as read:
+        assert read is not None
+        assert read.experiment() == "toys"
+        assert read.manifest() == MANIFEST
+        assert read.origins() == {1: ORIGIN}
+        entries = read.entries()
+        assert {key.replicate: entry.result["delay"] for key, entry in entries.items()} == {
+            0: 8.0,
+            1: 25 / 3,
+            2: 26 / 3,
+        }
+        assert read.keys() == set(entries) == set(read.statuses())
+        assert read.sessions() == [
+            {
+                "session": 1,
+                "started": "2026-11-21T04:00:00Z",
+                "stopped": "2026-11-21T05:00:00Z",
+                "reason": "finished",
+                "host": "here",
+            }
+        ]
+
+
+def test_settings_that_make_commits_durable(tmp_path: Path) -> None:
+    log = filled(tmp_path / "journal.sqlite")
+    pragmas = ("journal_mode", "synchronous", "locking_mode")
+    assert [log._connection.execute(f"PRAGMA {name}").fetchone()[0] for name in pragmas] == ["wal", 2, "exclusive"]
+    with pytest.raises(StorageError, match="locked"):
+        open_journal(log.path)
+    log.close()
+
+
+def test_reading_after_a_kill_finds_everything_and_changes_nothing(tmp_path: Path) -> None:
+    log = filled(tmp_path / "journal.sqlite")
+    dead = tmp_path / "dead"
+    dead.mkdir()
+    # The files as a killed process leaves them: most of the content is still in the write-ahead log.
+    for name in ("journal.sqlite", "journal.sqlite-wal"):
+        (dead / name).write_bytes((tmp_path / name).read_bytes())
+    log.close()
+    before = files(dead)
+    with read_journal(dead / "journal.sqlite") as read:
+        assert read is not None
+        assert len(read.entries()) == 3
+    assert files(dead) == before
+    again = open_journal(dead / "journal.sqlite")
+    assert len(again.entries()) == 3
+    again.close()
+
+
+def test_adding_an_estimate_twice_is_an_error_that_stores_nothing(tmp_path: Path) -> None:
+    log = filled(tmp_path / "journal.sqlite", count=1)
+    with pytest.raises(StorageError, match="could not be written"):
+        log.add([outcome(1), outcome(0)], 1)
+    assert log.keys() == {outcome(0).key}
+    log.close()
+
+
+def test_the_seal_is_broken_by_new_estimates_and_by_a_new_plan(tmp_path: Path) -> None:
+    log = filled(tmp_path / "journal.sqlite")
+    log.mark_sealed("abc")
+    assert log.sealed() == "abc"
+    log.begin(MANIFEST, ORIGIN, "later", {})
+    assert log.sealed() == "abc"
+    log.add([outcome(7)], 2)
+    assert log.sealed() is None
+    log.mark_sealed("def")
+    log.begin({**MANIFEST, "starts": {"3": 3.0}}, ORIGIN, "later", {})
+    assert log.sealed() is None
+    log.close()
+
+
+def test_a_changed_estimate_is_found_by_its_checksum(tmp_path: Path) -> None:
+    path = tmp_path / "journal.sqlite"
+    filled(path).close()
+    data = path.read_bytes()
+    assert data.count(b'"delay":8.0,') == 1
+    path.write_bytes(data.replace(b'"delay":8.0,', b'"delay":9.0,'))
+    with read_journal(path) as read:
+        assert read is not None
+        read.check()
+        with pytest.raises(StorageError, match=f"estimate {outcome(0).key.id} has changed"):
+            read.entries()
+
+
+def test_every_damaged_page_is_reported_as_damage(tmp_path: Path) -> None:
+    path = tmp_path / "journal.sqlite"
+    log = filled(path, count=300)
+    expected = log.entries()
+    log.close()
+    intact = path.read_bytes()
+    found = 0
+    for page in range(0, len(intact), 4096):
+        path.write_bytes(intact[:page] + b"\xa5" * 4096 + intact[page + 4096 :])
+        try:
+            with read_journal(path) as read:
+                assert read is not None
+                read.check()
+                assert (read.experiment(), read.manifest(), read.origins()) == ("toys", MANIFEST, {1: ORIGIN})
+                assert read.entries() == expected
+        except StorageError:
+            found += 1
+    assert found == len(intact) // 4096
+
+
+@pytest.mark.parametrize("content", [b"not a database at all, only text\n" * 200, b"SQLite format 3\0"])
+def test_other_files_are_not_taken_for_a_journal(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "journal.sqlite"
+    path.write_bytes(content)
+    with pytest.raises(StorageError, match="journal"), read_journal(path):
+        pass
+    with pytest.raises(StorageError):
+        open_journal(path)
+    assert path.read_bytes() == content
+
+
+def test_another_programs_database_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "journal.sqlite"
+    with sqlite3.connect(path) as connection:
+        connection.execute("CREATE TABLE meta (name, value)")
+    connection.close()
+    with pytest.raises(StorageError, match="not a journal of ctid"), read_journal(path):
+        pass
+
+
+def test_a_newer_format_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "journal.sqlite"
+    log = filled(path)
+    log._connection.execute("PRAGMA user_version=2")
+    log.close()
+    with pytest.raises(RefusedError, match="format 2; this ctid reads formats up to 1"), read_journal(path):
+        pass
+
+
+def test_no_journal_and_an_empty_one_are_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "journal.sqlite"
+    with read_journal(path) as read:
+        assert read is None
+    path.touch()
+    with read_journal(path) as read:
+        assert read is None
+    open_journal(path).close()
+    with read_journal(path) as read:
+        assert read is None

@@ -1,0 +1,266 @@
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from ctid_cli.errors import RefusedError, StorageError, UsageError
+from ctid_cli.running.engine import run_experiment
+from ctid_cli.running.worker import failed
+from ctid_cli.storage.folder import experiment_folders
+from ctid_cli.storage.journal import open_journal, read_journal
+from ctid_cli.storage.manifest import build_manifest, slots, true_parameters
+from ctid_cli.storage.sealed import read_sealed, seal_image
+from ctid_cli.storage.store import experiment_status, find_estimate, load_estimates, read_stored
+from ctid_cli.storage.summary import export_rows
+from ctid_cli.storage.version import current_origin
+from tests.running.fakes import FakePlan, Toy
+
+PLAN = FakePlan(Toy("raise", at=1), Toy(order=3))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("store") / "results" / "toys"
+    run_experiment(PLAN, place, jobs=2, warm=lambda: 0.0)  # type: ignore[arg-type]
+    return place
+
+
+@pytest.fixture
+def place(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "results" / "toys"))
+
+
+def test_the_sealed_file_holds_what_the_journal_holds(place: Path) -> None:
+    with read_journal(place / "journal.sqlite") as log:
+        assert log is not None
+        journalled = {key: entry.result for key, entry in log.entries().items()}
+        assert log.sealed() == read_sealed(place / "runs.h5").checksum
+    assert read_sealed(place / "runs.h5").results == journalled
+
+
+def test_the_sealed_file_explains_itself_to_other_programs(place: Path) -> None:
+    with h5py.File(place / "runs.h5") as file:
+        assert file.attrs["experiment"] == "toys"
+        assert (file.attrs["seed"], file.attrs["runs"], file.attrs["format_version"]) == (7, 6, 1)
+        assert file.attrs["code_version"] == current_origin().code_version
+        assert json.loads(bytes(file["spec"][()]).decode()) == PLAN.spec.canonical()
+        group = file["estimates"]
+        status = group["status"].asstr()[()]
+        assert status.tolist().count("FAILED") == 4
+        first = int(np.argmax(group["estimator"].asstr()[()] == "toy0"))
+        length = group["denominator_length"][first]
+        assert group["denominator"][first, :length][0] == 1.0
+        assert np.isnan(group["denominator"][first, length:]).all()
+        assert group["delay"].attrs["unit"] == "s"
+        assert set(np.unique(group["swept/level"][()])) == {5.0, 15.5}
+        assert group["standard_error_names"].asstr()[()].tolist() == ["b0", "delay"]
+        everything: list[str] = []
+        file.visit(everything.append)
+        assert not [name for name in everything if any(word in name for word in ("second", "time", "host", "session"))]
+
+
+def test_rows_are_sorted_as_the_specification_is_written(place: Path) -> None:
+    frame = load_estimates(place)
+    assert frame["estimator"].tolist() == ["toy0"] * 24 + ["toy1"] * 12
+    assert frame["level"].tolist()[:24] == [5.0] * 12 + [15.5] * 12
+    assert frame["replicate"].tolist()[:12] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
+    assert frame["start"].tolist()[:2] == ["3", "uniform(0, 9)"]
+    assert frame["initial_delay"].tolist()[:2] == [3.0, "random"]
+    assert frame["initial_delay"].tolist()[-1] is None
+    random_start = frame["start_delay"][1]
+    assert 0 <= random_start <= 9
+    assert random_start != 3.0
+    assert (frame["true_delay"] == 8.0).all()
+    assert frame["seconds"].notna().sum() == 32
+    expected = (frame["delay"] - 8.0).abs() <= 0.08
+    assert frame["converged"].tolist() == expected.tolist()
+    assert {True, False} == set(frame["converged"])
+
+
+def test_estimates_are_the_same_from_the_journal_and_from_the_sealed_file(place: Path) -> None:
+    sealed = load_estimates(place)
+    (place / "runs.h5").unlink()
+    journalled = load_estimates(place)
+    assert journalled.drop(columns="seconds").equals(sealed.drop(columns="seconds"))
+    np.testing.assert_allclose(journalled["seconds"], sealed["seconds"])
+
+
+def test_the_sealed_file_is_enough(place: Path) -> None:
+    complete = load_estimates(place)
+    for name in ("journal.sqlite", "timings.csv", "spec.yaml", "spec.canonical.json"):
+        (place / name).unlink()
+    alone = load_estimates(place)
+    assert alone["seconds"].isna().all()
+    assert alone.drop(columns="seconds").equals(complete.drop(columns="seconds"))
+    status = experiment_status(place)
+    assert (status.planned, status.done, status.failed, status.left_aside) == (36, 36, 4, None)
+
+
+def test_flipped_bits_are_found_or_harmless(place: Path) -> None:
+    path = place / "runs.h5"
+    intact, expected = path.read_bytes(), read_sealed(path)
+    rng = np.random.default_rng(5)
+    found = 0
+    for position in rng.integers(0, len(intact), 150).tolist():
+        damaged = bytearray(intact)
+        damaged[position] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        try:
+            assert read_sealed(path) == expected
+        except (StorageError, RefusedError):
+            found += 1
+    assert found > 20
+    path.write_bytes(intact[: len(intact) // 2])
+    with pytest.raises(StorageError, match=r"'ctid run' with the same specification seals them again"):
+        load_estimates(place)
+
+
+def test_a_newer_sealed_format_is_refused(place: Path) -> None:
+    (place / "journal.sqlite").unlink()
+    with h5py.File(place / "runs.h5", "r+") as file:
+        file.attrs["format_version"] = 2
+    with pytest.raises(RefusedError, match="format 2; this ctid reads formats up to 1"):
+        load_estimates(place)
+
+
+def test_sealing_extreme_contents_gives_them_back(tmp_path: Path) -> None:
+    plan = FakePlan(Toy(), runs=1, levels=(1,))
+    manifest = build_manifest(plan)  # type: ignore[arg-type]
+    keys = [slot.key for slot in slots(manifest)]
+    odd: dict[str, Any] = {
+        "status": "CONVERGED",
+        "message": "τ̂ = 8\n\tπ",
+        "start_delay": 0.0,
+        "delay": 5e-324,
+        "numerator": [None, -0.0, 1.7976931348623157e308],
+        "denominator": [1.0],
+        "parameters": None,
+        "standard_errors": {},
+        "cost": None,
+        "fit_percent": -1e300,
+        "validation_fit_percent": 0.1,
+        "iterations": 0,
+        "condition_number": None,
+    }
+    for results in ({keys[0]: odd, keys[1]: failed("died", "CRASHED")}, {keys[1]: odd}, {}):
+        image, checksum, count = seal_image(manifest, [current_origin()], results)
+        (tmp_path / "runs.h5").write_bytes(image)
+        read = read_sealed(tmp_path / "runs.h5")
+        assert read.results == results
+        assert (read.checksum, count) == (checksum, len(results))
+        assert read.manifest == manifest
+        assert read.origins == (current_origin(),)
+
+
+def additive(manifest: dict[str, Any]) -> dict[str, Any]:
+    """The same plan for a system of two submodels, the faster one first."""
+    submodels = [{"numerator": [2.0], "denominator": [0.1, 1.0]}, {"numerator": [3.0], "denominator": [2.0, 1.0]}]
+    cells = [
+        cell | {"content": cell["content"] | {"system": {"additive": submodels, "delay": 0.0}}}
+        for cell in manifest["data_cells"]
+    ]
+    return manifest | {"data_cells": cells}
+
+
+def test_parameters_of_submodels_are_sealed(tmp_path: Path) -> None:
+    plan = FakePlan(Toy(), runs=2, levels=(1,))
+    plain = build_manifest(plan)  # type: ignore[arg-type]
+    manifest = additive(plain)
+    keys = [slot.key for slot in slots(manifest)]
+    result = failed("", "CONVERGED") | {"numerator": [1.0], "denominator": [1.0, 2.0], "iterations": 3}
+    results = {
+        keys[0]: result | {"parameters": {"g1_a1": 2.0, "g1_b0": 3.0}, "standard_errors": {"g1_a1": 0.1}},
+        keys[1]: result | {"parameters": {"g1_a1": 2.5, "g1_b0": None, "g1_b1": 0.0}, "standard_errors": {}},
+        keys[2]: result | {"parameters": None, "standard_errors": {"a1": 0.2}},
+        keys[3]: failed("died", "CRASHED"),
+    }
+    (tmp_path / "runs.h5").write_bytes(seal_image(manifest, [current_origin()], results)[0])
+    assert read_sealed(tmp_path / "runs.h5").results == results
+    frame = load_estimates(tmp_path)
+    assert frame["parameters"].tolist() == [results[key]["parameters"] for key in keys]
+    assert "g1_b1" in export_rows(frame)
+    # Where nothing is additive, there is no trace of it, neither in the file nor in the rows.
+    image, _, _ = seal_image(plain, [current_origin()], {key: result | {"standard_errors": {}} for key in keys})
+    (tmp_path / "runs.h5").write_bytes(image)
+    with h5py.File(tmp_path / "runs.h5") as file:
+        assert not [name for name in file["estimates"] if "parameter" in name]
+    assert "parameters" not in load_estimates(tmp_path)
+    assert not any("parameters" in row for row in read_stored(tmp_path).rows())
+
+
+def test_true_parameters_are_those_of_the_sorted_submodels(tmp_path: Path) -> None:
+    plain = build_manifest(FakePlan(Toy(), runs=1, levels=(1,)))  # type: ignore[arg-type]
+    manifest = additive(plain)
+    assert true_parameters(plain["data_cells"][0]) is None
+    truth = true_parameters(manifest["data_cells"][0])
+    assert truth == {"g1_a1": 2.0, "g1_b0": 3.0, "g2_a1": 0.1, "g2_b0": 2.0}
+    assert true_parameters({"content": {"data": {}}}) is None
+    manifest["success"] = {"parameter_relative_error": 0.1}
+    near, far = truth, truth | {"g2_b0": 2.3}
+    results = {
+        slot.key: failed("", "CONVERGED") | {"parameters": found, "standard_errors": {}}
+        for slot, found in zip(slots(manifest), (near, far), strict=True)
+    }
+    (tmp_path / "runs.h5").write_bytes(seal_image(manifest, [current_origin()], results)[0])
+    assert load_estimates(tmp_path)["converged"].tolist() == [True, False]
+
+
+def test_find_an_estimate_by_the_beginning_of_its_id(place: Path) -> None:
+    frame = load_estimates(place)
+    wanted = frame.iloc[5]
+    found = find_estimate(place.parent, wanted["id"][:8])
+    assert found.folder == place
+    assert found.row["id"] == wanted["id"]
+    assert found.row["delay"] == wanted["delay"]
+    assert found.data == {"system": PLAN.data_cells[0].content["system"], "level": 5, "seed": 7}
+    assert found.estimator["kind"] == "toy"
+    assert found.seed == 7
+    with pytest.raises(UsageError, match="36 estimates"):
+        find_estimate(place.parent, "")
+    with pytest.raises(UsageError, match="no estimate"):
+        find_estimate(place.parent, "xyz")
+
+
+def test_estimates_of_a_killed_run_are_readable(place: Path) -> None:
+    log = open_journal(place / "journal.sqlite")
+    log.begin(build_manifest(FakePlan(Toy("raise", at=1), Toy(order=3), runs=8)), current_origin(), "now", {})  # type: ignore[arg-type]
+    log.close()
+    assert len(read_stored(place).rows()) == 36
+    status = experiment_status(place)
+    assert (status.planned, status.done, status.todo, status.failed) == (48, 36, 12, 4)
+    assert [group.todo for group in status.groups] == [4, 4, 2, 2]
+    assert status.groups[1].swept == {"level": 15.5, "order": 2}
+
+
+def test_folders_without_results(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no results"):
+        load_estimates(tmp_path)
+    assert experiment_folders(tmp_path) == []
+    # As a run leaves it that is killed before it has planned anything.
+    open_journal(tmp_path / "journal.sqlite").close()
+    for read in (load_estimates, experiment_status):
+        with pytest.raises(UsageError, match="no results"):
+            read(tmp_path)
+    assert experiment_folders(tmp_path / "nowhere") == []
+
+
+def test_folders_with_spaces_and_umlauts(made: Path, tmp_path: Path) -> None:
+    odd = Path(shutil.copytree(made, tmp_path / "Ergebnisse für #1 100%?" / "toys"))
+    assert len(load_estimates(odd)) == 36
+    summary = run_experiment(PLAN, odd, jobs=1, warm=lambda: 0.0)  # type: ignore[arg-type]
+    assert summary.computed == 0
+
+
+def test_a_read_only_folder_can_be_read(place: Path) -> None:
+    place.chmod(0o555)
+    try:
+        assert len(load_estimates(place)) == 36
+        assert experiment_status(place).done == 36
+    finally:
+        place.chmod(0o755)
