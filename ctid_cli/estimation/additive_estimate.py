@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Literal, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.additive_problem import AdditiveProblem
 from ctid_cli.estimation.common import history_entry
@@ -19,8 +19,6 @@ from ctid_cli.inference.fit import IterationRecord
 from ctid_cli.inference.robust import sandwich_covariance
 from ctid_cli.inference.status import Status
 from ctid_cli.models.controller import DiscreteController
-
-Array = NDArray[np.float64]
 
 #: Noise that standard errors hold for.
 Covariance = Literal["white", "sandwich"]

@@ -9,8 +9,8 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.problems import is_hurwitz, reflect_unstable
 from ctid_cli.estimation.refined_iv import Equations
@@ -21,8 +21,6 @@ from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Record
-
-Array = NDArray[np.float64]
 
 #: Where instruments come from: the measured input, or the noise-free loop of the model.
 Instruments = Literal["open_loop", "closed_loop"]

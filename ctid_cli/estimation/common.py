@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.problems import CoefficientProblem
 from ctid_cli.filtering.bank import FilterData
@@ -20,8 +20,6 @@ from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.record import Record
-
-Array = NDArray[np.float64]
 
 #: What an estimator takes from a start: an initial delay, or initial parameters.
 StartFrom = Literal["delay", "parameters"]

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.estimation.delay_search import LEAST_CURVATURE
 from ctid_cli.estimation.problems import is_hurwitz
 from ctid_cli.estimation.refined_iv import NEGLIGIBLE_FALL, ROUNDING, SLOW_STEPS, SUFFICIENT_FALL
@@ -23,10 +23,6 @@ from ctid_cli.filtering.bank import (
 )
 from ctid_cli.filtering.sections import polynomial_roots, time_scale
 from ctid_cli.inference.sensitivity import Structure
-
-Array = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
 
 
 @njit(cache=True, nogil=True)
@@ -144,14 +140,14 @@ def _output_power(moments: Array, theta: Array, n: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _take_submatrix(moments: Array, rows: IntArray, columns: IntArray, signs: Array, p: int, out: Array) -> None:
+def _take_submatrix(moments: Array, rows: IndexArray, columns: IndexArray, signs: Array, p: int, out: Array) -> None:
     for i in range(p):
         for j in range(p):
             out[i, j] = moments[rows[i], columns[j]] * signs[i] * signs[j]
 
 
 @njit(cache=True, nogil=True)
-def _refit_numerator(moments: Array, theta: Array, rows: IntArray, n: int) -> None:
+def _refit_numerator(moments: Array, theta: Array, rows: IndexArray, n: int) -> None:
     """Best numerator for the denominator of theta, from moments taken with a zero numerator; in place."""
     q = theta.size - n
     gram, right, diagonal, numerator = np.empty((q, q)), np.empty(q), np.empty(q), np.empty(q)
@@ -169,8 +165,8 @@ def _refit_numerator(moments: Array, theta: Array, rows: IntArray, n: int) -> No
 def _iterate(
     theta: Array,
     n: int,
-    sensitivity_rows: IntArray,
-    regressor_rows: IntArray,
+    sensitivity_rows: IndexArray,
+    regressor_rows: IndexArray,
     signs: Array,
     max_iterations: int,
     tolerance: float,
@@ -264,7 +260,7 @@ def _iterate(
 
 
 @njit(cache=True, nogil=True)
-def _delay_step(moments: Array, rows: IntArray, signs: Array, n: int, p: int) -> float:
+def _delay_step(moments: Array, rows: IndexArray, signs: Array, n: int, p: int) -> float:
     """Gauss-Newton step of the delay with the coefficients projected out; NaN where it is not determined."""
     hessian, mixed, diagonal, projection = np.empty((p, p)), np.empty(p), np.empty(p), np.empty(p)
     _take_submatrix(moments, rows, rows, signs, p, hessian)
@@ -288,8 +284,8 @@ def _delay_step(moments: Array, rows: IntArray, signs: Array, n: int, p: int) ->
 def _best_of(
     starts: Array,
     n: int,
-    sensitivity_rows: IntArray,
-    regressor_rows: IntArray,
+    sensitivity_rows: IndexArray,
+    regressor_rows: IndexArray,
     signs: Array,
     max_iterations: int,
     tolerance: float,

@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.estimation.delay_search import Minimum, descend
 from ctid_cli.estimation.filtered_costs import FilteredCost
-
-Array = NDArray[np.float64]
 
 #: Local minima of a level around which the next level looks, and those of the last level that are returned.
 KEPT = 8

@@ -13,12 +13,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.estimation.refined_iv import Equations, scaled_solve
 from ctid_cli.inference.status import Status
-
-Array = NDArray[np.float64]
 
 #: The smallest delay step, as a fraction of the range of the delay.
 SMALLEST_STEP = 1e-5

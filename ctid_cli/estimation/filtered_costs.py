@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.estimation.compiled_iteration import best_coefficients
 from ctid_cli.estimation.delay_search import DelayCost, Minimum, delay_step
 from ctid_cli.estimation.problems import least_squares_start
@@ -27,7 +27,6 @@ from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
-Array = NDArray[np.float64]
 Search = Literal["time", "spectral"]
 
 #: Highest frequency of a spectral search, as a multiple of the highest cut-off: a filter of order 10 passes 3e-4 of the

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from itertools import combinations, islice
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import check_record
 from ctid_cli.estimation.pole_relocation import (
@@ -33,9 +33,6 @@ from ctid_cli.filtering.submodels import SubmodelFilter
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.signals.record import Record
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 #: Noise levels within this factor of each other are not worth a second search with other weights.
 NEARLY_WHITE = 2.0
@@ -318,8 +315,8 @@ class _Responses:
 
     forced: Array
     free: Array
-    forced_owner: NDArray[np.intp]
-    free_owner: NDArray[np.intp]
+    forced_owner: IndexArray
+    free_owner: IndexArray
 
     def of(self, owners: Sequence[int]) -> _Responses:
         """Those of some submodels."""
@@ -383,7 +380,7 @@ def _with_poles(groups: Sequence[Sequence[complex]], terms: Sequence[Term], dela
     return AdditiveModel(submodels, delay)
 
 
-def _numerator_places(terms: Sequence[Term]) -> NDArray[np.intp]:
+def _numerator_places(terms: Sequence[Term]) -> IndexArray:
     """Places of the numerators' coefficients in theta."""
     flags = [k >= term.poles for term in terms for k in range(term.size)]
     return np.flatnonzero(flags)

@@ -12,14 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.estimation.problems import with_stable_denominator
 from ctid_cli.estimation.refined_iv import Equations, scaled_solve
 from ctid_cli.filtering.bank import FilterData, standard_rows
 from ctid_cli.inference.sensitivity import Structure
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -177,7 +175,7 @@ class OutputErrorProblem:
         free = np.arange(self.layout.size) >= self.structure.size
         return self._solved(np.where(free, 0.0, theta), free)
 
-    def _solved(self, theta: Array, free: NDArray[np.bool_], least_norm: bool = False) -> Array | None:
+    def _solved(self, theta: Array, free: BoolArray, least_norm: bool = False) -> Array | None:
         """Minimise over parameters that are zero and that the output depends on linearly."""
         if not free.any():
             return theta

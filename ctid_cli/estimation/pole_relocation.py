@@ -27,14 +27,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, ComplexArray, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.spectra import record_spectra
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-IndexArray = NDArray[np.intp]
 
 #: Longer records are searched in their first samples only: poles need not be exact, and the work stays bounded.
 LONGEST_STRETCH = 8192

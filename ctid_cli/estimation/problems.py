@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.estimation.refined_iv import Equations, scaled_solve
 from ctid_cli.filtering.bank import FilterData, second_moments
 from ctid_cli.inference.sensitivity import Structure
-
-Array = NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True)

@@ -14,11 +14,10 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.inference.status import Status
 
-Array = NDArray[np.float64]
 #: How steps are accepted where the solution is a minimum of the output-error cost, and in general.
 Variant = Literal["plain", "guarded"]
 StepRule = Literal["plain", "guarded", "relaxed"]

@@ -16,16 +16,13 @@ from functools import lru_cache
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, ComplexArray, IndexArray
 from ctid_cli.estimation.problems import reflect_unstable, with_stable_denominator
 from ctid_cli.estimation.refined_iv import Equations, scaled_solve
 from ctid_cli.filtering.bank import plain_array
 from ctid_cli.filtering.spectra import RecordSpectra
 from ctid_cli.inference.sensitivity import Structure
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 #: Frequencies above the last one whose weight exceeds this fraction of the greatest are left out.
 NEGLIGIBLE_WEIGHT = 1e-6
@@ -142,7 +139,7 @@ def spectral_refit_numerator(
     return theta if numerator is None else np.concatenate((theta[:n], numerator))
 
 
-def _regressors(n: int, m: int, with_delay: bool) -> NDArray[np.intp]:
+def _regressors(n: int, m: int, with_delay: bool) -> IndexArray:
     """Columns of the moments that hold the regressors: the sensitivities but for the denominator's."""
     columns = np.arange(n + m + 1 + int(with_delay))
     columns[:n] += n + m + 2
@@ -150,7 +147,7 @@ def _regressors(n: int, m: int, with_delay: bool) -> NDArray[np.intp]:
 
 
 @lru_cache(maxsize=64)
-def _places(n: int, m: int, with_delay: bool) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+def _places(n: int, m: int, with_delay: bool) -> tuple[IndexArray, IndexArray, IndexArray]:
     """Places of the Hessian, the instrumental-variable matrix and the gradient in the flattened moments."""
     size = 2 * n + m + 3
     regressors = _regressors(n, m, with_delay)

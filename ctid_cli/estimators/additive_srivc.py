@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import ClassVar, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.additive_estimate import Covariance, SubmodelEstimate, estimate_submodels
@@ -25,8 +24,6 @@ from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.checks import require_choice, require_not_negative
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Start, StartFrom, check_iteration, check_record, history_entry
 from ctid_cli.estimation.delay_grid import Level, local_minima, search_grid
@@ -31,7 +31,6 @@ from ctid_cli.signals.checks import require_choice, require_integer, require_not
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.record import Record
 
-Array = NDArray[np.float64]
 InitialState = Literal["rest", "estimate", "periodic"]
 Offset = Literal["none", "remove", "estimate"]
 ProfileSearch = Literal["time", "spectral", "samples"]
@@ -262,7 +261,7 @@ class MeasuredFit(Fit):
     profile: Profile | None = field(default=None, repr=False)
     residuals: tuple[Array, ...] = field(default=(), repr=False)
     sensitivities: tuple[Array, ...] = field(default=(), repr=False)
-    used: tuple[NDArray[np.bool_], ...] = field(default=(), repr=False)
+    used: tuple[BoolArray, ...] = field(default=(), repr=False)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -284,7 +283,7 @@ class AppliedModel:
 
     #: Output errors at the used samples of each experiment [output unit].
     residuals: tuple[Array, ...] = field(repr=False)
-    used: tuple[NDArray[np.bool_], ...] = field(repr=False)
+    used: tuple[BoolArray, ...] = field(repr=False)
     initial_states: tuple[Array, ...]
     #: Output offset of each experiment [output unit].
     offsets: tuple[float, ...]
@@ -489,7 +488,7 @@ class PreparedProfile:
             on_step=on_step,
         )
 
-    def _used(self, problem: OutputErrorProblem) -> tuple[NDArray[np.bool_], ...]:
+    def _used(self, problem: OutputErrorProblem) -> tuple[BoolArray, ...]:
         """Which samples of each record enter the sums, without those of periods put before it."""
         return tuple(
             data.use[data.use.size - record.t.size :] for data, record in zip(problem.data, self.records, strict=True)

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 
+from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.delay_profile import AppliedModel, DelayProfile, MeasuredFit, PreparedProfile
 from ctid_cli.inference.conditioning import (
@@ -32,8 +32,6 @@ from ctid_cli.inference.residuals import ResidualTests, residual_tests
 from ctid_cli.inference.robust import sandwich_covariance
 from ctid_cli.inference.status import Status
 from ctid_cli.signals.record import Record
-
-Array = NDArray[np.float64]
 
 #: Confidence level of intervals and tests.
 LEVEL = 0.95
@@ -276,7 +274,7 @@ def _conditioning(fit: MeasuredFit, covariance: Array) -> list[str]:
     return [*words, *describe_conditioning(block, fit.theta[free], names, condition_number(hessian), hessian=hessian)]
 
 
-def _free_block(fit: MeasuredFit) -> tuple[NDArray[np.intp], Array]:
+def _free_block(fit: MeasuredFit) -> tuple[IndexArray, Array]:
     """Indices of the parameters that are not at a bound, and their part of ``sum psi psi'``."""
     held = fit.status is Status.DELAY_AT_BOUND
     free = np.array([k for k, name in enumerate(fit.parameter_names) if not (held and name == "delay")])

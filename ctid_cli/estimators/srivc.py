@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.additive_estimate import Covariance, estimate_submodels
 from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
@@ -38,8 +38,6 @@ from ctid_cli.models.factoring import unfactored, unfactored_jacobian
 from ctid_cli.signals.checks import require_choice, require_not_negative, require_positive
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
-
-Array = NDArray[np.float64]
 
 #: How steps are accepted; ``auto`` depends on the instruments.
 SrivcVariant = Literal["auto", "guarded", "plain", "relaxed"]

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import ClassVar, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import (
     Start,
@@ -31,8 +31,6 @@ from ctid_cli.inference.status import Status
 from ctid_cli.signals.checks import require_choice, require_positive
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
-
-Array = NDArray[np.float64]
 
 #: SRIVC iterations at each trial delay while searching.
 INNER_ITERATIONS = 20

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Start, StartFrom, check_iteration, check_structure, initial_delay
 from ctid_cli.estimation.delay_grid import scan
@@ -22,8 +22,6 @@ from ctid_cli.inference.status import Status
 from ctid_cli.signals.checks import require_choice, require_integer, require_positive
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
-
-Array = NDArray[np.float64]
 
 #: J0 is evaluated on a lattice of delays of this fraction of the shortest period, so that candidates that agree share
 #: it, and so do searches of the same data from different initial delays.

@@ -23,17 +23,15 @@ from typing import Literal
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.filtering.exponential import held_step, place
 from ctid_cli.filtering.kernels import irregular_chain_pass, modal_pass, regular_chain_pass
 from ctid_cli.filtering.sections import chain, polynomial_roots, time_scale
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-BoolArray = NDArray[np.bool_]
 Form = Literal["auto", "modal", "chain"]
 
 #: Partial fractions are used while they amplify rounding by less than this; beyond, poles count as repeated.

@@ -14,13 +14,12 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array
 from ctid_cli.filtering.filter_theory import extrema
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.signals.checks import require_integer, require_positive
-
-Array = NDArray[np.float64]
 
 #: Least ratio of the longest to the shortest period for which a sufficient number of filters exists, (41): the second
 #: extremum over the first, both by (36). Those of the true cost ask for 1.7192; between the two a narrow gap remains.

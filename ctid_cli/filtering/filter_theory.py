@@ -18,13 +18,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
 
-Array = NDArray[np.float64]
 Spectrum = Callable[[Array], ArrayLike]
 
 #: Panels of the quadrature whose two halves change them by less than this part of the whole are settled.

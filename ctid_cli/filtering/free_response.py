@@ -13,12 +13,10 @@ from collections.abc import Sequence
 from math import factorial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.filtering.submodel_map import simple_modes
 from ctid_cli.models.additive import Term
-
-Array = NDArray[np.float64]
 
 
 def free_response_size(terms: Sequence[Term]) -> int:

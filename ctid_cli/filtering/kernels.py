@@ -15,13 +15,9 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.filtering.exponential import exponential_minus_identity, place
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-BoolArray = NDArray[np.bool_]
 
 #: Rows are collected in blocks of this many samples, so that the products run along contiguous memory.
 BLOCK = 128

@@ -11,8 +11,9 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.bank import plain_array
 from ctid_cli.filtering.sampled import SampledModel, sampled_model, state_space_response
@@ -21,8 +22,6 @@ from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_choice
 from ctid_cli.signals.record import Controller, Enters
-
-Array = NDArray[np.float64]
 
 #: Below this fraction of its terms, 1 + (direct gain round the loop) is rounding.
 NO_GAIN = 1e-12
@@ -209,7 +208,7 @@ def input_sensitivity(
     interval: float,
     frequencies: ArrayLike,
     enters: Enters = "controller",
-) -> NDArray[np.complex128]:
+) -> ComplexArray:
     r"""Frequency response from the reference to the input of the noise-free loop.
 
     Evaluated on the state space of the loop, so it stays finite where model or controller integrate.

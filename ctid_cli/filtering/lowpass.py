@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
-
-Array = NDArray[np.float64]
 
 #: A resampled record has this many samples, but no fewer and no more than so many for each period of the cut-off.
 ENOUGH_SAMPLES = 500
@@ -140,7 +138,7 @@ class Lowpass:
         return Record(t, np.where(covered, y, np.nan), HeldSignal(t, u, "foh"), name=record.name)
 
 
-def _covered(t: Array, record: Record, longest: float) -> NDArray[np.bool_]:
+def _covered(t: Array, record: Record, longest: float) -> BoolArray:
     """Whether instants lie between two neighbouring samples, or in a hole no longer than given."""
     places = np.flatnonzero(record.valid)
     present = record.t[places]

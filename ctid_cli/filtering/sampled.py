@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.bank import plain_array, scaled_denominator, split_delay
 from ctid_cli.filtering.exponential import held_step
@@ -16,8 +17,6 @@ from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_positive
 from ctid_cli.signals.held import HeldSignal
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +94,7 @@ def sampled_state_space(model: AdditiveModel | TransferFunction, interval: float
 
 def state_space_response(
     A: ArrayLike, B: ArrayLike, C: ArrayLike, D: ArrayLike, frequencies: ArrayLike, interval: float
-) -> NDArray[np.complex128]:
+) -> ComplexArray:
     r"""``C (q I - A)^(-1) B + D`` at ``q = exp(j w h)``."""
     dynamics, inputs, outputs, feedthrough = (np.asarray(matrix, dtype=float) for matrix in (A, B, C, D))
     q = np.exp(1j * np.asarray(frequencies, dtype=float) * interval)

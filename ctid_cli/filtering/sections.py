@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+from ctid_cli.arrays import Array, BoolArray, ComplexArray
 
 #: Roots whose distance is a smaller fraction of their magnitudes together count as close to each other.
 APART = 0.2
@@ -194,7 +192,7 @@ def chain(roots: ComplexArray) -> tuple[Array, Array, Array]:
 
 
 @njit(cache=True, nogil=True)
-def _expand(polynomial: Array, roots: ComplexArray, paired: NDArray[np.bool_], cumulative: Array, out: Array) -> None:
+def _expand(polynomial: Array, roots: ComplexArray, paired: BoolArray, cumulative: Array, out: Array) -> None:
     """Write ``polynomial/A`` on the states: divide by the slowest section, keep the remainder, go on."""
     n = roots.size
     quotient = polynomial.copy()

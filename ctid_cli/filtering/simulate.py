@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.bank import plain_array, scaled_denominator, split_delay
 from ctid_cli.filtering.exponential import held_step
@@ -14,8 +15,6 @@ from ctid_cli.filtering.sections import chain, polynomial_roots, time_scale
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import REGULARITY, regular_interval
-
-Array = NDArray[np.float64]
 
 
 def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> Array:

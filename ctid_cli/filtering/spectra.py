@@ -15,17 +15,13 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.bank import plain_array
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-IndexArray = NDArray[np.int64]
 
 #: Partial sums are kept for this many stretches of breaks; within a stretch they are formed when a delay asks.
 STRETCHES = 128
@@ -212,7 +208,7 @@ def _add_jumps(times: Array, jumps: Array, first: int, last: int, base: float, p
 
 
 @njit(cache=True, nogil=True)
-def _partial_sums(times: Array, jumps: Array, marks: IndexArray, base: float, count: int) -> Array:
+def _partial_sums(times: Array, jumps: Array, marks: IntArray, base: float, count: int) -> Array:
     """Sums over the first ``marks[r]`` breaks, shape (marks, 2, count)."""
     sums = np.zeros((marks.size, 2, count))
     phases, total = np.zeros((2, count)), np.zeros((2, count))
@@ -227,7 +223,7 @@ def _partial_sums(times: Array, jumps: Array, marks: IndexArray, base: float, co
 
 
 @njit(cache=True, nogil=True)
-def _last_at(grid: Array | IndexArray, value: float) -> int:
+def _last_at(grid: Array | IntArray, value: float) -> int:
     """Index of the last entry not above ``value``; 0 if there is none."""
     low, high = 0, grid.size
     while high - low > 1:
@@ -247,7 +243,7 @@ def _window_spectrum(
     jumps: Array,
     integral: Array,
     foh: bool,
-    marks: IndexArray,
+    marks: IntArray,
     sums: Array,
     duration: float,
     delay: float,

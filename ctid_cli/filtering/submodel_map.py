@@ -6,14 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, modal_condition, plain_array, scaled_denominator
 from ctid_cli.filtering.sections import polynomial_roots, time_scale
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-IntArray = NDArray[np.int64]
 
 
 @njit(cache=True, nogil=True)

@@ -13,14 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, BoolArray, ComplexArray, IntArray
 from ctid_cli.filtering.kernels import BLOCK, accumulate, step_weights
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 
 @njit(cache=True, nogil=True)

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.bank import (
     FilterData,
@@ -34,10 +34,6 @@ from ctid_cli.filtering.submodel_map import PooledModes, simple_modes
 from ctid_cli.filtering.submodel_pass import submodel_pass
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.controller import DiscreteController
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-IntArray = NDArray[np.int64]
 
 #: State of the filters at the first sample.
 InitialState = Literal["rest", "periodic", "estimated"]
@@ -204,7 +200,7 @@ class SubmodelFilter:
         modes: PooledModes,
         state: ComplexArray,
         y: Array,
-        use: NDArray[np.bool_],
+        use: BoolArray,
         rows: Array,
         gram: Array,
     ) -> None:

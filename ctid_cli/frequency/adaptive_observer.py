@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, IntArray
 from ctid_cli.frequency.checks import one_for_each, samples_in
 from ctid_cli.frequency.decoding import flag_uncertain
 from ctid_cli.frequency.flags import GAP, OUT_OF_BOUNDS, STARTING, UNDETERMINED
@@ -16,9 +17,6 @@ from ctid_cli.frequency.moments import factorise, substitute
 from ctid_cli.frequency.regression import MOST_TONES
 from ctid_cli.frequency.tracking import OnlineEstimator, Recursion
 from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: Ridge of the Gauss-Newton matrix, as a fraction of its trace.
 RIDGE = 1e-4

@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.checks import LARGEST_SAMPLE
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.regression import MOST_TONES
 from ctid_cli.signals.checks import require_positive
-
-Array = NDArray[np.float64]
 
 #: Below this ratio of the singular values the sinusoids cannot be told apart.
 SINGULAR = 1e-10

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.adaptive_observer import AdaptiveObserver
 from ctid_cli.frequency.checks import LARGEST_SAMPLE
@@ -24,8 +24,6 @@ from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.frequency.spectrum import Peaks, find_peaks
 from ctid_cli.frequency.windows import estimate_window
 from ctid_cli.signals.checks import require_choice, require_integer, require_positive
-
-Array = NDArray[np.float64]
 
 #: Samples in a period of the highest tone, for estimators that take windows, that delay, and that integrate.
 WINDOW_SAMPLES = 4

@@ -10,13 +10,11 @@ from math import gcd
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.frequency.flags import INCONSISTENT
 from ctid_cli.frequency.moments import accumulate_row, factorise, least_squares, squared_residual
 from ctid_cli.frequency.regression import form_row
-
-Array = NDArray[np.float64]
 
 #: The second delay is near this fraction of the first, as far from every simple ratio as can be.
 GOLDEN_FRACTION = (np.sqrt(5.0) - 1.0) / 2.0

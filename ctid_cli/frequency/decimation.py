@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.frequency.prefilter import fast_convolve
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

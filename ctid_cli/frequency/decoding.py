@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array
 from ctid_cli.filtering.sections import polynomial_roots, time_scale
 from ctid_cli.frequency.flags import CERTAIN_FRACTION, COMPLEX_ROOTS, OUT_OF_BOUNDS, UNCERTAIN, Flag
-
-Array = NDArray[np.float64]
 
 #: A root must settle within this many Newton steps; simple roots need fewer than ten.
 NEWTON_STEPS = 60

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.frequency.checks import require_bounds
 from ctid_cli.frequency.consistency import second_lag
 from ctid_cli.frequency.prefilter import impulse_response
 from ctid_cli.frequency.regression import MOST_TONES, delay_table, whole_delay
 from ctid_cli.frequency.tracking import OnlineEstimator
 from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
-
-Array = NDArray[np.float64]
 
 #: A delay that rounding to whole sampling intervals changes by a larger fraction is worth a note.
 NOTEWORTHY_ROUNDING = 0.01

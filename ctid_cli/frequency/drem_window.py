@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, IntArray
 from ctid_cli.frequency.consistency import (
     DETECTOR_SPAN,
     USUAL_SPANS,
@@ -30,9 +31,6 @@ from ctid_cli.frequency.scalar_regressions import (
     rows_before_valid,
 )
 from ctid_cli.frequency.tracking import Recursion
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: A scatter of the scalar regressions below this fraction of their square is rounding.
 SCATTER_ROUNDING = 1e-14

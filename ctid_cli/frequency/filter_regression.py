@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, IntArray
 from ctid_cli.filtering.exponential import held_step
 from ctid_cli.frequency.checks import one_for_each, require_bounds, samples_in
 from ctid_cli.frequency.decoding import flag_uncertain, root_real_parts, root_sensitivities
@@ -19,8 +20,6 @@ from ctid_cli.frequency.regression import MOST_TONES
 from ctid_cli.frequency.tracking import OnlineEstimator, Recursion
 from ctid_cli.signals.checks import require_choice, require_integer, require_not_negative, require_positive
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Algorithm = Literal["least_squares", "gradient"]
 
 #: The estimate is decoded anew every so many samples.

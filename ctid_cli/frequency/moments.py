@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ctid_cli.arrays import Array
 
 #: Second moments summed over many samples carry relative errors of about this size.
 ROUNDING = 4e-15

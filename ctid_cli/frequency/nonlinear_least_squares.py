@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.amplitudes import flag_insignificant, frequency_errors, present_samples
@@ -17,8 +17,6 @@ from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.regression import MOST_TONES
 from ctid_cli.frequency.tracking import FrequencyEstimate
 from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
-
-Array = NDArray[np.float64]
 
 #: Halvings of a step that raises the cost by more than these fractions of itself and of the signal's square.
 HALVINGS = 20

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.frequency.automatic import Settings
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.tracking import FrequencyEstimate
 from ctid_cli.frequency.windows import amplitudes_of, estimate_window, wanted_tones
-
-Array = NDArray[np.float64]
 
 #: Rows of a track if nobody says how many.
 USUAL_ROWS = 1000
@@ -45,7 +44,7 @@ class RecordTrack:
     every: float
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> BoolArray:
         """Rows without any flag, shape (N,)."""
         return np.asarray(self.flags == 0)
 

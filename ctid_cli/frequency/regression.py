@@ -15,12 +15,10 @@ from math import comb
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array, IntArray
 from ctid_cli.signals.checks import require_integer, require_positive
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: More tones than this cannot be told apart in double precision.
 MOST_TONES = 8

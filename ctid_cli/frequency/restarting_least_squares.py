@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, IntArray
 from ctid_cli.frequency.consistency import (
     ALARM_RATIO,
     DETECTOR_SPAN,
@@ -31,8 +32,6 @@ from ctid_cli.frequency.regression import form_row
 from ctid_cli.frequency.tracking import Recursion
 from ctid_cli.signals.checks import require_choice, require_positive
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Solution = Literal["least_squares", "total_least_squares"]
 
 #: The estimate is computed anew with every row at first, later every so many.

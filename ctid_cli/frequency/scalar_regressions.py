@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, IntArray
 from ctid_cli.frequency.checks import one_for_each
 from ctid_cli.frequency.consistency import (
     DETECTOR_SPAN,
@@ -25,9 +26,6 @@ from ctid_cli.frequency.flags import GAP, STARTING, UNCERTAIN, UNDETERMINED
 from ctid_cli.frequency.regression import form_row, minor_plan, mix_rows, theta_of, whole_delay
 from ctid_cli.frequency.tracking import Recursion
 from ctid_cli.signals.checks import require_integer, require_positive
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: A mixed regression may be wrong by this fraction of the product of its rows' lengths.
 MIXING_ROUNDING = 1e-15

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ctid_cli.arrays import Array, BoolArray
 
 #: Points of the spectrum for each bin of an unpadded one.
 PADDING = 4
@@ -82,7 +81,7 @@ def find_peaks(samples: Array, interval: float, tones: int) -> Peaks:
     return next((peaks for peaks in good if peaks.segment <= LONGEST_FRACTION * values.size * interval), good[-1])
 
 
-def median_spectrum(values: Array, missing: NDArray[np.bool_], size: int, most_missing: float) -> Array | None:
+def median_spectrum(values: Array, missing: BoolArray, size: int, most_missing: float) -> Array | None:
     """Median over segments of the amplitude spectrum, with a Hann window."""
     count = max(1, min(2 * values.size // size - 1, MOST_SAMPLES // size))
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(size) + 0.5) / size)

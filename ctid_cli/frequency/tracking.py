@@ -11,13 +11,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.checks import LARGEST_SAMPLE
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.prefilter import convolve, fast_convolve
 from ctid_cli.signals.checks import require_positive
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +71,7 @@ class FrequencyTrack:
     uncertainty: Array
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> BoolArray:
         """Samples without any flag, shape (N,)."""
         return np.asarray(self.flags == 0)
 

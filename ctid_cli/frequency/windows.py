@@ -6,15 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.amplitudes import fit_sinusoids
 from ctid_cli.frequency.flags import CERTAIN_FRACTION, Flag
 from ctid_cli.frequency.nonlinear_least_squares import NonlinearLeastSquares
 from ctid_cli.frequency.tracking import FrequencyEstimate
-
-Array = NDArray[np.float64]
 
 #: A window with a larger fraction of missing samples has no estimate.
 MOST_MISSING = 0.5
@@ -72,7 +70,7 @@ def wanted_tones(found: FrequencyEstimate, expected: Array, wanted: int) -> Wind
     return WindowEstimate(omega[kept], uncertainty[kept], flags, omega)
 
 
-def belonging(found: Array, expected: Array, wanted: int) -> NDArray[np.intp]:
+def belonging(found: Array, expected: Array, wanted: int) -> IndexArray:
     """Which of the estimated frequencies belong to the wanted tones.
 
     The sum over all pairs of ``x/(x + NEAR)`` is least, with x the distance of the logarithms: one pair that fits is

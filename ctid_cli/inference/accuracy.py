@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import FactoringError, factored, unfactored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +26,7 @@ class ParameterAccuracy:
     covariance: Array
 
     @property
-    def standard_errors(self) -> NDArray[np.float64]:
+    def standard_errors(self) -> Array:
         """Square roots of the variances, in the units of the parameters, shape (p,)."""
         errors: Array = np.sqrt(np.diag(self.covariance))
         return errors
@@ -67,7 +65,7 @@ class ParameterAccuracy:
 
 def estimated_parameters(
     model: AdditiveModel | TransferFunction, zeros: int | None = None, *, delay: bool = False
-) -> tuple[tuple[str, ...], NDArray[np.float64]]:
+) -> tuple[tuple[str, ...], Array]:
     """Names and true values of what is estimated."""
     if isinstance(model, AdditiveModel):
         if zeros is not None or delay:

@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.stats import norm
 
+from ctid_cli.arrays import Array
 from ctid_cli.inference.derived import DerivedParameter, pole_rows
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import pole_jacobian
 from ctid_cli.models.transfer_function import sorted_roots
-
-Array = NDArray[np.float64]
 
 
 def additive_derived(

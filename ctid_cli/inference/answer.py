@@ -6,13 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.inference.faults import outliers
 from ctid_cli.inference.input_moves import InputMoves, input_moves
 from ctid_cli.signals.record import Record
-
-Array = NDArray[np.float64]
 
 #: Share of the power of the answer that its band holds.
 SHARE = 0.95
@@ -53,7 +51,7 @@ class Grid:
     #: Output [output unit], interpolated; zero in holes, shape (n,).
     y: Array
     #: False in holes: where no output was measured for more than three intervals, shape (n,).
-    known: NDArray[np.bool_]
+    known: BoolArray
 
 
 @dataclass(frozen=True)
@@ -347,7 +345,7 @@ class _Picture:
         return DelayHint(max(begin - margin, 0.0) * interval, late, self.strength)
 
 
-def _first_of_run(above: NDArray[np.bool_], k: int, pause: int) -> int:
+def _first_of_run(above: BoolArray, k: int, pause: int) -> int:
     """First place of the run that place ``k`` ends, where up to ``pause`` places below do not end it."""
     while True:
         earlier = np.flatnonzero(above[max(0, k - pause) : k])

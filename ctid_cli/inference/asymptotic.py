@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.loop import NO_GAIN
 from ctid_cli.filtering.sampled import sampled_model
@@ -20,7 +21,6 @@ from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_choice, require_integer, require_not_negative, require_positive
 from ctid_cli.signals.record import Enters
 
-Array = NDArray[np.float64]
 #: What the estimator's instruments are made from: the input, or the noise-free input of the loop.
 Instruments = Literal["open_loop", "closed_loop"]
 

@@ -6,7 +6,9 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from ctid_cli.arrays import Array
 
 #: A coefficient or delay whose standard error exceeds its magnitude by this factor is called undetermined.
 LARGE_STANDARD_ERROR = 10.0
@@ -83,7 +85,7 @@ def describe_conditioning(
     return tuple(sentences)
 
 
-def _singular_direction(C: NDArray[np.float64], hessian: ArrayLike | None, defined: bool) -> list[int]:
+def _singular_direction(C: Array, hessian: ArrayLike | None, defined: bool) -> list[int]:
     """Parameters with more than a tenth of the direction that changes the output least; none if unknown."""
     if hessian is not None:
         H = np.asarray(hessian, dtype=float)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ctid_cli.arrays import Array
 
 
 def white_noise_covariance(hessian: Array, squared_error: float, count: int) -> Array:

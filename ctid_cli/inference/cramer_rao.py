@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ctid_cli.arrays import Array
 from ctid_cli.filtering.bank import filter_data, second_moments
 from ctid_cli.inference.covariance import white_noise_covariance
 from ctid_cli.inference.sensitivity import Structure
@@ -18,7 +16,7 @@ def cramer_rao_bound(
     noise_standard_deviation: float,
     start: float = 0.0,
     estimate_delay: bool = True,
-) -> NDArray[np.float64]:
+) -> Array:
     """Cramér-Rao bound for white Gaussian output noise.
 
     Parameters

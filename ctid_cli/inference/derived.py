@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.stats import norm
 
+from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.models.factoring import pole_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 NAN = float("nan")
 
@@ -131,7 +129,7 @@ def pole_rows(
 
 
 def _undetermined(
-    poles: ComplexArray, k: int, slope: ComplexArray, A: Array, quantile: float, others: NDArray[np.bool_]
+    poles: ComplexArray, k: int, slope: ComplexArray, A: Array, quantile: float, others: BoolArray
 ) -> str:
     """Reason for which pole k has no standard error, or nothing."""
     if not others.any():

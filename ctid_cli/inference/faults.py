@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ctid_cli.arrays import Array, IntArray
 
 #: A sample this many robust standard deviations away from its neighbours is an outlier.
 OUTLIER = 10.0
 
 
-def outliers(y: Array) -> NDArray[np.int64]:
+def outliers(y: Array) -> IntArray:
     """Single samples, or pairs, far from the median of the five about them."""
     if y.size < 20:
         return np.empty(0, dtype=np.int64)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array
 from ctid_cli.filtering.bank import filter_data, standard_rows
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.covariance import condition_number
@@ -14,10 +15,8 @@ from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
-Array = NDArray[np.float64]
 
-
-def additive_sensitivities(model: AdditiveModel, signal: HeldSignal, times: ArrayLike) -> NDArray[np.float64]:
+def additive_sensitivities(model: AdditiveModel, signal: HeldSignal, times: ArrayLike) -> Array:
     r"""Derivatives of the output of an additive model with respect to its parameters.
 
     Each is the exact response of a transfer function: ``-p^k B/(p^l A^2)`` for ``a_k`` and ``p^k/(p^l A)`` for
@@ -43,7 +42,7 @@ def unfactored_sensitivities(
     zeros: int | None = None,
     *,
     estimate_delay: bool = False,
-) -> NDArray[np.float64]:
+) -> Array:
     """Derivatives of the output of a transfer function with respect to its coefficients and its delay."""
     own = model.numerator.size - 1
     degree = own if zeros is None else zeros
@@ -56,7 +55,7 @@ def unfactored_sensitivities(
     return np.asarray(rows[:, structure.sensitivity_rows] * structure.signs)
 
 
-def finite_record_covariance(psi: ArrayLike, autocovariances: ArrayLike) -> NDArray[np.float64]:
+def finite_record_covariance(psi: ArrayLike, autocovariances: ArrayLike) -> Array:
     r"""Covariance of an unweighted output-error estimate from one record with noise of known autocovariances.
 
     With ``M = psi' psi`` and the covariance matrix R of the noise, ``M^-1 psi' R psi M^-1``, to first order in the

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.inference.status import Status
 from ctid_cli.models.transfer_function import TransferFunction
 
@@ -58,7 +58,7 @@ class Fit:
 
     model: TransferFunction
     parameter_names: tuple[str, ...]
-    covariance: NDArray[np.float64] = field(repr=False)
+    covariance: Array = field(repr=False)
     status: Status
     cost: float
     fit_percent: float

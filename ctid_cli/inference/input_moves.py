@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, IntArray
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
-
-Array = NDArray[np.float64]
 
 #: An input with at most this many changes gives single answers in time and no averages over frequency.
 FEW_CHANGES = 3
@@ -68,11 +66,11 @@ def _within(signal: HeldSignal, first: float, last: float) -> tuple[Array, Array
     return np.append(first, signal.t[inside]), np.append(signal.at([first]), signal.values[inside])
 
 
-def _changes(label: NDArray[np.int64]) -> int:
+def _changes(label: IntArray) -> int:
     return int(np.count_nonzero(label[1:] != label[:-1]))
 
 
-def _heaps(u: Array, spread: float) -> NDArray[np.int64] | None:
+def _heaps(u: Array, spread: float) -> IntArray | None:
     """Number of the heap that each value lies in or came from; None where the values do not lie in narrow heaps."""
     bins = np.minimum((50 * (u - u.min()) / spread).astype(np.int64), 49)
     full = np.flatnonzero(np.bincount(bins, minlength=50) >= LEVEL_SHARE * u.size)

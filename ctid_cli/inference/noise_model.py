@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import lfilter, lfiltic
 
-Array = NDArray[np.float64]
+from ctid_cli.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.inference.answer import Answer, analyse_answer, output_bandwidth, regular_grid
 from ctid_cli.inference.faults import outliers, quantum, saturated
 from ctid_cli.inference.input_moves import InputMoves, input_moves
@@ -16,7 +16,6 @@ from ctid_cli.signals.record import Record
 
 __all__ = ["Finding", "Gap", "RecordReport", "check_record_quality", "output_bandwidth"]
 
-Array = NDArray[np.float64]
 Level = Literal["ok", "note", "warning", "problem"]
 
 #: From the best to the worst.

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.signal import correlate
 from scipy.stats import chi2, norm
 
+from ctid_cli.arrays import Array
 from ctid_cli.inference.noise_model import fit_noise_model
-
-Array = NDArray[np.float64]
 
 #: Directions of the lagged inputs with less than this share of the largest variance are repetitions of the others.
 NEGLIGIBLE_VARIANCE = 1e-8

@@ -5,18 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from ctid_cli.arrays import Array
 from ctid_cli.inference.covariance import condition_number
 from ctid_cli.inference.noise_model import fit_noise_model
 
-Array = NDArray[np.float64]
 
-
-def sandwich_covariance(
-    psi: Array | Sequence[Array], residuals: Array | Sequence[Array], *, regular: bool
-) -> NDArray[np.float64]:
+def sandwich_covariance(psi: Array | Sequence[Array], residuals: Array | Sequence[Array], *, regular: bool) -> Array:
     r"""Covariance ``M^-1 Sigma M^-1`` of an unweighted output-error estimate under coloured output noise.
 
     With noise v independent of the input (open loop) and ``M = sum psi psi'`` [1]_,

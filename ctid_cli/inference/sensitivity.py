@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ctid_cli.arrays import Array, IndexArray
 
 
 @dataclass(frozen=True)
@@ -37,14 +36,14 @@ class Structure:
         return tuple(names + ["delay"] * self.delay)
 
     @cached_property
-    def sensitivity_rows(self) -> NDArray[np.intp]:
+    def sensitivity_rows(self) -> IndexArray:
         """Standard rows of dx/dtheta, up to the sign."""
         n, m = self.poles, self.zeros
         rows = [n + 1 + n - i for i in range(1, n + 1)] + [m - j for j in range(m + 1)]
         return np.array(rows + [3 * n + 2] * self.delay, dtype=np.intp)
 
     @cached_property
-    def regressor_rows(self) -> NDArray[np.intp]:
+    def regressor_rows(self) -> IndexArray:
         """Standard rows of the regressor: as the sensitivities, the measured output in the model output's place."""
         rows = self.sensitivity_rows.copy()
         rows[: self.poles] += self.poles
@@ -65,18 +64,18 @@ class Structure:
         return 3 * self.poles + 1
 
     @cached_property
-    def _hessian_index(self) -> NDArray[np.intp]:
+    def _hessian_index(self) -> IndexArray:
         return self._flat(self.sensitivity_rows, self.sensitivity_rows)
 
     @cached_property
-    def _mixed_index(self) -> NDArray[np.intp]:
+    def _mixed_index(self) -> IndexArray:
         return self._flat(self.sensitivity_rows, self.regressor_rows)
 
     @cached_property
-    def _error_index(self) -> NDArray[np.intp]:
+    def _error_index(self) -> IndexArray:
         return self._flat(self.sensitivity_rows, np.array([self.error_row]))[:, 0]
 
-    def _flat(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.intp]:
+    def _flat(self, rows: IndexArray, columns: IndexArray) -> IndexArray:
         """Places of a submatrix in the flattened moments: twice as fast to take as row and column lists."""
         return rows[:, None] * (3 * self.poles + 3) + columns
 

@@ -6,14 +6,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
 from ctid_cli.signals.checks import require_integer
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 #: Poles nearer to each other than this fraction of their magnitude count as one: a double root of rounded coefficients
 #: comes out as two that lie 1e-8 apart.
@@ -365,7 +363,7 @@ class AdditiveModel:
         return np.asarray(total * np.exp(-1j * w * self.delay), dtype=complex)
 
 
-def same_pole(one: ArrayLike, other: ArrayLike) -> NDArray[np.bool_]:
+def same_pole(one: ArrayLike, other: ArrayLike) -> BoolArray:
     """Whether two poles are too close to be told apart in double precision."""
     p, q = np.asarray(one, dtype=complex), np.asarray(other, dtype=complex)
     return np.asarray(np.abs(p - q) <= SAME_POLE * np.maximum(np.abs(p), np.abs(q)))

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.models.transfer_function import sorted_roots
 from ctid_cli.signals.checks import require_finite, require_positive
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +106,7 @@ class DiscreteController:
         return int(self.denominator.size - 1)
 
     @property
-    def poles(self) -> NDArray[np.complex128]:
+    def poles(self) -> ComplexArray:
         """Roots of the denominator [-], largest magnitude first, shape (n,)."""
         return sorted_roots(self.denominator)
 
@@ -137,7 +136,7 @@ class DiscreteController:
         A[:1] -= a
         return A, np.eye(n, 1), (b[1:] - b[0] * a)[None, :], b[None, :1].copy()
 
-    def frequency_response(self, frequencies: ArrayLike, interval: float) -> NDArray[np.complex128]:
+    def frequency_response(self, frequencies: ArrayLike, interval: float) -> ComplexArray:
         """``C(exp(j w h))``.
 
         Parameters

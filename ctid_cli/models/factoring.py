@@ -16,12 +16,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term, pole_text, same_pole
 from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 Number = TypeVar("Number", np.float64, np.complex128)
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 
 
@@ -36,8 +37,8 @@ class TransferFunction:
     (array([8.]), array([1. , 2.8, 4. ]), 2.0)
     """
 
-    numerator: NDArray[np.float64]
-    denominator: NDArray[np.float64]
+    numerator: Array
+    denominator: Array
     delay: float = 0.0
 
     def __init__(self, numerator: ArrayLike, denominator: ArrayLike, delay: float = 0.0) -> None:
@@ -71,12 +72,12 @@ class TransferFunction:
         return int(self.denominator.size - self.numerator.size)
 
     @property
-    def poles(self) -> NDArray[np.complex128]:
+    def poles(self) -> ComplexArray:
         """Roots of A [rad/s], fastest first, shape (n,)."""
         return sorted_roots(self.denominator)
 
     @property
-    def zeros(self) -> NDArray[np.complex128]:
+    def zeros(self) -> ComplexArray:
         """Roots of B [rad/s], fastest first, shape (m,)."""
         return sorted_roots(self.numerator)
 
@@ -90,7 +91,7 @@ class TransferFunction:
         """``G(0)``; infinite with a pole at the origin."""
         return float(self.numerator[-1] / self.denominator[-1]) if self.denominator[-1] else float("inf")
 
-    def frequency_response(self, frequencies: ArrayLike) -> NDArray[np.complex128]:
+    def frequency_response(self, frequencies: ArrayLike) -> ComplexArray:
         """``G(j w)``.
 
         Parameters
@@ -108,7 +109,7 @@ class TransferFunction:
         return np.asarray(gain, dtype=complex)
 
 
-def sorted_roots(coefficients: NDArray[np.float64]) -> NDArray[np.complex128]:
+def sorted_roots(coefficients: Array) -> ComplexArray:
     """Roots of a polynomial, largest magnitude first."""
     roots = np.asarray(np.roots(coefficients), dtype=complex)
     return roots[np.lexsort((roots.imag, -np.abs(roots)))]

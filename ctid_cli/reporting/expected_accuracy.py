@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.inference.accuracy import ParameterAccuracy, estimated_parameters
@@ -30,8 +30,6 @@ from ctid_cli.signals.excitation import Gaussian
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.simulation.dataset import SimulatedSource
-
-Array = NDArray[np.float64]
 
 #: From so many samples on the limit for long records is taken.
 LONG = 5000

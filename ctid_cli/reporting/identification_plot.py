@@ -7,13 +7,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.signals.measurement import Measurement
-
-Array = NDArray[np.float64]
 
 #: Experiments that are drawn; the others would leave no room.
 MOST_DRAWN = 3
@@ -65,7 +63,7 @@ def _draw_record(
     error.set_xlabel(f"{measurement.time} [{units.time}]")
 
 
-def _with_gaps(t: Array, use: NDArray[np.bool_], values: Array) -> tuple[Array, Array]:
+def _with_gaps(t: Array, use: BoolArray, values: Array) -> tuple[Array, Array]:
     """Values at the used instants, with breaks in the line where samples are missing."""
     full = np.full(t.size, np.nan)
     full[use] = values

@@ -14,8 +14,8 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.parameter_theory import long_record_variances
 from ctid_cli.reporting.results import Results, lookup
@@ -23,8 +23,6 @@ from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.spec import spec_from_canonical
 from ctid_cli.storage.manifest import FAILURES, true_parameters
 from ctid_cli.storage.summary import wilson_interval
-
-Array = NDArray[np.float64]
 
 #: Standard errors on either side of an estimate that make a 95 % interval.
 QUANTILE = NormalDist().inv_cdf(0.975)

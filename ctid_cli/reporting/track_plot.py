@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.frequency.record_track import RecordTrack
 from ctid_cli.reporting.figures.style import BAND, ramp, spread, svg
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 #: Up to so many tones get a panel each, which shows how far they move; more share one.
 MOST_PANELS = 5
@@ -98,7 +97,7 @@ def _line(axes: Any, t: Array, values: Array, style: dict[str, Any]) -> None:
     axes.plot(t[lonely], values[lonely], ".", color=style["color"], markersize=3)
 
 
-def _limit(axes: Any, frequencies: Array, valid: NDArray[np.bool_]) -> None:
+def _limit(axes: Any, frequencies: Array, valid: BoolArray) -> None:
     """Show the valid rows; what strays elsewhere may leave the axes."""
     shown = frequencies[valid] if valid.any() else frequencies
     shown = shown[np.isfinite(shown)]
@@ -110,7 +109,7 @@ def _limit(axes: Any, frequencies: Array, valid: NDArray[np.bool_]) -> None:
     axes.set_ylim(low - room, high + room)
 
 
-def _shade(axes: Any, t: Array, valid: NDArray[np.bool_]) -> None:
+def _shade(axes: Any, t: Array, valid: BoolArray) -> None:
     """Grey bands where no row is valid."""
     if t.size < 2 or valid.all():
         return

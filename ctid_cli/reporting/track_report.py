@@ -18,8 +18,6 @@ from ctid_cli.reporting.layout import count, number, text_table, wrapped
 from ctid_cli.running.worker import plain
 from ctid_cli.signals.sampled_signal import SampledSignal
 
-Array = NDArray[np.float64]
-
 _UNITS = {"t": "s", "omega": "rad/s", "frequency": "Hz"}
 #: A smaller share of valid time is worth a warning.
 MOSTLY_VALID = 0.9

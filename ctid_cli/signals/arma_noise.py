@@ -7,12 +7,11 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array
 from ctid_cli.signals.checks import require_finite
 from ctid_cli.signals.noise_level import require_one_level, variance_at
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Literal, NoReturn, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import require_choice
 from ctid_cli.signals.held import HeldSignal, Hold
@@ -114,7 +114,7 @@ def read_csv_table(path: str | os.PathLike[str]) -> Table:
     frame = frame[~blank]
     lines = frame.index.to_numpy(dtype=np.int64) + 2
 
-    def convert(name: str) -> NDArray[np.float64]:
+    def convert(name: str) -> Array:
         text = frame[name].str.strip()
         numbers = pd.to_numeric(text, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
         wrong = np.isnan(numbers) & ~text.str.lower().isin(MISSING).to_numpy(dtype=bool)

@@ -9,6 +9,7 @@ from typing import ClassVar, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import (
     require_choice,
@@ -109,7 +110,7 @@ class Prbs:
         require_positive("clock_period", self.clock_period, "s")
         require_positive("amplitude", self.amplitude, "input unit")
 
-    def generate(self, sample_times: NDArray[np.float64], rng: np.random.Generator) -> HeldSignal:
+    def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """The signal over one record.
 
         Parameters
@@ -173,11 +174,11 @@ class Multisine:
             raise ValueError(f"{self.tones} tones need a band, but both ends are at {self.lowest_frequency:g} rad/s.")
 
     @property
-    def frequencies(self) -> NDArray[np.float64]:
+    def frequencies(self) -> Array:
         """Frequencies of the tones [rad/s], shape (tones,)."""
         return np.linspace(self.lowest_frequency, self.highest_frequency, self.tones)
 
-    def generate(self, sample_times: NDArray[np.float64], rng: np.random.Generator) -> HeldSignal:
+    def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """The signal over one record.
 
         Parameters
@@ -235,7 +236,7 @@ class Gaussian:
         require_positive("standard_deviation", self.standard_deviation, "input unit")
         _check_clock(self.clock_period)
 
-    def generate(self, sample_times: NDArray[np.float64], rng: np.random.Generator) -> HeldSignal:
+    def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """The signal over one record.
 
         Parameters
@@ -277,7 +278,7 @@ class Step:
             raise ValueError("amplitude must not be zero [input unit]: a step of height zero excites nothing.")
         require_not_negative("time", self.time, "s")
 
-    def generate(self, sample_times: NDArray[np.float64], rng: np.random.Generator) -> HeldSignal:
+    def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """The signal over one record.
 
         Parameters
@@ -338,7 +339,7 @@ class InputFile:
         if self.time == self.input:
             raise ValueError(f"time and input must be two columns; both are {self.time!r}.")
 
-    def generate(self, sample_times: NDArray[np.float64], rng: np.random.Generator) -> HeldSignal:
+    def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """The signal over one record.
 
         Parameters
@@ -384,7 +385,7 @@ EXCITATIONS: dict[str, type[Excitation]] = {
 }
 
 
-def _clock(sample_times: NDArray[np.float64], period: float | None) -> NDArray[np.float64]:
+def _clock(sample_times: Array, period: float | None) -> Array:
     """Instants at which the signal takes a new value, from the first sample to the last."""
     if period is None:
         return sample_times

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 
 Hold = Literal["zoh", "foh"]
@@ -37,8 +38,8 @@ class HeldSignal:
         If the arrays differ in length, hold non-finite numbers, or the times do not increase.
     """
 
-    t: NDArray[np.float64]
-    values: NDArray[np.float64]
+    t: Array
+    values: Array
     hold: Hold = "zoh"
 
     def __post_init__(self) -> None:
@@ -62,7 +63,7 @@ class HeldSignal:
         object.__setattr__(self, "t", t)
         object.__setattr__(self, "values", values)
 
-    def at(self, times: ArrayLike) -> NDArray[np.float64]:
+    def at(self, times: ArrayLike) -> Array:
         """Value of the signal at given instants, from the right at a jump.
 
         Parameters

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.signals.csv_file import require_file
 from ctid_cli.signals.table import Table
@@ -45,7 +45,7 @@ def read_mat_table(path: str | os.PathLike[str]) -> Table:
     if not arrays:
         raise DataError(f"{file}: {hint}" if hint else f"{file}: the file holds no arrays; {_how_to_save(path)}")
 
-    def convert(name: str) -> NDArray[np.float64]:
+    def convert(name: str) -> Array:
         return _vector(file, name, arrays[name])
 
     return Table(file, tuple(arrays), convert, lines=None, noun="variable", hint=hint)
@@ -107,7 +107,7 @@ def _read_hdf5(path: str | os.PathLike[str], file: str) -> tuple[dict[str, Any],
     return arrays, objects
 
 
-def _vector(file: str, name: str, value: Any) -> NDArray[np.float64]:
+def _vector(file: str, name: str, value: Any) -> Array:
     array = np.asarray(value)
     if hasattr(value, "toarray"):
         array = value.toarray()  # a sparse matrix

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Literal, NoReturn, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import require_choice
 from ctid_cli.signals.csv_file import read_csv_table
@@ -223,16 +223,14 @@ def _refuse_unrecognised(table: Table, role: Role, chosen: Mapping[Role, str]) -
     raise DataError(message)
 
 
-def _clock(table: Table, name: str, interval: float, samples: int, unit: str) -> tuple[NDArray[np.float64], str]:
+def _clock(table: Table, name: str, interval: float, samples: int, unit: str) -> tuple[Array, str]:
     if not (np.isfinite(interval) and interval > 0):
         raise DataError(f"{table.file}: {name!r} is {interval:g}; a sampling interval must be a positive number")
     note = f"{name!r} is one number: it was taken as the sampling interval, {interval:g} {unit}, from 0 {unit} on."
     return interval * np.arange(samples, dtype=float), note
 
 
-def _window(
-    table: Table, t: NDArray[np.float64], start: float | None, stop: float | None, unit: str
-) -> tuple[int, int]:
+def _window(table: Table, t: Array, start: float | None, stop: float | None, unit: str) -> tuple[int, int]:
     """First row of the window and the first after it."""
     low = -np.inf if start is None else start
     high = np.inf if stop is None else stop

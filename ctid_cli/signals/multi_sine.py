@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.signals.arma_noise import ArmaNoise
 from ctid_cli.signals.checks import require_choice, require_finite, require_positive
 from ctid_cli.signals.held import COINCIDENCE
 from ctid_cli.signals.noise import WhiteNoise
 
-Array = NDArray[np.float64]
 PhaseAtSteps = Literal["jump", "continuous"]
 
 
@@ -238,7 +238,7 @@ def _steps(courses: list[float | tuple[Piece, ...]]) -> tuple[float, ...]:
     return tuple(sorted(steps))
 
 
-def _place(course: float | tuple[Piece, ...], t: Array) -> NDArray[np.intp]:
+def _place(course: float | tuple[Piece, ...], t: Array) -> IndexArray:
     """Number of the piece at each instant; 3 k 0.1 and k 0.3 are one instant, whatever their last bits."""
     ends = _ends(course)
     return np.searchsorted(ends * (1.0 - COINCIDENCE), t, side="right")

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array
 from ctid_cli.signals.arma_noise import ArmaNoise
 from ctid_cli.signals.noise_level import require_one_level, variance_at
 
@@ -66,7 +67,7 @@ class WhiteNoise:
         """Numerator and denominator in rising powers of q^-1 of what white innovations pass through."""
         return (1.0,), (1.0,)
 
-    def innovation_variance_of(self, noise_free: NDArray[np.float64] | None = None) -> float:
+    def innovation_variance_of(self, noise_free: Array | None = None) -> float:
         """Variance of the innovations, which are the noise itself.
 
         Parameters
@@ -91,7 +92,7 @@ class WhiteNoise:
         assert self.snr_db is not None
         return variance_at(self.snr_db, noise_free)
 
-    def variance_of(self, noise_free: NDArray[np.float64] | None = None) -> float:
+    def variance_of(self, noise_free: Array | None = None) -> float:
         """Variance of the noise.
 
         Parameters
@@ -111,7 +112,7 @@ class WhiteNoise:
         """
         return self.innovation_variance_of(noise_free)
 
-    def autocovariance(self, lags: ArrayLike, noise_free: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    def autocovariance(self, lags: ArrayLike, noise_free: Array | None = None) -> Array:
         """Covariance of samples at a distance.
 
         Parameters
@@ -128,7 +129,7 @@ class WhiteNoise:
         """
         return np.where(np.asarray(lags) == 0, self.variance_of(noise_free), 0.0)
 
-    def generate(self, noise_free: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    def generate(self, noise_free: Array, rng: np.random.Generator) -> Array:
         """Noise for one record.
 
         Parameters

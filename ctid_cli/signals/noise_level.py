@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import require_finite, require_not_negative
 
@@ -33,7 +33,7 @@ def require_one_level(levels: Mapping[str, float | None]) -> None:
     check(name, value, LEVEL_UNITS[name])
 
 
-def variance_at(snr_db: float, noise_free: NDArray[np.float64] | None) -> float:
+def variance_at(snr_db: float, noise_free: Array | None) -> float:
     """Variance of noise with a signal-to-noise ratio."""
     if noise_free is None:
         raise DataError("a signal-to-noise ratio says how strong noise is only beside a noise-free output; give that")

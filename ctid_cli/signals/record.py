@@ -7,8 +7,9 @@ from functools import cached_property
 from typing import Literal, Protocol, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import require_choice
 from ctid_cli.signals.held import HeldSignal, Hold
@@ -54,7 +55,7 @@ class Loop:
         If it is not said where it enters.
     """
 
-    reference: NDArray[np.float64]
+    reference: Array
     controller: Controller
     enters: Enters = "controller"
 
@@ -97,10 +98,10 @@ class Record:
     Arrays are copied and made read-only: a record never changes, and never changes its owner's data.
     """
 
-    t: NDArray[np.float64]
-    y: NDArray[np.float64]
+    t: Array
+    y: Array
     input: HeldSignal
-    noise_free: NDArray[np.float64] | None = None
+    noise_free: Array | None = None
     name: str = ""
     loop: Loop | None = None
 
@@ -183,12 +184,12 @@ class Record:
         return float(self.t[-1] - self.t[0])
 
     @cached_property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> BoolArray:
         """Which output samples are present, shape (N,)."""
         return np.isfinite(self.y)
 
     @cached_property
-    def bridged_y(self) -> NDArray[np.float64]:
+    def bridged_y(self) -> Array:
         """Outputs with missing samples bridged by straight lines [output unit], shape (N,)."""
         if self.valid.all():
             return self.y
@@ -207,7 +208,7 @@ class Record:
         return bool(np.abs(self.input.t - self.t).max() <= REGULARITY * self.interval)
 
 
-def regular_interval(t: NDArray[np.float64]) -> float | None:
+def regular_interval(t: Array) -> float | None:
     """Interval of a regular clock."""
     if t.size < 2:
         return None

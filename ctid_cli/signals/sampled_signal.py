@@ -8,16 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import require_positive
 from ctid_cli.signals.csv_file import read_csv_table, require_file
 from ctid_cli.signals.mat_file import read_mat_table
 from ctid_cli.signals.measurement import TEXT_EXTENSIONS, USUAL_NAMES, split_header
 from ctid_cli.signals.table import Table, listing, refuse_missing, refuse_nameless, wrong_separator
-
-Array = NDArray[np.float64]
 
 #: Names by which the signal is recognised when nobody says which column it is, the most telling first.
 SIGNAL_NAMES = (

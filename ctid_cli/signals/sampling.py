@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.signals.checks import require_choice, require_integer, require_positive
 
 InputRecord = Literal["sampled", "exact"]
@@ -63,7 +63,7 @@ class RegularSampling:
         require_integer("samples", self.samples, 2)
         require_choice("input_record", self.input_record, get_args(InputRecord))
 
-    def times(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def times(self, rng: np.random.Generator) -> Array:
         """Sampling instants.
 
         Parameters
@@ -115,7 +115,7 @@ class UniformIntervals:
         require_integer("samples", self.samples, 2)
         require_choice("input_record", self.input_record, get_args(InputRecord))
 
-    def times(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def times(self, rng: np.random.Generator) -> Array:
         """Sampling instants.
 
         Parameters

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, IntArray
 from ctid_cli.errors import DataError
 
 
@@ -19,8 +19,8 @@ class Table:
 
     file: str
     names: tuple[str, ...]
-    convert: Callable[[str], NDArray[np.float64]]
-    lines: NDArray[np.int64] | None = None
+    convert: Callable[[str], Array]
+    lines: IntArray | None = None
     noun: str = "column"
     hint: str = ""
 
@@ -37,7 +37,7 @@ class Table:
         """Place of a row, for the beginning of a message."""
         return f"{self.file}: sample {k + 1}" if self.lines is None else f"{self.file}:{self.lines[k]}"
 
-    def numbers(self, name: str) -> NDArray[np.float64]:
+    def numbers(self, name: str) -> Array:
         """One column."""
         self.require(name)
         return self.convert(name)
@@ -47,11 +47,11 @@ class Table:
         if name not in self.names:
             refuse_missing(self, name)
 
-    def times(self, name: str, unit: str = "s") -> NDArray[np.float64]:
+    def times(self, name: str, unit: str = "s") -> Array:
         """The column of the instants."""
         return self.check_times(name, self.numbers(name), unit)
 
-    def check_times(self, name: str, t: NDArray[np.float64], unit: str = "s") -> NDArray[np.float64]:
+    def check_times(self, name: str, t: Array, unit: str = "s") -> Array:
         """Refuse instants that are missing or do not increase."""
         if not np.isfinite(t).all():
             k = int(np.argmin(np.isfinite(t)))
@@ -69,7 +69,7 @@ class Table:
             )
         return t
 
-    def check_input(self, name: str, u: NDArray[np.float64], first: int = 0) -> NDArray[np.float64]:
+    def check_input(self, name: str, u: Array, first: int = 0) -> Array:
         """Refuse an input with gaps."""
         if not np.isfinite(u).all():
             k = first + int(np.argmin(np.isfinite(u)))
@@ -79,7 +79,7 @@ class Table:
             )
         return u
 
-    def check_output(self, name: str, y: NDArray[np.float64], first: int = 0) -> NDArray[np.float64]:
+    def check_output(self, name: str, y: Array, first: int = 0) -> Array:
         """Refuse an output that is infinite somewhere or missing everywhere."""
         if np.isinf(y).any():
             k = first + int(np.argmax(np.isinf(y)))

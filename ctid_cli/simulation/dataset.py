@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.controller import DiscreteController
@@ -72,7 +72,7 @@ class SimulatedSource:
         record = Record(times, output + self._drawn(output, replicate), known, noise_free=output)
         return DataSet(record, true_model=self.system)
 
-    def _simulated(self, applied: HeldSignal, times: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _simulated(self, applied: HeldSignal, times: Array) -> Array:
         from ctid_cli.filtering.sampled import simulate_additive
         from ctid_cli.filtering.simulate import simulate
 
@@ -80,9 +80,7 @@ class SimulatedSource:
             return simulate_additive(self.system, applied, times)
         return simulate(self.system, applied, times)
 
-    def _record_in(
-        self, loop: LoopOptions, times: NDArray[np.float64], reference: NDArray[np.float64], replicate: int
-    ) -> Record:
+    def _record_in(self, loop: LoopOptions, times: Array, reference: Array, replicate: int) -> Record:
         from ctid_cli.filtering.loop import simulate_loop
 
         interval = regular_interval(times)
@@ -94,7 +92,7 @@ class SimulatedSource:
         closed = Loop(reference, loop.controller, loop.enters)
         return Record(times, x + noise, HeldSignal(times, u), noise_free=x, loop=closed)
 
-    def _drawn(self, output: NDArray[np.float64], replicate: int) -> NDArray[np.float64]:
+    def _drawn(self, output: Array, replicate: int) -> Array:
         if self.noise is None:
             return np.zeros(output.size)
         return self.noise.generate(output, stream(self.seed, "noise", replicate))
@@ -152,7 +150,7 @@ class MeasuredSource:
             return DataSet(record)
         return DataSet(record, validation=Record(t, rest, HeldSignal(t, u, self.hold), name=name))
 
-    def _reference(self) -> NDArray[np.float64] | None:
+    def _reference(self) -> Array | None:
         if self.reference is None:
             return None
         return read_held_signal(self.file, time=self.time, input=self.reference).values

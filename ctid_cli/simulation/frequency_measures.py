@@ -26,12 +26,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.signals.multi_sine import Disturbance, MultiSine, SineDisturbance
 
 if TYPE_CHECKING:
     from ctid_cli.frequency.tracking import FrequencyEstimate, FrequencyTrack
 
-Array = NDArray[np.float64]
 
 #: Units of the measures, in the order of columns.
 MEASURE_UNITS = {
@@ -168,7 +168,7 @@ def _numbered(name: str, values: Array) -> dict[str, float | None]:
     return {f"{name}_{k + 1}": float(value) if np.isfinite(value) else None for k, value in enumerate(values)}
 
 
-def _settling(inside: NDArray[np.bool_], t: Array, first: int, last: int, since: float) -> float | None:
+def _settling(inside: BoolArray, t: Array, first: int, last: int, since: float) -> float | None:
     outside = np.flatnonzero(~inside[first:last])
     if not outside.size:
         place = first
@@ -178,7 +178,7 @@ def _settling(inside: NDArray[np.bool_], t: Array, first: int, last: int, since:
     return None if place == last else max(0.0, round(float(t[place] - since), 9))
 
 
-def _in_window(t: Array, window: tuple[float, float] | None) -> NDArray[np.bool_]:
+def _in_window(t: Array, window: tuple[float, float] | None) -> BoolArray:
     low, high = (t[-1] - USUAL_WINDOW, t[-1]) if window is None else window
     slack = 1e-9 * max(1.0, abs(high))
     return np.asarray((t >= low - slack) & (t <= high + slack))

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.frequency.tracking import FrequencyEstimate, FrequencyTrack
 from ctid_cli.signals.multi_sine import Disturbance, MultiSine, disturb
 from ctid_cli.signals.sampling import RegularSampling
@@ -20,8 +20,6 @@ from ctid_cli.simulation.frequency_measures import (
     thinned,
     true_frequencies,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

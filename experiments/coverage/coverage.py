@@ -16,9 +16,9 @@ from pathlib import Path
 import joblib
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from ctid_cli.arrays import Array
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.inference.robust import sandwich_covariance
 from ctid_cli.models.transfer_function import TransferFunction
@@ -29,8 +29,6 @@ from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.storage.provenance import now
 from ctid_cli.storage.summary import wilson_interval
 from ctid_cli.storage.version import code_version, numeric_platform, package_versions
-
-Array = NDArray[np.float64]
 
 SEED = 2024
 #: Standard errors on either side of an estimate that make a 95 % interval.

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.frequency.adaptive_observer import AdaptiveObserver
 from ctid_cli.frequency.drem_finite_time import DremFiniteTime
 from ctid_cli.frequency.drem_gradient import DremGradient
@@ -29,8 +29,6 @@ from ctid_cli.frequency.nonlinear_least_squares import NonlinearLeastSquares
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.frequency.tracking import FrequencyTrack
 from experiments.additive import acceptance as checked
-
-Array = NDArray[np.float64]
 
 #: Standard deviation of noise between -0.2 and 0.2.
 SIGMA = 0.4 / np.sqrt(12.0)

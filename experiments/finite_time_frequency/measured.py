@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.reporting.figures.finite_time_frequency import CONFIGS, DERIVED, GROUPS
 from ctid_cli.reporting.results import Results, find_results
@@ -19,7 +19,6 @@ from ctid_cli.specification.spec import spec_from_canonical
 from ctid_cli.storage.store import read_tracks
 from experiments.finite_time_frequency.acceptance import Check, at_most, cramer_rao, settle
 
-Array = NDArray[np.float64]
 Row = dict[str, Any]
 
 #: Errors below which settling is measured [rad/s].

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.figures.frequency_plot import Response, dense_frequencies, response_svg
 from ctid_cli.reporting.figures.from_results import FromResults
@@ -141,9 +141,7 @@ def figure_coverage(open_loop: Results, closed_loop: Results) -> bytes:
     )
 
 
-def empirical_response(
-    record: Record, lowest: float, highest: float
-) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+def empirical_response(record: Record, lowest: float, highest: float) -> tuple[Array, ComplexArray]:
     r"""Frequency response as the quotient of windowed spectra, without a model.
 
     The system does not repeat itself within the record, least of all from rest: the Hann window takes the ends of the

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, svg
 
 if TYPE_CHECKING:
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-Array = NDArray[np.float64]
 
 #: Looks of up to three estimators of a group, told apart by colour, lightness and dashes.
 LOOKS: tuple[dict[str, Any], ...] = (
@@ -45,7 +44,7 @@ class Curve:
     omega: Array
     true: Array
     #: Whether the estimator itself calls them valid, shape (N,).
-    valid: NDArray[np.bool_]
+    valid: BoolArray
 
     @property
     def error(self) -> Array:

@@ -7,15 +7,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.figures.style import svg
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +24,7 @@ class Response:
     #: Frequencies, in the unit of the figure, rising, shape (K,).
     frequencies: Array
     #: Response [output unit/input unit], shape (K,).
-    values: NDArray[np.complex128]
+    values: ComplexArray
     style: Mapping[str, Any] = field(default_factory=dict)
     phase: bool = True
 
@@ -53,7 +51,7 @@ def response_svg(curves: Sequence[Response], title: str, unit: str, *, unwrap: b
     return svg(7.5, 5.2, draw)
 
 
-def _phase(values: NDArray[np.complex128], unwrap: bool) -> Array:
+def _phase(values: ComplexArray, unwrap: bool) -> Array:
     """Phase in degrees; where it jumps from one end of the range to the other, the curve is interrupted."""
     angle = np.angle(values)
     if unwrap:

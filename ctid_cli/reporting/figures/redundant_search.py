@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.delay_search import Minimum
@@ -17,8 +18,6 @@ from ctid_cli.reporting.figures.specification import published_plan
 from ctid_cli.reporting.study import load_study
 from ctid_cli.signals.record import Record
 from ctid_cli.simulation.dataset import DataSet
-
-Array = NDArray[np.float64]
 
 #: How often the delays are gone through, up and down in turn: more does not lower the costs visibly.
 SWEEPS = 2

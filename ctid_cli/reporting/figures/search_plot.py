@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.reporting.figures.redundant_search import Landscape
 from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, ramp, spread, svg
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 
 def costs_svg(result: Landscape, title: str) -> bytes:

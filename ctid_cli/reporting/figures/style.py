@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from ctid_cli.arrays import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 #: Colours that differ in lightness too, so that a grey print can be read.
 DARK, MIDDLE, LIGHT, BAND = "#08306b", "#6b6b6b", "#a8a8a8", "#e4e4e4"

@@ -14,8 +14,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctid_cli.arrays import Array
 from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
 from ctid_cli.filtering.filter_set import FilterSet, check_filters
 from ctid_cli.filtering.filter_theory import convergence_region, extrema, ideal_cost
@@ -26,7 +26,6 @@ from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, ra
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 #: SNR of the data sets that are drawn [dB].
 SNR = 15.0

@@ -1,0 +1,12 @@
+"""Names for the arrays that travel through the package."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+ComplexArray = NDArray[np.complex128]
+IntArray = NDArray[np.int64]
+IndexArray = NDArray[np.intp]
