@@ -7,8 +7,8 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
-from ctid_cli.cli.check_accuracy import check_accuracy
-from ctid_cli.cli.check_filters import check_filters
+from ctid_cli.cli.check_accuracy_command import check_accuracy
+from ctid_cli.cli.check_filters_command import check_filters
 
 _further = typer.Typer(rich_markup_mode=None, context_settings={"help_option_names": ["-h", "--help"]})
 # A further check is registered here, under its name.

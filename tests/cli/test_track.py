@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from scipy.io import wavfile
 
-from ctid_cli.cli.track import MethodOption
+from ctid_cli.cli.track_command import MethodOption
 from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
 
 T = 0.002 * np.arange(3000)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from ctid_cli.cli._common import Json, guarded
-from ctid_cli.cli.fit import HoldOption
+from ctid_cli.cli.fit_command import HoldOption
 
 
 @guarded
