@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import norm
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
@@ -28,6 +27,7 @@ from ctid_cli.inference.criteria import (
 from ctid_cli.inference.delay_interval import DelayInterval, profile_likelihood_interval, quadratic_is_doubtful
 from ctid_cli.inference.derived import DerivedParameter, derived_parameters
 from ctid_cli.inference.diagnostics import fit_percent, r_squared
+from ctid_cli.inference.quantile import normal_quantile
 from ctid_cli.inference.residuals import ResidualTests, residual_tests
 from ctid_cli.inference.robust import sandwich_covariance
 from ctid_cli.inference.status import Status
@@ -370,7 +370,7 @@ def _estimates(
 ) -> tuple[Estimate, ...]:
     """Parameters, numerator first, then denominator, delay, and what belongs to the experiments."""
     nan = float("nan")
-    quantile = float(norm.ppf(0.5 + LEVEL / 2))
+    quantile = normal_quantile(LEVEL)
     found: dict[str, Estimate] = {}
     for name, value, variance in zip(fit.parameter_names, fit.theta.tolist(), np.diag(covariance), strict=True):
         if name in unclear:

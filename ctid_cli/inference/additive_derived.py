@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import norm
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.derived import DerivedParameter, pole_rows
+from ctid_cli.inference.quantile import normal_quantile
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import pole_jacobian
 from ctid_cli.models.transfer_function import sorted_roots
@@ -32,7 +32,7 @@ def additive_derived(
     size = model.theta.size
     if C.shape != (size, size):
         raise ValueError(f"the covariance must have a row and a column for each of {size} parameters; got {C.shape}")
-    quantile = float(norm.ppf(0.5 + level / 2))
+    quantile = normal_quantile(level)
     rows: list[DerivedParameter] = []
     first = 0
     for number, (submodel, term) in enumerate(zip(model.submodels, model.terms, strict=True), 1):

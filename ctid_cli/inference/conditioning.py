@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
+from ctid_cli.text import listed
 
 #: A coefficient or delay whose standard error exceeds its magnitude by this factor is called undetermined.
 LARGE_STANDARD_ERROR = 10.0
@@ -42,7 +43,7 @@ def describe_conditioning(
 
     if not defined or not condition_number <= NEARLY_SINGULAR:
         group = _singular_direction(C, hessian, defined)
-        what = _join([names[i] for i in group]) if 0 < len(group) < size else "all the parameters together"
+        what = listed([names[i] for i in group]) if 0 < len(group) < size else "all the parameters together"
         number = f"condition number {condition_number:.1e}" if np.isfinite(condition_number) else "singular equations"
         if len(group) == 1:
             start = f"{what} has no effect that these data show ({number})"
@@ -79,7 +80,7 @@ def describe_conditioning(
     if len(group) > 1:
         several = [names[i] for i in group]
         sentences.append(
-            f"{_join(several)} can hardly be told apart by these data (multiple correlations above {CLOSE_TO_ONE}): "
+            f"{listed(several)} can hardly be told apart by these data (multiple correlations above {CLOSE_TO_ONE}): "
             f"only combinations of them are well determined. {_advice(several, names)}"
         )
     return tuple(sentences)
@@ -113,7 +114,3 @@ def _advice(group: Sequence[str], names: Sequence[str]) -> str:
     if "delay" in group and numerator:
         return "The input hardly shows when the response begins: fix the delay, or use an input with sharper changes."
     return "Use fewer poles or zeros, or an input that excites the system at more frequencies."
-
-
-def _join(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

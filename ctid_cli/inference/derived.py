@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import norm
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
+from ctid_cli.inference.quantile import normal_quantile
 from ctid_cli.models.factoring import pole_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 
@@ -73,7 +73,7 @@ def derived_parameters(
             f"the covariance must be square, with a row for each of {n} denominator and at least "
             f"{model.numerator.size} numerator coefficients; got shape {C.shape}"
         )
-    quantile = float(norm.ppf(0.5 + level / 2))
+    quantile = normal_quantile(level)
     poles = model.poles
     rows = pole_rows(poles, pole_jacobian(model.denominator, poles), C[:n, :n], quantile)
     gradient = np.zeros(C.shape[0])

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.signal import correlate
-from scipy.stats import chi2, norm
+from scipy.stats import chi2
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.noise_model import fit_noise_model
+from ctid_cli.inference.quantile import normal_quantile
 
 #: Directions of the lagged inputs with less than this share of the largest variance are repetitions of the others.
 NEGLIGIBLE_VARIANCE = 1e-8
@@ -85,7 +86,7 @@ def residual_tests(
         lags = min(25, count // 4)
     if not 1 <= lags < count:
         raise ValueError(f"lags must be between 1 and the number of samples less one, {count - 1}; got {lags}")
-    quantile = float(norm.ppf(0.5 + level / 2))
+    quantile = normal_quantile(level)
 
     power = float(e @ e)
     autocorrelation = np.full(lags, np.nan)

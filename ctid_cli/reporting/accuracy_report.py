@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.errors import DataError, UsageError
+from ctid_cli.inference.quantile import normal_quantile
 from ctid_cli.reporting.expected_accuracy import expected_accuracy
 from ctid_cli.reporting.layout import count, number, text_table
 from ctid_cli.reporting.tables import setting_text, setting_title
@@ -20,8 +21,6 @@ WIDTH = 100
 SIZES = 4
 #: Combinations of the other swept settings that are shown.
 SETTINGS = 6
-#: Half width of a 95 % interval in standard errors.
-QUANTILE = 1.959964
 
 
 def accuracy_object(plan: Plan) -> dict[str, Any]:
@@ -80,7 +79,7 @@ def _entry(cell: DataCell, source: SimulatedSource, estimator: EstimatorCell, pl
             "value": float(value),
             "standard_error": float(error),
             "relative_percent": float(100 * error / abs(value)) if value else None,
-            "half_width_95": float(QUANTILE * error),
+            "half_width_95": float(normal_quantile() * error),
         }
         for name, value, error in zip(found.names, found.values, found.standard_errors, strict=True)
     ]

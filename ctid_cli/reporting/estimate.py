@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from ctid_cli.inference.quantile import normal_quantile
 from ctid_cli.reporting.layout import markdown_table, number, text_table
 
 #: Keys that every estimate carries in machine-readable output, in this order.
@@ -29,7 +30,7 @@ ESTIMATE_KEYS = (
 )
 
 #: Half-width of a 95 % interval of a normal estimate, in standard errors.
-NORMAL_95 = 1.959963984540054
+NORMAL_95 = normal_quantile()
 
 
 #: Seconds in a unit of time, by the labels that files use.

@@ -10,13 +10,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
+from ctid_cli.inference.quantile import normal_quantile
 from ctid_cli.reporting.parameter_theory import long_record_variances
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.running.plan import build_plan
@@ -25,7 +25,7 @@ from ctid_cli.storage.manifest import FAILURES, true_parameters
 from ctid_cli.storage.summary import wilson_interval
 
 #: Standard errors on either side of an estimate that make a 95 % interval.
-QUANTILE = NormalDist().inv_cdf(0.975)
+QUANTILE = normal_quantile()
 
 
 @dataclass(frozen=True, eq=False)

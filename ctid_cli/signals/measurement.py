@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NoReturn, get_args
@@ -18,7 +18,8 @@ from ctid_cli.signals.csv_file import read_csv_table
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.mat_file import read_mat_table
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.table import Table, closest, listing, refuse_missing, refuse_nameless, wrong_separator
+from ctid_cli.signals.table import Table, listing, refuse_missing, refuse_nameless, wrong_separator
+from ctid_cli.text import closest, listed
 
 Role = Literal["time", "input", "output"]
 
@@ -144,7 +145,7 @@ def _choose(table: Table, asked: Mapping[Role, str | None]) -> tuple[dict[Role, 
             _refuse_unrecognised(table, by_position[0], chosen)
         chosen.update(zip(by_position, left, strict=True))
         taken = [f"{chosen[role]!r} as the {role}" for role in by_position]
-        notes.append(f"Columns were taken by their position: {_enumerated(taken)}.")
+        notes.append(f"Columns were taken by their position: {listed(taken)}.")
     for one, other in (("time", "input"), ("time", "output"), ("input", "output")):
         if chosen[_role(one)] == chosen[_role(other)]:
             raise DataError(f"{table.head}: {chosen[_role(one)]!r} cannot be both the {one} and the {other}")
@@ -152,7 +153,7 @@ def _choose(table: Table, asked: Mapping[Role, str | None]) -> tuple[dict[Role, 
     if unused and table.lines is not None:
         verb = "is" if len(unused) == 1 else "are"
         notes.append(
-            f"Column{'s' if len(unused) > 1 else ''} {_enumerated([repr(name) for name in unused])} {verb} not used."
+            f"Column{'s' if len(unused) > 1 else ''} {listed([repr(name) for name in unused])} {verb} not used."
         )
     return chosen, notes
 
@@ -182,7 +183,7 @@ def _recognised(table: Table, role: Role, chosen: Mapping[Role, str]) -> str | N
         matching = close or matching
         if len(matching) > 1:
             raise DataError(
-                f"{table.head}: {_enumerated([repr(name) for name in matching])} may all be the {role}; "
+                f"{table.head}: {listed([repr(name) for name in matching])} may all be the {role}; "
                 f"say which one (option {role})"
             )
         if matching:
@@ -250,7 +251,3 @@ def _span(start: float | None, stop: float | None, unit: str) -> str:
     if stop is None:
         return f"at {start:g} {unit} or later"
     return f"at {stop:g} {unit} or earlier" if start is None else f"between {start:g} and {stop:g} {unit}"
-
-
-def _enumerated(words: Sequence[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NoReturn
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array, IntArray
 from ctid_cli.errors import DataError
+from ctid_cli.text import closest
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,12 +122,6 @@ def wrong_separator(table: Table) -> str:
 def listing(table: Table) -> str:
     """The columns of a file."""
     return f"the file has {', '.join(map(repr, table.names)) or f'no {table.noun} of numbers'}"
-
-
-def closest(wanted: str, names: Sequence[str]) -> str | None:
-    """The name that may have been meant."""
-    found = difflib.get_close_matches(wanted.lower(), [name.lower() for name in names], n=1)
-    return next(name for name in names if name.lower() == found[0]) if found else None
 
 
 def _is_number(text: str) -> bool:

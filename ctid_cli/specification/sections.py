@@ -43,7 +43,8 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from ctid_cli.errors import CtidError
 from ctid_cli.signals.sampling import geometric_sizes
-from ctid_cli.specification.yaml_source import KeyPath, did_you_mean
+from ctid_cli.specification.yaml_source import KeyPath
+from ctid_cli.text import did_you_mean
 
 #: Combinations that one section may sweep, and data cells that one experiment may hold.
 MAX_COMBINATIONS = 10_000

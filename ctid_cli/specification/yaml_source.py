@@ -15,7 +15,6 @@ alias (``b: *a``) says the same openly.
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -25,6 +24,7 @@ from typing import Any
 import yaml
 
 from ctid_cli.errors import Problem, SpecError, UsageError
+from ctid_cli.text import did_you_mean
 
 #: Keys and list indices that lead from the top of a file to a value.
 KeyPath = tuple[str | int, ...]
@@ -104,12 +104,6 @@ def path_text(path: KeyPath) -> str:
     for part in path:
         text += f"[{part}]" if isinstance(part, int) else f"{'.' if text else ''}{part}"
     return text
-
-
-def did_you_mean(word: str, allowed: Iterable[str]) -> str:
-    """A hint at the allowed word that was probably meant."""
-    close = difflib.get_close_matches(word, list(allowed), n=1, cutoff=0.6)
-    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def read_yaml(path: Path) -> YamlSource:

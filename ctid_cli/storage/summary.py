@@ -17,9 +17,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
+from ctid_cli.inference.quantile import normal_quantile
 from ctid_cli.simulation.frequency_measures import is_settled, measure_names
 from ctid_cli.storage.manifest import FAILURES
 
@@ -65,7 +65,7 @@ def wilson_interval(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
         raise ValueError(f"successes must lie between 0 and the number of trials; got {k} of {n}")
     if n == 0:
         return math.nan, math.nan
-    z = NormalDist().inv_cdf(0.5 + level / 2)
+    z = normal_quantile(level)
     p = k / n
     centre = p + z**2 / (2 * n)
     half = z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.reporting.figures import additive, finite_time_frequency, useful_redundancy
 from ctid_cli.reporting.figures.from_results import FromResults, not_run
 from ctid_cli.reporting.study import DEFAULT_STUDY
+from ctid_cli.text import did_you_mean
 
 #: Figures of every study: number or name, and what draws it as an SVG file.
 STUDIES: Mapping[str, Mapping[str, Callable[[], bytes] | FromResults]] = {
@@ -65,8 +65,7 @@ def require_results(figures: Iterable[StudyFigure], out: Path) -> None:
 
 def _unknown(name: str) -> str:
     known = [*STUDIES[DEFAULT_STUDY], *(entry for study in STUDIES for entry in _names(study))]
-    close = difflib.get_close_matches(name, known, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else "."
+    hint = did_you_mean(name, known) or "."
     return f"{name!r} is neither a figure nor a study with figures{hint} Known: {', '.join(known)}"
 
 

@@ -1,0 +1,41 @@
+"""How messages are put together, on every floor: enumerations, paragraphs, hints at names that are nearly right."""
+
+from __future__ import annotations
+
+import difflib
+import textwrap
+from collections.abc import Iterable
+
+#: Columns of a paragraph.
+WIDTH = 100
+
+
+def listed(words: Iterable[object], last: str = "and") -> str:
+    """Words as a sentence lists them: ``a, b and c``, each once."""
+    *first, end = dict.fromkeys(map(str, words))
+    return f"{', '.join(first)} {last} {end}" if first else end
+
+
+def wrapped(text: str, indent: str = "", hanging: str | None = None) -> str:
+    """A paragraph, with another indent for all lines but the first if one is given."""
+    return textwrap.fill(
+        text,
+        WIDTH,
+        initial_indent=indent,
+        subsequent_indent=indent if hanging is None else hanging,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def closest(word: str, known: Iterable[str]) -> str | None:
+    """The known name that was probably meant, whatever its capitals."""
+    names = {name.lower(): name for name in reversed(list(known))}
+    near = difflib.get_close_matches(word.lower(), list(names), n=1)
+    return names[near[0]] if near else None
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """The same as the end of a sentence; empty where no name is near."""
+    near = closest(word, known)
+    return f"; did you mean {near!r}?" if near else ""
