@@ -161,13 +161,13 @@ def _covariance(problem: AdditiveProblem, theta: Array, equations: Equations, ki
     if rows is None:
         return np.full((theta.size, theta.size), np.nan)
     psi, _, error, _ = rows
-    return sandwich_covariance(psi, error, regular=problem.data.interval is not None)
+    return sandwich_covariance(psi, error, regular=problem.data.interval > 0.0)
 
 
 def _loop_radius(problem: AdditiveProblem, theta: Array) -> float:
     """Spectral radius of the loop of the model with the controller; NaN in open loop."""
     loop, interval = problem.filter.loop, problem.data.interval
-    if not loop.closed or interval is None:
+    if not loop.closed or interval == 0.0:
         return float("nan")
     try:
         model = problem.model(theta)

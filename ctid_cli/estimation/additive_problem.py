@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import Literal
 
@@ -81,7 +80,7 @@ class AdditiveProblem:
 
     def with_other_hold(self) -> AdditiveProblem:
         """The same problem with the other interpolation of the output in the regressors."""
-        data = replace(self.data, y_foh=not self.data.y_foh)
+        data = self.data._replace(y_foh=not self.data.y_foh)
         return AdditiveProblem(data, self.terms, self.delay, self.filter.loop, self.initial_state)
 
     @property

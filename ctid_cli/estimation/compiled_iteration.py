@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ctid_cli.arrays import Array, BoolArray, IndexArray
+from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.estimation.delay_search import LEAST_CURVATURE
 from ctid_cli.estimation.problems import is_hurwitz
 from ctid_cli.estimation.refined_iv import NEGLIGIBLE_FALL, ROUNDING, SLOW_STEPS, SUFFICIENT_FALL
@@ -100,15 +100,7 @@ def _moments(
     theta: Array,
     n: int,
     delay: float,
-    interval: float,
-    tu: Array,
-    u: Array,
-    input_foh: bool,
-    t: Array,
-    y: Array,
-    y_foh: bool,
-    common_clock: bool,
-    use: BoolArray,
+    data: FilterData,
     limit: float,
 ) -> Array:
     a = np.ones(n + 1)
@@ -117,7 +109,7 @@ def _moments(
         a[i + 1] = theta[i]
     for i in range(b.size):
         b[i] = theta[n + i]
-    return standard_moments(a, b, delay, interval, tu, u, input_foh, t, y, y_foh, common_clock, use, False, limit)
+    return standard_moments(a, b, delay, data, False, limit)
 
 
 @njit(cache=True, nogil=True)
@@ -173,15 +165,7 @@ def _iterate(
     halvings: int,
     first: int,
     delay: float,
-    interval: float,
-    tu: Array,
-    u: Array,
-    input_foh: bool,
-    t: Array,
-    y: Array,
-    y_foh: bool,
-    common_clock: bool,
-    use: BoolArray,
+    data: FilterData,
     limit: float,
 ) -> tuple[bool, Array, int]:
     """Fit the numerator, then iterate, all in place; whether theta is admissible, its moments, number of steps."""
@@ -189,11 +173,11 @@ def _iterate(
     stabilise(theta, n)
     for i in range(n, p):
         theta[i] = 0.0
-    start = _moments(theta, n, delay, interval, tu, u, input_foh, t, y, y_foh, common_clock, use, limit)
+    start = _moments(theta, n, delay, data, limit)
     if not _is_finite(start):
         return False, start, 0
     _refit_numerator(start, theta, sensitivity_rows, n)
-    moments = _moments(theta, n, delay, interval, tu, u, input_foh, t, y, y_foh, common_clock, use, limit)
+    moments = _moments(theta, n, delay, data, limit)
     if not _is_finite(moments):
         return False, moments, 0
     error_row = 3 * n + 1
@@ -234,7 +218,7 @@ def _iterate(
                 for i in range(p):
                     candidate[i] = theta[i] + fraction * step[i]
                 stabilise(candidate, n)
-                trial = _moments(candidate, n, delay, interval, tu, u, input_foh, t, y, y_foh, common_clock, use, limit)
+                trial = _moments(candidate, n, delay, data, limit)
                 if _is_finite(trial):
                     rounding = ROUNDING * (_output_power(trial, candidate, n) + power)
                     promised = 2.0 * fraction * slope
@@ -292,15 +276,7 @@ def _best_of(
     halvings: int,
     first: int,
     delay: float,
-    interval: float,
-    tu: Array,
-    u: Array,
-    input_foh: bool,
-    t: Array,
-    y: Array,
-    y_foh: bool,
-    common_clock: bool,
-    use: BoolArray,
+    data: FilterData,
     limit: float,
 ) -> tuple[float, float, Array, int]:
     """Iterate from every start and keep the least cost: its sum of squares, delay step, parameters, start."""
@@ -322,15 +298,7 @@ def _best_of(
             halvings,
             first,
             delay,
-            interval,
-            tu,
-            u,
-            input_foh,
-            t,
-            y,
-            y_foh,
-            common_clock,
-            use,
+            data,
             limit,
         )
         if admissible and moments[3 * n + 1, 3 * n + 1] < best_error:
@@ -365,15 +333,7 @@ def best_coefficients(
         halvings,
         1 if gauss_newton else 0,
         float(delay),
-        data.interval or 0.0,
-        data.tu,
-        data.u,
-        data.input_foh,
-        data.t,
-        data.y,
-        data.y_foh,
-        data.common_clock,
-        data.use,
+        data,
         MODAL_CONDITION_LIMIT,
     )
     if best < 0:

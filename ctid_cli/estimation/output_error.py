@@ -9,7 +9,7 @@ C are the initial state, whatever happened before. C and the offset c belong to 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -71,12 +71,11 @@ class OutputErrorProblem:
         self.bounds = bounds
         # The records with a unit step at the first used instant in the place of their input.
         self._steps = tuple(
-            replace(
-                record,
+            record._replace(
                 tu=record.t[record.use][:1].copy(),
                 u=np.ones(1),
                 input_foh=False,
-                interval=None,
+                interval=0.0,
                 common_clock=False,
                 y=np.zeros_like(record.y),
             )

@@ -240,7 +240,7 @@ class PreparedAdditiveSrivc:
         loop = loop_data(record, options.instruments)
         # A record of one period has an input before its first sample: the same one.
         data = filter_data(record, 0.0 if options.initial_state == "periodic" else options.delay, options.hold_output)
-        if options.initial_state == "periodic" and (data.interval is None or not record.valid.all()):
+        if options.initial_state == "periodic" and (data.interval == 0.0 or not record.valid.all()):
             where = f"{record.name}: " if record.name else ""
             raise DataError(
                 f"{where}one period of a steady state must be sampled on one regular clock without missing samples; "

@@ -239,7 +239,7 @@ class PreparedSrivc:
         rows = standard_rows(problem.data, a, b, delay)
         structure = problem.structure
         psi = rows[:, structure.sensitivity_rows] * structure.signs
-        covariance = sandwich_covariance(psi, rows[:, structure.error_row], regular=problem.data.interval is not None)
+        covariance = sandwich_covariance(psi, rows[:, structure.error_row], regular=problem.data.interval > 0.0)
         return replace(fit, covariance=covariance)
 
 

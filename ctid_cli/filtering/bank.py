@@ -18,8 +18,7 @@ Every refined instrumental variable step, cost, gradient and Hessian is a functi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -40,9 +39,11 @@ MODAL_CONDITION_LIMIT = 1e4
 WHOLE_INTERVAL = 1e-10
 
 
-@dataclass(frozen=True, eq=False)
-class FilterData:
-    """A record laid out for the compiled passes."""
+class FilterData(NamedTuple):
+    """A record laid out for the compiled passes, which take it whole.
+
+    Arrays are contiguous and writeable: for any other layout every pass would be compiled again.
+    """
 
     #: Sampling instants [s] and outputs, masked samples bridged by straight lines, shape (N,).
     t: Array
@@ -54,12 +55,13 @@ class FilterData:
     u: Array
     input_foh: bool
     y_foh: bool
-    #: The common interval [s] if input and output share one regular clock.
-    interval: float | None
+    #: The common interval [s] if input and output share one regular clock, else 0.
+    interval: float
+    #: Whether input and output have the same instants.
     common_clock: bool
 
     @property
-    def count(self) -> int:
+    def count(self) -> int:  # type: ignore[override]  # what a tuple counts is of no use here
         """Number of samples that enter sums."""
         return int(self.use.sum())
 
@@ -88,7 +90,7 @@ def filter_data(record: Record, start: float = 0.0, hold_output: Hold = "foh") -
         u=plain_array(record.input.values),
         input_foh=record.input.hold == "foh",
         y_foh=hold_output == "foh",
-        interval=record.interval if on_grid else None,
+        interval=(record.interval or 0.0) if on_grid else 0.0,
         common_clock=same,
     )
 
@@ -168,19 +170,9 @@ def split_delay(delay: float, interval: float) -> tuple[int, float]:
 
 
 @njit(cache=True, nogil=True)
-def _regular_chain(
-    a: Array,
-    b: Array,
-    delay: float,
-    interval: float,
-    u: Array,
-    input_foh: bool,
-    y: Array,
-    y_foh: bool,
-    use: BoolArray,
-    want_rows: bool,
-) -> Array:
+def _regular_chain(a: Array, b: Array, delay: float, data: FilterData, want_rows: bool) -> Array:
     n = a.size - 1
+    interval = data.interval
     w0, dynamics, gain, powers, output = double_chain(a, b)
     transition, from_value, from_change = held_step(dynamics, gain, interval * w0)
     y_transition = transition[:n, :n].copy()
@@ -205,7 +197,7 @@ def _regular_chain(
     place(mapping, 2 * n + 1, 2 * n + 2, powers)
     mapping[3 * n + 1, 3 * n + 2] = 1.0
     _fill_derivative(a, b, mapping)
-    count = np.count_nonzero(use)
+    count = np.count_nonzero(data.use)
     rows = np.zeros((count if want_rows else 0, q))
     gram = np.zeros((0 if want_rows else q, 0 if want_rows else q))
     regular_chain_pass(
@@ -213,15 +205,15 @@ def _regular_chain(
         from_value,
         from_change,
         output @ readout[:n],
-        u,
-        input_foh,
+        data.u,
+        data.input_foh,
         shift,
         y_transition,
         y_value,
         y_change,
-        y,
-        y_foh,
-        use,
+        data.y,
+        data.y_foh,
+        data.use,
         np.zeros(0),
         rows,
         gram,
@@ -334,38 +326,30 @@ def _modal(
     residues: ComplexArray,
     mapping: Array,
     delay: float,
-    interval: float,
-    tu: Array,
-    u: Array,
-    input_foh: bool,
-    t: Array,
-    y: Array,
-    y_foh: bool,
-    common_clock: bool,
-    use: BoolArray,
+    data: FilterData,
     want_rows: bool,
 ) -> Array:
     q = mapping.shape[1]
-    rows = np.zeros((np.count_nonzero(use) if want_rows else 0, q))
+    rows = np.zeros((np.count_nonzero(data.use) if want_rows else 0, q))
     gram = np.zeros((0 if want_rows else q, 0 if want_rows else q))
     shift, fraction = 0, 0.0
-    if interval > 0.0:
-        shift, fraction = split_delay(delay, interval)
+    if data.interval > 0.0:
+        shift, fraction = split_delay(delay, data.interval)
     modal_pass(
         poles,
         residues,
-        interval,
+        data.interval,
         shift,
         fraction,
-        tu,
-        u,
-        input_foh,
+        data.tu,
+        data.u,
+        data.input_foh,
         delay,
-        t,
-        y,
-        y_foh,
-        common_clock,
-        use,
+        data.t,
+        data.y,
+        data.y_foh,
+        data.common_clock,
+        data.use,
         np.zeros(0),
         rows,
         gram,
@@ -374,19 +358,7 @@ def _modal(
 
 
 @njit(cache=True, nogil=True)
-def _irregular_chain(
-    a: Array,
-    b: Array,
-    delay: float,
-    tu: Array,
-    u: Array,
-    input_foh: bool,
-    t: Array,
-    y: Array,
-    y_foh: bool,
-    use: BoolArray,
-    want_rows: bool,
-) -> Array:
+def _irregular_chain(a: Array, b: Array, delay: float, data: FilterData, want_rows: bool) -> Array:
     n = a.size - 1
     w0, dynamics, gain, powers, output = double_chain(a, b)
     q = 3 * n + 2
@@ -397,7 +369,7 @@ def _irregular_chain(
     place(mapping, 2 * n + 1, 2 * n + 1, powers)
     mapping[3 * n + 1, 3 * n + 1] = 1.0
     _fill_derivative(a, b, mapping)
-    rows = np.zeros((np.count_nonzero(use) if want_rows else 0, q))
+    rows = np.zeros((np.count_nonzero(data.use) if want_rows else 0, q))
     gram = np.zeros((0 if want_rows else q, 0 if want_rows else q))
     output_map = np.zeros(2 * n)
     for i in range(n):
@@ -406,16 +378,16 @@ def _irregular_chain(
         dynamics,
         gain,
         output_map,
-        tu * w0,
-        u,
-        input_foh,
+        data.tu * w0,
+        data.u,
+        data.input_foh,
         delay * w0,
         dynamics[:n, :n].copy(),
         gain[:n].copy(),
-        t * w0,
-        y,
-        y_foh,
-        use,
+        data.t * w0,
+        data.y,
+        data.y_foh,
+        data.use,
         np.zeros(0),
         rows,
         gram,
@@ -428,47 +400,22 @@ def standard_moments(
     a: Array,
     b: Array,
     delay: float,
-    interval: float,
-    tu: Array,
-    u: Array,
-    input_foh: bool,
-    t: Array,
-    y: Array,
-    y_foh: bool,
-    common_clock: bool,
-    use: BoolArray,
+    data: FilterData,
     want_rows: bool,
     limit: float,
 ) -> Array:
     """Second moments of the standard rows, or the rows: one compiled entry, so that a call costs one crossing."""
     condition, poles, residues, mapping = modal_map(a, b)
     if condition < limit:
-        return _modal(
-            poles, residues, mapping, delay, interval, tu, u, input_foh, t, y, y_foh, common_clock, use, want_rows
-        )
-    if interval > 0.0:
-        return _regular_chain(a, b, delay, interval, u, input_foh, y, y_foh, use, want_rows)
-    return _irregular_chain(a, b, delay, tu, u, input_foh, t, y, y_foh, use, want_rows)
+        return _modal(poles, residues, mapping, delay, data, want_rows)
+    if data.interval > 0.0:
+        return _regular_chain(a, b, delay, data, want_rows)
+    return _irregular_chain(a, b, delay, data, want_rows)
 
 
 def _run(data: FilterData, a: Array, b: Array, delay: float, want_rows: bool, form: Form) -> Array:
     limit = {"chain": 0.0, "modal": np.inf, "auto": MODAL_CONDITION_LIMIT}[form]
-    moments: Array = standard_moments(
-        plain_array(a),
-        plain_array(b),
-        float(delay),
-        data.interval or 0.0,
-        data.tu,
-        data.u,
-        data.input_foh,
-        data.t,
-        data.y,
-        data.y_foh,
-        data.common_clock,
-        data.use,
-        want_rows,
-        limit,
-    )
+    moments: Array = standard_moments(plain_array(a), plain_array(b), float(delay), data, want_rows, limit)
     return moments
 
 

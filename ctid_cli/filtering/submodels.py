@@ -15,7 +15,7 @@ open and closed loop*, equations (10), (20), (29) and (31)).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -102,7 +102,7 @@ class SubmodelFilter:
         self.size = sum(term.size for term in terms)
         self._u = data.u
         if self.periodic:
-            if data.interval is None:
+            if data.interval == 0.0:
                 raise ValueError("initial_state periodic needs input and output on one regular clock")
             shift, _ = split_delay(delay, data.interval)
             # Two samples more: the last interval leads back to the first sample, where the next slope begins.
@@ -151,7 +151,7 @@ class SubmodelFilter:
         if response is None:
             return None
         x, by_theta, by_free = response
-        forced = self._rows(replace(data, y=plain_array(data.y - x)), parameters)
+        forced = self._rows(data._replace(y=plain_array(data.y - x)), parameters)
         if forced is None:
             return None
         psi, phi, error, output = forced
@@ -178,7 +178,7 @@ class SubmodelFilter:
 
     def _run(self, data: FilterData, theta: Array, want_rows: bool) -> tuple[Array, Array, Array] | None:
         """The compiled pass: maps, rows and moments; None where it does not apply."""
-        if data.interval is None:
+        if data.interval == 0.0:
             return None
         loop = self.loop
         modes = simple_modes(theta, self.degrees, loop.closed)
@@ -205,7 +205,6 @@ class SubmodelFilter:
         gram: Array,
     ) -> None:
         """One pass; ``state`` is overwritten with the state at the end."""
-        assert data.interval is not None
         shift, fraction = split_delay(self.delay, data.interval)
         submodel_pass(
             modes.poles,
@@ -236,7 +235,6 @@ class SubmodelFilter:
 
     def _periodic_state(self, data: FilterData, modes: PooledModes) -> ComplexArray:
         """State of the pass that comes back after one period."""
-        assert data.interval is not None
         count = data.y.size
         period = data.interval * count
         initial = np.zeros((modes.poles.size, 4), dtype=np.complex128)
@@ -266,8 +264,8 @@ class SubmodelFilter:
 
     def _composed_rows(self, data: FilterData, model: AdditiveModel) -> tuple[Array, Array, Array, Array]:
         """The same, of a model."""
-        source = replace(data, u=plain_array(self._loop_input(data, model))) if self.loop.closed else data
-        everywhere = replace(data, use=np.ones(data.y.size, dtype=bool))
+        source = data._replace(u=plain_array(self._loop_input(data, model))) if self.loop.closed else data
+        everywhere = data._replace(use=np.ones(data.y.size, dtype=bool))
         outputs = [self._submodel_output(everywhere, part) for part in model.submodels]
         error = data.y - np.sum(outputs, axis=0)
         psi, phi = np.empty((data.count, self.size)), np.empty((data.count, self.size))
@@ -275,9 +273,9 @@ class SubmodelFilter:
         offset = 0
         for part, term, output in zip(model.submodels, self.terms, outputs, strict=True):
             width = term.size
-            left = replace(source, y=plain_array(error + output))
+            left = source._replace(y=plain_array(error + output))
             psi[:, offset : offset + width] = self._submodel_rows(left, part, term, instruments=True)
-            left = replace(data, y=left.y)
+            left = data._replace(y=left.y)
             phi[:, offset : offset + width] = self._submodel_rows(left, part, term, instruments=False)
             total += self._submodel_output(source, part)
             offset += width
@@ -285,7 +283,6 @@ class SubmodelFilter:
 
     def _loop_input(self, data: FilterData, model: AdditiveModel) -> Array:
         """Input of the noise-free loop of a model."""
-        assert data.interval is not None
         controller = DiscreteController(self.loop.numerator, self.loop.denominator)
         enters: Literal["controller", "input"] = "controller" if self.loop.at_controller else "input"
         return simulate_loop(model, controller, self.loop.reference, np.zeros(data.y.size), data.interval, enters).u

@@ -1,7 +1,5 @@
 """The rows of a sum of submodels: the compiled pass, the general route, and what a simulation says."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -214,7 +212,7 @@ def test_moments_are_the_products_of_the_rows(name, closed):
 @ALL_SUMS
 def test_clock_that_is_not_recognised_as_regular_gives_the_same(terms, theta):
     data = filter_data(record(hold="foh"), 0.25)
-    regular, irregular = (SubmodelFilter(d, terms, 0.25) for d in (data, replace(data, interval=None)))
+    regular, irregular = (SubmodelFilter(d, terms, 0.25) for d in (data, data._replace(interval=0.0)))
     assert irregular._run(irregular.data, np.array(theta), True) is None
     assert_rows(irregular.rows(np.array(theta)), regular.rows(np.array(theta)), 1e-9)
 
