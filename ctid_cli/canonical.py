@@ -1,9 +1,11 @@
-"""The identity of what is described in plain data."""
+"""Plain data, as JSON can hold it, and the identity of what it describes."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
+from collections.abc import Mapping
 from typing import Any
 
 
@@ -15,3 +17,16 @@ def canonical_json(content: Any) -> str:
 def content_hash(content: Any) -> str:
     """Identity of some content."""
     return hashlib.sha256(canonical_json(content).encode()).hexdigest()[:16]
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON can hold it."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

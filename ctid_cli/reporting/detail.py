@@ -8,12 +8,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from ctid_cli.canonical import plain
 from ctid_cli.errors import MismatchError
 from ctid_cli.reporting.estimate import Parameter, as_object, parameter_table, parameters
 from ctid_cli.reporting.layout import delay_label, number, seconds, text_table
 from ctid_cli.reporting.results import out_option
 from ctid_cli.running.plan import build_plan
-from ctid_cli.running.worker import plain
 from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name, measure_names
 from ctid_cli.simulation.frequency_runs import FrequencyFit, SignalDataSet
 from ctid_cli.specification.spec import spec_from_canonical

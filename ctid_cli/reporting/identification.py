@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from ctid_cli.canonical import plain
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.inference.derived import DerivedParameter
 from ctid_cli.reporting.estimate import Parameter, Units, parameter_table
 from ctid_cli.reporting.layout import count, number, text_table, wrapped
-from ctid_cli.running.worker import plain
 from ctid_cli.signals.measurement import Measurement
 
 FIT_DEFINITION = "100 (1 - ||y - x|| / ||y - mean y||)"

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ctid_cli.canonical import plain
 from ctid_cli.frequency.automatic import Settings
 from ctid_cli.frequency.flags import MEANINGS, Flag
 from ctid_cli.frequency.record_track import RecordTrack
 from ctid_cli.reporting.layout import count, number, text_table, wrapped
-from ctid_cli.running.worker import plain
 from ctid_cli.signals.sampled_signal import SampledSignal
 
 _UNITS = {"t": "s", "omega": "rad/s", "frequency": "Hz"}

@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Any
 from ctid_cli.errors import DataError, RefusedError, StorageError
 from ctid_cli.running import events
 from ctid_cli.running.stopping import StopRequest
-from ctid_cli.running.worker import Job, Outcome
+from ctid_cli.running.worker import Job
 from ctid_cli.storage import folder as place
 from ctid_cli.storage import journal
-from ctid_cli.storage.manifest import FAILURES, Key, Manifest, Slot, assemble, build_manifest, slots
+from ctid_cli.storage.manifest import FAILURES, Key, Manifest, Outcome, Slot, assemble, slots
 from ctid_cli.storage.provenance import now, session_info
 from ctid_cli.storage.store import seal
 from ctid_cli.storage.version import Origin, current_origin
@@ -121,7 +121,7 @@ class _Run:
     ) -> None:
         self.plan, self.folder, self.log, self.origin = plan, folder, log, origin
         self.on_event, self.workers = on_event, jobs
-        self.manifest: Manifest = build_manifest(plan)
+        self.manifest: Manifest = plan.manifest()
         self.slots: dict[Key, list[Slot]] = defaultdict(list)
         for slot in slots(self.manifest):
             self.slots[slot.key].append(slot)
@@ -203,7 +203,7 @@ class _Run:
         place.announce(self.folder, self.plan.experiment, self.started, self.done, len(self.jobs))
 
     def finish(self, reason: str | None) -> None:
-        self.on_event(seal(self.folder, self.log))
+        self.on_event(events.Sealed(self.folder / place.SEALED, *seal(self.folder, self.log)))
         statuses = self.log.statuses()
         self.failed = sum(statuses.get(key) in FAILURES for key in self.slots)
         self.mixed = len(self.log.origins()) > 1
@@ -242,7 +242,7 @@ class _Run:
 def preview(plan: Plan, folder: Path, *, fresh: bool = False, allow_mixed: bool = False) -> events.PlanReady:
     """What a run would do, without doing or writing anything."""
     stored = _look(plan, folder, current_origin(), fresh=fresh, allow_mixed=allow_mixed)
-    planned = {slot.key for slot in slots(build_manifest(plan))}
+    planned = {slot.key for slot in slots(plan.manifest())}
     reused = len(planned & stored)
     return events.PlanReady(
         plan.experiment, folder, len(_jobs(plan, stored)), len(planned) - reused, reused, len(stored - planned)

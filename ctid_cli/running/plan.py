@@ -21,7 +21,7 @@ from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, variants
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.start_points import NO_START, AnyStart, ParameterStart, StartPoint, start_points
 from ctid_cli.specification.yaml_source import KeyPath
-from ctid_cli.storage.manifest import Key
+from ctid_cli.storage.manifest import Key, Manifest
 
 #: Data sets that one experiment may ask for; beyond this its plan alone would fill the memory.
 MAX_DATA_SETS = 1_000_000
@@ -111,6 +111,41 @@ class Plan:
             return cell.system.sorted().terms
         found = (getattr(cell.estimator, "terms", None) for cell in self.estimators)
         return next((tuple(terms) for terms in found if terms is not None), None)
+
+    def manifest(self) -> Manifest:
+        """The plan as plain data."""
+        replicates = [0] * len(self.data_cells)
+        starts: dict[str, list[str]] = {}
+        for task in self.tasks():
+            replicates[task.cell] += 1
+            if not starts:
+                for _, cell, start in self.keys(task):
+                    starts.setdefault(f"{cell.name}/{cell.hash}", []).append(start.label)
+        canonical = self.spec.canonical()
+        return {
+            "experiment": self.experiment,
+            "runs": self.runs,
+            "seed": (canonical.get("monte_carlo") or {}).get("seed"),
+            "spec_hash": self.spec_hash,
+            "spec": canonical,
+            "success": canonical.get("success"),
+            "data_cells": [
+                {"hash": cell.hash, "replicates": count, "swept": dict(cell.swept), "content": cell.content}
+                for cell, count in zip(self.data_cells, replicates, strict=True)
+            ],
+            "estimators": [
+                {
+                    "name": cell.name,
+                    "kind": cell.kind,
+                    "hash": cell.hash,
+                    "swept": dict(cell.swept),
+                    "content": cell.content,
+                    "starts": starts.get(f"{cell.name}/{cell.hash}", []),
+                }
+                for cell in self.estimators
+            ],
+            "starts": {start.label: start.initial_delay for start in self.starts},
+        }
 
 
 def build_plan(spec: Spec, runs: int | None = None) -> Plan:

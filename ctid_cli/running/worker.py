@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import faulthandler
-import math
 import os
 import re
 import signal
@@ -16,12 +15,12 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from ctid_cli.storage.manifest import RESULT_FIELDS, Key
+from ctid_cli.canonical import plain
+from ctid_cli.storage.manifest import RESULT_FIELDS, Key, Outcome
 
 if TYPE_CHECKING:
     from ctid_cli.models.additive import Term
@@ -45,17 +44,6 @@ class Job:
     seed: int | None
     wanted: tuple[tuple[Key, EstimatorCell, AnyStart], ...]
     terms: tuple[Term, ...] | None = None
-
-
-class Outcome(NamedTuple):
-    """One estimate, or how it failed."""
-
-    #: Which estimate.
-    key: Key
-    #: Values of `RESULT_FIELDS`.
-    result: dict[str, Any]
-    #: Time for preparing the record and fitting [s]; None where nothing was measured.
-    seconds: float | None
 
 
 def initialise(parent: int) -> None:
@@ -168,16 +156,3 @@ def _validation_fit_percent(model: Any, data: DataSet) -> float | None:
 
     simulated = simulate(model, record.input, record.t)
     return float(fit_percent(record.y[record.valid], simulated[record.valid]))
-
-
-def plain(value: Any) -> Any:
-    """A value as JSON can hold it."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

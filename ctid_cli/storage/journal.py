@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from ctid_cli.errors import RefusedError, StorageError
-from ctid_cli.running.worker import Outcome
-from ctid_cli.storage.manifest import Key, Manifest
+from ctid_cli.storage.manifest import Key, Manifest, Outcome
 from ctid_cli.storage.version import Origin
 
 FILE_NAME = "journal.sqlite"

@@ -25,10 +25,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-if TYPE_CHECKING:
-    from ctid_cli.running.plan import Plan
+from typing import Any, NamedTuple
 
 Manifest = dict[str, Any]
 
@@ -74,40 +71,15 @@ class Slot(NamedTuple):
     estimator: Mapping[str, Any]
 
 
-def build_manifest(plan: Plan) -> Manifest:
-    """Describe a plan as plain data."""
-    replicates = [0] * len(plan.data_cells)
-    starts: dict[str, list[str]] = {}
-    for task in plan.tasks():
-        replicates[task.cell] += 1
-        if not starts:
-            for _, cell, start in plan.keys(task):
-                starts.setdefault(f"{cell.name}/{cell.hash}", []).append(start.label)
-    canonical = plan.spec.canonical()
-    return {
-        "experiment": plan.experiment,
-        "runs": plan.runs,
-        "seed": (canonical.get("monte_carlo") or {}).get("seed"),
-        "spec_hash": plan.spec_hash,
-        "spec": canonical,
-        "success": canonical.get("success"),
-        "data_cells": [
-            {"hash": cell.hash, "replicates": count, "swept": dict(cell.swept), "content": cell.content}
-            for cell, count in zip(plan.data_cells, replicates, strict=True)
-        ],
-        "estimators": [
-            {
-                "name": cell.name,
-                "kind": cell.kind,
-                "hash": cell.hash,
-                "swept": dict(cell.swept),
-                "content": cell.content,
-                "starts": starts.get(f"{cell.name}/{cell.hash}", []),
-            }
-            for cell in plan.estimators
-        ],
-        "starts": {start.label: start.initial_delay for start in plan.starts},
-    }
+class Outcome(NamedTuple):
+    """One estimate, or how it failed."""
+
+    #: Which estimate.
+    key: Key
+    #: Values of `RESULT_FIELDS`.
+    result: dict[str, Any]
+    #: Time for preparing the record and fitting [s]; None where nothing was measured.
+    seconds: float | None
 
 
 def slots(manifest: Manifest) -> Iterator[Slot]:

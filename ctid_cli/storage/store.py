@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.errors import StorageError, UsageError
-from ctid_cli.running.events import Sealed
 from ctid_cli.storage import journal
 from ctid_cli.storage.folder import (
     SEALED,
@@ -140,8 +139,11 @@ class ExperimentStatus:
     groups: tuple[GroupStatus, ...]
 
 
-def seal(folder: Path, log: journal.Journal) -> Sealed:
-    """Write the estimates of the journal's plan to the sealed file, and their times to a table."""
+def seal(folder: Path, log: journal.Journal) -> tuple[int, str]:
+    """Write the estimates of the journal's plan to the sealed file, and their times to a table.
+
+    Returns the number of estimates and the checksum of the file.
+    """
     from ctid_cli.storage.sealed import seal_image, verify_sealed
 
     manifest, entries, origins = log.manifest(), log.entries(), log.origins()
@@ -166,7 +168,7 @@ def seal(folder: Path, log: journal.Journal) -> Sealed:
     if verify_sealed(target) != checksum:
         raise StorageError(f"{target} reads back otherwise than it was written; all estimates are safe in {log.path}")
     log.mark_sealed(checksum)
-    return Sealed(target, count, checksum)
+    return count, checksum
 
 
 def read_stored(folder: Path) -> Stored:

@@ -5,7 +5,6 @@ from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
 from ctid_cli.running.worker import Job, run_job
 from ctid_cli.specification.spec import load_spec
-from ctid_cli.storage.manifest import build_manifest
 from ctid_cli.storage.sealed import seal_image
 from ctid_cli.storage.version import Origin
 
@@ -23,6 +22,6 @@ def run_here(name, out, overrides):
         results |= {outcome.key: outcome.result for outcome in run_job(job)}
     folder = out / plan.experiment
     folder.mkdir(parents=True)
-    image, _, _ = seal_image(build_manifest(plan), (Origin("c", "p", ()),), results)
+    image, _, _ = seal_image(plan.manifest(), (Origin("c", "p", ()),), results)
     (folder / "runs.h5").write_bytes(image)
     return folder

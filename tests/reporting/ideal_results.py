@@ -6,7 +6,7 @@ from ctid_cli.reporting.parameter_theory import long_record_variances
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.spec import load_spec
-from ctid_cli.storage.manifest import Key, build_manifest, true_parameters
+from ctid_cli.storage.manifest import Key, true_parameters
 from ctid_cli.storage.store import Stored
 from ctid_cli.storage.version import Origin
 
@@ -56,7 +56,7 @@ def estimate(parameters, standard_errors=None, status="CONVERGED", **more):
 
 def results_of(plan, found, folder):
     """Results from what workers returned: ``found[estimator name, samples]`` is a list by replicate."""
-    manifest = build_manifest(plan)
+    manifest = plan.manifest()
     start = next(point.label for point in plan.starts)
     results = {}
     for part in plan.estimators:
@@ -74,7 +74,7 @@ def ideal_results(plan, folder, *, bias=None, width=None, seed=1):
     their standard errors.
     """
     variances = long_record_variances(plan)
-    truth = true_parameters(build_manifest(plan)["data_cells"][0])
+    truth = true_parameters(plan.manifest()["data_cells"][0])
     rng = np.random.default_rng(seed)
     found = {}
     for k, cell in enumerate(plan.data_cells):

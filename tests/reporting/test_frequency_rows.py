@@ -9,7 +9,7 @@ from ctid_cli.reporting.tables import frequency_table
 from ctid_cli.running.plan import build_plan
 from ctid_cli.running.worker import failed
 from ctid_cli.specification.spec import load_spec
-from ctid_cli.storage.manifest import build_manifest, slots
+from ctid_cli.storage.manifest import slots
 from ctid_cli.storage.store import Stored
 from ctid_cli.storage.version import Origin
 
@@ -52,7 +52,7 @@ def results(tmp_path):
     def make(tracks, records):
         file = tmp_path / "made.yaml"
         file.write_text(SPEC, encoding="utf-8")
-        manifest = build_manifest(build_plan(load_spec(file)))
+        manifest = build_plan(load_spec(file)).manifest()
         values = {"tracker": tracks, "whole": records}
         found = {
             slot.key: values[slot.estimator["name"]][slot.key.replicate]

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.errors import DataError
+from ctid_cli.running.plan import Plan
 from ctid_cli.storage.manifest import Key
 
 
@@ -180,6 +181,7 @@ class FakePlan:
     """Same surface as the real plan: cells of several noise levels, estimators, starts, runs."""
 
     terms = None
+    manifest = Plan.manifest
 
     def __init__(
         self,

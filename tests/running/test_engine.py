@@ -24,7 +24,7 @@ from ctid_cli.running.engine import RunSummary, preview, run_experiment
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.spec import load_spec
 from ctid_cli.storage import folder, journal
-from ctid_cli.storage.manifest import RESULT_FIELDS, Key, build_manifest, slots
+from ctid_cli.storage.manifest import RESULT_FIELDS, Key, slots
 from ctid_cli.storage.store import experiment_status, load_estimates
 from tests.running import run_toys
 from tests.running.fakes import FakePlan, Toy
@@ -115,7 +115,7 @@ def test_every_estimate_of_the_plan_is_stored_once_in_its_order(tmp_path: Path) 
     plan = FakePlan()
     summary = run(plan, tmp_path)
     expected = {(k.data_hash, k.replicate, k.estimator_hash, k.start) for t in plan.tasks() for k, _, _ in plan.keys(t)}
-    listed = [slot.key for slot in slots(build_manifest(plan))]  # type: ignore[arg-type]
+    listed = [slot.key for slot in slots(plan.manifest())]  # type: ignore[arg-type]
     assert set(listed) == expected
     assert len(listed) == len(expected) == summary.planned == summary.computed
     assert load_estimates(tmp_path)["id"].tolist() == [key.id for key in listed]

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ctid_cli.canonical import plain
 from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.running.worker import Job, failure, plain, run_job
+from ctid_cli.running.worker import Job, failure, run_job
 from ctid_cli.storage.manifest import RESULT_FIELDS, Key
 from tests.running.fakes import (
     STARTS,

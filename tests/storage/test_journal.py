@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from ctid_cli.errors import RefusedError, StorageError
-from ctid_cli.running.worker import Outcome
 from ctid_cli.storage.journal import Journal, open_journal, read_journal
-from ctid_cli.storage.manifest import Key
+from ctid_cli.storage.manifest import Key, Outcome
 from ctid_cli.storage.version import Origin
 
 ORIGIN = Origin("c0de", "a platform", (("python", "3.11.7"), ("numpy", "2.4")))

@@ -14,7 +14,7 @@ from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.worker import failed
 from ctid_cli.storage.folder import experiment_folders
 from ctid_cli.storage.journal import open_journal, read_journal
-from ctid_cli.storage.manifest import build_manifest, slots, true_parameters
+from ctid_cli.storage.manifest import slots, true_parameters
 from ctid_cli.storage.sealed import read_sealed, seal_image
 from ctid_cli.storage.store import experiment_status, find_estimate, load_estimates, read_stored
 from ctid_cli.storage.summary import export_rows
@@ -131,7 +131,7 @@ def test_a_newer_sealed_format_is_refused(place: Path) -> None:
 
 def test_sealing_extreme_contents_gives_them_back(tmp_path: Path) -> None:
     plan = FakePlan(Toy(), runs=1, levels=(1,))
-    manifest = build_manifest(plan)  # type: ignore[arg-type]
+    manifest = plan.manifest()  # type: ignore[arg-type]
     keys = [slot.key for slot in slots(manifest)]
     odd: dict[str, Any] = {
         "status": "CONVERGED",
@@ -170,7 +170,7 @@ def additive(manifest: dict[str, Any]) -> dict[str, Any]:
 
 def test_parameters_of_submodels_are_sealed(tmp_path: Path) -> None:
     plan = FakePlan(Toy(), runs=2, levels=(1,))
-    plain = build_manifest(plan)  # type: ignore[arg-type]
+    plain = plan.manifest()  # type: ignore[arg-type]
     manifest = additive(plain)
     keys = [slot.key for slot in slots(manifest)]
     result = failed("", "CONVERGED") | {"numerator": [1.0], "denominator": [1.0, 2.0], "iterations": 3}
@@ -195,7 +195,7 @@ def test_parameters_of_submodels_are_sealed(tmp_path: Path) -> None:
 
 
 def test_true_parameters_are_those_of_the_sorted_submodels(tmp_path: Path) -> None:
-    plain = build_manifest(FakePlan(Toy(), runs=1, levels=(1,)))  # type: ignore[arg-type]
+    plain = FakePlan(Toy(), runs=1, levels=(1,)).manifest()  # type: ignore[arg-type]
     manifest = additive(plain)
     assert true_parameters(plain["data_cells"][0]) is None
     truth = true_parameters(manifest["data_cells"][0])
@@ -229,7 +229,7 @@ def test_find_an_estimate_by_the_beginning_of_its_id(place: Path) -> None:
 
 def test_estimates_of_a_killed_run_are_readable(place: Path) -> None:
     log = open_journal(place / "journal.sqlite")
-    log.begin(build_manifest(FakePlan(Toy("raise", at=1), Toy(order=3), runs=8)), current_origin(), "now", {})  # type: ignore[arg-type]
+    log.begin(FakePlan(Toy("raise", at=1), Toy(order=3), runs=8).manifest(), current_origin(), "now", {})  # type: ignore[arg-type]
     log.close()
     assert len(read_stored(place).rows()) == 36
     status = experiment_status(place)
