@@ -4,7 +4,8 @@ import time
 
 import numpy as np
 
-from ctid_cli.filtering.bank import filter_data, second_moments
+from ctid_cli.filtering.bank import second_moments
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Record
 

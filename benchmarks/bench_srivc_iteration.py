@@ -6,7 +6,7 @@ import numpy as np
 
 from ctid_cli.estimation.problems import CoefficientProblem
 from ctid_cli.estimation.refined_iv import iterate
-from ctid_cli.filtering.bank import filter_data
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.models.transfer_function import TransferFunction

@@ -13,7 +13,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.problems import is_hurwitz, reflect_unstable
 from ctid_cli.estimation.refined_iv import Equations
-from ctid_cli.filtering.bank import FilterData, plain_array
+from ctid_cli.filtering.filter_data import FilterData, plain_array
 from ctid_cli.filtering.submodels import OPEN_LOOP, InitialState, LoopData, SubmodelFilter
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController

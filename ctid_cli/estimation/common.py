@@ -10,7 +10,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.problems import CoefficientProblem
-from ctid_cli.filtering.bank import FilterData
+from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
 from ctid_cli.inference.diagnostics import percent_from_r_squared
 from ctid_cli.inference.fit import Fit, IterationRecord

@@ -11,7 +11,8 @@ import numpy as np
 from ctid_cli.estimation.compiled_iteration import best_coefficients
 from ctid_cli.estimation.problems import is_hurwitz
 from ctid_cli.estimation.spectral_problem import SpectralCoefficientProblem
-from ctid_cli.filtering.bank import filter_data, second_moments
+from ctid_cli.filtering.bank import second_moments
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.filtering.spectra import record_spectra

@@ -20,7 +20,7 @@ from ctid_cli.estimation.spectral_problem import (
     spectral_least_squares_start,
     spectral_refit_numerator,
 )
-from ctid_cli.filtering.bank import FilterData, filter_data
+from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.spectra import RecordSpectra, lowpass_weight, record_spectra
 from ctid_cli.inference.sensitivity import Structure

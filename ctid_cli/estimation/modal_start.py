@@ -27,7 +27,7 @@ from ctid_cli.estimation.pole_relocation import (
 )
 from ctid_cli.estimation.problems import CoefficientProblem, least_squares_start, refit_numerator
 from ctid_cli.estimation.refined_iv import iterate, scaled_solve
-from ctid_cli.filtering.bank import FilterData, filter_data
+from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.filtering.free_response import free_response, free_response_size
 from ctid_cli.filtering.submodels import SubmodelFilter
 from ctid_cli.inference.sensitivity import Structure

@@ -16,7 +16,8 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.estimation.problems import with_stable_denominator
 from ctid_cli.estimation.refined_iv import Equations, scaled_solve
-from ctid_cli.filtering.bank import FilterData, standard_rows
+from ctid_cli.filtering.bank import standard_rows
+from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.sensitivity import Structure
 
 

@@ -7,7 +7,8 @@ from numba import njit
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.refined_iv import Equations, scaled_solve
-from ctid_cli.filtering.bank import FilterData, second_moments
+from ctid_cli.filtering.bank import second_moments
+from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.sensitivity import Structure
 
 

@@ -20,7 +20,7 @@ from numba import njit
 from ctid_cli.arrays import Array, ComplexArray, IndexArray
 from ctid_cli.estimation.problems import reflect_unstable, with_stable_denominator
 from ctid_cli.estimation.refined_iv import Equations, scaled_solve
-from ctid_cli.filtering.bank import plain_array
+from ctid_cli.filtering.filter_data import plain_array
 from ctid_cli.filtering.spectra import RecordSpectra
 from ctid_cli.inference.sensitivity import Structure
 

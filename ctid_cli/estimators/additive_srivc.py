@@ -13,7 +13,7 @@ from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, c
 from ctid_cli.estimation.common import Start, StartFrom, check_iteration, check_record
 from ctid_cli.estimation.modal_start import automatic_start
 from ctid_cli.estimation.refined_iv import StepRule
-from ctid_cli.filtering.bank import filter_data
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.submodels import InitialState
 from ctid_cli.inference.additive_derived import additive_derived
 from ctid_cli.inference.derived import DerivedParameter

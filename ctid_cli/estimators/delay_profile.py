@@ -18,7 +18,7 @@ from ctid_cli.estimation.filtered_costs import Effort, filtered_costs
 from ctid_cli.estimation.output_error import Layout, OutputErrorProblem
 from ctid_cli.estimation.problems import CoefficientProblem, least_squares_start, refit_numerator
 from ctid_cli.estimation.refined_iv import Equations, Iterated, iterate
-from ctid_cli.filtering.bank import FilterData, filter_data
+from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance

@@ -27,7 +27,8 @@ from ctid_cli.estimation.problems import (
     with_stable_denominator,
 )
 from ctid_cli.estimation.refined_iv import Equations, Iterated, StepRule, iterate
-from ctid_cli.filtering.bank import FilterData, filter_data, standard_rows
+from ctid_cli.filtering.bank import standard_rows
+from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.inference.diagnostics import percent_from_r_squared
 from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.robust import sandwich_covariance

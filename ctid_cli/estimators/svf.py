@@ -8,7 +8,7 @@ from typing import ClassVar, get_args
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Start, StartFrom, check_record, check_structure, finish, history_entry
 from ctid_cli.estimation.problems import CoefficientProblem, least_squares_start
-from ctid_cli.filtering.bank import filter_data
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status

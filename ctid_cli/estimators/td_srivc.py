@@ -23,7 +23,7 @@ from ctid_cli.estimation.delay_search import Descent, Minimum, bound_in_the_way,
 from ctid_cli.estimation.problems import CoefficientProblem, DelayProblem
 from ctid_cli.estimation.refined_iv import Equations, Iterated, Variant, iterate
 from ctid_cli.estimators.srivc import initial_coefficients
-from ctid_cli.filtering.bank import FilterData, filter_data
+from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.sensitivity import Structure

@@ -18,90 +18,21 @@ Every refined instrumental variable step, cost, gradient and Hessian is a functi
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike
 
-from ctid_cli.arrays import Array, BoolArray, ComplexArray
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.filtering.exponential import held_step, place
+from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
 from ctid_cli.filtering.kernels import irregular_chain_pass, modal_pass, regular_chain_pass
-from ctid_cli.filtering.sections import chain, polynomial_roots, time_scale
-from ctid_cli.signals.held import Hold
-from ctid_cli.signals.record import Record
+from ctid_cli.filtering.realisation import chain, polynomial_roots, scaled_denominator, time_scale
 
 Form = Literal["auto", "modal", "chain"]
 
 #: Partial fractions are used while they amplify rounding by less than this; beyond, poles count as repeated.
 MODAL_CONDITION_LIMIT = 1e4
-#: A delay closer to a whole number of intervals than this fraction of one is that whole number.
-WHOLE_INTERVAL = 1e-10
-
-
-class FilterData(NamedTuple):
-    """A record laid out for the compiled passes, which take it whole.
-
-    Arrays are contiguous and writeable: for any other layout every pass would be compiled again.
-    """
-
-    #: Sampling instants [s] and outputs, masked samples bridged by straight lines, shape (N,).
-    t: Array
-    y: Array
-    #: Samples that enter sums: present, and not before the start-up time, shape (N,).
-    use: BoolArray
-    #: Breaks [s] and values of the input, shape (M,).
-    tu: Array
-    u: Array
-    input_foh: bool
-    y_foh: bool
-    #: The common interval [s] if input and output share one regular clock, else 0.
-    interval: float
-    #: Whether input and output have the same instants.
-    common_clock: bool
-
-    @property
-    def count(self) -> int:  # type: ignore[override]  # what a tuple counts is of no use here
-        """Number of samples that enter sums."""
-        return int(self.use.sum())
-
-    @property
-    def y_used(self) -> Array:
-        """Outputs that enter sums, shape (count,)."""
-        return self.y[self.use]
-
-
-def plain_array(values: ArrayLike) -> Array:
-    """A fresh, writeable, contiguous array."""
-    return np.array(values, dtype=np.float64, order="C")
-
-
-def filter_data(record: Record, start: float = 0.0, hold_output: Hold = "foh") -> FilterData:
-    """Lay a record out for filtering."""
-    slack = 1e-9 * (record.interval or 0.0)
-    use = record.valid & (record.t >= record.input.t[0] + start - slack)
-    on_grid = record.input_on_grid
-    same = record.input.t.size == record.t.size and bool(np.array_equal(record.input.t, record.t))
-    return FilterData(
-        t=plain_array(record.t),
-        y=plain_array(record.bridged_y),
-        use=use,
-        tu=plain_array(record.input.t),
-        u=plain_array(record.input.values),
-        input_foh=record.input.hold == "foh",
-        y_foh=hold_output == "foh",
-        interval=(record.interval or 0.0) if on_grid else 0.0,
-        common_clock=same,
-    )
-
-
-@njit(cache=True, nogil=True)
-def scaled_denominator(coefficients: Array, w0: float) -> Array:
-    """Coefficients of a monic denominator in the time unit 1/w0."""
-    scaled = np.empty(coefficients.size)
-    for k in range(coefficients.size):
-        scaled[k] = coefficients[k] / w0**k
-    return scaled
 
 
 @njit(cache=True, nogil=True)
@@ -154,19 +85,6 @@ def _to_standard(mapping: Array, rows: Array, gram: Array, want_rows: bool) -> A
     if want_rows:
         return rows @ np.ascontiguousarray(mapping.T)
     return mapping @ gram @ np.ascontiguousarray(mapping.T)
-
-
-@njit(cache=True, nogil=True)
-def split_delay(delay: float, interval: float) -> tuple[int, float]:
-    """Whole intervals by which the read-out lags, and the fraction of an interval read beyond that break."""
-    ratio = delay / interval
-    shift = int(np.ceil(ratio))
-    fraction = shift - ratio
-    if fraction > 1.0 - WHOLE_INTERVAL:
-        return shift - 1, 0.0
-    if fraction < WHOLE_INTERVAL:
-        return shift, 0.0
-    return shift, fraction
 
 
 @njit(cache=True, nogil=True)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.bank import plain_array
+from ctid_cli.filtering.filter_data import plain_array
 from ctid_cli.filtering.sampled import SampledModel, sampled_model, state_space_response
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.controller import DiscreteController

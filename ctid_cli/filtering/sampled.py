@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.bank import plain_array, scaled_denominator, split_delay
 from ctid_cli.filtering.exponential import held_step
-from ctid_cli.filtering.sections import chain, polynomial_roots, time_scale
+from ctid_cli.filtering.filter_data import plain_array, split_delay
+from ctid_cli.filtering.realisation import chain, polynomial_roots, scaled_denominator, time_scale
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction

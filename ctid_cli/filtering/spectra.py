@@ -18,7 +18,7 @@ from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.bank import plain_array
+from ctid_cli.filtering.filter_data import plain_array
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record

@@ -8,8 +8,9 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
-from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, modal_condition, plain_array, scaled_denominator
-from ctid_cli.filtering.sections import polynomial_roots, time_scale
+from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, modal_condition
+from ctid_cli.filtering.filter_data import plain_array
+from ctid_cli.filtering.realisation import polynomial_roots, scaled_denominator, time_scale
 
 
 @njit(cache=True, nogil=True)

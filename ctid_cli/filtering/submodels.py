@@ -22,12 +22,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.bank import (
-    FilterData,
-    plain_array,
-    split_delay,
-    standard_rows,
-)
+from ctid_cli.filtering.bank import standard_rows
+from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
 from ctid_cli.filtering.free_response import free_response, free_response_size
 from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.filtering.submodel_map import PooledModes, simple_modes

@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
-from ctid_cli.filtering.sections import polynomial_roots, time_scale
+from ctid_cli.filtering.realisation import polynomial_roots, time_scale
 from ctid_cli.frequency.flags import CERTAIN_FRACTION, COMPLEX_ROOTS, OUT_OF_BOUNDS, UNCERTAIN, Flag
 
 #: A root must settle within this many Newton steps; simple roots need fewer than ten.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from ctid_cli.arrays import Array
-from ctid_cli.filtering.bank import filter_data, second_moments
+from ctid_cli.filtering.bank import second_moments
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.covariance import white_noise_covariance
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.models.transfer_function import TransferFunction

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
-from ctid_cli.filtering.bank import filter_data, standard_rows
+from ctid_cli.filtering.bank import standard_rows
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.covariance import condition_number
 from ctid_cli.inference.sensitivity import Structure

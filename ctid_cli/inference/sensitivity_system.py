@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.filtering.bank import plain_array, scaled_denominator, split_delay
 from ctid_cli.filtering.exponential import held_step
-from ctid_cli.filtering.sections import chain, polynomial_roots, time_scale
+from ctid_cli.filtering.filter_data import plain_array, split_delay
+from ctid_cli.filtering.realisation import chain, polynomial_roots, scaled_denominator, time_scale
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_positive

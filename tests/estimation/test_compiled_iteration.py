@@ -19,7 +19,7 @@ from ctid_cli.estimation.problems import (
     with_stable_denominator,
 )
 from ctid_cli.estimation.refined_iv import iterate, scaled_solve
-from ctid_cli.filtering.bank import filter_data
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from ctid_cli.estimation.delay_search import Minimum, bound_in_the_way, delay_step, descend
 from ctid_cli.estimation.problems import CoefficientProblem, DelayProblem
 from ctid_cli.estimation.refined_iv import Equations, iterate
-from ctid_cli.filtering.bank import filter_data, standard_rows
+from ctid_cli.filtering.bank import standard_rows
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
 from ctid_cli.models.transfer_function import TransferFunction

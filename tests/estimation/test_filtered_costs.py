@@ -6,7 +6,7 @@ import pytest
 from ctid_cli.estimation.compiled_iteration import best_coefficients
 from ctid_cli.estimation.filtered_costs import Effort, SampledCost, filtered_costs
 from ctid_cli.estimation.problems import CoefficientProblem, least_squares_start
-from ctid_cli.filtering.bank import filter_data
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.signals.held import HeldSignal

@@ -11,7 +11,7 @@ from ctid_cli.estimation import modal_start
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.modal_start import _arrangements, _criterion, _NumeratorFit, automatic_start
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc
-from ctid_cli.filtering.bank import filter_data
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.sampled import simulate_additive
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.signals.held import HeldSignal

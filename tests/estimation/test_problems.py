@@ -13,7 +13,8 @@ from ctid_cli.estimation.problems import (
     refit_numerator,
     reflect_unstable,
 )
-from ctid_cli.filtering.bank import filter_data, standard_rows
+from ctid_cli.filtering.bank import standard_rows
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.sensitivity import Structure
 from tests.estimators.records import CASE_1, CASE_2, make_record, theta_of
 

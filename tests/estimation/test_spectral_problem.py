@@ -13,7 +13,7 @@ from ctid_cli.estimation.spectral_problem import (
     spectral_refit_numerator,
     used_bins,
 )
-from ctid_cli.filtering.bank import filter_data
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.filtering.spectra import lowpass_weight, record_spectra

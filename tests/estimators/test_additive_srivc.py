@@ -12,7 +12,7 @@ from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.refined_iv import iterate
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc
 from ctid_cli.estimators.srivc import Srivc
-from ctid_cli.filtering.bank import filter_data
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.sampled import simulate_additive
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.status import Status

@@ -8,7 +8,7 @@ import pytest
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.output_error import Layout, OutputErrorProblem
 from ctid_cli.estimators.delay_profile import DelayProfile
-from ctid_cli.filtering.bank import filter_data
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.diagnostics import r_squared
 from ctid_cli.inference.sensitivity import Structure

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.filtering.bank import filter_data
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.kernels import BLOCK
 from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.filtering.sampled import simulate_additive

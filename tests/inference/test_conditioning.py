@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from ctid_cli.filtering.bank import filter_data, second_moments
+from ctid_cli.filtering.bank import second_moments
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.conditioning import describe_conditioning
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance

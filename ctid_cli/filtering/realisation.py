@@ -28,6 +28,15 @@ def time_scale(denominator: Array) -> float:
 
 
 @njit(cache=True, nogil=True)
+def scaled_denominator(coefficients: Array, w0: float) -> Array:
+    """Coefficients of a monic denominator in the time unit 1/w0."""
+    scaled = np.empty(coefficients.size)
+    for k in range(coefficients.size):
+        scaled[k] = coefficients[k] / w0**k
+    return scaled
+
+
+@njit(cache=True, nogil=True)
 def polynomial_roots(coefficients: Array) -> ComplexArray:
     """Roots of a monic real polynomial, fastest first and conjugates side by side."""
     n = coefficients.size - 1
