@@ -19,7 +19,28 @@ class UsageError(CtidError):
 
 
 class DataError(UsageError):
-    """A record (times, input, output) that cannot be used, and why."""
+    """A record (times, input, output) or model that cannot be used, and why.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong.
+    field : str, default ""
+        Argument at fault, where it is a single one.
+    """
+
+    def __init__(self, message: str, field: str = "") -> None:
+        super().__init__(message)
+        self.field = field
+
+
+class OptionError(ValueError):
+    """An option that has no allowed value."""
+
+    def __init__(self, field: str, message: str) -> None:
+        super().__init__(message)
+        #: Name of the option.
+        self.field = field
 
 
 @dataclass(frozen=True)

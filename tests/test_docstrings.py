@@ -13,9 +13,9 @@ import ctid_cli
 from ctid_cli.estimators.registry import ESTIMATORS
 from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
 from ctid_cli.signals.excitation import EXCITATIONS
-from ctid_cli.signals.multi_sine import DISTURBANCES
 from ctid_cli.signals.noise import NOISES
 from ctid_cli.signals.sampling import SAMPLINGS
+from ctid_cli.signals.sinusoids import DISTURBANCES
 
 
 def members_of(name, member):

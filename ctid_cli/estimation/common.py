@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.errors import DataError
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.problems import CoefficientProblem
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
@@ -37,8 +37,8 @@ class Start:
         Initial parameters, as a sum of submodels; None leaves them to the estimator.
     """
 
-    delay: float | None = field(default=None, metadata={"doc": "Initial delay", "unit": "s"})
-    model: AdditiveModel | None = field(default=None, metadata={"doc": "Initial parameters"})
+    delay: float | None = None
+    model: AdditiveModel | None = None
 
 
 def initial_delay(start: Start | None, bounds: tuple[float, float]) -> float:
@@ -55,8 +55,8 @@ def check_structure(poles: int, zeros: int) -> None:
     require_integer("poles", poles, 1, 12)
     require_integer("zeros", zeros, 0)
     if zeros >= poles:
-        raise ValueError(
-            f"zeros must be fewer than poles (a strictly proper model): got {zeros} zeros and {poles} poles"
+        raise OptionError(
+            "zeros", f"zeros must be fewer than poles (a strictly proper model): got {zeros} zeros and {poles} poles"
         )
 
 
@@ -64,7 +64,7 @@ def check_iteration(max_iterations: int, tolerance: float) -> None:
     """Check the stopping rule of an iteration."""
     require_integer("max_iterations", max_iterations, 1)
     if not 0 < tolerance < 1:
-        raise ValueError(f"tolerance must lie between 0 and 1, not {tolerance}")
+        raise OptionError("tolerance", f"tolerance must lie between 0 and 1, not {tolerance}")
 
 
 def check_record(record: Record, data: FilterData, parameters: int) -> None:

@@ -7,7 +7,7 @@ from typing import ClassVar, get_args
 
 import numpy as np
 
-from ctid_cli.errors import DataError
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.additive_estimate import Covariance, SubmodelEstimate, estimate_submodels
 from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
 from ctid_cli.estimation.common import Start, StartFrom, check_iteration, check_record
@@ -143,21 +143,19 @@ class AdditiveSrivc:
     kind: ClassVar[str] = "additive_srivc"
     start_from: ClassVar[StartFrom | None] = "parameters"
 
-    terms: tuple[Term, ...] = field(metadata={"doc": "Degrees of the submodels"})
-    delay: float = field(default=0.0, metadata={"doc": "Known delay", "unit": "s"})
-    instruments: Instruments = field(
-        default="open_loop", metadata={"doc": "From the measured input, or from the noise-free loop of the model"}
-    )
-    initial_state: InitialState = field(default="rest", metadata={"doc": "State at the first sample"})
-    covariance: Covariance = field(default="white", metadata={"doc": "Noise that the standard errors hold for"})
-    max_iterations: int = field(default=100, metadata={"doc": "Largest number of iterations"})
-    tolerance: float = field(default=1e-8, metadata={"doc": "Relative change of the output at which to stop"})
-    variant: StepRule = field(default="relaxed", metadata={"doc": "How steps are accepted"})
-    hold_output: Hold = field(default="foh", metadata={"doc": "Interpolation of the measured output between samples"})
+    terms: tuple[Term, ...]
+    delay: float = 0.0
+    instruments: Instruments = "open_loop"
+    initial_state: InitialState = "rest"
+    covariance: Covariance = "white"
+    max_iterations: int = 100
+    tolerance: float = 1e-8
+    variant: StepRule = "relaxed"
+    hold_output: Hold = "foh"
 
     def __post_init__(self) -> None:
         if not self.terms:
-            raise ValueError("terms must list at least one submodel, for example {poles: 2, zeros: 0}")
+            raise OptionError("terms", "terms must list at least one submodel, for example {poles: 2, zeros: 0}")
         check_terms(self.terms)
         require_not_negative("delay", self.delay, "s")
         require_choice("instruments", self.instruments, get_args(Instruments))
@@ -169,10 +167,13 @@ class AdditiveSrivc:
         check_closed_loop(self.instruments, self.variant)
         if self.initial_state == "periodic":
             if self.instruments == "closed_loop":
-                raise ValueError("initial_state periodic is for open-loop instruments; use rest or estimated")
+                raise OptionError(
+                    "initial_state", "initial_state periodic is for open-loop instruments; use rest or estimated"
+                )
             if any(term.integrators for term in self.terms):
-                raise ValueError(
-                    "initial_state periodic needs terms without integrators: their output has no steady state"
+                raise OptionError(
+                    "initial_state",
+                    "initial_state periodic needs terms without integrators: their output has no steady state",
                 )
 
     def prepare(self, record: Record) -> PreparedAdditiveSrivc:
@@ -222,13 +223,16 @@ class AdditiveSrivc:
 def check_terms(terms: tuple[Term, ...]) -> None:
     """Check that a sum of terms determines its parameters."""
     if sum(term.integrators > 0 for term in terms) > 1:
-        raise ValueError("terms may have integrators in one submodel only: several could not be told apart")
+        raise OptionError("terms", "terms may have integrators in one submodel only: several could not be told apart")
     if sum(term.zeros == term.order for term in terms) > 1:
-        raise ValueError(
-            "terms may have as many zeros as poles in one submodel only: several constants could not be told apart"
+        raise OptionError(
+            "terms",
+            "terms may have as many zeros as poles in one submodel only: several constants could not be told apart",
         )
     if sum(term.order for term in terms) > 40:
-        raise ValueError(f"terms have {sum(term.order for term in terms)} poles together; at most 40 are supported")
+        raise OptionError(
+            "terms", f"terms have {sum(term.order for term in terms)} poles together; at most 40 are supported"
+        )
 
 
 class PreparedAdditiveSrivc:

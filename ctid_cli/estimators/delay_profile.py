@@ -10,7 +10,7 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.errors import DataError
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Start, StartFrom, check_iteration, check_record, history_entry
 from ctid_cli.estimation.delay_grid import Level, local_minima, search_grid
 from ctid_cli.estimation.delay_search import bound_in_the_way
@@ -108,24 +108,16 @@ class DelayProfile:
     kind: ClassVar[str] = "delay_profile"
     start_from: ClassVar[StartFrom | None] = None
 
-    poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})
-    zeros: int = field(metadata={"doc": "Number of zeros, fewer than poles"})
-    delay_bounds: tuple[float, float] = field(metadata={"doc": "Least and greatest delay", "unit": "s"})
-    initial_state: InitialState = field(default="rest", metadata={"doc": "State of the system before the record"})
-    offset: Offset = field(default="none", metadata={"doc": "Constant offset of the output"})
-    search: ProfileSearch = field(
-        default="time",
-        metadata={"doc": "What the search over the delay looks at: filtered signals, spectra, or every sample"},
-    )
-    svf_cutoff: float | None = field(
-        default=None, metadata={"doc": "Cut-off of the state-variable filter of the starts", "unit": "rad/s"}
-    )
-    max_iterations: int = field(default=100, metadata={"doc": "Largest number of Gauss-Newton iterations"})
-    tolerance: float = field(
-        default=1e-8,
-        metadata={"doc": "Stop when a step changes the simulated output by less than this fraction of its rms value"},
-    )
-    hold_output: Hold = field(default="foh", metadata={"doc": "Interpolation of the measured output between samples"})
+    poles: int
+    zeros: int
+    delay_bounds: tuple[float, float]
+    initial_state: InitialState = "rest"
+    offset: Offset = "none"
+    search: ProfileSearch = "time"
+    svf_cutoff: float | None = None
+    max_iterations: int = 100
+    tolerance: float = 1e-8
+    hold_output: Hold = "foh"
 
     def __post_init__(self) -> None:
         require_integer("poles", self.poles, 1, 12)
@@ -140,15 +132,22 @@ class DelayProfile:
         try:
             low, high = (float(bound) for bound in self.delay_bounds)
         except (TypeError, ValueError):
-            raise ValueError(f"delay_bounds must be two delays in seconds, not {self.delay_bounds!r}") from None
+            raise OptionError(
+                "delay_bounds", f"delay_bounds must be two delays in seconds, not {self.delay_bounds!r}"
+            ) from None
         require_not_negative("delay_bounds", low, "s")
         if not low <= high < np.inf:
-            raise ValueError(f"delay_bounds must be two delays in seconds, the smaller first: got [{low:g}, {high:g}]")
+            raise OptionError(
+                "delay_bounds",
+                f"delay_bounds must be two delays in seconds, the smaller first: got [{low:g}, {high:g}]",
+            )
         object.__setattr__(self, "delay_bounds", (low, high))
         allowed = self.poles if low == high else self.poles - 1
         if self.zeros > allowed:
             reason = "" if low == high else " while the delay is estimated"
-            raise ValueError(f"zeros must be at most {allowed}{reason}: got {self.zeros} zeros and {self.poles} poles")
+            raise OptionError(
+                "zeros", f"zeros must be at most {allowed}{reason}: got {self.zeros} zeros and {self.poles} poles"
+            )
 
     def prepare(self, records: Record | Sequence[Record]) -> PreparedProfile:
         """Check one or more records and lay them out.

@@ -107,32 +107,16 @@ class Srivc:
     kind: ClassVar[str] = "srivc"
     start_from: ClassVar[StartFrom | None] = "parameters"
 
-    poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})
-    zeros: int = field(metadata={"doc": "Number of zeros, fewer than poles"})
-    delay: float = field(default=0.0, metadata={"doc": "Known delay", "unit": "s"})
-    svf_cutoff: float = field(
-        default=1.0, metadata={"doc": "Cut-off of the state-variable filter of the start", "unit": "rad/s"}
-    )
-    max_iterations: int = field(default=50, metadata={"doc": "Largest number of iterations"})
-    tolerance: float = field(
-        default=1e-6,
-        metadata={"doc": "Stop when a step changes the simulated output by less than this fraction of its rms value"},
-    )
-    variant: SrivcVariant = field(
-        default="auto",
-        metadata={
-            "doc": "plain: as published; guarded: the cost never rises; relaxed: shorter steps where they do not "
-            "settle; auto: guarded, and relaxed in closed loop"
-        },
-    )
-    hold_output: Hold = field(default="foh", metadata={"doc": "Interpolation of the measured output between samples"})
-    instruments: Instruments = field(
-        default="open_loop",
-        metadata={"doc": "From the measured input, or from the noise-free loop of the model", "added_later": True},
-    )
-    covariance: Covariance = field(
-        default="white", metadata={"doc": "Noise that the standard errors hold for", "added_later": True}
-    )
+    poles: int
+    zeros: int
+    delay: float = 0.0
+    svf_cutoff: float = 1.0
+    max_iterations: int = 50
+    tolerance: float = 1e-6
+    variant: SrivcVariant = "auto"
+    hold_output: Hold = "foh"
+    instruments: Instruments = field(default="open_loop", metadata={"added_later": True})
+    covariance: Covariance = field(default="white", metadata={"added_later": True})
 
     def __post_init__(self) -> None:
         check_structure(self.poles, self.zeros)

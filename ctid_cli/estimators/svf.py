@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import ClassVar, get_args
 
 from ctid_cli.errors import DataError
@@ -53,11 +53,11 @@ class Svf:
     kind: ClassVar[str] = "svf"
     start_from: ClassVar[StartFrom | None] = None
 
-    poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})
-    zeros: int = field(metadata={"doc": "Number of zeros, fewer than poles"})
-    delay: float = field(default=0.0, metadata={"doc": "Known delay", "unit": "s"})
-    svf_cutoff: float = field(default=1.0, metadata={"doc": "Cut-off of the state-variable filter", "unit": "rad/s"})
-    hold_output: Hold = field(default="foh", metadata={"doc": "Interpolation of the measured output between samples"})
+    poles: int
+    zeros: int
+    delay: float = 0.0
+    svf_cutoff: float = 1.0
+    hold_output: Hold = "foh"
 
     def __post_init__(self) -> None:
         check_structure(self.poles, self.zeros)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, get_args
 
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.errors import DataError
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import (
     Start,
     StartFrom,
@@ -89,21 +89,15 @@ class TdSrivc:
     kind: ClassVar[str] = "td_srivc"
     start_from: ClassVar[StartFrom | None] = "delay"
 
-    poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})
-    zeros: int = field(metadata={"doc": "Number of zeros, fewer than poles"})
-    delay_bounds: tuple[float, float] = field(metadata={"doc": "Least and greatest delay", "unit": "s"})
-    lowpass: Lowpass | None = field(
-        default=None, metadata={"doc": "Low-pass filter of the search; none searches on the data as they are"}
-    )
-    svf_cutoff: float = field(
-        default=1.0, metadata={"doc": "Cut-off of the state-variable filter of the start", "unit": "rad/s"}
-    )
-    max_iterations: int = field(
-        default=50, metadata={"doc": "Largest number of Gauss-Newton iterations on the delay in each stage"}
-    )
-    tolerance: float = field(default=1e-6, metadata={"doc": "Stop when the cost falls by less than this fraction"})
-    variant: Variant = field(default="guarded", metadata={"doc": "plain: as published; guarded: the cost never rises"})
-    hold_output: Hold = field(default="foh", metadata={"doc": "Interpolation of the measured output between samples"})
+    poles: int
+    zeros: int
+    delay_bounds: tuple[float, float]
+    lowpass: Lowpass | None = None
+    svf_cutoff: float = 1.0
+    max_iterations: int = 50
+    tolerance: float = 1e-6
+    variant: Variant = "guarded"
+    hold_output: Hold = "foh"
 
     def __post_init__(self) -> None:
         check_structure(self.poles, self.zeros)
@@ -116,8 +110,9 @@ class TdSrivc:
         except (TypeError, ValueError):
             low, high = np.nan, np.nan
         if not 0 <= low < high < np.inf:
-            raise ValueError(
-                f"delay_bounds must be two delays in seconds, the smaller (0 or more) first: got {self.delay_bounds!r}"
+            raise OptionError(
+                "delay_bounds",
+                f"delay_bounds must be two delays in seconds, the smaller (0 or more) first: got {self.delay_bounds!r}",
             )
         object.__setattr__(self, "delay_bounds", (low, high))
 

@@ -158,27 +158,19 @@ class UsefulRedundancy:
     kind: ClassVar[str] = "useful_redundancy"
     start_from: ClassVar[StartFrom | None] = "delay"
 
-    poles: int = field(metadata={"doc": "Number of poles, 1 to 12"})
-    zeros: int = field(metadata={"doc": "Number of zeros, fewer than poles"})
-    delay_bounds: tuple[float, float] = field(metadata={"doc": "Least and greatest delay", "unit": "s"})
-    bandwidth: float | None = field(
-        default=None, metadata={"doc": "Bandwidth of the system, its last -3 dB crossing", "unit": "rad/s"}
-    )
-    filters: int = field(default=10, metadata={"doc": "Number of low-pass filters"})
-    beta: float = field(default=10.0, metadata={"doc": "Ratio of the longest to the shortest period of the filters"})
-    order: int = field(default=10, metadata={"doc": "Order of the Butterworth filters"})
-    svf_cutoff: float | None = field(
-        default=None, metadata={"doc": "Cut-off of the state-variable filter of the starts", "unit": "rad/s"}
-    )
-    search: Search = field(
-        default="time", metadata={"doc": "Search on samples of the filtered signals or on their spectra"}
-    )
-    max_iterations: int = field(default=10, metadata={"doc": "Largest number of Gauss-Newton iterations on each path"})
-    tolerance: float = field(
-        default=1e-3, metadata={"doc": "Relative tolerance of the cost on a path, and of the delay between rounds"}
-    )
-    max_rounds: int = field(default=20, metadata={"doc": "Largest number of rounds over all filters"})
-    hold_output: Hold = field(default="foh", metadata={"doc": "Interpolation of the measured output between samples"})
+    poles: int
+    zeros: int
+    delay_bounds: tuple[float, float]
+    bandwidth: float | None = None
+    filters: int = 10
+    beta: float = 10.0
+    order: int = 10
+    svf_cutoff: float | None = None
+    search: Search = "time"
+    max_iterations: int = 10
+    tolerance: float = 1e-3
+    max_rounds: int = 20
+    hold_output: Hold = "foh"
 
     def __post_init__(self) -> None:
         check_structure(self.poles, self.zeros)

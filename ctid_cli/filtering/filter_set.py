@@ -11,12 +11,13 @@ continuous-time models" (arXiv:1703.09344).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
+from ctid_cli.errors import OptionError
 from ctid_cli.filtering.filter_theory import extrema
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.signals.checks import require_integer, require_positive
@@ -61,12 +62,10 @@ class FilterSet:
     array([2. , 1.8, 1.6, 1.4, 1.2, 1. ])
     """
 
-    bandwidth: float = field(metadata={"doc": "Bandwidth of the system, its last -3 dB crossing", "unit": "rad/s"})
-    count: int = field(default=10, metadata={"doc": "Number of filters, at least 2", "unit": "-"})
-    beta: float = field(
-        default=10.0, metadata={"doc": "Ratio of the longest to the shortest period, 1.717 to 10", "unit": "-"}
-    )
-    order: int = field(default=10, metadata={"doc": "Order of the Butterworth filters, 1 to 20", "unit": "-"})
+    bandwidth: float
+    count: int = 10
+    beta: float = 10.0
+    order: int = 10
 
     def __post_init__(self) -> None:
         require_positive("bandwidth", self.bandwidth, "rad/s")
@@ -93,9 +92,10 @@ class FilterSet:
 
 def _check_beta(beta: float) -> None:
     if not isinstance(beta, int | float | np.number) or not LEAST_BETA <= beta <= GREATEST_BETA:
-        raise ValueError(
+        raise OptionError(
+            "beta",
             f"beta, the ratio of the longest to the shortest period, must be between {LEAST_BETA:.4f} (bound (41): the "
-            f"least for which some number of filters suffices) and {GREATEST_BETA:g}, not {beta}."
+            f"least for which some number of filters suffices) and {GREATEST_BETA:g}, not {beta}.",
         )
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.errors import OptionError
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
@@ -36,13 +37,15 @@ class Lowpass:
         If the cut-off frequency is not positive or the order is out of range.
     """
 
-    cutoff: float = field(metadata={"doc": "Frequency at which the gain is -3 dB", "unit": "rad/s"})
-    order: int = field(default=2, metadata={"doc": "Order of the Butterworth filter, 1 to 20"})
+    cutoff: float
+    order: int = 2
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.cutoff) and self.cutoff > 0):
-            raise ValueError(f"the low-pass cut-off must be a positive frequency in rad/s, not {self.cutoff}")
-        require_integer("the low-pass order", self.order, 1, 20)
+            raise OptionError(
+                "cutoff", f"the low-pass cut-off must be a positive frequency in rad/s, not {self.cutoff}"
+            )
+        require_integer("order", self.order, 1, 20, label="the low-pass order")
 
     @property
     def model(self) -> TransferFunction:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, IntArray
+from ctid_cli.errors import OptionError
 from ctid_cli.frequency.checks import one_for_each, samples_in
 from ctid_cli.frequency.decoding import flag_uncertain
 from ctid_cli.frequency.flags import GAP, OUT_OF_BOUNDS, STARTING, UNDETERMINED
@@ -66,15 +67,15 @@ class AdaptiveObserver(OnlineEstimator):
 
     kind: ClassVar[str] = "adaptive_observer"
 
-    tones: int = field(metadata={"doc": "Number of sinusoids, 1 to 8"})
-    initial_frequencies: tuple[float, ...] = field(metadata={"doc": "Frequencies to begin with", "unit": "rad/s"})
-    pole: float = field(default=2.0, metadata={"doc": "Slowest rate of the observer", "unit": "rad/s"})
-    ratio: float = field(default=1.2, metadata={"doc": "Ratio of one rate to the next, 1 or more"})
-    rate: float = field(default=0.3, metadata={"doc": "Rate of the adaptation", "unit": "1/s"})
-    hold: float = field(default=2.0, metadata={"doc": "No adaptation before this time", "unit": "s"})
-    smallest_gap: float = field(default=0.3, metadata={"doc": "Frequencies are kept this far apart", "unit": "rad/s"})
-    lowest_frequency: float = field(default=0.2, metadata={"doc": "Lower bound of the frequencies", "unit": "rad/s"})
-    highest_frequency: float = field(default=8.0, metadata={"doc": "Upper bound of the frequencies", "unit": "rad/s"})
+    tones: int
+    initial_frequencies: tuple[float, ...]
+    pole: float = 2.0
+    ratio: float = 1.2
+    rate: float = 0.3
+    hold: float = 2.0
+    smallest_gap: float = 0.3
+    lowest_frequency: float = 0.2
+    highest_frequency: float = 8.0
 
     def __post_init__(self) -> None:
         require_integer("tones", self.tones, 1, MOST_TONES)
@@ -84,19 +85,21 @@ class AdaptiveObserver(OnlineEstimator):
         require_positive("rate", self.rate, "1/s")
         require_not_negative("hold", self.hold, "s")
         if self.ratio < 1.0:
-            raise ValueError(f"ratio must be 1 or more, not {self.ratio!r}.")
+            raise OptionError("ratio", f"ratio must be 1 or more, not {self.ratio!r}.")
         if self.highest_frequency < self.lowest_frequency + (self.tones - 1) * self.smallest_gap:
-            raise ValueError(
+            raise OptionError(
+                "highest_frequency",
                 f"{self.tones} frequencies, {self.smallest_gap:g} rad/s apart, do not fit between lowest_frequency "
-                f"({self.lowest_frequency:g} rad/s) and highest_frequency ({self.highest_frequency:g} rad/s)."
+                f"({self.lowest_frequency:g} rad/s) and highest_frequency ({self.highest_frequency:g} rad/s).",
             )
         initial = one_for_each("initial_frequencies", self.initial_frequencies, self.tones, "rad/s")
         object.__setattr__(self, "initial_frequencies", initial)
         edges = np.concatenate(([self.lowest_frequency - self.smallest_gap], self.initial_frequencies))
         if (np.diff(edges) < self.smallest_gap - 1e-12).any() or edges[-1] > self.highest_frequency:
-            raise ValueError(
+            raise OptionError(
+                "initial_frequencies",
                 f"initial_frequencies must rise from lowest_frequency to highest_frequency in steps of at least "
-                f"smallest_gap, not {self.initial_frequencies!r}."
+                f"smallest_gap, not {self.initial_frequencies!r}.",
             )
 
     def recursion(self, interval: float) -> Recursion:
@@ -120,12 +123,15 @@ class AdaptiveObserver(OnlineEstimator):
         n = self.tones
         poles = self.pole * self.ratio ** np.arange(2 * n)
         if poles[-1] * interval > 1.0:
-            raise ValueError(
+            raise OptionError(
+                "pole",
                 f"the fastest pole of the observer, {poles[-1]:g} rad/s, needs a sampling interval below "
-                f"{1.0 / poles[-1]:g} s, not {interval:g} s."
+                f"{1.0 / poles[-1]:g} s, not {interval:g} s.",
             )
         if self.rate * interval >= 1.0:
-            raise ValueError(f"rate = {self.rate:g} 1/s needs a sampling interval below {1.0 / self.rate:g} s.")
+            raise OptionError(
+                "rate", f"rate = {self.rate:g} 1/s needs a sampling interval below {1.0 / self.rate:g} s."
+            )
         constants = (
             float(interval),
             poles,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ctid_cli.errors import OptionError
 from ctid_cli.signals.checks import require_not_negative, require_positive
 
 #: A sample larger than this counts as missing: its powers would overflow.
@@ -16,7 +17,7 @@ def one_for_each(name: str, values: Sequence[float] | None, count: int, unit: st
         return None
     numbers = tuple(float(value) for value in values)
     if len(numbers) != count:
-        raise ValueError(f"{name} must hold one number for each of the {count} tones, not {values!r}.")
+        raise OptionError(name, f"{name} must hold one number for each of the {count} tones, not {values!r}.")
     for number in numbers:
         require_positive(name, number, unit)
     return numbers
@@ -34,4 +35,7 @@ def require_bounds(lowest: float, highest: float | None) -> None:
         return
     require_positive("highest_frequency", highest, "rad/s")
     if lowest >= highest:
-        raise ValueError(f"lowest_frequency ({lowest:g} rad/s) must be below highest_frequency ({highest:g} rad/s).")
+        raise OptionError(
+            "lowest_frequency",
+            f"lowest_frequency ({lowest:g} rad/s) must be below highest_frequency ({highest:g} rad/s).",
+        )

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from ctid_cli.arrays import Array
+from ctid_cli.errors import OptionError
 from ctid_cli.frequency.checks import require_bounds
 from ctid_cli.frequency.consistency import second_lag
 from ctid_cli.frequency.prefilter import impulse_response
@@ -41,18 +42,12 @@ class DelayClock:
 class DelayRegression(OnlineEstimator):
     """Options of an estimator on the delay regression."""
 
-    tones: int = field(metadata={"doc": "Number of sinusoids, 1 to 8"})
-    h: float = field(metadata={"doc": "Delay of the regression, below pi over the highest frequency", "unit": "s"})
-    prefilter: float = field(
-        default=0.0, metadata={"doc": "Length of a Hann low-pass in front of the regression, 0 for none", "unit": "s"}
-    )
-    difference: float = field(
-        default=0.0, metadata={"doc": "Subtract the signal this much earlier, against a bias; 0 for not", "unit": "s"}
-    )
-    lowest_frequency: float = field(default=0.0, metadata={"doc": "Lower bound of the frequencies", "unit": "rad/s"})
-    highest_frequency: float | None = field(
-        default=None, metadata={"doc": "Upper bound of the frequencies; pi/h if not given", "unit": "rad/s"}
-    )
+    tones: int
+    h: float
+    prefilter: float = 0.0
+    difference: float = 0.0
+    lowest_frequency: float = 0.0
+    highest_frequency: float | None = None
 
     def __post_init__(self) -> None:
         require_integer("tones", self.tones, 1, MOST_TONES)
@@ -96,9 +91,10 @@ class DelayRegression(OnlineEstimator):
         unique = np.pi / delay
         highest = unique if self.highest_frequency is None else float(self.highest_frequency)
         if highest > unique * (1.0 + 1e-12):
-            raise ValueError(
+            raise OptionError(
+                "h",
                 f"with h = {delay:g} s, frequencies above pi/h = {unique:g} rad/s are seen as lower ones, but "
-                f"highest_frequency is {highest:g} rad/s; use an h below {np.pi / highest:g} s."
+                f"highest_frequency is {highest:g} rad/s; use an h below {np.pi / highest:g} s.",
             )
         require_bounds(self.lowest_frequency, highest)
         return min(highest, unique)

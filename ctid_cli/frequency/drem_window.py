@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, IntArray
+from ctid_cli.errors import OptionError
 from ctid_cli.frequency.consistency import (
     DETECTOR_SPAN,
     USUAL_SPANS,
@@ -84,9 +85,9 @@ class DremWindow(DelayRegression):
 
     kind: ClassVar[str] = "drem_window"
 
-    d: float = field(metadata={"doc": "Distance of the stacked rows", "unit": "s"})
-    memory: float = field(metadata={"doc": "Length of the window", "unit": "s"})
-    first_row: int = field(default=1, metadata={"doc": "Number of the first stacked row: 1 as published, 0 is earlier"})
+    d: float
+    memory: float
+    first_row: int = 1
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -115,9 +116,10 @@ class DremWindow(DelayRegression):
         spacing = whole_delay("d", self.d, interval)
         length = whole_delay("memory", self.memory, interval)
         if length < ROWS_PER_TONE * n:
-            raise ValueError(
+            raise OptionError(
+                "memory",
                 f"memory = {self.memory:g} s holds {length} samples of {interval:g} s, fewer than the "
-                f"{ROWS_PER_TONE * n} that {n} tones need."
+                f"{ROWS_PER_TONE * n} that {n} tones need.",
             )
         constants = (
             clock.table,

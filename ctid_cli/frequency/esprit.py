@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctid_cli.errors import DataError
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.frequency.amplitudes import flag_insignificant, frequency_errors, present_samples
 from ctid_cli.frequency.checks import require_bounds
 from ctid_cli.frequency.decoding import flag_uncertain
@@ -70,12 +70,10 @@ class Esprit:
     kind: ClassVar[str] = "esprit"
     online: ClassVar[bool] = False
 
-    tones: int = field(metadata={"doc": "Number of sinusoids, 1 to 8"})
-    averaging: float = field(default=0.0, metadata={"doc": "Blocks that are averaged first, 0 for none", "unit": "s"})
-    lowest_frequency: float = field(default=0.0, metadata={"doc": "Lower bound of the frequencies", "unit": "rad/s"})
-    highest_frequency: float | None = field(
-        default=None, metadata={"doc": "Upper bound of the frequencies", "unit": "rad/s"}
-    )
+    tones: int
+    averaging: float = 0.0
+    lowest_frequency: float = 0.0
+    highest_frequency: float | None = None
 
     def __post_init__(self) -> None:
         require_integer("tones", self.tones, 1, MOST_TONES)
@@ -112,10 +110,11 @@ class Esprit:
         highest = np.pi / (block * interval)
         if self.highest_frequency is not None:
             if self.highest_frequency > highest * (1.0 + 1e-12):
-                raise ValueError(
+                raise OptionError(
+                    "averaging",
                     f"averages over {block * interval:g} s show frequencies up to {highest:g} rad/s, but "
                     f"highest_frequency is {self.highest_frequency:g} rad/s; use an averaging below "
-                    f"{np.pi / self.highest_frequency:g} s."
+                    f"{np.pi / self.highest_frequency:g} s.",
                 )
             highest = self.highest_frequency
         averages = count // block
@@ -123,12 +122,14 @@ class Esprit:
         if rows < 2 * self.tones + 1:
             raise DataError(
                 f"{averages} samples, after the averaging, are too few for {self.tones} tones; use a longer record "
-                "or a shorter averaging."
+                "or a shorter averaging.",
+                "averaging",
             )
         if averages > MOST_AVERAGES:
             raise DataError(
                 f"{averages:,} samples are more than the {MOST_AVERAGES:,} that ESPRIT takes; use an averaging of at "
-                f"least {count / MOST_AVERAGES * interval:.2g} s, or a part of the record."
+                f"least {count / MOST_AVERAGES * interval:.2g} s, or a part of the record.",
+                "averaging",
             )
         return block, rows, highest
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import comb
 from typing import ClassVar, Literal, get_args
 
@@ -11,6 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, IntArray
+from ctid_cli.errors import OptionError
 from ctid_cli.filtering.exponential import held_step
 from ctid_cli.frequency.checks import one_for_each, require_bounds, samples_in
 from ctid_cli.frequency.decoding import flag_uncertain, root_real_parts, root_sensitivities
@@ -76,19 +77,15 @@ class FilterRegression(OnlineEstimator):
 
     kind: ClassVar[str] = "filter_regression"
 
-    tones: int = field(metadata={"doc": "Number of sinusoids, 1 to 8"})
-    pole: float = field(metadata={"doc": "Rate of the filter, near the frequencies", "unit": "rad/s"})
-    forgetting: float = field(default=0.5, metadata={"doc": "Rate at which old data are forgotten", "unit": "1/s"})
-    algorithm: Algorithm = field(default="least_squares", metadata={"doc": "How the parameters are adapted"})
-    gains: tuple[float, ...] | None = field(default=None, metadata={"doc": "Gains of the gradient algorithm"})
-    initial_frequencies: tuple[float, ...] | None = field(
-        default=None, metadata={"doc": "Frequencies to begin with", "unit": "rad/s"}
-    )
-    hold: float = field(default=1.0, metadata={"doc": "Least squares shows no estimate before this time", "unit": "s"})
-    lowest_frequency: float = field(default=0.0, metadata={"doc": "Lower bound of the frequencies", "unit": "rad/s"})
-    highest_frequency: float | None = field(
-        default=None, metadata={"doc": "Upper bound of the frequencies", "unit": "rad/s"}
-    )
+    tones: int
+    pole: float
+    forgetting: float = 0.5
+    algorithm: Algorithm = "least_squares"
+    gains: tuple[float, ...] | None = None
+    initial_frequencies: tuple[float, ...] | None = None
+    hold: float = 1.0
+    lowest_frequency: float = 0.0
+    highest_frequency: float | None = None
 
     def __post_init__(self) -> None:
         require_integer("tones", self.tones, 1, MOST_TONES)
@@ -121,9 +118,10 @@ class FilterRegression(OnlineEstimator):
         n = self.tones
         order = 2 * n
         if self.pole * interval > np.pi:
-            raise ValueError(
+            raise OptionError(
+                "pole",
                 f"pole = {self.pole:g} rad/s is beyond what samples every {interval:g} s can show; "
-                f"use one below {np.pi / interval:g} rad/s."
+                f"use one below {np.pi / interval:g} rad/s.",
             )
         dynamics = self.pole * (np.eye(order, k=-1) - np.eye(order))
         gain = np.zeros(order)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctid_cli.errors import DataError
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.frequency.amplitudes import flag_insignificant, frequency_errors, present_samples
 from ctid_cli.frequency.checks import one_for_each
 from ctid_cli.frequency.decoding import flag_uncertain
@@ -64,15 +64,12 @@ class NonlinearLeastSquares:
     kind: ClassVar[str] = "nonlinear_least_squares"
     online: ClassVar[bool] = False
 
-    tones: int = field(metadata={"doc": "Number of sinusoids, 1 to 8"})
-    initial_frequencies: tuple[float, ...] | None = field(default=None, metadata={"doc": "Start", "unit": "rad/s"})
-    averaging: float = field(default=0.0, metadata={"doc": "Blocks that ESPRIT averages for the start", "unit": "s"})
-    bias: bool = field(default=False, metadata={"doc": "Estimate a constant part too"})
-    max_iterations: int = field(default=50, metadata={"doc": "Largest number of iterations"})
-    tolerance: float = field(
-        default=1e-8,
-        metadata={"doc": "Stop when a step turns no phase by more than this over the record", "unit": "rad"},
-    )
+    tones: int
+    initial_frequencies: tuple[float, ...] | None = None
+    averaging: float = 0.0
+    bias: bool = False
+    max_iterations: int = 50
+    tolerance: float = 1e-8
 
     def __post_init__(self) -> None:
         require_integer("tones", self.tones, 1, MOST_TONES)
@@ -81,7 +78,10 @@ class NonlinearLeastSquares:
         require_positive("tolerance", self.tolerance, "rad")
         initial = one_for_each("initial_frequencies", self.initial_frequencies, self.tones, "rad/s")
         if initial is not None and len(set(initial)) < len(initial):
-            raise ValueError(f"initial_frequencies must differ from each other, not {self.initial_frequencies!r}.")
+            raise OptionError(
+                "initial_frequencies",
+                f"initial_frequencies must differ from each other, not {self.initial_frequencies!r}.",
+            )
         object.__setattr__(self, "initial_frequencies", initial)
 
     def estimate(self, samples: ArrayLike, interval: float) -> FrequencyEstimate:

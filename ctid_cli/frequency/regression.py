@@ -18,6 +18,7 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, IntArray
+from ctid_cli.errors import OptionError
 from ctid_cli.signals.checks import require_integer, require_positive
 
 #: More tones than this cannot be told apart in double precision.
@@ -42,13 +43,14 @@ def whole_delay(name: str, delay: float, interval: float) -> int:
     """Sampling intervals nearest to a delay."""
     require_positive("interval", interval, "s")
     if delay / interval > LONGEST_DELAY:
-        raise ValueError(
+        raise OptionError(
+            name,
             f"{name} = {delay:g} s is more than {LONGEST_DELAY:,} sampling intervals of {interval:g} s; keep fewer "
-            "of the samples."
+            "of the samples.",
         )
     count = round(delay / interval)
     if count < 1:
-        raise ValueError(f"{name} = {delay:g} s is shorter than half a sampling interval of {interval:g} s.")
+        raise OptionError(name, f"{name} = {delay:g} s is shorter than half a sampling interval of {interval:g} s.")
     return count
 
 

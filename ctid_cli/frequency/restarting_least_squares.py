@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, IntArray
+from ctid_cli.errors import OptionError
 from ctid_cli.frequency.consistency import (
     ALARM_RATIO,
     DETECTOR_SPAN,
@@ -114,12 +115,8 @@ class RestartingLeastSquares(DelayRegression):
 
     kind: ClassVar[str] = "restarting_least_squares"
 
-    memory: float | None = field(
-        default=None, metadata={"doc": "Older data are forgotten exponentially; 100 h if not given", "unit": "s"}
-    )
-    solution: Solution = field(
-        default="least_squares", metadata={"doc": "total_least_squares allows for white noise in the regressors too"}
-    )
+    memory: float | None = None
+    solution: Solution = "least_squares"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -151,8 +148,9 @@ class RestartingLeastSquares(DelayRegression):
         memory = DEFAULT_MEMORY * clock.delay if self.memory is None else self.memory
         needed = ROWS_PER_TONE * n
         if memory < needed * interval:
-            raise ValueError(
-                f"memory = {memory:g} s holds fewer than the {needed} samples of {interval:g} s that {n} tones need."
+            raise OptionError(
+                "memory",
+                f"memory = {memory:g} s holds fewer than the {needed} samples of {interval:g} s that {n} tones need.",
             )
         arming = round(ARMING_SPAN * clock.lag)
         settings = np.array(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -47,19 +47,13 @@ NEGLIGIBLE = 1e-4
 class DremOptions(DelayRegression):
     """Options that the finite-time and the gradient estimate share."""
 
-    d: float = field(metadata={"doc": "Distance of the stacked rows", "unit": "s"})
-    epsilon: float = field(default=1.0, metadata={"doc": "Normalisation of the mixed regression"})
-    gamma: float | tuple[float, ...] = field(
-        default=1.0, metadata={"doc": "Adaptation gain, one for all parameters or one for each"}
-    )
-    initial_frequencies: tuple[float, ...] | None = field(
-        default=None, metadata={"doc": "Frequencies before there is an estimate", "unit": "rad/s"}
-    )
-    first_row: int = field(default=1, metadata={"doc": "Number of the first stacked row: 1 as published, 0 is earlier"})
-    power: int | Literal["literal"] = field(
-        default=1, metadata={"doc": "Power of epsilon in the mixed regression; literal: the number of tones"}
-    )
-    gated: bool = field(default=True, metadata={"doc": "Wait until the delays are filled"})
+    d: float
+    epsilon: float = 1.0
+    gamma: float | tuple[float, ...] = 1.0
+    initial_frequencies: tuple[float, ...] | None = None
+    first_row: int = 1
+    power: int | Literal["literal"] = 1
+    gated: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
-from ctid_cli.errors import DataError
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
 from ctid_cli.signals.checks import require_integer
 
@@ -42,18 +42,19 @@ class Term:
     3
     """
 
-    poles: int = field(metadata={"doc": "Number of poles of a submodel, integrators not counted"})
-    zeros: int = field(metadata={"doc": "Number of zeros of a submodel, at most its poles and integrators"})
-    integrators: int = field(default=0, metadata={"doc": "Number of poles at the origin, in one submodel only"})
+    poles: int
+    zeros: int
+    integrators: int = 0
 
     def __post_init__(self) -> None:
-        require_integer("the number of poles of a submodel", self.poles, 0)
-        require_integer("the number of zeros of a submodel", self.zeros, 0)
-        require_integer("the number of integrators of a submodel", self.integrators, 0)
+        require_integer("poles", self.poles, 0, label="the number of poles of a submodel")
+        require_integer("zeros", self.zeros, 0, label="the number of zeros of a submodel")
+        require_integer("integrators", self.integrators, 0, label="the number of integrators of a submodel")
         if self.zeros > self.order:
-            raise ValueError(
+            raise OptionError(
+                "zeros",
                 f"a submodel must not have more zeros than poles; got {self.zeros} zeros and {self.order} poles "
-                "(integrators included)."
+                "(integrators included).",
             )
 
     @property
@@ -110,16 +111,20 @@ class Submodel:
         if not (np.isfinite(a).all() and np.isfinite(b).all()):
             raise DataError("a coefficient of a submodel is not a finite number")
         if a[0] == 0:
-            raise DataError("the first denominator coefficient of a submodel is zero; drop leading zeros")
+            raise DataError(
+                "the first denominator coefficient of a submodel is zero; drop leading zeros", "denominator"
+            )
         if a[-1] == 0:
             raise DataError(
-                "the last denominator coefficient of a submodel is zero; give poles at the origin as integrators"
+                "the last denominator coefficient of a submodel is zero; give poles at the origin as integrators",
+                "denominator",
             )
-        require_integer("the number of integrators of a submodel", integrators, 0)
+        require_integer("integrators", integrators, 0, label="the number of integrators of a submodel")
         if b.size > a.size + integrators:
             raise DataError(
                 f"a submodel with more zeros ({b.size - 1}) than poles ({a.size - 1 + integrators}) has no response to "
-                "a jump; give it fewer numerator coefficients"
+                "a jump; give it fewer numerator coefficients",
+                "numerator",
             )
         b = b / a[-1]
         a = a / a[-1]

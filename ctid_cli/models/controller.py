@@ -47,7 +47,9 @@ class DiscreteController:
         if not (np.isfinite(a).all() and np.isfinite(b).all()):
             raise DataError("a coefficient of the controller is not a finite number")
         if a[0] == 0:
-            raise DataError("the first denominator coefficient of the controller is zero; drop leading zeros")
+            raise DataError(
+                "the first denominator coefficient of the controller is zero; drop leading zeros", "denominator"
+            )
         b = np.trim_zeros(b, "f")
         b = (b if b.size else np.zeros(1)) / a[0]
         a = a / a[0]

@@ -49,7 +49,7 @@ class TransferFunction:
         if not (np.isfinite(a).all() and np.isfinite(b).all()):
             raise DataError("a coefficient of the transfer function is not a finite number")
         if a[0] == 0:
-            raise DataError("the first denominator coefficient is zero; drop leading zeros")
+            raise DataError("the first denominator coefficient is zero; drop leading zeros", "denominator")
         if not (np.isfinite(delay) and delay >= 0):
             raise DataError(f"a delay must be a finite number of seconds, zero or more; got {delay}")
         b = np.trim_zeros(b, "f")

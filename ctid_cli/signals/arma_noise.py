@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
+from ctid_cli.errors import OptionError
 from ctid_cli.signals.checks import require_finite
 from ctid_cli.signals.noise_level import require_one_level, variance_at
 
@@ -59,32 +60,28 @@ class ArmaNoise:
     #: Whether samples at different instants are correlated.
     coloured: ClassVar[bool] = True
 
-    numerator: tuple[float, ...] = field(metadata={"doc": "coefficients in rising powers of q^-1"})
-    denominator: tuple[float, ...] = field(metadata={"doc": "coefficients in rising powers of q^-1, stable"})
-    innovation_variance: float | None = field(
-        default=None, metadata={"doc": "variance of the white innovations", "unit": "output unit^2"}
-    )
-    variance: float | None = field(default=None, metadata={"doc": "variance of the noise", "unit": "output unit^2"})
-    snr_db: float | None = field(
-        default=None,
-        metadata={"doc": "mean square of the noise-free output over the variance of the noise", "unit": "dB"},
-    )
+    numerator: tuple[float, ...]
+    denominator: tuple[float, ...]
+    innovation_variance: float | None = None
+    variance: float | None = None
+    snr_db: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("numerator", "denominator"):
             coefficients = tuple(getattr(self, name))
             if not coefficients:
-                raise ValueError(f"{name} must hold at least one coefficient.")
+                raise OptionError(name, f"{name} must hold at least one coefficient.")
             for value in coefficients:
-                require_finite(f"a coefficient of {name}", value, "-")
+                require_finite(name, value, "-", label=f"a coefficient of {name}")
             if coefficients[0] == 0:
-                raise ValueError(f"the first coefficient of {name} is zero; it belongs to q^0 and must not be.")
+                raise OptionError(name, f"the first coefficient of {name} is zero; it belongs to q^0 and must not be.")
             object.__setattr__(self, name, tuple(float(value) for value in coefficients))
         largest = float(np.abs(np.roots(self.denominator)).max(initial=0.0))
         if largest >= 1.0:
-            raise ValueError(
+            raise OptionError(
+                "denominator",
                 f"denominator has a zero of magnitude {largest:.6g}: the noise would grow without bound; "
-                "all must lie inside the unit circle."
+                "all must lie inside the unit circle.",
             )
         require_one_level(
             {"innovation_variance": self.innovation_variance, "variance": self.variance, "snr_db": self.snr_db}

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array
-from ctid_cli.errors import DataError
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.signals.checks import (
     require_choice,
     require_finite,
@@ -46,8 +46,6 @@ TAPS: dict[int, tuple[int, ...]] = {
     19: (19, 6, 2, 1),
     20: (20, 17),
 }
-
-_CLOCK_DOC = "time for which each value is held; null: a new value at every sampling instant"
 
 
 def maximal_length_sequence(stages: int, length: int, state: int) -> NDArray[np.uint8]:
@@ -101,9 +99,9 @@ class Prbs:
 
     kind: ClassVar[str] = "prbs"
 
-    stages: int = field(metadata={"doc": "stages of the feedback register, 2 to 20", "unit": "-"})
-    clock_period: float = field(metadata={"doc": "time for which each value is held", "unit": "s"})
-    amplitude: float = field(default=1.0, metadata={"doc": "the signal is plus or minus this", "unit": "input unit"})
+    stages: int
+    clock_period: float
+    amplitude: float = 1.0
 
     def __post_init__(self) -> None:
         require_integer("stages", self.stages, min(TAPS), max(TAPS))
@@ -155,11 +153,11 @@ class Multisine:
 
     kind: ClassVar[str] = "multisine"
 
-    lowest_frequency: float = field(metadata={"doc": "frequency of the first tone", "unit": "rad/s"})
-    highest_frequency: float = field(metadata={"doc": "frequency of the last tone", "unit": "rad/s"})
-    tones: int = field(metadata={"doc": "number of tones, spaced linearly over the band", "unit": "-"})
-    amplitude: float = field(default=1.0, metadata={"doc": "root mean square", "unit": "input unit"})
-    clock_period: float | None = field(default=None, metadata={"doc": _CLOCK_DOC, "unit": "s"})
+    lowest_frequency: float
+    highest_frequency: float
+    tones: int
+    amplitude: float = 1.0
+    clock_period: float | None = None
 
     def __post_init__(self) -> None:
         require_positive("lowest_frequency", self.lowest_frequency, "rad/s")
@@ -169,9 +167,13 @@ class Multisine:
         _check_clock(self.clock_period)
         band = f"{self.lowest_frequency:g} and {self.highest_frequency:g} rad/s"
         if self.lowest_frequency > self.highest_frequency:
-            raise ValueError(f"lowest_frequency must not exceed highest_frequency; they are {band}.")
+            raise OptionError(
+                "lowest_frequency", f"lowest_frequency must not exceed highest_frequency; they are {band}."
+            )
         if self.tones > 1 and self.lowest_frequency == self.highest_frequency:
-            raise ValueError(f"{self.tones} tones need a band, but both ends are at {self.lowest_frequency:g} rad/s.")
+            raise OptionError(
+                "tones", f"{self.tones} tones need a band, but both ends are at {self.lowest_frequency:g} rad/s."
+            )
 
     @property
     def frequencies(self) -> Array:
@@ -229,8 +231,8 @@ class Gaussian:
 
     kind: ClassVar[str] = "gaussian"
 
-    standard_deviation: float = field(default=1.0, metadata={"doc": "standard deviation", "unit": "input unit"})
-    clock_period: float | None = field(default=None, metadata={"doc": _CLOCK_DOC, "unit": "s"})
+    standard_deviation: float = 1.0
+    clock_period: float | None = None
 
     def __post_init__(self) -> None:
         require_positive("standard_deviation", self.standard_deviation, "input unit")
@@ -269,13 +271,15 @@ class Step:
 
     kind: ClassVar[str] = "step"
 
-    amplitude: float = field(default=1.0, metadata={"doc": "height of the step, not zero", "unit": "input unit"})
-    time: float = field(default=0.0, metadata={"doc": "when the step happens", "unit": "s"})
+    amplitude: float = 1.0
+    time: float = 0.0
 
     def __post_init__(self) -> None:
         require_finite("amplitude", self.amplitude, "input unit")
         if self.amplitude == 0:
-            raise ValueError("amplitude must not be zero [input unit]: a step of height zero excites nothing.")
+            raise OptionError(
+                "amplitude", "amplitude must not be zero [input unit]: a step of height zero excites nothing."
+            )
         require_not_negative("time", self.time, "s")
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
@@ -329,15 +333,15 @@ class InputFile:
 
     kind: ClassVar[str] = "file"
 
-    file: str = field(metadata={"doc": "comma-separated file with the input", "unit": "-"})
-    time: str = field(default="t", metadata={"doc": "column of the times [s]", "unit": "-"})
-    input: str = field(default="u", metadata={"doc": "column of the input", "unit": "-"})
-    hold: Hold = field(default="zoh", metadata={"doc": "how the input behaves between its breaks", "unit": "-"})
+    file: str
+    time: str = "t"
+    input: str = "u"
+    hold: Hold = "zoh"
 
     def __post_init__(self) -> None:
         require_choice("hold", self.hold, get_args(Hold))
         if self.time == self.input:
-            raise ValueError(f"time and input must be two columns; both are {self.time!r}.")
+            raise OptionError("input", f"time and input must be two columns; both are {self.time!r}.")
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """The signal over one record.

@@ -46,16 +46,9 @@ class WhiteNoise:
     #: Whether samples at different instants are correlated.
     coloured: ClassVar[bool] = False
 
-    snr_db: float | None = field(
-        default=None,
-        metadata={"doc": "mean square of the noise-free output over the variance of the noise", "unit": "dB"},
-    )
-    standard_deviation: float | None = field(
-        default=None, metadata={"doc": "standard deviation of the noise", "unit": "output unit"}
-    )
-    variance: float | None = field(
-        default=None, metadata={"doc": "variance of the noise", "unit": "output unit^2", "added_later": True}
-    )
+    snr_db: float | None = None
+    standard_deviation: float | None = None
+    variance: float | None = field(default=None, metadata={"added_later": True})
 
     def __post_init__(self) -> None:
         require_one_level(

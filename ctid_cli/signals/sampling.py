@@ -8,6 +8,7 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from ctid_cli.arrays import Array
+from ctid_cli.errors import OptionError
 from ctid_cli.signals.checks import require_choice, require_integer, require_positive
 
 InputRecord = Literal["sampled", "exact"]
@@ -24,11 +25,6 @@ def geometric_sizes(first: int, last: int, count: int) -> list[int]:
     if len(set(sizes)) < count:
         raise ValueError(f"there are no {count} different sizes from {first} to {last}, spaced geometrically.")
     return sizes
-
-
-_INPUT_RECORD_DOC = (
-    "what the estimator is told of the input: its samples at the output's instants (sampled), or its true edges (exact)"
-)
 
 
 @dataclass(frozen=True)
@@ -54,9 +50,9 @@ class RegularSampling:
 
     kind: ClassVar[str] = "regular"
 
-    interval: float = field(metadata={"doc": "sampling interval", "unit": "s"})
-    samples: int = field(metadata={"doc": "number of samples, at least 2", "unit": "-", "geometric": True})
-    input_record: InputRecord = field(default="sampled", metadata={"doc": _INPUT_RECORD_DOC, "unit": "-"})
+    interval: float
+    samples: int = field(metadata={"geometric": True})
+    input_record: InputRecord = "sampled"
 
     def __post_init__(self) -> None:
         require_positive("interval", self.interval, "s")
@@ -102,16 +98,16 @@ class UniformIntervals:
 
     kind: ClassVar[str] = "uniform_intervals"
 
-    low: float = field(metadata={"doc": "shortest sampling interval", "unit": "s"})
-    high: float = field(metadata={"doc": "longest sampling interval", "unit": "s"})
-    samples: int = field(metadata={"doc": "number of samples, at least 2", "unit": "-", "geometric": True})
-    input_record: InputRecord = field(default="sampled", metadata={"doc": _INPUT_RECORD_DOC, "unit": "-"})
+    low: float
+    high: float
+    samples: int = field(metadata={"geometric": True})
+    input_record: InputRecord = "sampled"
 
     def __post_init__(self) -> None:
         require_positive("low", self.low, "s")
         require_positive("high", self.high, "s")
         if self.low > self.high:
-            raise ValueError(f"low must not exceed high; they are {self.low:g} s and {self.high:g} s.")
+            raise OptionError("low", f"low must not exceed high; they are {self.low:g} s and {self.high:g} s.")
         require_integer("samples", self.samples, 2)
         require_choice("input_record", self.input_record, get_args(InputRecord))
 

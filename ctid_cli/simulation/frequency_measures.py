@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.signals.multi_sine import Disturbance, MultiSine, SineDisturbance
+from ctid_cli.signals.sinusoids import Disturbance, SineDisturbance, SumOfSinusoids
 
 if TYPE_CHECKING:
     from ctid_cli.frequency.tracking import FrequencyEstimate, FrequencyTrack
@@ -65,7 +65,7 @@ class Measuring:
     runs: int = 0
 
 
-def true_frequencies(signal: MultiSine, disturbance: Disturbance | None, tones: int, times: Array) -> Array:
+def true_frequencies(signal: SumOfSinusoids, disturbance: Disturbance | None, tones: int, times: Array) -> Array:
     """The frequencies that an estimator of so many tones should find."""
     true = signal.frequencies_at(times)
     if tones == true.shape[1] + 1 and isinstance(disturbance, SineDisturbance):
@@ -76,7 +76,7 @@ def true_frequencies(signal: MultiSine, disturbance: Disturbance | None, tones: 
 
 
 def measure_track(
-    track: FrequencyTrack, true: Array, signal: MultiSine, measuring: Measuring, options: Any
+    track: FrequencyTrack, true: Array, signal: SumOfSinusoids, measuring: Measuring, options: Any
 ) -> dict[str, float | None]:
     """Measure the estimates of an online estimator."""
     t, errors, valid = track.t, track.omega - true, track.valid
@@ -184,7 +184,7 @@ def _in_window(t: Array, window: tuple[float, float] | None) -> BoolArray:
     return np.asarray((t >= low - slack) & (t <= high + slack))
 
 
-def _false_alarms(track: FrequencyTrack, signal: MultiSine) -> int:
+def _false_alarms(track: FrequencyTrack, signal: SumOfSinusoids) -> int:
     from ctid_cli.frequency.flags import Flag
 
     alarm = (track.flags & int(Flag.CHANGED)) != 0

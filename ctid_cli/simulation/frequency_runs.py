@@ -9,8 +9,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.tracking import FrequencyEstimate, FrequencyTrack
-from ctid_cli.signals.multi_sine import Disturbance, MultiSine, disturb
 from ctid_cli.signals.sampling import RegularSampling
+from ctid_cli.signals.sinusoids import Disturbance, SumOfSinusoids, disturb
 from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.frequency_measures import (
     Measuring,
@@ -46,7 +46,7 @@ class SignalDataSet:
 class SignalSource:
     """Data sets of a signal."""
 
-    signal: MultiSine
+    signal: SumOfSinusoids
     disturbance: Disturbance | None
     sampling: RegularSampling
     seed: int

@@ -7,9 +7,9 @@ An option dataclass is written once, with its units; this module turns it into a
 - explains in plain words what is wrong, everything in a section at once,
 - carries descriptions and units into the JSON Schema.
 
-Metadata of a field, all optional: ``doc``; ``unit``; ``geometric``, a sweep may be given as its ends and its length;
-``added_later``, left out of the canonical form at its default, so that what was stored before the field existed keeps
-its identity.
+Units and descriptions come from the class's docstring. Metadata of a field, all optional: ``geometric``, a sweep may be
+given as its ends and its length; ``added_later``, left out of the canonical form at its default, so that what was
+stored before the field existed keeps its identity.
 
 Messages are final sentences: they travel through pydantic as custom errors, with their key path as ``loc``.
 """
@@ -43,6 +43,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from ctid_cli.errors import CtidError
 from ctid_cli.signals.sampling import geometric_sizes
+from ctid_cli.specification.option_docs import OptionDoc, option_docs
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.text import did_you_mean
 
@@ -51,9 +52,6 @@ MAX_COMBINATIONS = 10_000
 
 #: Whole numbers beyond this fit no column of a table or archive.
 MAX_WHOLE = 2**63 - 1
-
-#: Keys of a section that are no options of its target.
-_NO_OPTIONS = ("kind", "sha256")
 
 Check = Callable[[Any], Any]
 #: Key path inside a section, and what is wrong there.
@@ -305,7 +303,7 @@ class Section(BaseModel):
                 problems.append(((key,), f"there is no such key here{hint} allowed: {', '.join(allowed)}", True))
         for name, info in cls.model_fields.items():
             if info.is_required() and name not in value:
-                meaning = f" ({info.description})" if info.description else ""
+                meaning = f": {info.description}" if info.description else ""
                 problems.append(((name,), f"is missing; add it{meaning}", True))
         problems += [(path, message, True) for path, message in cls.requirements(value)]
         section = None
@@ -465,8 +463,8 @@ def _instance(section: Section, values: Mapping[str, Any]) -> Any:
         raise
     except (ValueError, ArithmeticError, CtidError) as error:
         message = str(error).strip() or f"these values were refused ({type(error).__name__})"
-        names = [name for name in type(section).model_fields if name not in _NO_OPTIONS]
-        raise RefusedOptionsError(field_in(message, names), message) from None
+        field = getattr(error, "field", "")
+        raise RefusedOptionsError((field,) if field in type(section).model_fields else (), message) from None
 
 
 def _argument(inner: Any, value: Any, path: KeyPath) -> Any:
@@ -479,18 +477,6 @@ def _argument(inner: Any, value: Any, path: KeyPath) -> Any:
     if isinstance(value, list):
         return tuple(_argument(part, item, (*path, k)) for k, (part, item) in enumerate(zip(inner, value, strict=True)))
     return value
-
-
-def field_in(message: str, names: Sequence[str]) -> KeyPath:
-    """The only field that a message names."""
-    rest = re.sub(r"(?<=\w)-(?=\w)", "", message)  # "cut-off" means the field "cutoff"
-    found: list[str] = []
-    for name in sorted(names, key=len, reverse=True):
-        pattern = rf"\b{re.escape(name).replace('_', '[_ ]')}\b"
-        if re.search(pattern, rest):
-            found.append(name)
-            rest = re.sub(pattern, " ", rest)
-    return (found[0],) if len(found) == 1 else ()
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -510,7 +496,7 @@ def section_for(
     target: type, *, kind: str | None = None, extra: Mapping[str, Any] | None = None, sweeping: bool = True
 ) -> type[Section]:
     """Section model of an option dataclass."""
-    hints = get_type_hints(target)
+    hints, docs = get_type_hints(target), option_docs(target)
     definitions: dict[str, Any] = {}
     sweepable: set[str] = set()
     later: set[str] = set()
@@ -519,9 +505,8 @@ def section_for(
     for option in dataclasses.fields(target):
         if not option.init:
             continue
-        unit = str(option.metadata.get("unit", ""))
-        unit = "" if unit == "-" else unit
-        form = _form(hints[option.name], unit, f"{target.__name__}.{option.name}")
+        doc = docs.get(option.name, OptionDoc())
+        form = _form(hints[option.name], doc.unit, f"{target.__name__}.{option.name}")
         annotation, check = form.annotation, form.check
         if form.scalar and sweeping:
             sweepable.add(option.name)
@@ -535,7 +520,7 @@ def section_for(
         default = _default(option, form.check)
         definitions[option.name] = (
             Annotated[annotation, checked(check)],
-            Field(**({} if default is _NO_DEFAULT else {"default": default}), description=_description(option, unit)),
+            Field(**({} if default is _NO_DEFAULT else {"default": default}), description=doc.text or None),
         )
     definitions.update(extra or {})
     model = create_model(target.__name__, __base__=Section, __doc__=_summary(target), **definitions)
@@ -633,13 +618,6 @@ def _default(option: dataclasses.Field[Any], check: Check) -> Any:
     elif isinstance(default, tuple):
         default = [dataclasses.asdict(item) if hasattr(item, "__dataclass_fields__") else item for item in default]
     return check(default)
-
-
-def _description(option: dataclasses.Field[Any], unit: str) -> str | None:
-    doc = str(option.metadata.get("doc", "")).strip()
-    if unit and f"[{unit}]" not in doc:
-        doc = f"{doc.rstrip('.')} [{unit}]".strip()
-    return doc or None
 
 
 def _summary(target: type) -> str:

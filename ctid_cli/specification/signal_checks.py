@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ctid_cli.errors import DataError
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.frequency.drem_window import DremWindow
 from ctid_cli.frequency.esprit import Esprit
 from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
-from ctid_cli.signals.multi_sine import SineDisturbance
 from ctid_cli.signals.sampling import RegularSampling
+from ctid_cli.signals.sinusoids import SineDisturbance
 from ctid_cli.simulation.frequency_measures import true_frequencies
-from ctid_cli.specification.sections import Complaint, Variant, field_in, grouped, variants
+from ctid_cli.specification.sections import Complaint, Variant, grouped, variants
 from ctid_cli.specification.yaml_source import KeyPath
 
 if TYPE_CHECKING:
@@ -63,13 +63,12 @@ def signal_complaints(spec: Spec) -> Iterator[Complaint]:
     for name, section in spec.estimators.items():
         if str(getattr(section, "kind")) not in FREQUENCY_ESTIMATORS:  # noqa: B009
             continue
-        names = [field for field in type(section).model_fields if field != "kind"]
         cases = variants(section)
         failures: list[Failure] = []
         for case, clock in itertools.product(cases, clocks):
             combination = {**case.swept, **_prefixed("sampling", clock.swept)}
-            for message in _of_estimator(case.options, clock.options):
-                failures.append((("estimators", name, *field_in(message, names)), message, combination))
+            for path, message in _of_estimator(case.options, clock.options):
+                failures.append((("estimators", name, *path), message, combination))
         yield from grouped(failures, len(cases) * len(clocks))
         for case in cases[:1] if not signals else cases:
             if signals and not _fits(case.options, signals[0].options, disturbances):
@@ -101,9 +100,8 @@ def signal_warnings(spec: Spec) -> list[Complaint]:
             if hasattr(case.options, "h") and signal.highest_frequency > math.pi / case.options.h
         ]
         warnings += grouped(aliased, len(cases))
-        names = [field for field in type(section).model_fields if field != "kind"]
         rounded = [
-            (("estimators", name, *field_in(note, names)), note, {**case.swept, **_prefixed("sampling", clock.swept)})
+            (("estimators", name, "h"), note, {**case.swept, **_prefixed("sampling", clock.swept)})
             for case, clock in itertools.product(cases, clocks)
             if case.options.online
             for note in case.options.start(clock.options.interval).notes
@@ -140,7 +138,7 @@ def _of_clock(spec: Spec, signal: Variant, clock: Variant) -> Iterator[Failure]:
         yield ("success", "by"), f"{by:g} s come after the end of the record, {duration:g} s", combination
 
 
-def _of_estimator(options: Any, clock: RegularSampling) -> Iterator[str]:
+def _of_estimator(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
     if not options.online:
         yield from _of_batch(options, clock)
         return
@@ -149,33 +147,41 @@ def _of_estimator(options: Any, clock: RegularSampling) -> Iterator[str]:
     for name in ("prefilter", "difference", "d", "hold", *(("memory",) if options.kind == DremWindow.kind else ())):
         value = getattr(options, name, 0.0)
         if value > duration:
-            yield f"{name} = {value:g} s is longer than the record, {duration:g} s"
+            yield (name,), f"{name} = {value:g} s is longer than the record, {duration:g} s"
             return
     rows = options.first_row + options.tones - 1 if hasattr(options, "d") else 0
     filled = 2 * options.tones * getattr(options, "h", 0.0) + rows * getattr(options, "d", 0.0)
     filled += getattr(options, "prefilter", 0.0) + getattr(options, "difference", 0.0)
     if filled >= duration:
-        yield f"its delays are filled after {filled:g} s, and the record ends at {duration:g} s; take a smaller h"
+        yield (
+            ("h",),
+            f"its delays are filled after {filled:g} s, and the record ends at {duration:g} s; take a smaller h",
+        )
         return
     try:
         with np.errstate(all="ignore"):
             options.start(clock.interval)
-    except (ValueError, ArithmeticError) as error:
-        yield str(error) if isinstance(error, ValueError) else "these values are too large or too small to compute with"
+    except OptionError as error:
+        yield ((error.field,) if hasattr(options, error.field) else ()), str(error)
+    except ArithmeticError:
+        yield (), "these values are too large or too small to compute with"
 
 
-def _of_batch(options: Any, clock: RegularSampling) -> Iterator[str]:
+def _of_batch(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
     initial = getattr(options, "initial_frequencies", None)
     if initial is not None:
         highest = math.pi / clock.interval
         if max(initial) >= highest:
-            yield f"initial_frequencies must be below {highest:.4g} rad/s, pi over the sampling interval"
+            yield (
+                ("initial_frequencies",),
+                f"initial_frequencies must be below {highest:.4g} rad/s, pi over the sampling interval",
+            )
         return
     start = options if isinstance(options, Esprit) else Esprit(tones=options.tones, averaging=options.averaging)
     try:
         start.blocks(clock.samples, clock.interval)
-    except (ValueError, DataError) as error:
-        yield str(error)
+    except (OptionError, DataError) as error:
+        yield ((error.field,) if hasattr(options, error.field) else ()), str(error)
 
 
 def _fits(options: Any, signal: Any, disturbances: list[Any]) -> bool:

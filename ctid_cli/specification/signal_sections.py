@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from ctid_cli.signals.multi_sine import DISTURBANCES, MultiSine
+from ctid_cli.errors import OptionError
 from ctid_cli.signals.sampling import RegularSampling
+from ctid_cli.signals.sinusoids import DISTURBANCES, SumOfSinusoids
 from ctid_cli.specification.option_sections import SamplingSection, check_of
 from ctid_cli.specification.sections import (
     Complaint,
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     DisturbanceSection = Section
     DisturbanceOrNone = Section
 else:
-    SignalSection = section_for(MultiSine)
+    SignalSection = section_for(SumOfSinusoids)
     DisturbanceSection = by_kind({kind: section_for(target, kind=kind) for kind, target in DISTURBANCES.items()})
     DisturbanceOrNone = DisturbanceSection | Literal["none"]
 
@@ -58,9 +59,10 @@ class RegularDurationSection(Section):
     def build(self, values: Mapping[str, Any]) -> RegularSampling:
         """The sampling scheme."""
         if not values["duration"] >= 2.0 * values["interval"]:
-            raise ValueError(
+            raise OptionError(
+                "duration",
                 f"duration must be at least two sampling intervals of {values['interval']:g} s, "
-                f"not {values['duration']:g} s."
+                f"not {values['duration']:g} s.",
             )
         # Beyond the largest whole number of samples any number of them is refused as too many.
         return RegularSampling(values["interval"], int(min(round(values["duration"] / values["interval"]), 2**62)))

@@ -17,7 +17,7 @@ from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.plan import build_plan
 from ctid_cli.running.worker import Job, run_job
-from ctid_cli.signals.multi_sine import MultiSine, Piece, Tone
+from ctid_cli.signals.sinusoids import Piece, SumOfSinusoids, Tone
 from ctid_cli.simulation.frequency_measures import (
     Measuring,
     is_settled,
@@ -74,8 +74,8 @@ BROKEN = {
     "an endless hold": ("{kind: esprit, tones: 2, averaging: 0.05}",
                               "{kind: filter_regression, tones: 2, pole: 4, hold: 1e307}", 9, "estimators.esprit.hold",
                               "longer than the record"),
-    "too long averages": ("averaging: 0.05", "averaging: 29", 9, "estimators.esprit", "too few for 2 tones"),
-    "averages that alias": ("averaging: 0.05", "averaging: 1, highest_frequency: 10", 9, "estimators.esprit",
+    "too long averages": ("averaging: 0.05", "averaging: 29", 9, "estimators.esprit.averaging", "too few for 2 tones"),
+    "averages that alias": ("averaging: 0.05", "averaging: 1, highest_frequency: 10", 9, "estimators.esprit.averaging",
                             "averages over 1 s show frequencies up to"),
     "a start beyond the clock": ("{kind: esprit, tones: 2, averaging: 0.05}",
                                  "{kind: nonlinear_least_squares, tones: 2, initial_frequencies: [2, 5000]}", 9,
@@ -160,7 +160,7 @@ def made(t, first, flags=None):
 
 
 def test_measures_of_a_made_up_track():
-    signal = MultiSine((Tone((Piece(1.8, until=6.0), Piece(2.0))), Tone(3.0)))
+    signal = SumOfSinusoids((Tone((Piece(1.8, until=6.0), Piece(2.0))), Tone(3.0)))
     t = 0.5 * np.arange(32)
     first = np.where(t < 2.0, 5.0, 1.8)  # wrong until 2 s, right until the step, late by 1.5 s after it
     first[t >= 7.5] = 2.01

@@ -80,7 +80,7 @@ BROKEN = {
                              "system.additive[0].integrators", "at least 0"),
     "improper submodel": ("[3]", "[1, 2, 3, 4]", 4, 19, "system.additive[0].numerator",
                           "more zeros (3) than poles (2)"),
-    "pole at the origin": ("[0.25, 0.25, 1]", "[0.25, 0.25, 0]", 4, 7, "system.additive[0]", "as integrators"),
+    "pole at the origin": ("[0.25, 0.25, 1]", "[0.25, 0.25, 0]", 4, 37, "system.additive[0].denominator", "as integrators"),
     "leading zero": ("[0.25, 0.25, 1]", "[0, 0.25, 1]", 4, 37, "system.additive[0].denominator", "leading zeros"),
     "submodel that overflows": ("[0.25, 0.25, 1]", "[0.25, 0.25, 1e-310]", 4, 37, "system.additive[0].denominator",
                                 "scale the coefficients"),
@@ -139,7 +139,7 @@ BROKEN = {
                            "is missing"),
     "swept term": ("[{poles: 2, zeros: 0}, {", "[{poles: [1, 2], zeros: 0}, {", 12, 48,
                    "estimators.both.terms[0].poles", "cannot be swept"),
-    "improper term": ("[{poles: 2, zeros: 0}, {", "[{poles: 2, zeros: 4}, {", 12, 40, "estimators.both.terms[0]",
+    "improper term": ("[{poles: 2, zeros: 0}, {", "[{poles: 2, zeros: 4}, {", 12, 58, "estimators.both.terms[0].zeros",
                       "more zeros than poles"),
     "refused terms": (
         "[{poles: 2, zeros: 0}, {poles: 2,", "[{poles: 2, zeros: 0, integrators: 1}, {poles: 2, integrators: 1,",

@@ -81,7 +81,7 @@ BROKEN = {
     "unknown key names the known ones": (
         "cutoff: 0.2,", "cutoff: 0.2, ripple: 3,", 15, 28, "estimators.one.lowpass.ripple", "allowed: cutoff, order"
     ),
-    "missing key": ("interval: 0.05, ", "", 7, 1, "sampling.interval", "is missing; add it (sampling interval [s])"),
+    "missing key": ("interval: 0.05, ", "", 7, 1, "sampling.interval", "is missing; add it: Sampling interval [s]."),
     "missing nested key": ("cutoff: 0.2, ", "", 15, 5, "estimators.one.lowpass.cutoff", "[rad/s]"),
     "missing kind": ("  kind: prbs\n", "", 3, 1, "excitation.kind", "prbs, multisine, gaussian, step, file"),
     "unknown kind": ("kind: prbs", "kind: prsb", 4, 9, "excitation.kind", "did you mean 'prbs'?"),
@@ -112,9 +112,9 @@ BROKEN = {
     "options that exclude each other": (
         "[5, 15]", "[5, 15], standard_deviation: 1", 8, 1, "noise", "snr_db and standard_deviation were given"
     ),
-    "zeros not fewer than poles": ("zeros: 0", "zeros: 2", 10, 3, "estimators.one", "strictly proper"),
+    "zeros not fewer than poles": ("zeros: 0", "zeros: 2", 13, 12, "estimators.one.zeros", "strictly proper"),
     "zeros not fewer than poles in a sweep": (
-        "zeros: 0", "zeros: [0, 1, 2]", 10, 3, "estimators.one", "(with zeros = 2)"
+        "zeros: 0", "zeros: [0, 1, 2]", 13, 19, "estimators.one.zeros[2]", "got 2 zeros and 2 poles"
     ),
     "system not strictly proper": ("[2]", "[2, 1, 1]", 2, 1, "system", "2 zeros and 2 poles"),
     "unstable system": ("0.7, 1]", "-0.7, 1]", 2, 1, "system", "poles at 1.4-1.428j, 1.4+1.428j rad/s"),
@@ -449,7 +449,7 @@ def test_the_schema_knows_every_option_and_its_unit():
             assert section["properties"]["kind"]["const"] == kind
             assert set(section["properties"]) - {"kind", "sha256"} == {option.name for option in fields(target)}
     interval = schema["$defs"]["RegularSampling"]["properties"]["interval"]
-    assert interval["description"].endswith("[s]")
+    assert interval["description"] == "Sampling interval [s]."
     assert interval["anyOf"] == [{"type": "number"}, {"type": "array", "items": {"type": "number"}}]
     bounds = schema["$defs"]["TdSrivc"]["properties"]["delay_bounds"]
     assert (bounds["type"], bounds["minItems"], bounds["maxItems"]) == ("array", 2, 2)

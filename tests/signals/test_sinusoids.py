@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ctid_cli.signals.multi_sine import MultiSine, Piece, SineDisturbance, Tone, UniformDisturbance, disturb
 from ctid_cli.signals.noise import WhiteNoise
+from ctid_cli.signals.sinusoids import Piece, SineDisturbance, SumOfSinusoids, Tone, UniformDisturbance, disturb
 
 T = 0.001 * np.arange(60_000)
 STEPPED = (
@@ -17,20 +17,20 @@ def test_constant_frequencies_are_a_sum_of_sinusoids_however_the_phase_is_read()
     tones = (Tone(2.0, 1.5, 0.3), Tone(3.0))
     expected = 1.5 * np.sin(2 * T + 0.3) + np.sin(3 * T) - 0.25
     for phase in ("jump", "continuous"):
-        assert np.allclose(MultiSine(tones, -0.25, phase).generate(T), expected, rtol=0, atol=1e-12)
+        assert np.allclose(SumOfSinusoids(tones, -0.25, phase).generate(T), expected, rtol=0, atol=1e-12)
 
 
 def test_a_jump_and_a_continuous_phase():
     after = T >= 30.0
     jump = np.sin(np.where(after, 2.0, 1.8) * T) + np.cos(np.where(after, 3.0, 3.2) * T)
-    assert np.allclose(MultiSine(STEPPED, phase_at_steps="jump").generate(T), jump, rtol=0, atol=1e-12)
-    smooth = MultiSine(STEPPED, phase_at_steps="continuous")
+    assert np.allclose(SumOfSinusoids(STEPPED, phase_at_steps="jump").generate(T), jump, rtol=0, atol=1e-12)
+    smooth = SumOfSinusoids(STEPPED, phase_at_steps="continuous")
     first, second = np.where(after, 2 * T - 6.0, 1.8 * T), np.where(after, 3 * T + 6.0, 3.2 * T)
     assert np.allclose(smooth.generate(T), np.sin(first) + np.cos(second), rtol=0, atol=1e-12)
 
 
 def test_a_piece_begins_at_its_instant_whatever_the_last_bits():
-    signal = MultiSine((Tone(1.0, (Piece(1.0, until=0.3), Piece(2.0))),))
+    signal = SumOfSinusoids((Tone(1.0, (Piece(1.0, until=0.3), Piece(2.0))),))
     times = np.array([3 * 0.1, 0.3, np.nextafter(0.3, 0)])
     assert np.allclose(signal.generate(times), 2 * np.sin(0.3))
     assert signal.steps == (0.3,)
@@ -38,7 +38,7 @@ def test_a_piece_begins_at_its_instant_whatever_the_last_bits():
 
 
 def test_true_frequencies_are_ascending():
-    signal = MultiSine((Tone(3.0), Tone((Piece(1.0, until=5.0), Piece(4.0)))))
+    signal = SumOfSinusoids((Tone(3.0), Tone((Piece(1.0, until=5.0), Piece(4.0)))))
     assert np.array_equal(signal.frequencies_at([0.0, 5.0]), [[1.0, 3.0], [3.0, 4.0]])
     assert signal.highest_frequency == 4.0
 
@@ -51,10 +51,10 @@ def test_true_frequencies_are_ascending():
         (lambda: Tone((Piece(1.0, 2.0),)), "the last has none"),
         (lambda: Tone((Piece(1.0), Piece(2.0))), "needs 'until'"),
         (lambda: Tone((Piece(1.0, 3.0), Piece(2.0, 2.0), Piece(1.0))), "follow one another"),
-        (lambda: MultiSine(()), "tones"),
-        (lambda: MultiSine((Tone(1.0), Tone(1.0))), "same frequency from 0 s"),
-        (lambda: MultiSine((Tone(1.0), Tone((Piece(2.0, 4.0), Piece(1.0))))), "same frequency from 4 s"),
-        (lambda: MultiSine((Tone(1.0),), phase_at_steps="smooth"), "phase_at_steps"),
+        (lambda: SumOfSinusoids(()), "tones"),
+        (lambda: SumOfSinusoids((Tone(1.0), Tone(1.0))), "same frequency from 0 s"),
+        (lambda: SumOfSinusoids((Tone(1.0), Tone((Piece(2.0, 4.0), Piece(1.0))))), "same frequency from 4 s"),
+        (lambda: SumOfSinusoids((Tone(1.0),), phase_at_steps="smooth"), "phase_at_steps"),
         (lambda: UniformDisturbance(0.0), "half_width"),
         (lambda: SineDisturbance(1.0, -1.0), "frequency"),
     ],

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.errors import OptionError
 from ctid_cli.signals.arma_noise import ArmaNoise
 from ctid_cli.signals.checks import require_choice, require_finite, require_positive
 from ctid_cli.signals.held import COINCIDENCE
@@ -20,21 +21,42 @@ PhaseAtSteps = Literal["jump", "continuous"]
 
 @dataclass(frozen=True)
 class Piece:
-    """A constant value up to an instant."""
+    """A constant value up to an instant.
 
-    value: float = field(metadata={"doc": "value, in the unit of what it belongs to"})
-    until: float | None = field(
-        default=None, metadata={"doc": "instant at which the next piece begins; none for the last one", "unit": "s"}
-    )
+    Parameters
+    ----------
+    value : float
+        Value, in the unit of what it belongs to.
+    until : float, optional
+        Instant at which the next piece begins [s]; the last piece has none.
+    """
+
+    value: float
+    until: float | None = None
 
 
 @dataclass(frozen=True)
 class Tone:
-    """One sinusoid."""
+    """One sinusoid.
 
-    frequency: float | tuple[Piece, ...] = field(metadata={"doc": "frequency", "unit": "rad/s"})
-    amplitude: float | tuple[Piece, ...] = field(default=1.0, metadata={"doc": "amplitude", "unit": "signal unit"})
-    phase: float = field(default=0.0, metadata={"doc": "phase at time 0", "unit": "rad"})
+    Parameters
+    ----------
+    frequency : float or tuple of Piece
+        Frequency [rad/s], positive.
+    amplitude : float or tuple of Piece, default 1.0
+        Amplitude [signal unit], positive.
+    phase : float, default 0.0
+        Phase at time 0 [rad].
+
+    Raises
+    ------
+    ValueError
+        If a value is not positive, or the pieces do not follow one another.
+    """
+
+    frequency: float | tuple[Piece, ...]
+    amplitude: float | tuple[Piece, ...] = 1.0
+    phase: float = 0.0
 
     def __post_init__(self) -> None:
         for name, unit in (("frequency", "rad/s"), ("amplitude", "signal unit")):
@@ -43,29 +65,54 @@ class Tone:
 
 
 @dataclass(frozen=True)
-class MultiSine:
+class SumOfSinusoids:
     r"""A sum of sinusoids and a constant.
 
+    Parameters
+    ----------
+    tones : tuple of Tone
+        The sinusoids.
+    bias : float, default 0.0
+        Constant that is added [signal unit].
+    phase_at_steps : {"continuous", "jump"}, default "continuous"
+        What a step of a frequency does to the phase: it is the integral of w (``continuous``), or jumps with
+        ``sin(w(t) t + phase)`` (``jump``).
+
+    Raises
+    ------
+    ValueError
+        If there is no tone, or two of them have the same frequency at the same time.
+
+    Notes
+    -----
     Each tone is ``A(t) sin(int_0^t w + phase)``; with ``jump`` it is ``A(t) sin(w(t) t + phase)``, whose phase jumps
     when the frequency w steps. A piece begins at the very instant that the one before it names.
+
+    Examples
+    --------
+    >>> from ctid_cli.signals.sinusoids import Piece, SumOfSinusoids, Tone
+    >>> signal = SumOfSinusoids((Tone(3.0), Tone((Piece(1.0, until=5.0), Piece(2.0)))))
+    >>> signal.frequencies_at([0.0, 5.0])
+    array([[1., 3.],
+           [2., 3.]])
     """
 
-    tones: tuple[Tone, ...] = field(metadata={"doc": "the sinusoids"})
-    bias: float = field(default=0.0, metadata={"doc": "constant that is added", "unit": "signal unit"})
-    phase_at_steps: PhaseAtSteps = field(
-        default="continuous", metadata={"doc": "jump: sin(w(t) t + phase); continuous: the phase is the integral of w"}
-    )
+    tones: tuple[Tone, ...]
+    bias: float = 0.0
+    phase_at_steps: PhaseAtSteps = "continuous"
 
     def __post_init__(self) -> None:
         if not self.tones:
-            raise ValueError("tones must hold at least one sinusoid.")
+            raise OptionError("tones", "tones must hold at least one sinusoid.")
         require_finite("bias", self.bias, "signal unit")
         require_choice("phase_at_steps", self.phase_at_steps, get_args(PhaseAtSteps))
         instants = [0.0, *self.frequency_steps]
         for instant, row in zip(instants, self.frequencies_at(instants), strict=True):
             if (np.diff(row) == 0.0).any():
-                raise ValueError(
-                    f"two tones have the same frequency from {instant:g} s on; they are one sinusoid, so leave one out."
+                raise OptionError(
+                    "tones",
+                    f"two tones have the same frequency from {instant:g} s on; they are one sinusoid, so leave one "
+                    "out.",
                 )
 
     @property
@@ -118,7 +165,7 @@ class UniformDisturbance:
 
     kind: ClassVar[str] = "uniform"
 
-    half_width: float = field(metadata={"doc": "largest size of a sample", "unit": "signal unit"})
+    half_width: float
 
     def __post_init__(self) -> None:
         require_positive("half_width", self.half_width, "signal unit")
@@ -162,9 +209,9 @@ class SineDisturbance:
 
     kind: ClassVar[str] = "sine"
 
-    amplitude: float = field(metadata={"doc": "amplitude", "unit": "signal unit"})
-    frequency: float = field(metadata={"doc": "frequency", "unit": "rad/s"})
-    phase: float = field(default=0.0, metadata={"doc": "phase at time 0", "unit": "rad"})
+    amplitude: float
+    frequency: float
+    phase: float = 0.0
 
     def __post_init__(self) -> None:
         require_positive("amplitude", self.amplitude, "signal unit")
@@ -209,16 +256,16 @@ def _check_course(name: str, course: float | tuple[Piece, ...], unit: str) -> No
         require_positive(name, course, unit)
         return
     if not course:
-        raise ValueError(f"{name} must hold at least one piece.")
+        raise OptionError(name, f"{name} must hold at least one piece.")
     for piece in course:
-        require_positive(f"the value of a piece of {name}", piece.value, unit)
+        require_positive(name, piece.value, unit, label=f"the value of a piece of {name}")
     if course[-1].until is not None or any(piece.until is None for piece in course[:-1]):
-        raise ValueError(f"every piece of {name} but the last needs 'until' [s], and the last has none.")
+        raise OptionError(name, f"every piece of {name} but the last needs 'until' [s], and the last has none.")
     ends = [piece.until for piece in course[:-1] if piece.until is not None]
     for end in ends:
-        require_positive(f"'until' of a piece of {name}", end, "s")
+        require_positive(name, end, "s", label=f"'until' of a piece of {name}")
     if any(later <= earlier for earlier, later in itertools.pairwise(ends)):
-        raise ValueError(f"the pieces of {name} must follow one another; their ends are {ends} s.")
+        raise OptionError(name, f"the pieces of {name} must follow one another; their ends are {ends} s.")
 
 
 def _values(course: float | tuple[Piece, ...]) -> Array:

@@ -1,0 +1,64 @@
+"""Which class each ``kind`` of a specification names: the one list of what there is to choose from.
+
+Names lead to classes of every floor, so that nothing is imported before it is asked for.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+#: Section, or what stands in it, to the kinds that it may have, to where the class of each is: ``module:Class``.
+KINDS: dict[str, dict[str, str]] = {
+    "excitation": {
+        "prbs": "ctid_cli.signals.excitation:Prbs",
+        "multisine": "ctid_cli.signals.excitation:Multisine",
+        "gaussian": "ctid_cli.signals.excitation:Gaussian",
+        "step": "ctid_cli.signals.excitation:Step",
+        "file": "ctid_cli.signals.excitation:InputFile",
+    },
+    "sampling": {
+        "regular": "ctid_cli.signals.sampling:RegularSampling",
+        "uniform_intervals": "ctid_cli.signals.sampling:UniformIntervals",
+    },
+    "noise": {
+        "white": "ctid_cli.signals.noise:WhiteNoise",
+        "arma": "ctid_cli.signals.arma_noise:ArmaNoise",
+    },
+    "disturbance": {
+        "uniform": "ctid_cli.signals.sinusoids:UniformDisturbance",
+        "sine": "ctid_cli.signals.sinusoids:SineDisturbance",
+        "white": "ctid_cli.signals.noise:WhiteNoise",
+        "arma": "ctid_cli.signals.arma_noise:ArmaNoise",
+    },
+    "estimator": {
+        "svf": "ctid_cli.estimators.svf:Svf",
+        "srivc": "ctid_cli.estimators.srivc:Srivc",
+        "td_srivc": "ctid_cli.estimators.td_srivc:TdSrivc",
+        "useful_redundancy": "ctid_cli.estimators.useful_redundancy:UsefulRedundancy",
+        "delay_profile": "ctid_cli.estimators.delay_profile:DelayProfile",
+        "additive_srivc": "ctid_cli.estimators.additive_srivc:AdditiveSrivc",
+    },
+    "frequency_estimator": {
+        "drem_gradient": "ctid_cli.frequency.drem_gradient:DremGradient",
+        "drem_finite_time": "ctid_cli.frequency.drem_finite_time:DremFiniteTime",
+        "drem_window": "ctid_cli.frequency.drem_window:DremWindow",
+        "restarting_least_squares": "ctid_cli.frequency.restarting_least_squares:RestartingLeastSquares",
+        "adaptive_observer": "ctid_cli.frequency.adaptive_observer:AdaptiveObserver",
+        "filter_regression": "ctid_cli.frequency.filter_regression:FilterRegression",
+        "esprit": "ctid_cli.frequency.esprit:Esprit",
+        "nonlinear_least_squares": "ctid_cli.frequency.nonlinear_least_squares:NonlinearLeastSquares",
+    },
+}
+
+
+def resolve(section: str, kind: str) -> type[Any]:
+    """The class that a kind names."""
+    module, _, name = KINDS[section][kind].partition(":")
+    found: type[Any] = getattr(importlib.import_module(module), name)
+    return found
+
+
+def classes(section: str) -> dict[str, type[Any]]:
+    """Every class of a section by its kind."""
+    return {kind: resolve(section, kind) for kind in KINDS[section]}
