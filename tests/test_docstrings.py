@@ -10,12 +10,8 @@ import typing
 import pytest
 
 import ctid_cli
-from ctid_cli.estimators.registry import ESTIMATORS
-from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
-from ctid_cli.signals.excitation import EXCITATIONS
-from ctid_cli.signals.noise import NOISES
-from ctid_cli.signals.sampling import SAMPLINGS
-from ctid_cli.signals.sinusoids import DISTURBANCES
+from ctid_cli.kinds import KINDS, classes
+from ctid_cli.signals.sinusoids import Piece, SumOfSinusoids, Tone
 
 
 def members_of(name, member):
@@ -36,10 +32,12 @@ def public_callables():
         member = getattr(ctid_cli, name)
         if callable(member):
             yield from members_of(name, member)
-    for registry in (DISTURBANCES, ESTIMATORS, EXCITATIONS, FREQUENCY_ESTIMATORS, NOISES, SAMPLINGS):
-        for kind, member in registry.items():
+    for section in KINDS:
+        for kind, member in classes(section).items():
             if member.__name__ not in ctid_cli.__all__:
                 yield from members_of(kind, member)
+    for member in (Piece, SumOfSinusoids, Tone):  # the section `signal` has no kinds
+        yield member.__name__, member
 
 
 def internal_docstrings():

@@ -5,46 +5,34 @@ from __future__ import annotations
 import math
 import sys
 import time as clock
-from enum import StrEnum
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import typer
 
 from ctid_cli.cli._common import Json, guarded, write_files
 from ctid_cli.cli._progress import LINE_EVERY
+from ctid_cli.kinds import KINDS
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from ctid_cli.signals.sampled_signal import SampledSignal
 
+    Method = str
+else:
+    Method = Literal[("automatic", *KINDS["frequency_estimator"])]
+
 #: Seconds before a bar appears: most records are done sooner.
 BAR_AFTER = 1.0
-
-
-class MethodOption(StrEnum):
-    """Estimators by their names."""
-
-    automatic = "automatic"
-    drem_gradient = "drem_gradient"
-    drem_finite_time = "drem_finite_time"
-    drem_window = "drem_window"
-    restarting_least_squares = "restarting_least_squares"
-    adaptive_observer = "adaptive_observer"
-    filter_regression = "filter_regression"
-    esprit = "esprit"
-    nonlinear_least_squares = "nonlinear_least_squares"
 
 
 @guarded
 def track(
     file: Annotated[Path, typer.Argument(metavar="SIGNAL", help="Recorded signal (.csv, .mat, .wav).")],
     tones: Annotated[int, typer.Option("--tones", help="Number of sinusoids, 1 to 8: the strongest ones.")],
-    method: Annotated[
-        MethodOption, typer.Option("--method", help="How the frequencies are estimated.")
-    ] = MethodOption.automatic,
+    method: Annotated[Method, typer.Option("--method", help="How the frequencies are estimated.")] = "automatic",
     time: Annotated[str | None, typer.Option("--time", metavar="NAME", help="Column of the times.")] = None,
     signal: Annotated[
         str | None, typer.Option("--signal", metavar="NAME", help="Column or channel of the signal.")
@@ -99,7 +87,7 @@ def track(
         if value is not None and not 0 < value < float("inf"):
             raise UsageError(f"{name} must be a positive number of seconds, not {value:g}")
     record = _in_seconds(read_sampled_signal(file, time=time, signal=signal, interval=given, start=start, stop=stop))
-    kind = None if method is MethodOption.automatic else method.value
+    kind = None if method == "automatic" else method
     try:
         settings = choose_settings(record.samples, record.interval, tones, method=kind, window=window)
         with _Progress(file.name) as tell:

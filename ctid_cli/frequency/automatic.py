@@ -18,11 +18,11 @@ from ctid_cli.frequency.drem_window import DremWindow
 from ctid_cli.frequency.esprit import Esprit
 from ctid_cli.frequency.filter_regression import FilterRegression
 from ctid_cli.frequency.nonlinear_least_squares import NonlinearLeastSquares
-from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
 from ctid_cli.frequency.regression import MOST_TONES
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.frequency.spectrum import Peaks, find_peaks
 from ctid_cli.frequency.windows import estimate_window
+from ctid_cli.kinds import KINDS
 from ctid_cli.signals.checks import require_choice, require_integer, require_positive
 
 #: Samples in a period of the highest tone, for estimators that take windows, that delay, and that integrate.
@@ -130,7 +130,7 @@ def choose_settings(
     require_integer("tones", tones, 1, MOST_TONES)
     require_positive("interval", interval, "s")
     if method is not None:
-        require_choice("method", method, tuple(FREQUENCY_ESTIMATORS))
+        require_choice("method", method, tuple(KINDS["frequency_estimator"]))
     if window is not None:
         require_positive("window", window, "s")
     _refuse_unusable(samples, tones)

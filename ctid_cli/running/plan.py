@@ -12,7 +12,7 @@ from typing import Any
 
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import UsageError
-from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
+from ctid_cli.kinds import KINDS
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.simulation.dataset import LoopOptions, SimulatedSource, Source, located
 from ctid_cli.simulation.frequency_measures import Measuring
@@ -274,7 +274,7 @@ def _of_signal(chosen: Mapping[str, Variant], spec: Spec, measuring: Measuring) 
 def _estimator_cell(name: str, variant: Variant, names: Mapping[KeyPath, str]) -> EstimatorCell:
     swept = {names["estimator", *path]: value for path, value in variant.swept.items()}
     content = variant.values
-    of_frequencies = content["kind"] in FREQUENCY_ESTIMATORS
+    of_frequencies = content["kind"] in KINDS["frequency_estimator"]
     estimator = FrequencyEstimation(variant.options) if of_frequencies else variant.options
     return EstimatorCell(name, content["kind"], estimator, content, content_hash(content), swept)
 

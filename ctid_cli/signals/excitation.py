@@ -383,11 +383,6 @@ class InputFile:
 
 Excitation = Prbs | Multisine | Gaussian | Step | InputFile
 
-#: Excitations by the word that selects them in a specification.
-EXCITATIONS: dict[str, type[Excitation]] = {
-    excitation.kind: excitation for excitation in (Prbs, Multisine, Gaussian, Step, InputFile)
-}
-
 
 def _clock(sample_times: Array, period: float | None) -> Array:
     """Instants at which the signal takes a new value, from the first sample to the last."""

@@ -149,6 +149,3 @@ class WhiteNoise:
 
 
 Noise = WhiteNoise | ArmaNoise
-
-#: Kinds of noise by the word that selects them in a specification.
-NOISES: dict[str, type[Noise]] = {noise.kind: noise for noise in (WhiteNoise, ArmaNoise)}

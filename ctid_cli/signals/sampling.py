@@ -128,6 +128,3 @@ class UniformIntervals:
 
 
 Sampling = RegularSampling | UniformIntervals
-
-#: Sampling schemes by the word that selects them in a specification.
-SAMPLINGS: dict[str, type[Sampling]] = {scheme.kind: scheme for scheme in (RegularSampling, UniformIntervals)}

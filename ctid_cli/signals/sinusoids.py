@@ -236,11 +236,6 @@ class SineDisturbance:
 
 Disturbance = UniformDisturbance | SineDisturbance | WhiteNoise | ArmaNoise
 
-#: Disturbances of a signal by the word that selects them in a specification.
-DISTURBANCES: dict[str, type[Disturbance]] = {
-    disturbance.kind: disturbance for disturbance in (UniformDisturbance, SineDisturbance, WhiteNoise, ArmaNoise)
-}
-
 
 def disturb(signal: Array, times: Array, disturbance: Disturbance | None, rng: np.random.Generator) -> Array:
     """Add a disturbance to a signal."""

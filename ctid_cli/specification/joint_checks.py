@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctid_cli.errors import DataError
-from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
+from ctid_cli.kinds import KINDS
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.streams import stream
@@ -59,7 +59,7 @@ def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool
     estimators = {
         name: section
         for name, section in spec.estimators.items()
-        if getattr(section, "kind", None) not in FREQUENCY_ESTIMATORS
+        if getattr(section, "kind", None) not in KINDS["frequency_estimator"]
     }
     for name, section in estimators.items():
         cases = variants(section)

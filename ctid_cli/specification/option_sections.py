@@ -7,11 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from ctid_cli.estimators.registry import ESTIMATORS
-from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
-from ctid_cli.signals.excitation import EXCITATIONS, InputFile
-from ctid_cli.signals.noise import NOISES
-from ctid_cli.signals.sampling import SAMPLINGS
+from ctid_cli.kinds import classes
+from ctid_cli.signals.excitation import InputFile
 from ctid_cli.specification.sections import Check, Section, by_kind, checked, optional, plain_text, section_for
 
 #: Check of a content hash that may be missing.
@@ -33,10 +30,10 @@ if TYPE_CHECKING:
     NoiseSection = Section
     EstimatorSection = Section
 else:
-    ExcitationSection = by_kind(_kinds(EXCITATIONS))
-    SamplingSection = by_kind(_kinds(SAMPLINGS))
-    NoiseSection = by_kind(_kinds(NOISES))
-    EstimatorSection = by_kind(_kinds(ESTIMATORS | FREQUENCY_ESTIMATORS))
+    ExcitationSection = by_kind(_kinds(classes("excitation")))
+    SamplingSection = by_kind(_kinds(classes("sampling")))
+    NoiseSection = by_kind(_kinds(classes("noise")))
+    EstimatorSection = by_kind(_kinds(classes("estimator") | classes("frequency_estimator")))
 
 
 def check_of(annotation: Any) -> Check:

@@ -12,7 +12,7 @@ import numpy as np
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.frequency.drem_window import DremWindow
 from ctid_cli.frequency.esprit import Esprit
-from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
+from ctid_cli.kinds import KINDS
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance
 from ctid_cli.simulation.frequency_measures import true_frequencies
@@ -36,10 +36,10 @@ def world_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
         return
     for name, section in spec.estimators.items():
         kind = str(getattr(section, "kind"))  # noqa: B009 - every section of an estimator has one
-        if on_signal and kind not in FREQUENCY_ESTIMATORS:
+        if on_signal and kind not in KINDS["frequency_estimator"]:
             message = f"{kind} identifies a system from its input and output, and this experiment has a signal"
-            yield ("estimators", name, "kind"), f"{message}; allowed: {', '.join(FREQUENCY_ESTIMATORS)}"
-        elif not on_signal and kind in FREQUENCY_ESTIMATORS:
+            yield ("estimators", name, "kind"), f"{message}; allowed: {', '.join(KINDS['frequency_estimator'])}"
+        elif not on_signal and kind in KINDS["frequency_estimator"]:
             message = f"{kind} estimates the frequencies of a signal, and this experiment has a system"
             yield ("estimators", name, "kind"), f"{message}; give signal in its place, or another estimator"
     if spec.success is None:
@@ -61,7 +61,7 @@ def signal_complaints(spec: Spec) -> Iterator[Complaint]:
     yield from grouped([failure for pair in pairs for failure in _of_clock(spec, *pair)], len(pairs))
     disturbances = [None] if spec.disturbance is None else [case.options for case in variants(spec.disturbance)]
     for name, section in spec.estimators.items():
-        if str(getattr(section, "kind")) not in FREQUENCY_ESTIMATORS:  # noqa: B009
+        if str(getattr(section, "kind")) not in KINDS["frequency_estimator"]:  # noqa: B009
             continue
         cases = variants(section)
         failures: list[Failure] = []

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from ctid_cli.errors import OptionError
+from ctid_cli.kinds import classes
 from ctid_cli.signals.sampling import RegularSampling
-from ctid_cli.signals.sinusoids import DISTURBANCES, SumOfSinusoids
+from ctid_cli.signals.sinusoids import SumOfSinusoids
 from ctid_cli.specification.option_sections import SamplingSection, check_of
 from ctid_cli.specification.sections import (
     Complaint,
@@ -34,7 +35,9 @@ if TYPE_CHECKING:
     DisturbanceOrNone = Section
 else:
     SignalSection = section_for(SumOfSinusoids)
-    DisturbanceSection = by_kind({kind: section_for(target, kind=kind) for kind, target in DISTURBANCES.items()})
+    DisturbanceSection = by_kind(
+        {kind: section_for(target, kind=kind) for kind, target in classes("disturbance").items()}
+    )
     DisturbanceOrNone = DisturbanceSection | Literal["none"]
 
 

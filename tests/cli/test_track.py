@@ -7,8 +7,7 @@ import pandas as pd
 import pytest
 from scipy.io import wavfile
 
-from ctid_cli.cli.track_command import MethodOption
-from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
+from ctid_cli.kinds import KINDS
 
 T = 0.002 * np.arange(3000)
 
@@ -30,8 +29,9 @@ def record(tmp_path):
     return write(tmp_path / "record.csv", T, signal())
 
 
-def test_names_of_the_methods():
-    assert [method.value for method in MethodOption] == ["automatic", *FREQUENCY_ESTIMATORS]
+def test_names_of_the_methods(ctid):
+    text = ctid("track", "--help").stdout
+    assert all(name in text for name in ("automatic", *KINDS["frequency_estimator"]))
 
 
 def test_table_track_and_figure(ctid, record, tmp_path):

@@ -5,13 +5,8 @@ import pytest
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Start
-from ctid_cli.estimators.additive_srivc import AdditiveSrivc
-from ctid_cli.estimators.delay_profile import DelayProfile
-from ctid_cli.estimators.registry import ESTIMATORS
 from ctid_cli.estimators.srivc import Srivc
 from ctid_cli.estimators.svf import Svf
-from ctid_cli.estimators.td_srivc import TdSrivc
-from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.diagnostics import fit_percent, r_squared
 from ctid_cli.inference.status import Status
@@ -134,17 +129,6 @@ def test_nothing_of_the_record_changes():
         estimator.fit(record)
     after = (record.t, record.y, record.input.t, record.input.values)
     assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
-
-
-def test_registry_holds_every_estimator_by_its_kind():
-    assert list(ESTIMATORS.items()) == [
-        ("svf", Svf),
-        ("srivc", Srivc),
-        ("td_srivc", TdSrivc),
-        ("useful_redundancy", UsefulRedundancy),
-        ("delay_profile", DelayProfile),
-        ("additive_srivc", AdditiveSrivc),
-    ]
 
 
 def test_too_few_iterations_say_so():

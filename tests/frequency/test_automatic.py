@@ -6,7 +6,7 @@ import pytest
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.automatic import choose_settings
 from ctid_cli.frequency.record_track import track_record
-from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
+from ctid_cli.kinds import KINDS
 
 
 def plucked(rate=8000.0, seconds=1.5, hum=0.003, noise=0.0005, seed=0):
@@ -55,7 +55,7 @@ def test_the_online_tracker_finds_the_string_too():
     assert track.valid.mean() > 0.7
 
 
-@pytest.mark.parametrize("method", list(FREQUENCY_ESTIMATORS))
+@pytest.mark.parametrize("method", KINDS["frequency_estimator"])
 def test_every_method_finds_two_tones_far_from_one_radian_per_second(method):
     t = 2e-6 * np.arange(30_000)
     rng = np.random.default_rng(2)

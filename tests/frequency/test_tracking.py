@@ -9,9 +9,9 @@ import pytest
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.drem_finite_time import DremFiniteTime
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.registry import FREQUENCY_ESTIMATORS
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.frequency.tracking import FrequencyEstimate
+from ctid_cli.kinds import KINDS, classes, resolve
 from ctid_cli.specification.option_docs import option_docs
 from tests.frequency.signals import INTERVAL, OMEGA, online_estimators, tones
 
@@ -173,7 +173,7 @@ def test_rounded_delays_are_noted():
 
 
 def test_the_table_of_estimators_names_all_kinds():
-    assert sorted(FREQUENCY_ESTIMATORS) == [
+    assert sorted(KINDS["frequency_estimator"]) == [
         "adaptive_observer",
         "drem_finite_time",
         "drem_gradient",
@@ -183,7 +183,7 @@ def test_the_table_of_estimators_names_all_kinds():
         "nonlinear_least_squares",
         "restarting_least_squares",
     ]
-    for kind, estimator in FREQUENCY_ESTIMATORS.items():
+    for kind, estimator in classes("frequency_estimator").items():
         assert estimator.kind == kind
         assert estimator.online == hasattr(estimator, "start") != hasattr(estimator, "estimate")
         assert set(option_docs(estimator)) == {item.name for item in fields(estimator) if item.init}
@@ -191,7 +191,7 @@ def test_the_table_of_estimators_names_all_kinds():
 
 def test_comparators_say_that_they_are_derived():
     for kind in ("adaptive_observer", "filter_regression"):
-        text = FREQUENCY_ESTIMATORS[kind].__doc__
+        text = resolve("frequency_estimator", kind).__doc__
         assert text.count("erived, not the published algorithm") == 2
 
 

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
 from ctid_cli.signals.excitation import (
-    EXCITATIONS,
     TAPS,
     Gaussian,
     InputFile,
@@ -221,16 +220,6 @@ def test_file_that_begins_late_is_zero_before_or_refused(input_file):
 
 
 # --- options --------------------------------------------------------------------------------------
-
-
-def test_kinds_name_their_classes():
-    assert EXCITATIONS == {
-        "prbs": Prbs,
-        "multisine": Multisine,
-        "gaussian": Gaussian,
-        "step": Step,
-        "file": InputFile,
-    }
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals.arma_noise import ArmaNoise
-from ctid_cli.signals.noise import NOISES, WhiteNoise
+from ctid_cli.signals.noise import WhiteNoise
 from ctid_cli.signals.streams import stream
 
 
@@ -64,10 +63,6 @@ def test_snr_of_nothing_is_refused():
         WhiteNoise(snr_db=10.0).generate(np.zeros(10), rng())
     with pytest.raises(DataError, match="beside a noise-free output"):
         WhiteNoise(snr_db=10.0).variance_of()
-
-
-def test_kinds_name_their_classes():
-    assert NOISES == {"white": WhiteNoise, "arma": ArmaNoise}
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.signals.record import regular_interval
-from ctid_cli.signals.sampling import SAMPLINGS, RegularSampling, UniformIntervals, geometric_sizes
+from ctid_cli.signals.sampling import RegularSampling, UniformIntervals, geometric_sizes
 from ctid_cli.signals.streams import ROLES, stream
 
 
@@ -50,10 +50,6 @@ def test_replicates_have_times_of_their_own():
     scheme = UniformIntervals(0.01, 0.09, 50)
     assert np.array_equal(scheme.times(rng(4)), scheme.times(rng(4)))
     assert not np.array_equal(scheme.times(rng(4)), scheme.times(rng(5)))
-
-
-def test_kinds_name_their_classes():
-    assert SAMPLINGS == {"regular": RegularSampling, "uniform_intervals": UniformIntervals}
 
 
 @pytest.mark.parametrize(
