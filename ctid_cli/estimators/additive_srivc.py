@@ -15,10 +15,10 @@ from ctid_cli.estimation.modal_start import automatic_start
 from ctid_cli.estimation.refined_iv import StepRule
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.submodels import InitialState
-from ctid_cli.inference.additive_derived import additive_derived
-from ctid_cli.inference.derived import DerivedParameter
+from ctid_cli.inference.derived import additive_derived
 from ctid_cli.inference.diagnostics import percent_from_r_squared
 from ctid_cli.inference.fit import Fit
+from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.checks import require_choice, require_not_negative
@@ -55,7 +55,7 @@ class AdditiveFit(Fit):
         """Parameters by name: ``g1_a1 … g1_b0 …, g2_a1 …``, where the number is the power of p."""
         return self.additive.parameters
 
-    def derived(self, level: float = 0.95) -> tuple[DerivedParameter, ...]:
+    def derived(self, level: float = 0.95) -> tuple[UncertainValue, ...]:
         """Poles, natural frequencies, damping and static gains of the submodels.
 
         Parameters
@@ -65,9 +65,9 @@ class AdditiveFit(Fit):
 
         Returns
         -------
-        tuple of DerivedParameter
+        tuple of UncertainValue
             With standard errors by the delta method, see
-            :func:`~ctid_cli.inference.additive_derived.additive_derived`.
+            :func:`~ctid_cli.inference.derived.additive_derived`.
         """
         return additive_derived(self.additive, self.covariance, level=level)
 

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
+from ctid_cli.estimators import identification_warnings as warnings
 from ctid_cli.estimators.delay_profile import AppliedModel, DelayProfile, MeasuredFit, PreparedProfile
-from ctid_cli.inference.conditioning import (
-    CLOSE_TO_ONE,
-    LARGE_STANDARD_ERROR,
-    NEARLY_SINGULAR,
-    describe_conditioning,
-)
+from ctid_cli.inference.conditioning import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR
 from ctid_cli.inference.covariance import condition_number
 from ctid_cli.inference.criteria import (
     InformationCriteria,
@@ -25,12 +22,12 @@ from ctid_cli.inference.criteria import (
     young_information_criterion,
 )
 from ctid_cli.inference.delay_interval import DelayInterval, profile_likelihood_interval, quadratic_is_doubtful
-from ctid_cli.inference.derived import DerivedParameter, derived_parameters
+from ctid_cli.inference.derived import derived_parameters
 from ctid_cli.inference.diagnostics import fit_percent, r_squared
-from ctid_cli.inference.quantile import normal_quantile
 from ctid_cli.inference.residuals import ResidualTests, residual_tests
 from ctid_cli.inference.robust import sandwich_covariance
 from ctid_cli.inference.status import Status
+from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.signals.record import Record
 
 #: Confidence level of intervals and tests.
@@ -42,18 +39,6 @@ NEARLY_REGULAR = 0.05
 #: An initial state or offset is asked for where it lowers the cost by this fraction, and Schwarz's criterion by ten.
 WORTHWHILE = 0.02
 DECISIVE = 10.0
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """One parameter of the model, or of an experiment."""
-
-    name: str
-    value: float
-    standard_error: float
-    low: float
-    high: float
-    status: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +68,11 @@ class Identification:
         Covariance that the standard errors are from; NaN where it is not defined.
     robust : bool
         Whether it is the sandwich for coloured residuals, and not that for white ones.
-    estimates : tuple of Estimate
+    estimates : tuple of UncertainValue
         The parameters with their uncertainty.
     delay_interval : DelayInterval or None
         Profile-likelihood interval of the delay, where the quadratic one is doubtful.
-    derived : tuple of DerivedParameter
+    derived : tuple of UncertainValue
         Poles, time constants, frequencies, damping, static gain.
     tests : tuple of ResidualTests
         One for each experiment with enough samples.
@@ -105,9 +90,9 @@ class Identification:
     fit: MeasuredFit
     covariance: Array = field(repr=False)
     robust: bool
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[UncertainValue, ...]
     delay_interval: DelayInterval | None
-    derived: tuple[DerivedParameter, ...]
+    derived: tuple[UncertainValue, ...]
     tests: tuple[ResidualTests, ...]
     criteria: InformationCriteria
     yic: float
@@ -147,33 +132,20 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
     checked = None if validation is None else _prepared_validation(options, validation)
     prepared = options.prepare(records)
     fit = prepared.fit()
-    outputs = [record.y[use] for record, use in zip(records, fit.used, strict=True)]
+    residuals = np.concatenate(fit.residuals)
+    output = np.concatenate([record.y[use] for record, use in zip(records, fit.used, strict=True)])
     tests = _tests(fit, records)
     robust = any(not test.white for test in tests)
     covariance = _sandwich(fit, records) if robust else fit.covariance
-    unclear = _undetermined(fit, covariance)
-    words = _status_words(fit)
-    words += _conditioning(fit, covariance)
+    free, hessian = _free_block(fit)
+    singular = not condition_number(hessian) <= NEARLY_SINGULAR
+    unclear = {fit.parameter_names[k] for k in (free if singular else _undetermined(fit, covariance))}
     interval = None
     if prepared.structure.delay and "delay" not in unclear:
         interval = _delay_interval(prepared, fit, covariance)
-    words += _interval_words(interval, options)
-    words += _test_words(tests, len(records))
-    words += _treatment_words(prepared, fit)
+    judged = None if checked is None or validation is None else _validate(checked, fit, validation)
     size = prepared.structure.size - int(prepared.structure.delay)
     coefficients = covariance[:size, :size]
-    free, hessian = _free_block(fit)
-    if not condition_number(hessian) <= NEARLY_SINGULAR:
-        coefficients = np.full_like(coefficients, np.nan)
-    judged = None
-    if checked is not None and validation is not None:
-        judged = _validate(checked, fit, validation)
-        if judged.r2 < 0.5 < fit.r2:
-            words.append(
-                f"The model explains {100 * fit.r2:.0f} % of the variance of the record it was estimated from, but "
-                f"only {100 * max(judged.r2, 0.0):.0f} % of the validation record's: it does not carry over."
-            )
-    residuals = np.concatenate(fit.residuals)
     return Identification(
         options=options,
         fit=fit,
@@ -181,22 +153,23 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
         robust=robust,
         estimates=_estimates(fit, covariance, unclear, interval),
         delay_interval=interval,
-        derived=derived_parameters(fit.model, coefficients, level=LEVEL),
+        derived=derived_parameters(
+            fit.model, np.full_like(coefficients, np.nan) if singular else coefficients, level=LEVEL
+        ),
         tests=tests,
         criteria=information_criteria(float(residuals @ residuals), fit.count, fit.theta.size),
-        yic=young_information_criterion(
-            residuals, np.concatenate(outputs), fit.theta[free], covariance[np.ix_(free, free)]
+        yic=young_information_criterion(residuals, output, fit.theta[free], covariance[np.ix_(free, free)]),
+        r_t_squared=r_t_squared(residuals, output),
+        warnings=(
+            *warnings.of_status(fit),
+            *warnings.of_conditioning(fit, covariance, free, hessian),
+            *warnings.of_interval(interval, options),
+            *warnings.of_residuals(tests, len(records), FEWEST_TESTED),
+            *warnings.of_treatment(_gains(prepared, fit)),
+            *(warnings.of_validation(fit.r2, judged.r2) if judged is not None else ()),
         ),
-        r_t_squared=r_t_squared(residuals, np.concatenate(outputs)),
-        warnings=tuple(words),
         validation=judged,
     )
-
-
-def _status_words(fit: MeasuredFit) -> list[str]:
-    if fit.status is Status.DELAY_AT_BOUND and fit.model.delay == 0.0:
-        return ["The delay stopped at zero: this model needs none; take it as known (--delay 0), or use fewer poles."]
-    return [] if fit.status.succeeded else [fit.status.value]
 
 
 # --- residuals and covariance ----------------------------------------------------------------------
@@ -232,46 +205,20 @@ def _nearly_regular(record: Record) -> bool:
     return bool(np.mean(np.abs(intervals - middle) <= NEARLY_REGULAR * middle) >= 0.95)
 
 
-def _undetermined(fit: MeasuredFit, covariance: Array) -> set[str]:
-    """Parameters of which the data tell next to nothing, so that no tidy number may stand beside them.
+def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
+    """Parameters that the data say next to nothing about, so that no tidy number may stand beside them.
 
     A coefficient or delay with ten times its own size for a standard error, and whatever moves along with it.
     """
     names, errors = fit.parameter_names, np.sqrt(np.diag(covariance))
-    at_bound = fit.status is Status.DELAY_AT_BOUND
-    free, hessian = _free_block(fit)
-    if not condition_number(hessian) <= NEARLY_SINGULAR:
-        return {names[k] for k in free}
-    unclear = {
-        k
-        for k, name in enumerate(names)
-        if not (at_bound and name == "delay")
-        and (
-            not np.isfinite(errors[k])
-            or (
-                re.fullmatch(r"[ab]\d+|delay", name) is not None
-                and errors[k] > LARGE_STANDARD_ERROR * abs(fit.theta[k])
-            )
-        )
-    }
+    looked_at = np.array([re.fullmatch(r"[ab]\d+|delay", name) is not None for name in names])
+    unclear = ~np.isfinite(errors) | (looked_at & (errors > LARGE_STANDARD_ERROR * np.abs(fit.theta)))
+    if fit.status is Status.DELAY_AT_BOUND:
+        unclear[[name == "delay" for name in names]] = False
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = np.abs(covariance / np.outer(errors, errors))
-    moving = {j for k in unclear for j in range(len(names)) if correlation[k, j] > CLOSE_TO_ONE}
-    return {names[k] for k in unclear | moving}
-
-
-def _conditioning(fit: MeasuredFit, covariance: Array) -> list[str]:
-    """Sentences on what the data do not determine; a delay at its bound is taken as known."""
-    free, hessian = _free_block(fit)
-    words = []
-    if fit.status is Status.DELAY_AT_BOUND:
-        words.append(
-            "The delay has no standard error, because it stopped at a bound; those of the other parameters take it "
-            "as known and are too small if it is not."
-        )
-    names = [fit.parameter_names[k] for k in free]
-    block = covariance[np.ix_(free, free)]
-    return [*words, *describe_conditioning(block, fit.theta[free], names, condition_number(hessian), hessian=hessian)]
+    moving = (correlation[unclear] > CLOSE_TO_ONE).any(axis=0)
+    return set(np.flatnonzero(unclear | moving).tolist())
 
 
 def _free_block(fit: MeasuredFit) -> tuple[IndexArray, Array]:
@@ -294,13 +241,7 @@ def _delay_interval(prepared: PreparedProfile, fit: MeasuredFit, covariance: Arr
     squared_error = fit.cost * fit.count
     delay = float(fit.theta[place])
     inflation = max(variance / white, np.finfo(float).tiny)
-    known: dict[float, float] = {}
-
-    def squared_error_at(trial: float) -> float:
-        if trial not in known:
-            known[trial] = prepared.squared_error_at(fit.theta, trial)
-        return known[trial]
-
+    squared_error_at = cache(lambda trial: prepared.squared_error_at(fit.theta, trial))
     common = (squared_error, fit.count, fit.theta.size, prepared.options.delay_bounds)
     error = float("nan") if fit.status is Status.DELAY_AT_BOUND else float(np.sqrt(variance))
     if not quadratic_is_doubtful(squared_error_at, delay, error, *common, inflation=inflation):
@@ -308,90 +249,47 @@ def _delay_interval(prepared: PreparedProfile, fit: MeasuredFit, covariance: Arr
     return profile_likelihood_interval(squared_error_at, delay, *common, level=LEVEL, inflation=inflation)
 
 
-def _interval_words(interval: DelayInterval | None, options: DelayProfile) -> list[str]:
-    if interval is None:
-        return []
-    low, high = options.delay_bounds
-    # Below zero there is nothing left to search.
-    ends = [f"{low:g}"] * (interval.open_low and low > 0) + [f"{high:g}"] * interval.open_high
-    if not ends:
-        return []
-    return [
-        f"The interval of the delay reaches the end of its search range ({' and '.join(ends)}): delays beyond may fit "
-        "as well; widen --delay."
-    ]
+# --- results ---------------------------------------------------------------------------------------
 
 
-# --- what else should be estimated -----------------------------------------------------------------
-
-
-def _treatment_words(prepared: PreparedProfile, fit: MeasuredFit) -> list[str]:
-    """Whether an initial state or an offset, taken as zero, is visible in the record."""
+def _gains(prepared: PreparedProfile, fit: MeasuredFit) -> dict[str, float]:
+    """Shares by which estimating what was taken as zero would lower the cost, where that is worth it."""
     options, squared_error = prepared.options, fit.cost * fit.count
-    n, experiments = options.poles, len(fit.residuals)
 
-    def gain(added: int, *, initial_state: bool = False, offset: bool = False) -> float:
-        lowered = prepared.squared_error_with(fit, initial_state=initial_state, offset=offset)
+    def gain(added: int, **treatment: bool) -> float:
+        lowered = prepared.squared_error_with(fit, **treatment)
         share = 1.0 - lowered / squared_error if squared_error > 0 else 0.0
-        if not share > 0:
-            return 0.0
-        evidence = -fit.count * np.log(max(1.0 - share, 1e-300)) - added * experiments * np.log(fit.count)
+        evidence = -fit.count * np.log(max(1.0 - share, 1e-300)) - added * len(fit.residuals) * np.log(fit.count)
         return share if share > WORTHWHILE and evidence > DECISIVE else 0.0
 
-    words = []
-    if options.initial_state == "rest" and (share := gain(n, initial_state=True)):
-        words.append(
-            f"The record does not start at rest: estimating the initial state would lower the cost by "
-            f"{100 * share:.2g} %; use --initial-state estimate (or periodic, if the input repeats the record)."
-        )
-    if options.offset == "none" and (share := gain(1, offset=True)):
-        words.append(
-            f"The output has an offset: estimating it would lower the cost by {100 * share:.2g} %; "
-            "use --offset estimate (or remove, to subtract the means of input and output)."
-        )
-    return words
-
-
-def _test_words(tests: Sequence[ResidualTests], experiments: int) -> list[str]:
-    words = []
-    for k, test in enumerate(tests, start=1):
-        if not (test.white and test.uncorrelated):
-            words.append((f"Experiment {k}: " if experiments > 1 else "") + test.sentence)
-    if len(tests) < experiments:
-        words.append(f"Fewer than {FEWEST_TESTED} residuals are too few to test; standard errors take them as white.")
-    return words
-
-
-# --- results ---------------------------------------------------------------------------------------
+    gains = {}
+    if options.initial_state == "rest":
+        gains["initial_state"] = gain(options.poles, initial_state=True)
+    if options.offset == "none":
+        gains["offset"] = gain(1, offset=True)
+    return {name: share for name, share in gains.items() if share}
 
 
 def _estimates(
     fit: MeasuredFit, covariance: Array, unclear: set[str], interval: DelayInterval | None
-) -> tuple[Estimate, ...]:
+) -> tuple[UncertainValue, ...]:
     """Parameters, numerator first, then denominator, delay, and what belongs to the experiments."""
-    nan = float("nan")
-    quantile = normal_quantile(LEVEL)
-    found: dict[str, Estimate] = {}
+    found: dict[str, UncertainValue] = {}
     for name, value, variance in zip(fit.parameter_names, fit.theta.tolist(), np.diag(covariance), strict=True):
         if name in unclear:
-            found[name] = Estimate(name, value, nan, nan, nan, "undetermined")
+            found[name] = UncertainValue(name, value, status="undetermined")
             continue
-        error = float(np.sqrt(variance))
-        low, high = value - quantile * error, value + quantile * error
-        status = "free"
-        if name == "delay":
-            if interval is not None:
-                low, high = interval.low, interval.high
-            if fit.status is Status.DELAY_AT_BOUND:
-                status, error = "at bound", nan
-        found[name] = Estimate(name, value, error, low, high, status)
-    found.setdefault("delay", Estimate("delay", fit.model.delay, nan, nan, nan, "fixed"))
+        item = UncertainValue.normal(name, value, float(np.sqrt(variance)), level=LEVEL)
+        if name == "delay" and interval is not None:
+            item = replace(item, low=interval.low, high=interval.high)
+        if name == "delay" and fit.status is Status.DELAY_AT_BOUND:
+            item = replace(item, standard_error=float("nan"), status="at bound")
+        found[name] = item
+    found.setdefault("delay", UncertainValue("delay", fit.model.delay, status="fixed"))
     order = {"b": 0, "a": 1, "delay": 2}
-
-    def place(estimate: Estimate) -> int:
-        return order.get("delay" if estimate.name == "delay" else estimate.name[0], 3)
-
-    return tuple(sorted(found.values(), key=place))
+    return tuple(
+        sorted(found.values(), key=lambda item: order.get("delay" if item.name == "delay" else item.name[0], 3))
+    )
 
 
 def _prepared_validation(options: DelayProfile, record: Record) -> PreparedProfile:

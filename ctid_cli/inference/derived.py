@@ -1,62 +1,26 @@
-"""Poles, time constants, frequencies, damping and gain of an estimated model, with their standard errors."""
+"""Poles, time constants, frequencies, damping and gain of estimated models, with their standard errors."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.inference.quantile import normal_quantile
+from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import pole_jacobian
-from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
 
 NAN = float("nan")
-
-
-@dataclass(frozen=True)
-class DerivedParameter:
-    """A quantity computed from the coefficients, and its accuracy."""
-
-    name: str
-    #: Value [unit].
-    estimate: float
-    #: By the delta method [unit]; NaN where it is not defined.
-    standard_error: float
-    #: Confidence interval [unit]; NaN where it is not defined.
-    low: float
-    high: float
-    unit: str
-    reason: str = ""
-
-    @classmethod
-    def by_delta_method(
-        cls,
-        name: str,
-        estimate: float,
-        gradient: Array,
-        covariance: Array,
-        unit: str,
-        quantile: float,
-        reason: str = "",
-    ) -> DerivedParameter:
-        """A quantity and its accuracy from its gradient: ``var g = (dg/dtheta) C (dg/dtheta)'``."""
-        variance = float(gradient @ covariance @ gradient) if np.isfinite(gradient).all() else NAN
-        error = float(np.sqrt(variance)) if variance >= 0 and not reason else NAN
-        if not reason and not np.isfinite(error):
-            reason = "The covariance of the coefficients is not defined."
-        reach = quantile * error
-        return cls(name, estimate, error, estimate - reach, estimate + reach, unit, reason)
+GAIN_UNIT = "output unit/input unit"
 
 
 def derived_parameters(
-    model: TransferFunction,
-    covariance: ArrayLike,
-    *,
-    level: float = 0.95,
-    gain_unit: str = "output unit/input unit",
-) -> tuple[DerivedParameter, ...]:
+    model: TransferFunction, covariance: ArrayLike, *, level: float = 0.95
+) -> tuple[UncertainValue, ...]:
     r"""What users read off a model, with standard errors by the delta method.
 
     ``var g = (dg/dtheta) C (dg/dtheta)'`` with analytic derivatives, those of the poles from :func:`pole_jacobian`, and
@@ -73,9 +37,9 @@ def derived_parameters(
             f"the covariance must be square, with a row for each of {n} denominator and at least "
             f"{model.numerator.size} numerator coefficients; got shape {C.shape}"
         )
-    quantile = normal_quantile(level)
     poles = model.poles
-    rows = pole_rows(poles, pole_jacobian(model.denominator, poles), C[:n, :n], quantile)
+    rows = _Rows(C, level)
+    rows.add_poles(poles, pole_jacobian(model.denominator, poles))
     gradient = np.zeros(C.shape[0])
     last = float(model.denominator[-1])
     reason = ""
@@ -85,63 +49,118 @@ def derived_parameters(
         gradient[-1] = 1.0 / last
         if n:
             gradient[n - 1] = -model.dc_gain / last
-    gain = DerivedParameter.by_delta_method("static_gain", model.dc_gain, gradient, C, gain_unit, quantile, reason)
-    return (*rows, gain)
+    rows.add("static_gain", model.dc_gain, gradient, GAIN_UNIT, reason)
+    return tuple(rows.found)
 
 
-def pole_rows(
-    poles: ComplexArray, jacobian: ComplexArray, covariance: Array, quantile: float, *, number_lone: bool = True
-) -> list[DerivedParameter]:
-    """Poles, time constants, natural frequencies and damping, for whatever parameters the poles depend on."""
-    rows: list[DerivedParameter] = []
+def additive_derived(model: AdditiveModel, covariance: ArrayLike, *, level: float = 0.95) -> tuple[UncertainValue, ...]:
+    r"""What users read off the submodels of a sum, as :func:`derived_parameters`.
 
-    def row(name: str, estimate: float, gradient: Array, unit: str, reason: str) -> None:
-        rows.append(DerivedParameter.by_delta_method(name, estimate, gradient, covariance, unit, quantile, reason))
-
-    upper = [k for k, pole in enumerate(poles) if pole.imag >= 0]
-    for number, k in enumerate(upper, 1):
-        label = f"_{number}" if number_lone or len(upper) > 1 else ""
-        pole, slope = poles[k], jacobian[k]
-        everyone_else = np.arange(poles.size) != k
-        reason = _undetermined(poles, k, slope, covariance, quantile, everyone_else)
-        if pole.imag == 0:
-            p = float(pole.real)
-            row(f"pole{label}", p, slope.real, "rad/s", reason)
-            if p == 0:
-                reason = "The pole lies at the origin: it integrates and has no time constant."
-                row(f"time_constant{label}", float("inf"), slope.real, "s", reason)
-            else:
-                row(f"time_constant{label}", -1.0 / p, slope.real / p**2, "s", reason)
-            continue
-        x, y = float(pole.real), float(pole.imag)
-        frequency = abs(complex(pole))
-        row(f"pole{label}_real", x, slope.real, "rad/s", reason)
-        row(f"pole{label}_imag", y, slope.imag, "rad/s", reason)
-        # d(x^2 + y^2) = 2 Re(conj(p) dp)
-        radial = (x * slope.real + y * slope.imag) / frequency
-        turning = y * (x * slope.imag - y * slope.real) / frequency**3
-        others = everyone_else & (poles != np.conj(pole))
-        reason = _undetermined(poles, k, slope, covariance, quantile, others)
-        row(f"natural_frequency{label}", frequency, radial, "rad/s", reason)
-        row(f"natural_frequency{label}_hz", frequency / (2 * np.pi), radial / (2 * np.pi), "Hz", reason)
-        row(f"damping{label}", -x / frequency, turning, "-", reason)
-    return rows
+    Each quantity depends on the parameters of its own submodel alone, so a pole is undetermined only where it cannot
+    be told from another one of the same submodel. With ``A = 1 + a_1 p + … + a_n p^n``, a pole moves by
+    ``dp/da_k = -p^k/A'(p)``.
+    """
+    C = np.asarray(covariance, dtype=float)
+    size = model.theta.size
+    if C.shape != (size, size):
+        raise ValueError(f"the covariance must have a row and a column for each of {size} parameters; got {C.shape}")
+    found: list[UncertainValue] = []
+    first = 0
+    for number, (submodel, term) in enumerate(zip(model.submodels, model.terms, strict=True), 1):
+        own = slice(first, first + term.size)
+        found += [replace(row, name=f"g{number}_{row.name}") for row in _of_submodel(submodel, C[own, own], level)]
+        first = own.stop
+    return tuple(found)
 
 
-def _undetermined(
-    poles: ComplexArray, k: int, slope: ComplexArray, A: Array, quantile: float, others: BoolArray
-) -> str:
-    """Reason for which pole k has no standard error, or nothing."""
-    if not others.any():
-        return ""
-    distance = float(np.abs(poles[others] - poles[k]).min())
-    size = float(np.abs(poles).max())
-    text = (
-        "This pole lies so close to another that these data cannot tell them apart: its standard error is not defined; "
-        "fewer poles may do."
-    )
-    if distance <= 1e-7 * size or not np.isfinite(slope).all():
-        return text
+def _of_submodel(submodel: Submodel, covariance: Array, level: float) -> list[UncertainValue]:
+    """All quantities of one submodel; covariance of its own parameters."""
+    n = submodel.term().poles
+    falling = submodel.denominator
+    poles = sorted_roots(falling)
+    # A = a_n times the monic polynomial, whose derivatives run from p^(n-1) down to 1; here they run from p to p^n.
     with np.errstate(invalid="ignore"):
-        spread = float(np.sqrt(slope.real @ A @ slope.real + slope.imag @ A @ slope.imag))
-    return text if quantile * spread >= distance else ""
+        jacobian = poles[:, None] * pole_jacobian(falling / falling[0], poles)[:, ::-1] / falling[0]
+    rows = _Rows(covariance, level)
+    rows.add_poles(poles, jacobian, number_lone=False)
+    if n == 2 and falling[0] > 0 and not poles.imag.any():
+        # Of two real poles, however close: natural frequency a_2^(-1/2) and damping a_1 a_2^(-1/2) / 2.
+        a1, a2 = falling[1], falling[0]
+        frequency, slope = a2**-0.5, -0.5 * a2**-1.5
+        turning = 0.5 * np.array([frequency, a1 * slope])
+        rows.add_mode("", frequency, np.array([0.0, slope]), 0.5 * a1 * frequency, turning)
+    gradient = np.zeros(len(covariance))
+    gradient[n] = 1.0
+    reason = "This submodel integrates and has no static gain." if submodel.integrators else ""
+    rows.add("static_gain", submodel.dc_gain, gradient, GAIN_UNIT, reason)
+    return rows.found
+
+
+class _Rows:
+    """Quantities computed from parameters of known covariance."""
+
+    def __init__(self, covariance: Array, level: float) -> None:
+        self.covariance = covariance
+        self.level = level
+        self.found: list[UncertainValue] = []
+
+    def add(self, name: str, estimate: float, gradient: Array, unit: str, reason: str = "") -> None:
+        """One quantity, from its gradient by the leading parameters; with a reason, it has no standard error."""
+        covariance = self.covariance[: gradient.size, : gradient.size]
+        variance = float(gradient @ covariance @ gradient) if np.isfinite(gradient).all() else NAN
+        error = float(np.sqrt(variance)) if variance >= 0 and not reason else NAN
+        if not reason and not np.isfinite(error):
+            reason = "The covariance of the coefficients is not defined."
+        self.found.append(UncertainValue.normal(name, estimate, error, unit, level=self.level, reason=reason))
+
+    def add_mode(
+        self, label: str, frequency: float, radial: Array, damping: float, turning: Array, reason: str = ""
+    ) -> None:
+        """Natural frequency, in rad/s and Hz, and damping of two poles."""
+        hertz = frequency / (2 * np.pi), radial / (2 * np.pi)
+        self.add(f"natural_frequency{label}", frequency, radial, "rad/s", reason)
+        self.add(f"natural_frequency{label}_hz", *hertz, "Hz", reason)
+        self.add(f"damping{label}", damping, turning, "-", reason)
+
+    def add_poles(self, poles: ComplexArray, jacobian: ComplexArray, *, number_lone: bool = True) -> None:
+        """Poles, time constants, natural frequencies and damping, for whatever parameters the poles depend on."""
+        upper = [k for k, pole in enumerate(poles) if pole.imag >= 0]
+        for number, k in enumerate(upper, 1):
+            label = f"_{number}" if number_lone or len(upper) > 1 else ""
+            pole, slope = poles[k], jacobian[k]
+            x, y = float(pole.real), float(pole.imag)
+            everyone_else = np.arange(poles.size) != k
+            reason = self._undetermined(poles, k, slope, everyone_else)
+            if pole.imag == 0:
+                self.add(f"pole{label}", x, slope.real, "rad/s", reason)
+                if x == 0:
+                    reason = "The pole lies at the origin: it integrates and has no time constant."
+                    self.add(f"time_constant{label}", float("inf"), slope.real, "s", reason)
+                else:
+                    self.add(f"time_constant{label}", -1.0 / x, slope.real / x**2, "s", reason)
+                continue
+            frequency = abs(complex(pole))
+            self.add(f"pole{label}_real", x, slope.real, "rad/s", reason)
+            self.add(f"pole{label}_imag", y, slope.imag, "rad/s", reason)
+            # d(x^2 + y^2) = 2 Re(conj(p) dp)
+            radial = (x * slope.real + y * slope.imag) / frequency
+            turning = y * (x * slope.imag - y * slope.real) / frequency**3
+            reason = self._undetermined(poles, k, slope, everyone_else & (poles != np.conj(pole)))
+            self.add_mode(label, frequency, radial, -x / frequency, turning, reason)
+
+    def _undetermined(self, poles: ComplexArray, k: int, slope: ComplexArray, others: BoolArray) -> str:
+        """Reason for which pole k has no standard error, or nothing."""
+        if not others.any():
+            return ""
+        distance = float(np.abs(poles[others] - poles[k]).min())
+        size = float(np.abs(poles).max())
+        text = (
+            "This pole lies so close to another that these data cannot tell them apart: its standard error is not "
+            "defined; fewer poles may do."
+        )
+        if distance <= 1e-7 * size or not np.isfinite(slope).all():
+            return text
+        A = self.covariance[: slope.size, : slope.size]
+        with np.errstate(invalid="ignore"):
+            spread = float(np.sqrt(slope.real @ A @ slope.real + slope.imag @ A @ slope.imag))
+        return text if normal_quantile(self.level) * spread >= distance else ""

@@ -10,7 +10,8 @@ from typing import Any
 
 from ctid_cli.canonical import plain
 from ctid_cli.errors import MismatchError
-from ctid_cli.reporting.estimate import Parameter, as_object, parameter_table, parameters
+from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.reporting.estimate import as_object, parameter_object, parameter_table, parameters
 from ctid_cli.reporting.layout import delay_label, number, seconds, text_table
 from ctid_cli.reporting.results import out_option
 from ctid_cli.running.plan import build_plan
@@ -37,7 +38,7 @@ class Repeated:
         return self.difference is None or self.difference <= AGREEMENT
 
 
-def parameters_of(found: FoundEstimate) -> list[Parameter]:
+def parameters_of(found: FoundEstimate) -> list[UncertainValue]:
     """Parameters of a stored estimate with their uncertainty."""
     return parameters(found.row, found.estimator.get("delay_bounds"))
 
@@ -45,7 +46,7 @@ def parameters_of(found: FoundEstimate) -> list[Parameter]:
 def detail_object(found: FoundEstimate, again: Repeated | None, out: Path) -> dict[str, Any]:
     """One estimate for ``ctid show --json``."""
     content = as_object(found.row) | {
-        "parameters": [item.as_dict() for item in parameters_of(found)],
+        "parameters": [parameter_object(item) for item in parameters_of(found)],
         "data": found.data,
         "settings": found.estimator,
         "seed": found.seed,
@@ -200,7 +201,7 @@ def _settings(content: Mapping[str, Any]) -> list[str]:
     return [f"  {key}: {json.dumps(value, ensure_ascii=False)}" for key, value in content.items()]
 
 
-def _conventions(shown: list[Parameter]) -> list[str]:
+def _conventions(shown: list[UncertainValue]) -> list[str]:
     """What the names and columns of a table of parameters mean."""
     interval = "low and high are estimate -+ 1.96 errors."
     submodels = any(item.name.startswith("g") for item in shown)

@@ -2,36 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
+from math import nan
 from typing import Any
 
-from ctid_cli.inference.quantile import normal_quantile
+from ctid_cli.canonical import plain
+from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.reporting.layout import markdown_table, number, text_table
 
 #: Keys that every estimate carries in machine-readable output, in this order.
 ESTIMATE_KEYS = (
-    "id",
-    "experiment",
-    "estimator",
-    "cell",
-    "replicate",
-    "start",
-    "status",
-    "delay",
-    "numerator",
-    "denominator",
-    "standard_errors",
-    "cost",
-    "fit_percent",
-    "iterations",
-    "seconds",
+    *("id", "experiment", "estimator", "cell", "replicate", "start", "status"),
+    *("delay", "numerator", "denominator", "standard_errors", "cost", "fit_percent", "iterations", "seconds"),
 )
-
-#: Half-width of a 95 % interval of a normal estimate, in standard errors.
-NORMAL_95 = normal_quantile()
-
 
 #: Seconds in a unit of time, by the labels that files use.
 SECONDS = {
@@ -92,70 +76,54 @@ class Units:
         return f"{unit}/{self.time}" if power == 1 else f"{unit}/{self.time}^{power}"
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """One parameter of an estimate."""
-
-    name: str
-    estimate: float | None
-    standard_error: float | None
-    #: Standard error relative to the value [%].
-    relative_percent: float | None
-    low: float | None
-    high: float | None
-    unit: str
-    status: str
-
-    def as_dict(self) -> dict[str, Any]:
-        """The parameter of ``ctid show --json``."""
-        return asdict(self)
-
-
-def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None = None) -> list[Parameter]:
+def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None = None) -> list[UncertainValue]:
     """Parameters of an estimate with their uncertainty."""
     numerator, denominator = estimate.get("numerator"), estimate.get("denominator")
     if not numerator or not denominator:
         return []
     errors = estimate.get("standard_errors") or {}
     poles, zeros, units = len(denominator) - 1, len(numerator) - 1, Units()
+    found = []
+
+    def add(name: str, value: float | None, unit: str) -> None:
+        error = errors.get(name)
+        found.append(
+            UncertainValue.normal(name, nan if value is None else value, nan if error is None else error, unit)
+        )
+
     values = {f"b{k}": value for k, value in enumerate(numerator)}
     values |= {f"a{k}": value for k, value in enumerate(denominator[1:], start=1)}
-    found = [
-        _parameter(name, value, errors.get(name), units.of(name, poles, zeros), "free")
-        for name, value in values.items()
-    ]
     submodels = estimate.get("parameters") or {}
-    if submodels and not values.keys() & errors.keys():
-        found = []
+    if not submodels or values.keys() & errors.keys():
+        for name, value in values.items():
+            add(name, value, units.of(name, poles, zeros))
     # Integrators have the least natural frequency of all, so that they are those of the first submodel.
     integrators = next(k for k, value in enumerate(reversed(denominator)) if value != 0)
     for name, value in submodels.items():
-        unit = units.of_submodel(name, integrators if name.startswith("g1_") else 0)
-        found.append(_parameter(name, value, errors.get(name), unit, "free"))
+        add(name, value, units.of_submodel(name, integrators if name.startswith("g1_") else 0))
     delay = estimate.get("delay")
+    add("delay", delay, units.time)
     status = "fixed"
     if delay_bounds is not None:
         low, high = delay_bounds
         at_bound = delay is not None and min(abs(delay - low), abs(high - delay)) <= 1e-9 * (high - low)
         status = "at bound" if at_bound else "free"
-    found.append(_parameter("delay", delay, errors.get("delay"), "s", status))
-    return found
+    return [*found[:-1], replace(found[-1], status=status)]
 
 
-def parameter_table(found: Iterable[Parameter], style: str = "text") -> str:
+def parameter_object(item: UncertainValue) -> dict[str, Any]:
+    """A parameter for JSON."""
+    names = ("name", "estimate", "standard_error", "relative_percent", "low", "high", "unit", "status")
+    cleaned: dict[str, Any] = plain({name: getattr(item, name) for name in names})
+    return cleaned
+
+
+def parameter_table(found: Iterable[UncertainValue], style: str = "text") -> str:
     """Parameters as an aligned or Markdown table."""
     header = ["parameter", "estimate", "standard error", "relative %", "95 % low", "95 % high", "unit", "status"]
+    digits = {"estimate": 6, "standard_error": 3, "relative_percent": 2, "low": 5, "high": 5}
     rows = [
-        [
-            item.name,
-            number(item.estimate),
-            number(item.standard_error, 3),
-            number(item.relative_percent, 2),
-            number(item.low, 5),
-            number(item.high, 5),
-            item.unit,
-            item.status,
-        ]
+        [item.name, *(number(getattr(item, name), size) for name, size in digits.items()), item.unit, item.status]
         for item in found
     ]
     return (text_table if style == "text" else markdown_table)(header, rows, "lrrrrrll")
@@ -167,10 +135,3 @@ def as_object(estimate: Mapping[str, Any]) -> dict[str, Any]:
     if "parameters" in estimate:
         keys.insert(keys.index("standard_errors"), "parameters")
     return {key: estimate.get(key) for key in keys} | {key: item for key, item in estimate.items() if key not in keys}
-
-
-def _parameter(name: str, value: float | None, error: float | None, unit: str, status: str) -> Parameter:
-    if value is None or error is None or not (math.isfinite(value) and math.isfinite(error)):
-        return Parameter(name, value, error, None, None, None, unit, status)
-    relative = 100 * error / abs(value) if value else None
-    return Parameter(name, value, error, relative, value - NORMAL_95 * error, value + NORMAL_95 * error, unit, status)

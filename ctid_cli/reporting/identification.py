@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -11,13 +11,17 @@ import numpy as np
 from ctid_cli.canonical import plain
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.identification import Identification
-from ctid_cli.inference.derived import DerivedParameter
-from ctid_cli.reporting.estimate import Parameter, Units, parameter_table
-from ctid_cli.reporting.layout import count, number, text_table, wrapped
+from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
+from ctid_cli.reporting.layout import count, number, text_table
 from ctid_cli.signals.measurement import Measurement
+from ctid_cli.text import wrapped
 
 FIT_DEFINITION = "100 (1 - ||y - x|| / ||y - mean y||)"
 R2_DEFINITION = "1 - ||y - x||^2 / ||y - mean y||^2"
+
+DERIVED_KEYS = ("name", "estimate", "standard_error", "low", "high", "unit", "reason")
+TEST_KEYS = ("white", "whiteness_p_value", "uncorrelated", "cross_p_value", "level", "lags", "sentence")
 
 #: What was done about the initial state and the offset, in words.
 TREATMENTS = {
@@ -43,19 +47,13 @@ def common_units(measurements: Sequence[Measurement]) -> Units:
     return Units(**found)
 
 
-def parameters_of(result: Identification, units: Units) -> list[Parameter]:
-    """Parameters with their uncertainty and units."""
-    found = []
-    for item in result.estimates:
-        value = item.value
-        relative = 100 * item.standard_error / abs(value) if value else None
-        unit = units.of(item.name, result.options.poles, result.options.zeros)
-        error, relative, low, high = plain([item.standard_error, relative, item.low, item.high])
-        found.append(Parameter(item.name, value, error, relative, low, high, unit, item.status))
-    return found
+def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:
+    """Parameters with the units of the records."""
+    poles, zeros = result.options.poles, result.options.zeros
+    return [replace(item, unit=units.of(item.name, poles, zeros)) for item in result.estimates]
 
 
-def derived_of(result: Identification, units: Units) -> list[DerivedParameter]:
+def derived_of(result: Identification, units: Units) -> list[UncertainValue]:
     """Derived quantities in the units of the records; frequencies that are called Hz are in Hz."""
     names = {"s": units.time, "rad/s": f"rad/{units.time}", "output unit/input unit": units.gain}
     found = []
@@ -63,9 +61,8 @@ def derived_of(result: Identification, units: Units) -> list[DerivedParameter]:
         if row.unit != "Hz":
             found.append(replace(row, unit=names.get(row.unit, row.unit)))
         elif (seconds := units.seconds) is not None:
-            values = (row.estimate, row.standard_error, row.low, row.high)
-            estimate, error, low, high = (value / seconds for value in values)
-            found.append(replace(row, estimate=estimate, standard_error=error, low=low, high=high))
+            scaled = {name: getattr(row, name) / seconds for name in ("estimate", "standard_error", "low", "high")}
+            found.append(replace(row, **scaled))
     return found
 
 
@@ -77,11 +74,11 @@ def identification_object(
     interval, profile, judged = result.delay_interval, fit.profile, result.validation
     content = {
         "model": {
-            "numerator": [item.value for item in result.estimates if item.name.startswith("b")],
+            "numerator": [item.estimate for item in result.estimates if item.name.startswith("b")],
             "denominator": fit.model.denominator,
             "delay": fit.model.delay,
         },
-        "parameters": [item.as_dict() for item in parameters_of(result, units)],
+        "parameters": [parameter_object(item) for item in parameters_of(result, units)],
         "fit_percent": fit.fit_percent,
         "r2": fit.r2,
         "cost": fit.cost,
@@ -92,7 +89,7 @@ def identification_object(
         "modes": _modes(result, units),
         "warnings": result.warnings,
         "notes": [note for measurement in measurements for note in measurement.notes],
-        "derived": [asdict(row) for row in derived_of(result, units)],
+        "derived": [{name: getattr(row, name) for name in DERIVED_KEYS} for row in derived_of(result, units)],
         "covariance": {
             "kind": "robust" if result.robust else "white",
             "names": fit.parameter_names,
@@ -108,18 +105,7 @@ def identification_object(
         },
         "condition_number": fit.condition_number,
         "iterations": fit.iterations,
-        "residual_tests": [
-            {
-                "white": test.white,
-                "whiteness_p_value": test.whiteness_p_value,
-                "uncorrelated": test.uncorrelated,
-                "cross_p_value": test.cross_p_value,
-                "level": test.level,
-                "lags": test.lags,
-                "sentence": test.sentence,
-            }
-            for test in result.tests
-        ],
+        "residual_tests": [{name: getattr(test, name) for name in TEST_KEYS} for test in result.tests],
         "profile": None if profile is None else {"delays": profile.delays, "costs": profile.costs},
         "validation": judged
         and {
@@ -143,56 +129,51 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
     """A fit for people, within 100 columns."""
     fit, options, criteria, judged = result.fit, result.options, result.criteria, result.validation
     lines: list[str] = []
+
+    def row(label: str, text: str) -> None:
+        lines.append(wrapped(f"{label:16} {text}", hanging=" " * 17))
+
     for measurement, use in zip(measurements, fit.used, strict=True):
-        lines += wrapped(_record_line(measurement, int(np.count_nonzero(use)), units))
-        lines += [line for note in measurement.notes for line in wrapped(note, "  ")]
+        lines.append(wrapped(_record_line(measurement, int(np.count_nonzero(use)), units)))
+        lines += [wrapped(note, "  ") for note in measurement.notes]
     low, high = options.delay_bounds
     searched = f"searched from {low:g} to {high:g} {units.time}" if low < high else f"known, {low:g} {units.time}"
-    lines += [
-        "",
-        f"model            {count(options.poles, 'pole')}, {count(options.zeros, 'zero')}; delay {searched}",
-        f"initial state    {TREATMENTS[options.initial_state]} (--initial-state {options.initial_state})",
-        *wrapped(f"offset           {_offset(result, units)} (--offset {options.offset})", hanging=17),
-        f"input            {'constant' if measurements[0].record.input.hold == 'zoh' else 'straight lines'} between "
-        f"its samples (--hold {measurements[0].record.input.hold})",
-        "",
-        parameter_table(parameters_of(result, units)),
-        *wrapped(_covariance_line(result)),
-        "",
-        _derived_table(derived_of(result, units)),
-        "",
-        f"fit              {number(fit.fit_percent, 5)} % = {FIT_DEFINITION}",
-        f"R2               {number(fit.r2, 6)} = {R2_DEFINITION}",
-        "                 y measured, x simulated, over the samples used",
-    ]
+    hold = measurements[0].record.input.hold
+    lines.append("")
+    row("model", f"{count(options.poles, 'pole')}, {count(options.zeros, 'zero')}; delay {searched}")
+    row("initial state", f"{TREATMENTS[options.initial_state]} (--initial-state {options.initial_state})")
+    row("offset", f"{_offset(result, units)} (--offset {options.offset})")
+    row("input", f"{'constant' if hold == 'zoh' else 'straight lines'} between its samples (--hold {hold})")
+    lines += ["", parameter_table(parameters_of(result, units)), wrapped(_covariance_line(result)), ""]
+    lines += [_derived_table(derived_of(result, units)), ""]
+    row("fit", f"{number(fit.fit_percent, 5)} % = {FIT_DEFINITION}")
+    row("R2", f"{number(fit.r2, 6)} = {R2_DEFINITION}")
+    row("", "y measured, x simulated, over the samples used")
     if judged is not None:
-        lines += [
-            *wrapped(
-                f"validation       fit {number(judged.fit_percent, 5)} %, R2 {number(judged.r2, 6)} on {judged.name}, "
-                f"{count(judged.count, 'sample')}; initial state and offset treated in the same way",
-                hanging=17,
-            )
-        ]
-    lines += [
-        f"cost             {number(fit.cost)} ({units.output})^2, mean squared output error",
-        f"AIC              {number(criteria.aic)} = N ln cost + 2 p with N = {criteria.count} samples and "
-        f"p = {criteria.parameters} parameters",
-        f"AICc             {number(criteria.aicc)} = AIC + 2 (p + 1)(p + 2) / (N - p - 2)",
-        f"BIC              {number(criteria.bic)} = N ln cost + p ln N",
-        f"FPE              {number(criteria.fpe)} ({units.output})^2 = cost (N + p) / (N - p)",
-        f"YIC, R_T^2       {number(result.yic, 5)}, {number(result.r_t_squared, 6)}",
-        f"condition number {number(fit.condition_number, 3)}",
-    ]
+        row(
+            "validation",
+            f"fit {number(judged.fit_percent, 5)} %, R2 {number(judged.r2, 6)} on {judged.name}, "
+            f"{count(judged.count, 'sample')}; initial state and offset treated in the same way",
+        )
+    row("cost", f"{number(fit.cost)} ({units.output})^2, mean squared output error")
+    sizes = f"N = {criteria.count} samples and p = {criteria.parameters} parameters"
+    row("AIC", f"{number(criteria.aic)} = N ln cost + 2 p with {sizes}")
+    row("AICc", f"{number(criteria.aicc)} = AIC + 2 (p + 1)(p + 2) / (N - p - 2)")
+    row("BIC", f"{number(criteria.bic)} = N ln cost + p ln N")
+    row("FPE", f"{number(criteria.fpe)} ({units.output})^2 = cost (N + p) / (N - p)")
+    row("YIC, R_T^2", f"{number(result.yic, 5)}, {number(result.r_t_squared, 6)}")
+    row("condition number", number(fit.condition_number, 3))
     for k, test in enumerate(result.tests, start=1):
-        label = "residuals" if len(measurements) == 1 else f"residuals {k}"
-        lines += wrapped(f"{label:16} {test.sentence}", hanging=17)
+        row("residuals" if len(measurements) == 1 else f"residuals {k}", test.sentence)
     # What the line of the residuals says need not be said again.
     told = tuple(test.sentence for test in result.tests)
-    warnings = [warning for warning in result.warnings if not warning.endswith(told)]
-    if warnings:
-        lines += ["", "Warnings:"]
-        lines += [line for warning in warnings for line in wrapped(f"- {warning}", hanging=2)]
-    return "\n".join(lines)
+    return "\n".join([*lines, *warning_lines(warning for warning in result.warnings if not warning.endswith(told))])
+
+
+def warning_lines(warnings: Iterable[str]) -> list[str]:
+    """Warnings as the end of a text; nothing where there are none."""
+    lines = [wrapped(f"- {warning}", hanging="  ") for warning in warnings]
+    return ["", "Warnings:", *lines] if lines else []
 
 
 def _record_line(measurement: Measurement, used: int, units: Units) -> str:
@@ -228,14 +209,14 @@ def _covariance_line(result: Identification) -> str:
     return text + ". Monic denominator, descending powers."
 
 
-def _derived_table(rows: Sequence[DerivedParameter]) -> str:
+def _derived_table(rows: Sequence[UncertainValue]) -> str:
     header = ["derived", "estimate", "standard error", "95 % low", "95 % high", "unit"]
     cells = [
         [row.name, number(row.estimate), number(row.standard_error, 3), number(row.low), number(row.high), row.unit]
         for row in rows
     ]
     reasons = dict.fromkeys(row.reason for row in rows if row.reason)
-    return "\n".join([text_table(header, cells, "lrrrrl"), *(line for text in reasons for line in wrapped(text))])
+    return "\n".join([text_table(header, cells, "lrrrrl"), *map(wrapped, reasons)])
 
 
 def _modes(result: Identification, units: Units) -> list[dict[str, float | None]]:

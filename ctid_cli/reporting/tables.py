@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -181,7 +182,7 @@ def record_table(
                 item = one.get(parameter)
                 if item is None:
                     texts.append("-")
-                elif item.estimate is None or item.standard_error is None:
+                elif not math.isfinite(item.standard_error):
                     texts.append(f"{number(item.estimate)} ({item.status})")
                 else:
                     texts.append(with_error(item.estimate, item.standard_error))

@@ -41,11 +41,11 @@ def test_white_residuals_keep_the_classical_covariance():
     items = by_name(result)
     assert list(items) == ["b0", "a1", "delay"]
     for name, item in items.items():
-        assert item.value == result.fit.parameters[name]
+        assert item.estimate == result.fit.parameters[name]
         assert item.standard_error == result.fit.standard_errors[name]
         assert item.status == "free"
         if name != "delay":
-            assert item.high - item.value == pytest.approx(1.959964 * item.standard_error)
+            assert item.high - item.estimate == pytest.approx(1.959964 * item.standard_error)
     assert result.warnings == ()
     assert result.criteria.aic == pytest.approx(1000 * np.log(result.fit.cost) + 6)
     gain = next(row for row in result.derived if row.name == "static_gain")
@@ -77,7 +77,7 @@ def test_a_delay_at_its_bound_has_no_standard_error():
     result = identify(DelayProfile(1, 0, (0, 0.4)), [record_of()])
     assert result.fit.status is Status.DELAY_AT_BOUND
     delay = by_name(result)["delay"]
-    assert (delay.value, delay.status) == (0.4, "at bound")
+    assert (delay.estimate, delay.status) == (0.4, "at bound")
     assert np.isnan(delay.standard_error)
     assert delay.high == 0.4
     assert np.isfinite(by_name(result)["a1"].standard_error)
@@ -113,7 +113,7 @@ def test_the_delay_has_a_profile_interval_where_the_cost_is_not_quadratic():
     assert interval is not None
     delay = by_name(result)["delay"]
     assert (delay.low, delay.high) == (interval.low, interval.high)
-    assert interval.low <= delay.value <= interval.high
+    assert interval.low <= delay.estimate <= interval.high
 
 
 @pytest.mark.parametrize(

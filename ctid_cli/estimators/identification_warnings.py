@@ -1,0 +1,83 @@
+"""What the user should know before using a model that was fitted to measured records, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.inference.conditioning import describe_conditioning
+from ctid_cli.inference.covariance import condition_number
+from ctid_cli.inference.delay_interval import DelayInterval
+from ctid_cli.inference.residuals import ResidualTests
+from ctid_cli.inference.status import Status
+
+
+def of_status(fit: MeasuredFit) -> list[str]:
+    """How the search ended, where it did not end well."""
+    if fit.status is Status.DELAY_AT_BOUND and fit.model.delay == 0.0:
+        return ["The delay stopped at zero: this model needs none; take it as known (--delay 0), or use fewer poles."]
+    return [] if fit.status.succeeded else [fit.status.value]
+
+
+def of_conditioning(fit: MeasuredFit, covariance: Array, free: IndexArray, hessian: Array) -> list[str]:
+    """What the data do not determine; a delay at its bound is taken as known."""
+    words = []
+    if fit.status is Status.DELAY_AT_BOUND:
+        words.append(
+            "The delay has no standard error, because it stopped at a bound; those of the other parameters take it "
+            "as known and are too small if it is not."
+        )
+    names = [fit.parameter_names[k] for k in free]
+    block = covariance[np.ix_(free, free)]
+    return [*words, *describe_conditioning(block, fit.theta[free], names, condition_number(hessian), hessian=hessian)]
+
+
+def of_interval(interval: DelayInterval | None, options: DelayProfile) -> list[str]:
+    """Whether the interval of the delay ends where its search ended."""
+    if interval is None:
+        return []
+    low, high = options.delay_bounds
+    # Below zero there is nothing left to search.
+    ends = [f"{low:g}"] * (interval.open_low and low > 0) + [f"{high:g}"] * interval.open_high
+    if not ends:
+        return []
+    return [
+        f"The interval of the delay reaches the end of its search range ({' and '.join(ends)}): delays beyond may fit "
+        "as well; widen --delay."
+    ]
+
+
+def of_residuals(tests: Sequence[ResidualTests], experiments: int, fewest: int) -> list[str]:
+    """Tests that failed, or could not be made."""
+    words = [
+        (f"Experiment {k}: " if experiments > 1 else "") + test.sentence
+        for k, test in enumerate(tests, start=1)
+        if not (test.white and test.uncorrelated)
+    ]
+    if len(tests) < experiments:
+        words.append(f"Fewer than {fewest} residuals are too few to test; standard errors take them as white.")
+    return words
+
+
+def of_treatment(gains: Mapping[str, float]) -> list[str]:
+    """What else should be estimated, from the shares by which the cost would fall."""
+    advice = {
+        "initial_state": "The record does not start at rest: estimating the initial state would lower the cost by "
+        "{:.2g} %; use --initial-state estimate (or periodic, if the input repeats the record).",
+        "offset": "The output has an offset: estimating it would lower the cost by {:.2g} %; use --offset estimate "
+        "(or remove, to subtract the means of input and output).",
+    }
+    return [advice[name].format(100 * share) for name, share in gains.items()]
+
+
+def of_validation(fitted: float, validated: float) -> list[str]:
+    """Whether the model carries over to another record, from the coefficients of determination of both."""
+    if not validated < 0.5 < fitted:
+        return []
+    return [
+        f"The model explains {100 * fitted:.0f} % of the variance of the record it was estimated from, but only "
+        f"{100 * max(validated, 0.0):.0f} % of the validation record's: it does not carry over."
+    ]

@@ -1,0 +1,38 @@
+"""A number that was estimated, and how far it may be off."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from ctid_cli.inference.quantile import normal_quantile
+
+
+@dataclass(frozen=True)
+class UncertainValue:
+    """An estimate with its accuracy, all in its unit; NaN stands for what is not defined."""
+
+    name: str
+    estimate: float
+    standard_error: float = math.nan
+    #: Confidence interval.
+    low: float = math.nan
+    high: float = math.nan
+    unit: str = ""
+    #: Of a parameter: free, fixed, at bound or undetermined.
+    status: str = "free"
+    #: Why there is no standard error.
+    reason: str = ""
+
+    @classmethod
+    def normal(
+        cls, name: str, estimate: float, standard_error: float, unit: str = "", *, level: float = 0.95, reason: str = ""
+    ) -> UncertainValue:
+        """Estimate of a normal distribution: the interval reaches as far to both sides."""
+        reach = normal_quantile(level) * standard_error
+        return cls(name, estimate, standard_error, estimate - reach, estimate + reach, unit, reason=reason)
+
+    @property
+    def relative_percent(self) -> float:
+        """Standard error relative to the estimate [%]."""
+        return 100 * self.standard_error / abs(self.estimate) if self.estimate else math.nan
