@@ -14,8 +14,9 @@ from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.estimation.delay_search import LEAST_CURVATURE
 from ctid_cli.estimation.problems import is_hurwitz
 from ctid_cli.estimation.refined_iv import NEGLIGIBLE_FALL, ROUNDING, SLOW_STEPS, SUFFICIENT_FALL
-from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, standard_moments
+from ctid_cli.filtering.bank import standard_moments
 from ctid_cli.filtering.filter_data import FilterData, plain_array
+from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT
 from ctid_cli.filtering.realisation import polynomial_roots, scaled_denominator, time_scale
 from ctid_cli.inference.sensitivity import Structure
 

@@ -24,24 +24,25 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.filtering.chain_pass import irregular_chain_pass, regular_chain_pass
 from ctid_cli.filtering.exponential import held_step, place
-from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
-from ctid_cli.filtering.kernels import irregular_chain_pass, modal_pass, regular_chain_pass
+from ctid_cli.filtering.filter_data import FilterData, in_unit, plain_array, split_delay
+from ctid_cli.filtering.modal_pass import modal_pass
+from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT, modal_condition, pole_slopes
 from ctid_cli.filtering.realisation import chain, polynomial_roots, scaled_denominator, time_scale
+from ctid_cli.filtering.row_sink import RowSink, row_sink
 
 Form = Literal["auto", "modal", "chain"]
 
-#: Partial fractions are used while they amplify rounding by less than this; beyond, poles count as repeated.
-MODAL_CONDITION_LIMIT = 1e4
-
 
 @njit(cache=True, nogil=True)
-def double_chain(a: Array, b: Array) -> tuple[float, Array, Array, Array, Array]:
+def _double_chain(a: Array, b: Array) -> tuple[float, Array, Array, Array, Array]:
     """Realise 1/A driven by the input and a second 1/A driven by the output of B/A."""
     n = a.size - 1
     m = b.size - 1
     w0 = time_scale(a)
     single, entry, powers = chain(polynomial_roots(scaled_denominator(a, w0)))
+    # p^k/A in seconds, from the chain in the time unit 1/w0.
     for k in range(n):
         for i in range(n):
             powers[k, i] *= w0 ** (k - n)
@@ -70,6 +71,7 @@ def _fill_derivative(a: Array, b: Array, mapping: Array) -> None:
         total = 0.0
         for i in range(m + 1):
             power = m - i + 1
+            # p^n/A u = u - sum of a_k p^(n-k)/A u, in terms of the rows below it.
             if power < n:
                 total += b[i] * mapping[power, column]
             else:
@@ -80,32 +82,31 @@ def _fill_derivative(a: Array, b: Array, mapping: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _to_standard(mapping: Array, rows: Array, gram: Array, want_rows: bool) -> Array:
-    """Apply the map to internal rows or to their moments."""
+def _to_standard(mapping: Array, sink: RowSink, want_rows: bool) -> Array:
+    """Apply the map from internal to standard rows to what a pass has left: rows, or their moments."""
     if want_rows:
-        return rows @ np.ascontiguousarray(mapping.T)
-    return mapping @ gram @ np.ascontiguousarray(mapping.T)
+        return sink.rows @ np.ascontiguousarray(mapping.T)
+    return mapping @ sink.gram @ np.ascontiguousarray(mapping.T)
 
 
 @njit(cache=True, nogil=True)
 def _regular_chain(a: Array, b: Array, delay: float, data: FilterData, want_rows: bool) -> Array:
+    """Standard rows of a regular clock, for any poles."""
     n = a.size - 1
-    interval = data.interval
-    w0, dynamics, gain, powers, output = double_chain(a, b)
-    transition, from_value, from_change = held_step(dynamics, gain, interval * w0)
-    y_transition = transition[:n, :n].copy()
-    y_value, y_change = from_value[:n].copy(), from_change[:n].copy()
-    shift, fraction = split_delay(delay, interval)
+    w0, dynamics, gain, powers, output = _double_chain(a, b)
+    shift, fraction = split_delay(delay, data.interval)
+    # The states at the instant that arrives now, from the states and the held input at the break before it.
     readout = np.zeros((2 * n, 2 * n + 2))
     if fraction > 0.0:
-        part, part_value, part_change = held_step(dynamics, gain, fraction * interval * w0)
-        place(readout, 0, 0, part)
+        part = held_step(dynamics, gain, fraction * data.interval * w0)
+        place(readout, 0, 0, part.transition)
         for i in range(2 * n):
-            readout[i, 2 * n] = part_value[i]
-            readout[i, 2 * n + 1] = part_change[i] * fraction
+            readout[i, 2 * n] = part.from_value[i]
+            readout[i, 2 * n + 1] = part.from_change[i] * fraction
     else:
         for i in range(2 * n):
             readout[i, i] = 1.0
+    # Standard rows from [z (both chains), u, change of u, filtered y, y - x].
     q = 3 * n + 3
     mapping = np.zeros((q, q))
     place(mapping, 0, 0, powers @ readout[:n])
@@ -115,170 +116,17 @@ def _regular_chain(a: Array, b: Array, delay: float, data: FilterData, want_rows
     place(mapping, 2 * n + 1, 2 * n + 2, powers)
     mapping[3 * n + 1, 3 * n + 2] = 1.0
     _fill_derivative(a, b, mapping)
-    count = np.count_nonzero(data.use)
-    rows = np.zeros((count if want_rows else 0, q))
-    gram = np.zeros((0 if want_rows else q, 0 if want_rows else q))
-    regular_chain_pass(
-        transition,
-        from_value,
-        from_change,
-        output @ readout[:n],
-        data.u,
-        data.input_foh,
-        shift,
-        y_transition,
-        y_value,
-        y_change,
-        data.y,
-        data.y_foh,
-        data.use,
-        np.zeros(0),
-        rows,
-        gram,
-    )
-    return _to_standard(mapping, rows, gram, want_rows)
-
-
-@njit(cache=True, nogil=True)
-def _evaluate(coefficients: Array, point: complex) -> tuple[complex, complex, complex]:
-    """Value and first two derivatives of a polynomial."""
-    value, first, second = 0.0j, 0.0j, 0.0j
-    for k in range(coefficients.size):
-        second = second * point + 2.0 * first
-        first = first * point + value
-        value = value * point + coefficients[k]
-    return value, first, second
-
-
-@njit(cache=True, nogil=True)
-def modal_condition(roots: ComplexArray, slopes: ComplexArray, curvatures: ComplexArray) -> float:
-    """How much the partial fractions of ``p^k/A^2`` amplify rounding, against the peak gain of each."""
-    n = roots.size
-    worst = 0.0
-    for k in range(n):
-        peak, spread = 0.0, 0.0
-        for at in range(n + 1):
-            s = 1j * (abs(roots[at - 1]) if at > 0 else 0.0)
-            exact, total = 1.0, 0.0
-            for i in range(n):
-                distance = s - roots[i]
-                exact /= abs(distance) ** 2
-                power = roots[i] ** k
-                lower = k * roots[i] ** (k - 1) if k > 0 else 0.0j
-                square = slopes[i] * slopes[i]
-                total += abs(power / (square * distance * distance))
-                total += abs((lower - power * curvatures[i]) / (square * distance))
-            peak = max(peak, exact * abs(s) ** k if k > 0 else exact)
-            spread = max(spread, total)
-        if not peak > 0.0:
-            return np.inf
-        worst = max(worst, spread / peak)
-    return worst
-
-
-@njit(cache=True, nogil=True)
-def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Array]:
-    """Partial fractions of the standard rows."""
-    n = a.size - 1
-    w0 = time_scale(a)
-    roots = polynomial_roots(scaled_denominator(a, w0)) * w0
-    modes = 0
-    for i in range(n):
-        if roots[i].imag >= 0.0:
-            modes += 1
-    poles = np.zeros(modes, np.complex128)
-    residues = np.zeros(modes, np.complex128)
-    mapping = np.zeros((3 * n + 3, 3 * n + 2))
-    place, mode = 0, 0
-    slopes, curvatures = np.zeros(n, np.complex128), np.zeros(n, np.complex128)
-    for i in range(n):
-        pole = roots[i]
-        if pole.imag < 0.0:
-            continue
-        paired = pole.imag > 0.0
-        weight = 2.0 if paired else 1.0
-        slope = 1.0 + 0.0j  # A'(pole), as a product: exact where the polynomial form would cancel
-        curvature = 0.0j  # A''/A' = 2 sum 1/(pole - other)
-        for j in range(n):
-            if j != i:
-                slope *= pole - roots[j]
-                if roots[j] != pole:
-                    curvature += 2.0 / (pole - roots[j])
-        if slope * slope == 0.0 or pole == 0.0:
-            return np.inf, poles, residues, mapping
-        slopes[i], curvatures[i] = slope, curvature
-        if paired:
-            slopes[i + 1], curvatures[i + 1] = np.conj(slope), np.conj(curvature)
-        poles[mode] = pole
-        value, first, _ = _evaluate(b, pole)
-        residues[mode] = weight * value / slope
-        power, power_slope = 1.0 + 0.0j, 0.0j
-        for k in range(n):
-            single = weight * power / slope
-            numerator = power * value
-            numerator_slope = power_slope * value + power * first
-            double = weight * numerator / (slope * slope)
-            mixed = weight * (numerator_slope - numerator * curvature) / (slope * slope)
-            mapping[k, place] = single.real
-            mapping[2 * n + 1 + k, 2 * n + 1 + place] = single.real
-            mapping[n + 1 + k, place] = mixed.real
-            mapping[n + 1 + k, n + place] = double.real
-            if paired:
-                mapping[k, place + 1] = -single.imag
-                mapping[2 * n + 1 + k, 2 * n + 2 + place] = -single.imag
-                mapping[n + 1 + k, place + 1] = -mixed.imag
-                mapping[n + 1 + k, n + place + 1] = -double.imag
-            power_slope = power_slope * pole + power
-            power *= pole
-        place += 2 if paired else 1
-        mode += 1
-    mapping[n, 2 * n] = 1.0
-    mapping[3 * n + 1, 3 * n + 1] = 1.0
-    _fill_derivative(a, b, mapping)
-    return modal_condition(roots, slopes, curvatures), poles, residues, mapping
-
-
-@njit(cache=True, nogil=True)
-def _modal(
-    poles: ComplexArray,
-    residues: ComplexArray,
-    mapping: Array,
-    delay: float,
-    data: FilterData,
-    want_rows: bool,
-) -> Array:
-    q = mapping.shape[1]
-    rows = np.zeros((np.count_nonzero(data.use) if want_rows else 0, q))
-    gram = np.zeros((0 if want_rows else q, 0 if want_rows else q))
-    shift, fraction = 0, 0.0
-    if data.interval > 0.0:
-        shift, fraction = split_delay(delay, data.interval)
-    modal_pass(
-        poles,
-        residues,
-        data.interval,
-        shift,
-        fraction,
-        data.tu,
-        data.u,
-        data.input_foh,
-        delay,
-        data.t,
-        data.y,
-        data.y_foh,
-        data.common_clock,
-        data.use,
-        np.zeros(0),
-        rows,
-        gram,
-    )
-    return _to_standard(mapping, rows, gram, want_rows)
+    sink = row_sink(q, data.use, want_rows)
+    step = held_step(dynamics, gain, data.interval * w0)
+    regular_chain_pass(step, output @ readout[:n], shift, n, data, sink)
+    return _to_standard(mapping, sink, want_rows)
 
 
 @njit(cache=True, nogil=True)
 def _irregular_chain(a: Array, b: Array, delay: float, data: FilterData, want_rows: bool) -> Array:
+    """Standard rows of an irregular clock, for any poles, from [z (both chains), u, filtered y, y - x]."""
     n = a.size - 1
-    w0, dynamics, gain, powers, output = double_chain(a, b)
+    w0, dynamics, gain, powers, output = _double_chain(a, b)
     q = 3 * n + 2
     mapping = np.zeros((3 * n + 3, q))
     place(mapping, 0, 0, powers)
@@ -287,45 +135,88 @@ def _irregular_chain(a: Array, b: Array, delay: float, data: FilterData, want_ro
     place(mapping, 2 * n + 1, 2 * n + 1, powers)
     mapping[3 * n + 1, 3 * n + 1] = 1.0
     _fill_derivative(a, b, mapping)
-    rows = np.zeros((np.count_nonzero(data.use) if want_rows else 0, q))
-    gram = np.zeros((0 if want_rows else q, 0 if want_rows else q))
+    sink = row_sink(q, data.use, want_rows)
     output_map = np.zeros(2 * n)
     for i in range(n):
         output_map[i] = output[i]
-    irregular_chain_pass(
-        dynamics,
-        gain,
-        output_map,
-        data.tu * w0,
-        data.u,
-        data.input_foh,
-        delay * w0,
-        dynamics[:n, :n].copy(),
-        gain[:n].copy(),
-        data.t * w0,
-        data.y,
-        data.y_foh,
-        data.use,
-        np.zeros(0),
-        rows,
-        gram,
-    )
-    return _to_standard(mapping, rows, gram, want_rows)
+    irregular_chain_pass(dynamics, gain, output_map, delay * w0, n, in_unit(data, w0), sink)
+    return _to_standard(mapping, sink, want_rows)
 
 
 @njit(cache=True, nogil=True)
-def standard_moments(
-    a: Array,
-    b: Array,
-    delay: float,
-    data: FilterData,
-    want_rows: bool,
-    limit: float,
-) -> Array:
-    """Second moments of the standard rows, or the rows: one compiled entry, so that a call costs one crossing."""
+def _evaluate(coefficients: Array, point: complex) -> tuple[complex, complex]:
+    """Value and derivative of a polynomial."""
+    value, slope = 0.0j, 0.0j
+    for k in range(coefficients.size):
+        slope = slope * point + value
+        value = value * point + coefficients[k]
+    return value, slope
+
+
+@njit(cache=True, nogil=True)
+def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Array]:
+    """Partial fractions of the standard rows: their condition, poles, residues of x, and the map from internal rows."""
+    n = a.size - 1
+    w0 = time_scale(a)
+    roots = polynomial_roots(scaled_denominator(a, w0)) * w0
+    modes = 0
+    for i in range(n):
+        if roots[i].imag >= 0.0:
+            modes += 1
+    poles, residues = np.zeros(modes, np.complex128), np.zeros(modes, np.complex128)
+    mapping = np.zeros((3 * n + 3, 3 * n + 2))
+    simple, slopes, curvatures = pole_slopes(roots)
+    if not simple:
+        return np.inf, poles, residues, mapping
+    row, mode = 0, 0  # of the internal rows
+    for i in range(n):
+        pole, slope = roots[i], slopes[i]
+        if pole.imag < 0.0:
+            continue
+        paired = pole.imag > 0.0
+        weight = 2.0 if paired else 1.0  # a pair gives twice the real part of one
+        poles[mode] = pole
+        value, first = _evaluate(b, pole)
+        residues[mode] = weight * value / slope
+        # p^k/A at its pole, and p^k B/A^2, a double pole: with f = p^k B it is f/A'^2 of w and
+        # (f' - f A''/A')/A'^2 of z.
+        power, power_slope = 1.0 + 0.0j, 0.0j
+        for k in range(n):
+            single = weight * power / slope
+            numerator = power * value
+            numerator_slope = power_slope * value + power * first
+            double = weight * numerator / (slope * slope)
+            mixed = weight * (numerator_slope - numerator * curvatures[i]) / (slope * slope)
+            mapping[k, row] = single.real
+            mapping[2 * n + 1 + k, 2 * n + 1 + row] = single.real
+            mapping[n + 1 + k, row] = mixed.real
+            mapping[n + 1 + k, n + row] = double.real
+            if paired:
+                mapping[k, row + 1] = -single.imag
+                mapping[2 * n + 1 + k, 2 * n + 2 + row] = -single.imag
+                mapping[n + 1 + k, row + 1] = -mixed.imag
+                mapping[n + 1 + k, n + row + 1] = -double.imag
+            power_slope = power_slope * pole + power
+            power *= pole
+        row += 2 if paired else 1
+        mode += 1
+    mapping[n, 2 * n] = 1.0
+    mapping[3 * n + 1, 3 * n + 1] = 1.0
+    _fill_derivative(a, b, mapping)
+    return modal_condition(roots, slopes, curvatures), poles, residues, mapping
+
+
+@njit(cache=True, nogil=True)
+def standard_moments(a: Array, b: Array, delay: float, data: FilterData, want_rows: bool, limit: float) -> Array:
+    """Second moments of the standard rows, or the rows: one compiled entry, so that a call costs one crossing.
+
+    Partial fractions where they amplify rounding by less than the limit, else chains.
+    """
     condition, poles, residues, mapping = modal_map(a, b)
     if condition < limit:
-        return _modal(poles, residues, mapping, delay, data, want_rows)
+        sink = row_sink(mapping.shape[1], data.use, want_rows)
+        modal_pass(poles, residues, delay, data, sink)
+        return _to_standard(mapping, sink, want_rows)
     if data.interval > 0.0:
         return _regular_chain(a, b, delay, data, want_rows)
     return _irregular_chain(a, b, delay, data, want_rows)

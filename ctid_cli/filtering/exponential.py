@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array
+
+
+class HeldStep(NamedTuple):
+    """``z+ = F z + g v + h (change of v)``: a linear system over one step with v constant or linear."""
+
+    #: F, shape (n, n).
+    transition: Array
+    #: g and h, shape (n,).
+    from_value: Array
+    from_change: Array
 
 
 @njit(cache=True, nogil=True)
@@ -66,9 +78,10 @@ def exponential_minus_identity(matrix: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def held_step(dynamics: Array, gain: Array, step: float) -> tuple[Array, Array, Array]:
-    r"""Exact map of ``z' = F z + g v`` over one step with v constant or linear."""
+def held_step(dynamics: Array, gain: Array, step: float) -> HeldStep:
+    """Exact map of ``z' = F z + g v`` over one step."""
     n = gain.size
+    # v and its change over the step are two further states: the exponential holds the integrals over both.
     augmented = np.zeros((n + 2, n + 2))
     for i in range(n):
         for j in range(n):
@@ -79,4 +92,4 @@ def held_step(dynamics: Array, gain: Array, step: float) -> tuple[Array, Array, 
     transition = result[:n, :n].copy()
     for i in range(n):
         transition[i, i] += 1.0
-    return transition, result[:n, n].copy(), result[:n, n + 1].copy()
+    return HeldStep(transition, result[:n, n].copy(), result[:n, n + 1].copy())

@@ -14,6 +14,8 @@ from ctid_cli.signals.record import Record
 
 #: A delay closer to a whole number of intervals than this fraction of one is that whole number.
 WHOLE_INTERVAL = 1e-10
+#: Instants closer than this fraction of the shortest interval are one instant, written with different rounding.
+ROUNDING_GAP = 1e-9
 
 
 class FilterData(NamedTuple):
@@ -83,3 +85,30 @@ def split_delay(delay: float, interval: float) -> tuple[int, float]:
     if fraction < WHOLE_INTERVAL:
         return shift, 0.0
     return shift, fraction
+
+
+@njit(cache=True, nogil=True)
+def clock_slack(data: FilterData) -> float:
+    """Distance [s] below which a break and a delayed sample are one instant: a fraction of the shortest interval."""
+    gap = np.inf
+    for k in range(data.t.size - 1):
+        gap = min(gap, data.t[k + 1] - data.t[k])
+    for k in range(data.tu.size - 1):
+        gap = min(gap, data.tu[k + 1] - data.tu[k])
+    return ROUNDING_GAP * gap if gap < np.inf else 0.0
+
+
+@njit(cache=True, nogil=True)
+def in_unit(data: FilterData, w0: float) -> FilterData:
+    """The record with its clocks in the time unit 1/w0."""
+    return FilterData(
+        data.t * w0,
+        data.y,
+        data.use,
+        data.tu * w0,
+        data.u,
+        data.input_foh,
+        data.y_foh,
+        data.interval * w0,
+        data.common_clock,
+    )

@@ -8,10 +8,11 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
+from ctid_cli.filtering.chain_pass import irregular_chain_pass, regular_chain_pass
 from ctid_cli.filtering.exponential import held_step
-from ctid_cli.filtering.filter_data import plain_array, split_delay
-from ctid_cli.filtering.kernels import irregular_chain_pass, regular_chain_pass
+from ctid_cli.filtering.filter_data import FilterData, in_unit, plain_array, split_delay
 from ctid_cli.filtering.realisation import chain, polynomial_roots, scaled_denominator, time_scale
+from ctid_cli.filtering.row_sink import RowSink
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import REGULARITY, regular_interval
@@ -63,31 +64,30 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
     numerator = np.concatenate([np.zeros(model.relative_degree), model.numerator])
     direct = numerator[0]
     strictly_proper = (numerator - direct * model.denominator)[1:]
-    foh = signal.hold == "foh"
     interval = regular_interval(t)
     on_grid = (
         interval is not None and signal.t.size == t.size and bool(np.abs(signal.t - t).max() <= REGULARITY * interval)
     )
-    x: Array = _response(
-        plain_array(model.denominator),
-        plain_array(strictly_proper),
-        model.delay,
-        (interval or 0.0) if on_grid else 0.0,
-        plain_array(signal.t),
-        plain_array(signal.values),
-        foh,
-        t,
+    data = FilterData(
+        t=t,
+        y=t,
+        use=np.zeros(0, dtype=bool),
+        tu=plain_array(signal.t),
+        u=plain_array(signal.values),
+        input_foh=signal.hold == "foh",
+        y_foh=False,
+        interval=(interval or 0.0) if on_grid else 0.0,
+        common_clock=False,
     )
+    x: Array = _response(plain_array(model.denominator), plain_array(strictly_proper), model.delay, data)
     if direct:
         x = x + direct * signal.at(t - model.delay)
     return x
 
 
 @njit(cache=True, nogil=True)
-def _response(
-    a: Array, b: Array, delay: float, interval: float, tu: Array, u: Array, input_foh: bool, t: Array
-) -> Array:
-    """Compiled body of :func:`simulate`; ``interval`` is 0 on an irregular clock, ``b`` has n entries."""
+def _response(a: Array, b: Array, delay: float, data: FilterData) -> Array:
+    """Compiled body of :func:`simulate`: no output is filtered and no row kept; ``b`` has n entries."""
     n = a.size - 1
     w0 = time_scale(a)
     dynamics, gain, powers = chain(polynomial_roots(scaled_denominator(a, w0)))
@@ -95,58 +95,23 @@ def _response(
     for i in range(n):
         for j in range(n):
             output_map[j] += b[i] / w0 ** (i + 1) * powers[n - 1 - i, j]
-    output = np.zeros(t.size)
-    none, empty = np.zeros(0), np.zeros((0, 0))
-    use = np.zeros(0, np.bool_)
-    if interval > 0.0:
-        transition, from_value, from_change = held_step(dynamics, gain, interval * w0)
-        shift, fraction = split_delay(delay, interval)
-        regular_map = np.zeros(n + 2)
-        if fraction > 0.0:
-            part, part_value, part_change = held_step(dynamics, gain, fraction * interval * w0)
-            for i in range(n):
-                for j in range(n):
-                    regular_map[j] += output_map[i] * part[i, j]
-                regular_map[n] += output_map[i] * part_value[i]
-                regular_map[n + 1] += output_map[i] * part_change[i] * fraction
-        else:
-            for i in range(n):
-                regular_map[i] = output_map[i]
-        regular_chain_pass(
-            transition,
-            from_value,
-            from_change,
-            regular_map,
-            u,
-            input_foh,
-            shift,
-            empty,
-            none,
-            none,
-            t,
-            False,
-            use,
-            output,
-            empty,
-            empty,
-        )
+    nothing = np.zeros((0, 0))
+    sink = RowSink(nothing, nothing, nothing, np.zeros(data.t.size))
+    if data.interval == 0.0:
+        irregular_chain_pass(dynamics, gain, output_map, delay * w0, 0, in_unit(data, w0), sink)
+        return sink.output
+    shift, fraction = split_delay(delay, data.interval)
+    # x at the instant that arrives now, from the states and the held input at the break before it.
+    readout = np.zeros(n + 2)
+    if fraction > 0.0:
+        part = held_step(dynamics, gain, fraction * data.interval * w0)
+        for i in range(n):
+            for j in range(n):
+                readout[j] += output_map[i] * part.transition[i, j]
+            readout[n] += output_map[i] * part.from_value[i]
+            readout[n + 1] += output_map[i] * part.from_change[i] * fraction
     else:
-        irregular_chain_pass(
-            dynamics,
-            gain,
-            output_map,
-            tu * w0,
-            u,
-            input_foh,
-            delay * w0,
-            empty,
-            none,
-            t * w0,
-            t,
-            False,
-            use,
-            output,
-            empty,
-            empty,
-        )
-    return output
+        for i in range(n):
+            readout[i] = output_map[i]
+    regular_chain_pass(held_step(dynamics, gain, data.interval * w0), readout, shift, 0, data, sink)
+    return sink.output

@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
-from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, modal_condition
 from ctid_cli.filtering.filter_data import plain_array
+from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT, modal_condition
 from ctid_cli.filtering.realisation import polynomial_roots, scaled_denominator, time_scale
 
 

@@ -15,7 +15,8 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray, IntArray
-from ctid_cli.filtering.kernels import BLOCK, accumulate, step_weights
+from ctid_cli.filtering.modal_pass import step_weights
+from ctid_cli.filtering.row_sink import BLOCK, accumulate
 
 
 @njit(cache=True, nogil=True)

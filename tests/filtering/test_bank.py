@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, modal_map, second_moments, standard_rows
+from ctid_cli.filtering.bank import modal_map, second_moments, standard_rows
 from ctid_cli.filtering.filter_data import filter_data, split_delay
+from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.filtering.filter_data import filter_data
-from ctid_cli.filtering.kernels import BLOCK
 from ctid_cli.filtering.loop import simulate_loop
+from ctid_cli.filtering.row_sink import BLOCK
 from ctid_cli.filtering.sampled import simulate_additive
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.filtering.submodels import OPEN_LOOP, LoopData, SubmodelFilter
