@@ -45,14 +45,17 @@ def table(
     """
     from ctid_cli.errors import MismatchError, UsageError
     from ctid_cli.reporting.comparison import check_tables, mismatch_sentence, write_comparison
-    from ctid_cli.reporting.report import build_tables, write_tables
+    from ctid_cli.reporting.layout import write_reports
+    from ctid_cli.reporting.tables import build_tables
 
     if reference is not None and not check:
         raise UsageError("--reference goes with --check")
     if not out.is_dir():
         typer.echo(f"ctid: there is no folder {out}, so nothing was run yet (--out names the results folder)", err=True)
     if not check:
-        typer.echo(write_tables(build_tables(names or [], out), style.value))
+        typer.echo(
+            write_reports(build_tables(names or [], out, style.value, committed=out == Path("results")), style.value)
+        )
         return
     comparison = check_tables(names or [], out, reference)
     typer.echo(write_comparison(comparison, style.value))

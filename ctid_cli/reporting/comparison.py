@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.layout import count, delay_label, markdown_table, number, percent, text_table
-from ctid_cli.reporting.report import build_tables
+from ctid_cli.reporting.committed import committed_tables, made_by, plain_row, read_tables
+from ctid_cli.reporting.layout import Report, Table, count, csv_text, delay_label, number, percent
+from ctid_cli.reporting.percentages import Row, settings_of
 from ctid_cli.reporting.results import out_option, shown_path
 from ctid_cli.reporting.study import Study, load_study
-from ctid_cli.reporting.tables import csv_text, setting_text, setting_title
-from ctid_cli.running.plan import RESERVED_COLUMNS
+from ctid_cli.reporting.study_table import setting_text, setting_title
+from ctid_cli.reporting.tables import build_tables
+from ctid_cli.text import listed
 
 #: Chance that a check reports any difference although nothing has changed.
 LEVEL = 0.01
+#: Chance that a difference as large as the one that is called detectable is reported.
+POWER = 0.8
 
 Against = Literal["committed", "paper"]
-
-#: Columns that tables must have to be compared with.
-_NEEDED = ("table", "experiment", "initial_delay", "method", "n", "converged")
-_Identity = tuple[str, str, Any, frozenset[tuple[str, Any]]]
 
 
 @dataclass(frozen=True)
@@ -34,31 +33,31 @@ class ComparedCell:
 
     against: Against
     decisive: bool
-    table: int | str
-    experiment: str
-    sampling: str | None
-    settings: Mapping[str, Any]
-    #: Where the search started [s]; None for an estimator that needs no start.
-    initial_delay: float | str | None
-    method: str
-    n: int
-    converged: int
+    #: The fresh cell.
+    row: Row
     reference_n: int
     reference_converged: int
     #: Two-sided p-value of Fisher's exact test that both percentages are equal [-].
     p_value: float
     #: The same after Holm's correction for the number of cells: a difference where it is below the level [-].
     adjusted_p_value: float
+    #: Smallest difference that would have been reported with 80 % probability [percentage points].
+    detectable: float | None
 
     @property
     def percent(self) -> float:
         """Fresh percentage [%]."""
-        return 100 * self.converged / self.n
+        return float(100 * self.row["converged"] / self.row["n"])
 
     @property
     def reference_percent(self) -> float:
         """Percentage of the reference [%]."""
         return 100 * self.reference_converged / self.reference_n
+
+    @property
+    def identical(self) -> bool:
+        """Whether the counts are those of the reference."""
+        return (self.row["n"], self.row["converged"]) == (self.reference_n, self.reference_converged)
 
     @property
     def differs(self) -> bool:
@@ -72,22 +71,26 @@ class ComparedCell:
 
     def as_dict(self) -> dict[str, Any]:
         """The cell of ``ctid table --check --format json``: swept fields are keys of their own."""
+        keys = (
+            "table",
+            "experiment",
+            "sampling",
+            *settings_of([self.row]),
+            "initial_delay",
+            "method",
+            "n",
+            "converged",
+        )
         return {
             "against": self.against,
-            "table": self.table,
-            "experiment": self.experiment,
-            "sampling": self.sampling,
-            **self.settings,
-            "initial_delay": self.initial_delay,
-            "method": self.method,
-            "n": self.n,
-            "converged": self.converged,
+            **{key: self.row.get(key) for key in keys},
             "percent": self.percent,
             "reference_n": self.reference_n,
             "reference_converged": self.reference_converged,
             "reference_percent": self.reference_percent,
             "p_value": self.p_value,
             "adjusted_p_value": self.adjusted_p_value,
+            "detectable": self.detectable,
             "differs": self.differs,
             "decisive": self.decisive,
             "mismatch": self.mismatch,
@@ -122,11 +125,7 @@ class Comparison:
     @property
     def identical(self) -> int:
         """Cells with the same counts as in the committed tables."""
-        return sum(
-            (cell.n, cell.converged) == (cell.reference_n, cell.reference_converged)
-            for cell in self.cells
-            if cell.against == "committed"
-        )
+        return sum(cell.identical for cell in self.cells if cell.against == "committed")
 
     def as_dict(self) -> dict[str, Any]:
         """The object of ``ctid table --check --format json``."""
@@ -150,9 +149,12 @@ def check_tables(names: Sequence[str], out: Path, reference: Path | None = None)
     file = committed_tables() if reference is None else reference
     committed = None if file is None else read_tables(file)
     tables = build_tables(names, out)
-    rows = [row for table in tables for row in table.rows]
-    notes = tuple(dict.fromkeys(note for table in tables for note in table.notes))
-    comparison = compare(rows, committed, study, None if file is None else shown_path(file), notes)
+    rows = [row for table in tables for row in table.records]
+    notes = list(dict.fromkeys(note for table in tables for note in table.notes))
+    shown = None if file is None else shown_path(file)
+    if file is not None and reference is None and (maker := made_by(file)):
+        notes.append(f"the percentages in {shown} were computed{maker}")
+    comparison = compare(rows, committed, study, shown, notes)
     if comparison.decisive:
         return comparison
     if not any(row["n"] for row in rows):
@@ -181,63 +183,47 @@ def compare(
     other. Where both sides used the same seed they share their data sets, so they agree even better than the test
     assumes. The comparisons for information are a family of their own.
     """
-    from scipy.stats import fisher_exact
-
-    fresh: dict[_Identity, dict[str, Any]] = {}
-    for row in rows:
-        fresh.setdefault(_identity(row), _plain_row(row))
-    tables = {str(row["table"]) for row in fresh.values()}
-    known: dict[_Identity, dict[str, Any]] = {}
-    for row in map(_plain_row, committed or ()):
-        if row["n"] and row["converged"] is not None:
+    fresh: dict[Any, Row] = {}
+    for row in map(plain_row, rows):
+        fresh.setdefault(_identity(row), row)
+    known: dict[Any, Row] = {}
+    for row in map(plain_row, committed or ()):
+        if _is_counted(row):
             known.setdefault(_identity(row), row)
 
-    pairs: list[tuple[Against, bool, dict[str, Any], int, int]] = []
-    lacking = 0
+    pairs: list[tuple[Against, bool, Row, int, int]] = []
     for identity, row in fresh.items():
-        if not row["n"] or row["converged"] is None:
+        if not _is_counted(row):
             continue
         if identity in known:
             pairs.append(("committed", True, row, known[identity]["n"], known[identity]["converged"]))
-        elif committed is not None:
-            lacking += 1
-        published = row.get("published_percent")
-        if published is not None:
+        if (published := row.get("published_percent")) is not None:
             trials = study.published_data_sets
             pairs.append(("paper", row["method"] in study.must_reach, row, trials, round(published * trials / 100)))
+    lacking = sum(_is_counted(row) and key not in known for key, row in fresh.items()) if committed is not None else 0
+    tables = {str(row["table"]) for row in fresh.values()}
     asked = {key for key, row in known.items() if not tables.isdisjoint((str(row["table"]), row["experiment"]))}
     asked |= {key for key, row in fresh.items() if row.get("published_percent") is not None}
     not_run = sum(not (key in fresh and fresh[key]["n"]) for key in asked)
 
-    p_values = [
-        float(fisher_exact([[k, n - k], [row["converged"], row["n"] - row["converged"]]]).pvalue)
-        for _, _, row, n, k in pairs
-    ]
-    adjusted = [0.0] * len(pairs)
+    cells: dict[int, ComparedCell] = {}
     for family in (True, False):
         members = [k for k, pair in enumerate(pairs) if pair[1] is family]
-        for k, value in zip(members, holm([p_values[k] for k in members]), strict=True):
-            adjusted[k] = value
-    cells = [
-        ComparedCell(
-            against=against,
-            decisive=decisive,
-            table=row["table"],
-            experiment=row["experiment"],
-            sampling=row.get("sampling"),
-            settings=_settings(row),
-            initial_delay=row["initial_delay"],
-            method=row["method"],
-            n=row["n"],
-            converged=row["converged"],
-            reference_n=n,
-            reference_converged=converged,
-            p_value=p_values[k],
-            adjusted_p_value=adjusted[k],
-        )
-        for k, (against, decisive, row, n, converged) in enumerate(pairs)
-    ]
-    return Comparison(tuple(cells), reference, not_run, lacking, tuple(notes))
+        p_values = [fisher(pairs[k][2]["converged"], pairs[k][2]["n"], *pairs[k][:2:-1]) for k in members]
+        for k, p_value, adjusted in zip(members, p_values, holm(p_values), strict=True):
+            against, decisive, row, n, converged = pairs[k]
+            change = smallest_detectable(row["n"], converged, n, LEVEL / len(members), rise=against == "committed")
+            cells[k] = ComparedCell(against, decisive, row, n, converged, p_value, adjusted, change)
+    return Comparison(tuple(cells[k] for k in range(len(pairs))), reference, not_run, lacking, tuple(notes))
+
+
+@cache
+def fisher(converged: int, n: int, reference_converged: int, reference_n: int) -> float:
+    """Two-sided p-value of Fisher's exact test that two percentages are equal [-]."""
+    from scipy.stats import fisher_exact
+
+    reference = [reference_converged, reference_n - reference_converged]
+    return float(fisher_exact([reference, [converged, n - converged]]).pvalue)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -246,47 +232,38 @@ def holm(p_values: Sequence[float]) -> list[float]:
     With ``p_(1) <= ... <= p_(m)``, the adjusted p-value of ``p_(i)`` is the largest ``(m + 1 - j) p_(j)``, j <= i,
     and at most 1.
     """
-    adjusted = [0.0] * len(p_values)
-    largest = 0.0
-    for rank, k in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
-        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[k]))
-        adjusted[k] = largest
-    return adjusted
+    import numpy as np
+
+    order = np.argsort(p_values, kind="stable")
+    adjusted = np.empty(len(order))
+    scaled = np.arange(len(order), 0, -1) * np.asarray(p_values, dtype=float)[order]
+    adjusted[order] = np.minimum(np.maximum.accumulate(scaled), 1.0) if len(order) else 0.0
+    return adjusted.tolist()
 
 
-def committed_tables() -> Path | None:
-    """File of the default study's committed tables."""
-    file = Path(__file__).resolve().parents[2] / "results" / "published" / "useful_redundancy" / "tables.csv"
-    return file if file.is_file() else None
+def smallest_detectable(
+    n: int, reference_converged: int, reference_n: int, level: float, *, rise: bool = True
+) -> float | None:
+    """Smallest difference from a reference that n data sets show with 80 % power [percentage points].
 
+    The reference counts as given. Successes of the n data sets are binomial with probability q, and k of them or fewer
+    are significant at the level, so that the drop is the one to the q with P(K <= k) = 0.8. A rise of successes is a
+    drop of failures. None where not even 0 and n successes are significant.
+    """
+    from scipy.stats import beta
 
-def read_tables(file: Path) -> list[dict[str, Any]]:
-    """Read tables that ``ctid table --format csv`` wrote."""
-    try:
-        with file.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.DictReader(stream)
-            missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
-            if missing:
-                advice = "write such a file with: ctid table --format csv"
-                raise UsageError(f"{file} has no column {', '.join(missing)}; {advice}")
-            rows = []
-            for line in reader:
-                line.pop(None, None)
-                row = _plain_row(line)
-                n, converged = row["n"], row["converged"]
-                # An empty field is a cell without a success rule.
-                judged = line["converged"] not in (None, "")
-                if n is None or (judged and not (converged is not None and 0 <= converged <= n)):
-                    raise UsageError(
-                        f"{file}:{reader.line_num}: n and converged must be counts with 0 <= converged <= n, "
-                        f"not {line['n']!r} and {line['converged']!r}"
-                    )
-                rows.append(row)
-    except OSError as error:
-        raise UsageError(f"{file} cannot be read: {error.strerror or error}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise UsageError(f"{file} is not a comma-separated text file: {error}") from None
-    return rows
+    drops = []
+    for expected in (reference_converged, reference_n - reference_converged)[: 1 + rise]:
+        low, high = -1, n * expected // reference_n
+        while low < high:
+            middle = (low + high + 1) // 2
+            if fisher(middle, n, expected, reference_n) < level:
+                low = middle
+            else:
+                high = middle - 1
+        if 0 <= low < n:
+            drops.append(100 * (expected / reference_n - float(beta.ppf(1 - POWER, low + 1, n - low))))
+    return min(drops, default=None)
 
 
 def write_comparison(comparison: Comparison, style: str = "text") -> str:
@@ -295,21 +272,16 @@ def write_comparison(comparison: Comparison, style: str = "text") -> str:
         return json.dumps(comparison.as_dict(), indent=1, allow_nan=False)
     if style == "csv":
         return csv_text([cell.as_dict() for cell in comparison.cells]).rstrip("\n")
-    parts = [_fill(_verdict(comparison), style)]
     wrong = comparison.mismatches
-    for title, cells in (
-        (f"Other than in {comparison.reference}:", [cell for cell in wrong if cell.against == "committed"]),
-        ("Lower than in the paper:", [cell for cell in wrong if cell.against == "paper"]),
-        (
-            "For information, differences from the paper that are no mismatch (reasons: the study's README):",
-            comparison.differences,
+    parts: dict[str, list[ComparedCell]] = {
+        f"Other than in {comparison.reference}:": [cell for cell in wrong if cell.against == "committed"],
+        "Lower than in the paper:": [cell for cell in wrong if cell.against == "paper"],
+        "For information, differences from the paper that are no mismatch (reasons: the study's README):": (
+            comparison.differences
         ),
-    ):
-        if cells:
-            parts.append(("\n\n" if style == "md" else "\n").join([_fill(title, style), _listing(cells, style)]))
-    # Notes hold commands, which must stay on one line.
-    notes = ("\n\n" if style == "md" else "\n").join(f"Note: {note}" for note in comparison.notes)
-    return "\n\n".join([*parts, notes] if notes else parts)
+    }
+    listings: list[list[str | Table]] = [[title, _listing(cells)] for title, cells in parts.items() if cells]
+    return Report([[_verdict(comparison)], *listings], notes=comparison.notes).draw(style)
 
 
 def mismatch_sentence(comparison: Comparison) -> str:
@@ -321,23 +293,21 @@ def mismatch_sentence(comparison: Comparison) -> str:
 
 def _verdict(comparison: Comparison) -> str:
     cells = comparison.decisive
-    committed = sum(cell.against == "committed" for cell in cells)
-    paper = len(cells) - committed
+    paper = [cell for cell in cells if cell.against == "paper"]
     parts = []
-    if committed:
+    if len(paper) < len(cells):
         same = f"{comparison.identical} of them with the same counts"
-        parts.append(f"{count(committed, 'cell')} with {comparison.reference} ({same})")
+        parts.append(f"{count(len(cells) - len(paper), 'cell')} with {comparison.reference} ({same})")
     if paper:
-        methods = ", ".join(dict.fromkeys(cell.method for cell in cells if cell.against == "paper"))
-        parts.append(f"{count(paper, 'cell')} of {methods} with the paper")
-    least, most = min(cell.n for cell in cells), max(cell.n for cell in cells)
+        methods = ", ".join(dict.fromkeys(cell.row["method"] for cell in paper))
+        parts.append(f"{count(len(paper), 'cell')} of {methods} with the paper")
+    least, most = (extreme(cell.row["n"] for cell in cells) for extreme in (min, max))
     sizes = count(most, "data set") if least == most else f"{least} to {count(most, 'data set')}"
-    if comparison.mismatches:
-        text = mismatch_sentence(comparison)
-    else:
-        text = f"No difference beyond sampling error in {count(len(cells), 'comparison')}"
-    text += f": {' and '.join(parts)}, from {sizes} a cell."
+    text = f"No difference beyond sampling error in {count(len(cells), 'comparison')}"
+    text = mismatch_sentence(comparison) if comparison.mismatches else text
+    text += f": {listed(parts)}, from {sizes} a cell."
     text += f" Fisher's exact test, Holm's correction: a chance of at most {100 * LEVEL:g} % of any false alarm."
+    text += f" {_power(cells)}"
     if comparison.not_run:
         text += f" Not run, so not compared: {count(comparison.not_run, 'cell')}."
     if comparison.not_in_reference:
@@ -347,72 +317,39 @@ def _verdict(comparison: Comparison) -> str:
     return text
 
 
-def _listing(cells: Sequence[ComparedCell], style: str) -> str:
-    keys = list(dict.fromkeys(key for cell in cells for key in cell.settings))
-    header = [
-        "table",
-        "sampling",
-        *map(setting_title, keys),
-        "initial delay",
-        "method",
-        "ours %",
-        "n",
-        "reference %",
-        "n",
-        "p",
-    ]
+def _power(cells: Sequence[ComparedCell]) -> str:
+    """What the comparisons could have found."""
+    found = [cell.detectable for cell in cells if cell.detectable is not None]
+    if not found:
+        return "With so few data sets no difference could have been detected, however large."
+    ends = " to ".join(dict.fromkeys(f"{end:.0f}" for end in (min(found), max(found))))
+    text = f"A single cell that differs by {ends} percentage points is detected with {100 * POWER:g} % probability"
+    text += ", by the exact binomial distribution and with the reference as given"
+    blind = len(cells) - len(found)
+    return f"{text}; in {count(blind, 'cell')} no difference could have been detected." if blind else f"{text}."
+
+
+def _listing(cells: Sequence[ComparedCell]) -> Table:
+    keys = settings_of(cell.row for cell in cells)
+    titles = ["table", "sampling", *map(setting_title, keys), "initial delay", "method"]
     body = [
         [
-            str(cell.table),
-            cell.sampling or "-",
-            *(setting_text(key, cell.settings.get(key)) for key in keys),
-            delay_label(cell.initial_delay),
-            cell.method,
-            percent(cell.percent, cell.n),
-            str(cell.n),
-            percent(cell.reference_percent, cell.reference_n),
-            str(cell.reference_n),
-            number(cell.p_value, 2),
+            *(str(cell.row["table"]), cell.row.get("sampling") or "-"),
+            *(setting_text(key, cell.row.get(key)) for key in keys),
+            *(delay_label(cell.row["initial_delay"]), cell.row["method"]),
+            *(percent(cell.percent, cell.row["n"]), str(cell.row["n"])),
+            *(percent(cell.reference_percent, cell.reference_n), str(cell.reference_n), number(cell.p_value, 2)),
         ]
         for cell in cells
     ]
-    return (text_table if style == "text" else markdown_table)(header, body, "l" * (len(keys) + 4) + "rrrrr")
+    return Table([*titles, "ours %", "n", "reference %", "n", "p"], body, "l" * len(titles) + "rrrrr")
 
 
-def _fill(text: str, style: str) -> str:
-    return text if style == "md" else textwrap.fill(text, 98, break_long_words=False, break_on_hyphens=False)
+def _is_counted(row: Row) -> bool:
+    return bool(row["n"]) and row["converged"] is not None
 
 
-def _identity(row: Mapping[str, Any]) -> _Identity:
+def _identity(row: Row) -> Any:
     """What makes two cells the same one, whichever table shows it."""
-    plain = _plain_row(row)
-    return plain["experiment"], plain["method"], plain["initial_delay"], frozenset(_settings(plain).items())
-
-
-def _settings(row: Mapping[str, Any]) -> dict[str, Any]:
-    # No swept field has a reserved name.
-    return {key: value for key, value in row.items() if key not in RESERVED_COLUMNS and value is not None}
-
-
-def _plain_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row in which values are the same whether they come from a CSV file or from results."""
-    plain = {key: _plain(value) for key, value in row.items()}
-    # Names stay what they are, also where they look like numbers.
-    plain |= {key: row[key] for key in ("table", "experiment", "method")}
-    for key in ("n", "converged"):
-        value = plain[key]
-        plain[key] = int(value) if isinstance(value, float) and value.is_integer() else None
-    return plain
-
-
-def _plain(value: Any) -> Any:
-    if value is None or value == "":
-        return None
-    if isinstance(value, bool):
-        return str(value)
-    if isinstance(value, list | dict):
-        return json.dumps(value)
-    try:
-        return float(value)
-    except ValueError:
-        return str(value)
+    settings = {(key, row[key]) for key in settings_of([row]) if row[key] is not None}
+    return row["experiment"], row["method"], row["initial_delay"], frozenset(settings)

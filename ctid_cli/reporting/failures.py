@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from typing import Any
 
+from ctid_cli.reporting.percentages import ALWAYS
 from ctid_cli.reporting.results import Results, lookup
-from ctid_cli.reporting.rows import ALWAYS
 
 #: Columns of the list; further swept fields follow.
 FAILING_COLUMNS = (

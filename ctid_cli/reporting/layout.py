@@ -1,38 +1,104 @@
-"""Aligned text and Markdown tables, and how numbers look in them."""
+"""How answers look: aligned text or Markdown, and how numbers are written in it."""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 import math
-import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
-#: Width of paragraphs.
-WIDTH = 100
+from ctid_cli import text
+
+
+@dataclass(frozen=True)
+class Table:
+    """Texts in columns under a header, each column to the left (``l``) or to the right (``r``)."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    align: str
+
+    def draw(self, style: str = "text") -> str:
+        """Columns padded with blanks and a rule under the header, or Markdown (``md``)."""
+        lines = [self.header, *self.rows]
+        if style == "md":
+            drawn = ["| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |" for cells in lines]
+            rule = "|" + "|".join(":--" if side == "l" else "--:" for side in self.align) + "|"
+        else:
+            widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+            columns = list(zip(self.align, widths, strict=True))
+            drawn = [
+                "  ".join(
+                    cell.ljust(width) if side == "l" else cell.rjust(width)
+                    for cell, (side, width) in zip(cells, columns, strict=True)
+                ).rstrip()
+                for cells in lines
+            ]
+            rule = "-" * (sum(widths) + 2 * (len(widths) - 1))
+        return "\n".join([drawn[0], rule, *drawn[1:]])
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a command answers: for people blocks of paragraphs and tables, for programs records."""
+
+    #: A paragraph that begins with ``### `` is a heading; what holds line ends is drawn already.
+    blocks: Sequence[Sequence[str | Table]]
+    records: Sequence[Mapping[str, Any]] = ()
+    #: Remarks, never wrapped because they hold commands.
+    notes: Sequence[str] = field(default=())
+
+    def draw(self, style: str = "text") -> str:
+        """The report for people, as text or as Markdown (``md``)."""
+        notes = [f"Note: {note}" for note in self.notes]
+        if style == "md":
+            items = [item for block in self.blocks for item in block]
+            return "\n\n".join([*(item.draw("md") if isinstance(item, Table) else item for item in items), *notes])
+        blocks = ["\n".join(map(_drawn, block)) for block in self.blocks if block]
+        return "\n\n".join([*blocks, "\n".join(notes)] if notes else blocks)
+
+
+def _drawn(item: str | Table) -> str:
+    if isinstance(item, Table):
+        return item.draw()
+    return item if "\n" in item else text.wrapped(item.removeprefix("### "))
+
+
+def write_reports(reports: Sequence[Report], style: str) -> str:
+    """Reports as ``text``, ``md``, ``csv`` or ``json``."""
+    records = [record for report in reports for record in report.records]
+    if style == "json":
+        return json.dumps(records, indent=1, allow_nan=False)
+    if style == "csv":
+        return csv_text(records).rstrip("\n")
+    return "\n\n\n".join(report.draw(style) for report in reports)
+
+
+def csv_text(rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None) -> str:
+    """Rows as CSV: an empty field where a row lacks a column, JSON for lists and mappings."""
+    rows = [
+        {key: json.dumps(value) if isinstance(value, dict | list) else value for key, value in row.items()}
+        for row in rows
+    ]
+    names = list(dict.fromkeys(key for row in rows for key in row) if columns is None else columns)
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, names, restval="", lineterminator="\n", extrasaction="ignore")
+    writer.writeheader()
+    writer.writerows(rows)
+    return buffer.getvalue()
 
 
 def text_table(header: Sequence[str], rows: Sequence[Sequence[str]], align: str) -> str:
-    """Columns padded with blanks, with a rule under the header."""
-    widths = [max(len(row[k]) for row in [header, *rows]) for k in range(len(header))]
-
-    def line(cells: Sequence[str]) -> str:
-        padded = [
-            cell.ljust(width) if side == "l" else cell.rjust(width)
-            for cell, width, side in zip(cells, widths, align, strict=True)
-        ]
-        return "  ".join(padded).rstrip()
-
-    rule = "-" * (sum(widths) + 2 * (len(widths) - 1))
-    return "\n".join([line(header), rule, *(line(row) for row in rows)])
+    """A table as text."""
+    return Table(header, rows, align).draw()
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]], align: str) -> str:
-    """A Markdown table."""
-    sides = "|" + "|".join(":--" if side == "l" else "--:" for side in align) + "|"
-
-    def line(cells: Sequence[str]) -> str:
-        return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
-    return "\n".join([line(header), sides, *(line(row) for row in rows)])
+    """A table as Markdown."""
+    return Table(header, rows, align).draw("md")
 
 
 def number(value: object, digits: int = 6) -> str:
@@ -93,13 +159,6 @@ def delay_label(initial_delay: float | str | None) -> str:
     return initial_delay if isinstance(initial_delay, str) else f"{initial_delay:g} s"
 
 
-def wrapped(text: str, indent: str = "", hanging: int = 0) -> list[str]:
-    """Lines of a paragraph of `WIDTH` columns."""
-    return textwrap.wrap(
-        text,
-        WIDTH,
-        initial_indent=indent,
-        subsequent_indent=indent + " " * hanging,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+def wrapped(paragraph: str, indent: str = "", hanging: int = 0) -> list[str]:
+    """Lines of a paragraph."""
+    return text.wrapped(paragraph, indent, indent + " " * hanging).splitlines()

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import shlex
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,10 @@ from ctid_cli.storage.folder import experiment_folders
 from ctid_cli.storage.manifest import FAILURES, Manifest
 from ctid_cli.storage.store import Stored, read_stored
 from ctid_cli.storage.summary import summarise
+from ctid_cli.text import did_you_mean
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Results:
     """One experiment's results."""
 
@@ -65,20 +65,21 @@ class Results:
     def sampling(self) -> str | None:
         """``regular`` or ``irregular``; None for a measured record."""
         kind = lookup(self.settings, "sampling.kind")
-        if kind is None:
-            return None
-        return "regular" if kind == "regular" else "irregular"
+        return kind if kind in (None, "regular") else "irregular"
+
+    def swept(self, part: str) -> list[str]:
+        """Names of the fields swept over ``data_cells`` or ``estimators``."""
+        return list(dict.fromkeys(name for item in self.manifest[part] for name in item["swept"]))
 
     def summaries(self, by: Sequence[str]) -> list[dict[str, Any]]:
         """Counts and percentages in groups, as plain Python."""
         import pandas as pd
 
         frame = pd.DataFrame(self.rows, columns=[*by, "status", "converged", "seconds"])
-        frame = frame.astype({"converged": "boolean", "seconds": "float64"})
-        counted = summarise(frame, by)
+        counted = summarise(frame.astype({"converged": "boolean", "seconds": "float64"}), by).astype(object)
         return [
             {str(key): value for key, value in row.items()}
-            for row in counted.astype(object).where(counted.notna(), None).to_dict("records")
+            for row in counted.where(counted.notna(), None).to_dict("records")
         ]
 
 
@@ -89,20 +90,12 @@ def out_option(out: Path) -> str:
 
 def shown_path(file: Path) -> str:
     """A file as a message names it."""
-    try:
-        return str(file.relative_to(Path.cwd()))
-    except ValueError:
-        return str(file)
+    return str(file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file)
 
 
-def lookup(settings: Mapping[str, Any], path: str) -> Any:
-    """Value at a key path such as ``noise.snr_db``."""
-    value: Any = settings
-    for key in path.split("."):
-        if not isinstance(value, Mapping) or key not in value:
-            return None
-        value = value[key]
-    return value
+def lookup(settings: Any, path: str) -> Any:
+    """Value at a key path such as ``noise.snr_db``; None where there is none."""
+    return reduce(lambda value, key: value.get(key) if isinstance(value, Mapping) else None, path.split("."), settings)
 
 
 def experiments_in(out: Path) -> list[str]:
@@ -112,19 +105,17 @@ def experiments_in(out: Path) -> list[str]:
 
 def find_results(out: Path, experiment: str) -> Results | None:
     """Results of one experiment, or None if it was never run into this folder."""
-    return read_results(out, experiment) if experiment in experiments_in(out) else None
+    return Results(out / experiment, read_stored(out / experiment)) if experiment in experiments_in(out) else None
 
 
 def read_results(out: Path, experiment: str) -> Results:
     """Results of one experiment."""
-    known = experiments_in(out)
-    if experiment not in known:
-        close = difflib.get_close_matches(experiment, known, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else "."
-        there = ", ".join(known) or "none"
+    found = find_results(out, experiment)
+    if found is None:
+        known = experiments_in(out)
+        hint, there = did_you_mean(experiment, known) or ".", ", ".join(known) or "none"
         raise UsageError(f"there are no results of {experiment!r} in {out}{hint} Experiments there: {there}")
-    folder = out / experiment
-    return Results(folder, read_stored(folder))
+    return found
 
 
 def differences(settings: Mapping[str, Any], reference: Mapping[str, Any], shown: Collection[str]) -> list[str]:
@@ -140,7 +131,7 @@ def differences(settings: Mapping[str, Any], reference: Mapping[str, Any], shown
         ours, theirs = left.get(path), right.get(path)
         if path == "starts.initial_delay":
             # Fixed delays are columns of their own; only another random range would go unnoticed.
-            ours, theirs = (_random_only(side) for side in (ours, theirs))
+            ours, theirs = ([item for item in side or () if isinstance(item, Mapping)] for side in (ours, theirs))
             if not ours:
                 continue
         if ours != theirs:
@@ -148,15 +139,8 @@ def differences(settings: Mapping[str, Any], reference: Mapping[str, Any], shown
     return found
 
 
-def _random_only(delays: Any) -> list[Any]:
-    return [delay for delay in delays if isinstance(delay, Mapping)] if isinstance(delays, list) else []
-
-
 def _leaves(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     leaves: dict[str, Any] = {}
     for key, value in settings.items():
-        if isinstance(value, Mapping):
-            leaves |= _leaves(value, f"{prefix}{key}.")
-        else:
-            leaves[f"{prefix}{key}"] = value
+        leaves |= _leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
     return leaves

@@ -21,7 +21,6 @@ DEFAULT_STUDY = "useful-redundancy"
 class StudyExperiment:
     """One experiment of a study."""
 
-    name: str
     config: str
     sampling: str
 
@@ -52,7 +51,6 @@ class Study:
     """A published study."""
 
     name: str
-    title: str
     source: str
     success: str
     published_data_sets: int
@@ -75,38 +73,31 @@ def load_study(name: str = DEFAULT_STUDY) -> Study:
     for file in sorted(data_folder("experiments").glob("*/study.yaml")):
         content = yaml.safe_load(file.read_text(encoding="utf-8"))
         if content["study"] == name:
-            return _study(content)
+            source, fields = content["source"], content["fields"]
+            return Study(
+                name=name,
+                source=f"{source['authors']}: {source['title']} ({source['identifier']})",
+                success=content["success"],
+                published_data_sets=content["published_data_sets"],
+                methods=content["methods"],
+                must_reach=tuple(content["must_reach"]),
+                fields=fields,
+                experiments={key: StudyExperiment(**item) for key, item in content["experiments"].items()},
+                tables={number: _table(number, table, fields) for number, table in content["tables"].items()},
+            )
     raise UsageError(f"there is no study named {name!r}")
 
 
 def tables_of(experiment: str) -> list[int]:
     """Numbers of the default study's tables that an experiment fills."""
-    study = load_study()
-    return [n for n, table in study.tables.items() if any(row.experiment == experiment for row in table.rows)]
-
-
-def _study(content: dict[str, Any]) -> Study:
-    source = content["source"]
-    tables = {number: _table(number, table, content["fields"]) for number, table in content["tables"].items()}
-    return Study(
-        name=content["study"],
-        title=content["title"],
-        source=f"{source['authors']}: {source['title']} ({source['identifier']})",
-        success=content["success"],
-        published_data_sets=content["published_data_sets"],
-        methods=content["methods"],
-        must_reach=tuple(content["must_reach"]),
-        fields=content["fields"],
-        experiments={name: StudyExperiment(name, **item) for name, item in content["experiments"].items()},
-        tables=tables,
-    )
+    return [n for n, table in load_study().tables.items() if experiment in (row.experiment for row in table.rows)]
 
 
 def _table(number: int, content: dict[str, Any], fields: Mapping[str, str]) -> StudyTable:
     delays = tuple(delay if delay == "random" else float(delay) for delay in content["initial_delays"])
     rows = []
     for row in content["rows"]:
-        published = {method: tuple(float(v) for v in values) for method, values in row["published"].items()}
+        published = {method: tuple(map(float, values)) for method, values in row["published"].items()}
         if any(len(values) != len(delays) for values in published.values()):
             raise ValueError(f"table {number}: every published row needs {len(delays)} values")
         rows.append(StudyRow(row["experiment"], {field: float(row[field]) for field in fields}, published))

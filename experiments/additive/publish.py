@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.layout import markdown_table, number
+from ctid_cli.reporting.layout import csv_text, markdown_table, number
 from ctid_cli.reporting.parameter_errors import ParameterErrors, ParameterEstimates, mse_ratio
 from ctid_cli.reporting.publication import copy_figures, environment
-from ctid_cli.reporting.tables import csv_text
 from experiments.additive.acceptance import COVERING, Found, acceptance, is_misused, read_study, write
 
 #: Numbers of samples that the text shows, of all that were run.

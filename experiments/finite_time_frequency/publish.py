@@ -11,10 +11,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ctid_cli.reporting.figures.finite_time_frequency import DERIVED
-from ctid_cli.reporting.layout import markdown_table, number
+from ctid_cli.reporting.layout import csv_text, markdown_table, number
 from ctid_cli.reporting.publication import copy_figures, environment
 from ctid_cli.reporting.results import Results
-from ctid_cli.reporting.tables import csv_text
 from experiments.additive.publish import rounded
 from experiments.finite_time_frequency import as_printed
 from experiments.finite_time_frequency.acceptance import ITEMS, write

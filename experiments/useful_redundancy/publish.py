@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ctid_cli.reporting.failures import FAILING_COLUMNS, failing_estimates
+from ctid_cli.reporting.layout import csv_text
 from ctid_cli.reporting.publication import copy_figures, environment
 from ctid_cli.reporting.results import experiments_in, read_results
 from ctid_cli.reporting.study import load_study
-from ctid_cli.reporting.tables import csv_text
 
 #: Methods whose failures are not listed one by one: from most initial delays this one is meant to fail.
 UNLISTED = ("existing",)

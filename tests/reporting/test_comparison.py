@@ -5,17 +5,19 @@ from math import comb
 import pytest
 
 from ctid_cli.errors import UsageError
+from ctid_cli.reporting.committed import read_tables
 from ctid_cli.reporting.comparison import (
     LEVEL,
     check_tables,
     compare,
+    fisher,
     holm,
     mismatch_sentence,
-    read_tables,
+    smallest_detectable,
     write_comparison,
 )
+from ctid_cli.reporting.layout import csv_text
 from ctid_cli.reporting.study import load_study
-from ctid_cli.reporting.tables import csv_text
 
 STUDY = load_study()
 
@@ -78,7 +80,7 @@ def test_the_same_tables_agree_cell_by_cell_also_by_way_of_a_file(tmp_path):
     ]
     comparison = compare(rows, read_tables(written(tmp_path, rows)), STUDY, "tables.csv")
     # an estimate without a start stands in two tables and is compared once
-    assert [(cell.against, cell.method, cell.initial_delay) for cell in comparison.cells] == [
+    assert [(cell.against, cell.row["method"], cell.row["initial_delay"]) for cell in comparison.cells] == [
         ("committed", "existing", 0.0),
         ("committed", "existing", "random"),
         ("committed", "delay_profile", None),
@@ -129,8 +131,11 @@ def test_the_proposed_method_must_not_fall_below_the_paper_but_may_exceed_it():
 def test_the_existing_method_differs_from_the_paper_for_information_only():
     rows = [row(0, published_percent=100.0), row(100, method="proposed", published_percent=99.0)]
     comparison = compare(rows, None, STUDY)
-    assert [(cell.method, cell.decisive) for cell in comparison.cells] == [("existing", False), ("proposed", True)]
-    assert (comparison.mismatches, [cell.method for cell in comparison.differences]) == ([], ["existing"])
+    assert [(cell.row["method"], cell.decisive) for cell in comparison.cells] == [
+        ("existing", False),
+        ("proposed", True),
+    ]
+    assert (comparison.mismatches, [cell.row["method"] for cell in comparison.differences]) == ([], ["existing"])
     # each is a family of its own
     assert all(cell.adjusted_p_value == cell.p_value for cell in comparison.cells)
     text = write_comparison(comparison)
@@ -231,3 +236,32 @@ def test_without_any_results_it_says_what_to_run(tmp_path):
         check_tables(["3"], tmp_path)
     assert "ctid run" in str(caught.value)
     assert "case2_irregular.yaml" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("n", "reference", "m", "level"), [(100, 100, 100, 1e-4), (40, 55, 100, 0.01), (20, 0, 30, 0.01)]
+)
+def test_the_detectable_difference_is_found_with_80_percent_probability(n, reference, m, level):
+    change = smallest_detectable(n, reference, m, level) / 100
+
+    def power(q):
+        significant = [k for k in range(n + 1) if fisher(k, n, reference, m) < level]
+        return sum(comb(n, k) * q**k * (1 - q) ** (n - k) for k in significant)
+
+    # the other side of the reference adds next to nothing
+    powers = [power(q) for q in (reference / m - change, reference / m + change) if 0 <= q <= 1]
+    assert max(powers) == pytest.approx(0.8, abs=1e-6)
+
+
+def test_a_check_says_what_it_could_have_found():
+    few = compare([row(1, n=1)], [row(90)], STUDY, "tables.csv")
+    assert few.cells[0].detectable is None
+    assert "no difference could have been detected, however large" in " ".join(write_comparison(few).split())
+    many = compare([row(100), row(1, n=1, initial_delay=1.0)], [row(100), row(100, initial_delay=1.0)], STUDY, "t.csv")
+    assert 5 < many.cells[0].detectable < 20
+    text = " ".join(write_comparison(many).split())
+    assert f"differs by {many.cells[0].detectable:.0f} percentage points is detected with 80 % probability" in text
+    assert "in 1 cell no difference could have been detected" in text
+    # a higher percentage than the paper's is no mismatch, so that only a lower one is looked for
+    above = compare([row(0, method="proposed", published_percent=0.0)], None, STUDY)
+    assert above.cells[0].detectable is None

@@ -2,10 +2,9 @@
 
 import pytest
 
-from ctid_cli.reporting.report import success_sentence
+from ctid_cli.reporting.experiment_tables import experiment_report, success_sentence
+from ctid_cli.reporting.percentages import experiment_rows, measures_of
 from ctid_cli.reporting.results import Results
-from ctid_cli.reporting.rows import experiment_rows
-from ctid_cli.reporting.tables import frequency_table
 from ctid_cli.running.plan import build_plan
 from ctid_cli.running.worker import failed
 from ctid_cli.specification.spec import load_spec
@@ -67,14 +66,18 @@ def results(tmp_path):
 
 def tracker_and_whole(results):
     tracker, whole = experiment_rows(results, "made")
-    assert (tracker.method, whole.method) == ("tracker", "whole")
+    assert (tracker["method"], whole["method"]) == ("tracker", "whole")
     return tracker, whole
+
+
+def measured(row):
+    return {name: row[name] for name in measures_of([row])}
 
 
 def test_medians_are_of_the_slowest_tone(results):
     tracks = [of_track(1.0, 3.0, 2.0, 0.1, 0), of_track(2.0, 1.5, 3.0, 0.3, 2), of_track(5.0, 0.0, 9.0, 0.2, 1)]
     tracker, whole = tracker_and_whole(results(tracks, [of_record(0.01)]))
-    assert tracker.measures == {
+    assert measured(tracker) == {
         "median_settling_time": 3.0,
         "median_settling_after_step": 3.0,
         "median_rms_1": 0.2,
@@ -82,45 +85,45 @@ def test_medians_are_of_the_slowest_tone(results):
         "false_alarms": 3,
     }
     # settled in time: not the one with 5 and 9 s
-    assert (tracker.n, tracker.converged) == (3, 2)
-    assert whole.measures == {
+    assert (tracker["n"], tracker["converged"]) == (3, 2)
+    assert measured(whole) == {
         "median_settling_time": None,
         "median_settling_after_step": None,
         "median_rms_1": 0.01,
         "median_rms_2": 0.05,
         "false_alarms": None,
     }
-    assert whole.converged == 1, "an estimate of a whole record has settled if its errors lie in the band"
+    assert whole["converged"] == 1, "an estimate of a whole record has settled if its errors lie in the band"
 
 
 def test_what_never_settles_counts_as_later_than_all_others(results):
     never = of_track(None, 1.0, None, 0.1, 0)
     once = of_track(1.0, 1.0, 1.0, 0.1, 0)
     tracker, _ = tracker_and_whole(results([never, once, once], []))
-    assert tracker.measures["median_settling_time"] == 1.0
-    assert tracker.converged == 2
+    assert tracker["median_settling_time"] == 1.0
+    assert tracker["converged"] == 2
     tracker, _ = tracker_and_whole(results([never, never, once, once], []))
-    assert tracker.measures["median_settling_time"] is None, "half of them never did"
-    assert tracker.percent == 50.0
+    assert tracker["median_settling_time"] is None, "half of them never did"
+    assert tracker["percent"] == 50.0
 
 
 def test_estimates_that_failed_have_no_measures_and_have_not_settled(results):
     broken = failed("ValueError: too short", "FAILED")
     tracker, whole = tracker_and_whole(results([of_track(1.0, 1.0, 1.0, 0.1, 1), broken, broken], [broken]))
-    assert (tracker.n, tracker.failed, tracker.converged) == (3, 2, 1)
-    assert tracker.measures["median_rms_1"] is None
-    assert tracker.measures["false_alarms"] == 1
-    assert (whole.failed, whole.converged, whole.measures["median_rms_1"]) == (1, 0, None)
+    assert (tracker["n"], tracker["failed"], tracker["converged"]) == (3, 2, 1)
+    assert tracker["median_rms_1"] is None
+    assert tracker["false_alarms"] == 1
+    assert (whole["failed"], whole["converged"], whole["median_rms_1"]) == (1, 0, None)
     nothing, _ = tracker_and_whole(results([broken], []))
-    assert (nothing.n, nothing.measures) == (1, {})
+    assert (nothing["n"], measures_of([nothing])) == (1, [])
 
 
 def test_rows_that_were_not_run_stay_in_the_table(results):
     made = results([of_track(1.0, 1.0, 1.0, 0.1, 0)], [])
     rows = experiment_rows(made, "made")
-    assert [row.n for row in rows] == [1, 0]
-    assert "initial_delay" in rows[0].as_dict()
-    text = frequency_table("made", rows, success_sentence(made.settings))
+    assert [row["n"] for row in rows] == [1, 0]
+    assert "initial_delay" in rows[0]
+    text = experiment_report(made).draw()
     lines = text.splitlines()
     header = next(k for k, line in enumerate(lines) if line.startswith("estimator"))
     assert lines[header].split("  ")[0] == "estimator"
@@ -129,8 +132,8 @@ def test_rows_that_were_not_run_stay_in_the_table(results):
     assert whole.split()[0] == "whole"
     assert "100" not in whole
     assert "alarms: false ones" in text
-    markdown = frequency_table("made", rows, "x", "md")
-    assert markdown.startswith("### made\n\nCounted: x.\n\n| estimator | % |")
+    markdown = experiment_report(made).draw("md")
+    assert markdown.startswith(f"### made\n\nCounted: {success_sentence(made.settings)}.\n\n| estimator | % |")
 
 
 def test_the_rule_in_words(results):

@@ -1,11 +1,16 @@
+import json
+
 import pytest
 
 from ctid_cli.errors import UsageError
+from ctid_cli.reporting.committed import made_by
 from ctid_cli.reporting.failures import FAILING_COLUMNS, failing_estimates
-from ctid_cli.reporting.report import build_tables, write_tables
-from ctid_cli.reporting.rows import pooled_rows, study_rows
+from ctid_cli.reporting.layout import Report, write_reports
+from ctid_cli.reporting.percentages import pooled_rows, study_rows
 from ctid_cli.reporting.study import load_study
-from ctid_cli.reporting.tables import study_table
+from ctid_cli.reporting.study_table import study_blocks
+from ctid_cli.reporting.tables import build_tables
+from ctid_cli.storage.version import code_version
 
 RANDOM = "uniform(0, 9)"
 
@@ -33,7 +38,7 @@ def test_every_published_number_of_the_existing_method_stands_in_its_cell(empty,
     def published(number):
         return {
             row["initial_delay"]: row["published_percent"]
-            for row in empty[number].rows
+            for row in empty[number].records
             if (row["sampling"], row["snr_db"], row["method"]) == (sampling, snr, "existing")
         }
 
@@ -44,7 +49,7 @@ def test_every_published_number_of_the_existing_method_stands_in_its_cell(empty,
 def test_the_proposed_method_reached_99_or_100_percent_everywhere(empty):
     published = {number: [] for number in empty}
     for number, table in empty.items():
-        for row in table.rows:
+        for row in table.records:
             if row["method"] == "proposed":
                 published[number].append((row["sampling"], row["snr_db"], row["published_percent"]))
     assert {number: len(values) for number, values in published.items()} == {1: 24, 2: 4, 3: 24, 4: 4}
@@ -54,18 +59,40 @@ def test_the_proposed_method_reached_99_or_100_percent_everywhere(empty):
 
 def test_without_results_every_cell_says_not_run_and_keeps_its_published_value(empty):
     for number, table in empty.items():
-        assert all(row["n"] == 0 and row["percent"] is None and row["low"] is None for row in table.rows)
-        assert "not run" in table.text
+        assert all(row["n"] == 0 and row["percent"] is None and row["low"] is None for row in table.records)
+        assert "not run" in table.draw()
         assert f"case{(number + 1) // 2}_regular.yaml" in "\n".join(table.notes)
-        assert max(len(line) for line in table.text.splitlines()) <= 100
+        assert max(len(line) for line in Report(table.blocks).draw().splitlines()) <= 100
 
 
 def test_the_whole_study_is_the_default(tmp_path):
     tables = build_tables([], tmp_path)
-    assert [table.rows[0]["table"] for table in tables] == [1, 2, 3, 4]
-    text = write_tables(tables, "text")
+    assert [table.records[0]["table"] for table in tables] == [1, 2, 3, 4]
+    text = write_reports(tables, "text")
     assert all(f"Table {number}." in text for number in (1, 2, 3, 4))
     assert "arXiv:1703.09344" in text
+
+
+def test_in_a_fresh_clone_the_committed_tables_stand_in(tmp_path):
+    (table,) = build_tables(["3"], tmp_path, committed=True)
+    assert {row["table"] for row in table.records} == {3}
+    assert all(row["n"] and row["percent"] is not None for row in table.records)
+    assert "committed results, of " in table.notes[0]
+    assert "not run" not in Report(table.blocks).draw()
+    assert json.loads(write_reports([table], "json"))[0]["table"] == 3
+
+
+def test_results_of_earlier_code_are_called_so(tmp_path):
+    tables, current = tmp_path / "tables.csv", {"code_version": code_version()}
+    environment = tmp_path / "environment.json"
+    assert made_by(tables) == ""
+    environment.write_text(json.dumps({"case1": [current]}), encoding="utf-8")
+    assert made_by(tables) == ""
+    old = {"case1": [current], "case2": [{"code_version": "0" * 16}]}
+    environment.write_text(json.dumps(old), encoding="utf-8")
+    assert made_by(tables) == " by an earlier version of the code or of its numerical libraries"
+    environment.write_text(json.dumps({"commit": "abcdef" * 7, "sessions": old}), encoding="utf-8")
+    assert made_by(tables).endswith(" libraries (commit abcdefabcdef)")
 
 
 @pytest.mark.parametrize("name", ["5", "useful-redundancy/0", "quickstrat", "other-study/1"])
@@ -88,15 +115,15 @@ def mixed(make_results, add_estimator, estimate):
 def tabulated(results, number, style="text"):
     study = load_study()
     rows = study_rows(study, study.tables[number], {results.experiment: results})
-    return rows, study_table(study, study.tables[number], rows, style)
+    return rows, Report(study_blocks(study, study.tables[number], rows, style)).draw(style)
 
 
 def test_methods_stand_in_the_order_of_the_study_below_each_setting(mixed):
     for number in (1, 2):
         rows, text = tabulated(mixed, number)
-        regular = [row for row in rows if (row.sampling, row.settings["snr_db"]) == ("regular", 5.0)]
+        regular = [row for row in rows if (row["sampling"], row["snr_db"]) == ("regular", 5.0)]
         methods = ["existing", "proposed", "delay_profile", "profile_spectral"]
-        assert list(dict.fromkeys(row.method for row in regular)) == methods
+        assert list(dict.fromkeys(row["method"] for row in regular)) == methods
         first = text.split("15 dB")[0]
         assert sorted(methods, key=lambda method: first.index(f"{method} ")) == methods
 
@@ -104,8 +131,8 @@ def test_methods_stand_in_the_order_of_the_study_below_each_setting(mixed):
 @pytest.mark.parametrize("number", [1, 2])
 def test_an_estimator_without_a_start_is_in_every_table_with_one_estimate_per_data_set(mixed, number):
     rows, text = tabulated(mixed, number)
-    mine = [row for row in rows if row.method == "profile_spectral"]
-    assert [(row.settings["snr_db"], row.initial_delay, row.n, row.percent) for row in mine] == [
+    mine = [row for row in rows if row["method"] == "profile_spectral"]
+    assert [(row["snr_db"], row["initial_delay"], row["n"], row["percent"]) for row in mine] == [
         (5.0, None, 4, 75.0),
         (15.0, None, 4, 100.0),
     ]
@@ -150,13 +177,13 @@ def test_times_stand_in_text_and_markdown(mixed):
 def test_the_pooled_percentage_is_that_of_all_estimates_in_the_cells_of_the_table(mixed):
     study = load_study()
     rows, text = tabulated(mixed, 1)
-    pooled = {row.method: row for row in pooled_rows(study, study.tables[1], rows)}
+    pooled = {row["method"]: row for row in pooled_rows(study, study.tables[1], rows)}
     existing = pooled["existing"]
     # 1 of 4 at 5 dB, 1 of 1 at 15 dB; published from 0 s 65 and 69
-    assert (existing.cells, existing.cells_run, existing.n, existing.converged) == (24, 2, 5, 2)
-    assert (existing.percent, existing.published_percent) == (40.0, 67.0)
-    assert (pooled["delay_profile"].cells, pooled["delay_profile"].cells_run) == (4, 2)
-    assert (pooled["delay_profile"].percent, pooled["delay_profile"].published_percent) == (87.5, None)
+    assert (existing["cells"], existing["cells_run"], existing["n"], existing["converged"]) == (24, 2, 5, 2)
+    assert (existing["percent"], existing["published_percent"]) == (40.0, 67.0)
+    assert (pooled["delay_profile"]["cells"], pooled["delay_profile"]["cells_run"]) == (4, 2)
+    assert (pooled["delay_profile"]["percent"], pooled["delay_profile"]["published_percent"]) == (87.5, None)
     line = next(line for line in text.split("All cells")[1].splitlines() if line.startswith("existing"))
     assert line.split() == ["existing", "2", "of", "24", "5", "40.0", "67.0", "20", "ms"]
 
@@ -166,16 +193,16 @@ def test_what_was_run_beyond_the_table_is_not_pooled(make_results, estimate):
     results = make_results({(10.0, "0.0"): [estimate(8.0)], (5.0, "0.0"): [estimate(3.0)]}, snrs=(5.0, 10.0))
     results.manifest["starts"]["0.0"] = 2.0
     rows, _ = tabulated(results, 1)
-    assert sum(row.n for row in rows) == 2
-    assert all(row.n == 0 for row in pooled_rows(study, study.tables[1], rows))
+    assert sum(row["n"] for row in rows) == 2
+    assert all(row["n"] == 0 for row in pooled_rows(study, study.tables[1], rows))
     results.manifest["starts"]["0.0"] = 0.0
     (existing, _) = pooled_rows(study, study.tables[1], tabulated(results, 1)[0])
-    assert (existing.n, existing.converged) == (1, 0)
+    assert (existing["n"], existing["converged"]) == (1, 0)
 
 
 def test_without_results_the_pooled_published_percentage_is_the_mean_of_the_table(empty):
     values = [value for case, _, _, fixed, _ in EXISTING if case == 1 for value in fixed]
-    line = next(line for line in empty[1].text.split("All cells")[1].splitlines() if line.startswith("existing"))
+    line = next(line for line in empty[1].draw().split("All cells")[1].splitlines() if line.startswith("existing"))
     assert line.split() == ["existing", "0", "of", "24", "0", "not", "run", f"{sum(values) / len(values):.1f}"]
 
 

@@ -2,11 +2,12 @@ import json
 
 import pytest
 
-from ctid_cli.reporting.report import write_tables
+from ctid_cli.reporting.experiment_tables import experiment_report
+from ctid_cli.reporting.layout import Report, csv_text, write_reports
+from ctid_cli.reporting.percentages import experiment_rows, settings_of, study_rows
 from ctid_cli.reporting.results import differences
-from ctid_cli.reporting.rows import experiment_rows, study_rows
 from ctid_cli.reporting.study import load_study
-from ctid_cli.reporting.tables import csv_text, experiment_table, study_table
+from ctid_cli.reporting.study_table import study_blocks
 from ctid_cli.storage.summary import wilson_interval
 
 RANDOM = "uniform(0, 9)"
@@ -23,8 +24,12 @@ def results(make_results, estimate):
     )
 
 
+def study_table(study, table, rows, style="text"):
+    return Report(study_blocks(study, table, rows, style)).draw(style)
+
+
 def cell(rows, snr, delay, method="existing"):
-    (row,) = [r for r in rows if (r.settings["snr_db"], r.initial_delay, r.method) == (snr, delay, method)]
+    (row,) = [r for r in rows if (r["snr_db"], r["initial_delay"], r["method"]) == (snr, delay, method)]
     return row
 
 
@@ -32,50 +37,49 @@ def test_percentages_count_failures_as_not_converged(results):
     rows = experiment_rows(results, "e")
     row = cell(rows, 5.0, 0.0)
     low, high = wilson_interval(2, 4)
-    assert (row.n, row.failed, row.converged, row.percent) == (4, 1, 2, 50.0)
-    assert (row.low, row.high) == pytest.approx((100 * low, 100 * high))
-    assert row.median_seconds == pytest.approx(0.02)
-    assert cell(rows, 5.0, "random").percent == 100.0
-    assert cell(rows, 15.0, 0.0).n == 1
-    assert (cell(rows, 15.0, "random").n, cell(rows, 15.0, "random").percent) == (0, None)
+    assert (row["n"], row["failed"], row["converged"], row["percent"]) == (4, 1, 2, 50.0)
+    assert (row["low"], row["high"]) == pytest.approx((100 * low, 100 * high))
+    assert row["median_seconds"] == pytest.approx(0.02)
+    assert cell(rows, 5.0, "random")["percent"] == 100.0
+    assert cell(rows, 15.0, 0.0)["n"] == 1
+    assert (cell(rows, 15.0, "random")["n"], cell(rows, 15.0, "random")["percent"]) == (0, None)
 
 
 def test_fixed_and_random_starts_go_to_their_tables_beside_the_published_values(results):
     study = load_study()
     found = {results.experiment: results}
     fixed = study_rows(study, study.tables[1], found)
-    row = cell([r for r in fixed if r.sampling == "regular"], 5.0, 0.0)
-    assert (row.n, row.percent, row.published_percent) == (4, 50.0, 65.0)
+    row = cell([r for r in fixed if r["sampling"] == "regular"], 5.0, 0.0)
+    assert (row["n"], row["percent"], row["published_percent"]) == (4, 50.0, 65.0)
     random = study_rows(study, study.tables[2], found)
-    row = cell([r for r in random if r.sampling == "regular"], 5.0, "random")
-    assert (row.n, row.percent, row.published_percent) == (4, 100.0, 90.0)
+    row = cell([r for r in random if r["sampling"] == "regular"], 5.0, "random")
+    assert (row["n"], row["percent"], row["published_percent"]) == (4, 100.0, 90.0)
     # what was not run stays in the table
     assert len(fixed) == 48
     assert len(random) == 8
-    assert all(r.n == 0 for r in fixed if r.sampling == "irregular" or r.method == "proposed")
+    assert all(r["n"] == 0 for r in fixed if r["sampling"] == "irregular" or r["method"] == "proposed")
 
 
 def test_a_setting_that_is_not_swept_still_finds_its_row(make_results, estimate):
     results = make_results({(15.0, "0.0"): [estimate(8.0)]}, snrs=(15.0,), swept=False)
     study = load_study()
-    rows = [r for r in study_rows(study, study.tables[1], {results.experiment: results}) if r.n]
-    assert [(r.settings["snr_db"], r.initial_delay, r.n, r.published_percent) for r in rows] == [(15.0, 0.0, 1, 69.0)]
+    rows = [r for r in study_rows(study, study.tables[1], {results.experiment: results}) if r["n"]]
+    assert [(r["snr_db"], r["initial_delay"], r["n"], r["published_percent"]) for r in rows] == [(15.0, 0.0, 1, 69.0)]
 
 
 def test_the_snr_is_a_key_of_an_experiment_that_does_not_sweep_it(make_results, estimate):
     results = make_results({(15.0, "0.0"): [estimate(8.0)]}, snrs=(15.0,), swept=False)
-    assert {row.as_dict()["snr_db"] for row in experiment_rows(results, "e")} == {15.0}
+    assert {row["snr_db"] for row in experiment_rows(results, "e")} == {15.0}
     results.settings["noise"]["snr_db"] = None
-    rows = experiment_rows(results, "e")
-    assert {row.as_dict()["snr_db"] for row in rows} == {None}
-    assert "SNR" not in experiment_table("e", rows, "percent of something")
+    assert {row["snr_db"] for row in experiment_rows(results, "e")} == {None}
+    assert "SNR" not in experiment_report(results).draw()
 
 
 def test_values_beyond_the_published_ones_get_rows_without_a_published_value(make_results, estimate):
     results = make_results({(10.0, "0.0"): [estimate(8.0)]}, snrs=(10.0,))
     study = load_study()
-    rows = [r for r in study_rows(study, study.tables[1], {results.experiment: results}) if r.n]
-    assert [(r.settings["snr_db"], r.published_percent) for r in rows] == [(10.0, None)]
+    rows = [r for r in study_rows(study, study.tables[1], {results.experiment: results}) if r["n"]]
+    assert [(r["snr_db"], r["published_percent"]) for r in rows] == [(10.0, None)]
     text = study_table(study, study.tables[1], study_rows(study, study.tables[1], {results.experiment: results}))
     assert "10 dB" in text
 
@@ -100,7 +104,7 @@ def test_the_markdown_of_a_study_table_has_one_cell_per_column(results):
 
 
 def test_the_text_of_an_experiment(results):
-    text = experiment_table("e", experiment_rows(results, "e"), "percent of something")
+    text = experiment_report(results).draw()
     row = next(line for line in text.splitlines() if line.startswith("5 dB") and "0 s" in line)
     assert row.split() == ["5", "dB", "0", "s", "50", "[15,", "85]", "4", "20", "ms"]
     assert any("15 dB" in line and "not run" in line for line in text.splitlines())
@@ -110,14 +114,12 @@ def test_the_text_of_an_experiment(results):
 def test_without_a_success_rule_there_is_no_percentage(make_results, estimate):
     results = make_results({(5.0, "0.0"): [estimate(8.0)] * 2}, success=None)
     row = cell(experiment_rows(results, "e"), 5.0, 0.0)
-    assert (row.n, row.converged, row.percent, row.low) == (2, None, None, None)
+    assert (row["n"], row["converged"], row["percent"], row["low"]) == (2, None, None, None)
 
 
 def test_rows_become_json_and_csv(results):
-    class Only:
-        rows = [row.as_dict() for row in experiment_rows(results, "e")]  # noqa: RUF012
-
-    rows = json.loads(write_tables([Only], "json"))
+    report = Report([], experiment_rows(results, "e"))
+    rows = json.loads(write_reports([report], "json"))
     assert rows[0] == {
         "table": "e",
         "experiment": "useful-redundancy/case1-regular",
@@ -134,7 +136,7 @@ def test_rows_become_json_and_csv(results):
         "published_percent": None,
         "median_seconds": pytest.approx(0.02),
     }
-    header, first = csv_text(Only.rows).splitlines()[:2]
+    header, first = csv_text(report.records).splitlines()[:2]
     assert header.startswith("table,experiment,sampling,snr_db,initial_delay,method,n,")
     assert first.startswith("e,useful-redundancy/case1-regular,regular,5.0,0.0,existing,4,1,2,50.0,")
 
@@ -154,12 +156,12 @@ def test_differing_settings_are_named(results):
 
 def test_several_initial_parameters_are_told_apart(make_results, estimate):
     results = make_results({(15.0, "0.0"): [estimate(8.0)], (15.0, RANDOM): [estimate(3.0)]}, snrs=(15.0,), swept=False)
-    assert not any("start" in row.settings for row in experiment_rows(results, "e"))
+    assert "start" not in settings_of(experiment_rows(results, "e"))
     starts = results.manifest["starts"]
     starts.clear()
     starts |= {"0.0": None, RANDOM: None, "none": None}
     rows = experiment_rows(results, "e")
-    assert [(row.settings["start"], row.percent) for row in rows] == [("0.0", 100.0), (RANDOM, 0.0)]
+    assert [(row["start"], row["percent"]) for row in rows] == [("0.0", 100.0), (RANDOM, 0.0)]
     del starts[RANDOM]
     results.manifest["estimators"][0]["starts"] = ["0.0", "none"]
-    assert not any("start" in row.settings for row in experiment_rows(results, "e"))
+    assert "start" not in settings_of(experiment_rows(results, "e"))

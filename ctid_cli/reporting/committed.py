@@ -1,0 +1,92 @@
+"""The tables that are committed beside the program, and what made them."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ctid_cli.errors import UsageError
+from ctid_cli.reporting.percentages import Row
+from ctid_cli.reporting.study import DEFAULT_STUDY, data_folder
+from ctid_cli.storage.version import code_version
+
+#: Columns that tables must have to be compared with.
+NEEDED = ("table", "experiment", "initial_delay", "method", "n", "converged")
+
+
+def committed_tables(study: str = DEFAULT_STUDY) -> Path | None:
+    """File of a study's committed tables; an installed package has none."""
+    folder = data_folder("experiments").parent / "results" / "published" / study.replace("-", "_")
+    return folder / "tables.csv" if (folder / "tables.csv").is_file() else None
+
+
+def committed_rows(study: str) -> list[Row]:
+    """The cells of a study's committed tables, as `study_rows` has them."""
+    file = committed_tables(study)
+    return [row | {"table": int(row["table"])} for row in read_tables(file)] if file else []
+
+
+def made_by(tables: Path) -> str:
+    """Which code computed committed tables, as a clause that begins with a blank; empty where it is the present one."""
+    try:
+        environment = json.loads((tables.parent / "environment.json").read_text(encoding="utf-8"))
+    except OSError:
+        return ""
+    sessions = environment.get("sessions", environment)
+    versions = {session["code_version"] for name in sessions for session in sessions[name]}
+    if versions <= {code_version()}:
+        return ""
+    commit = f" (commit {environment['commit'][:12]})" if "commit" in environment else ""
+    return f" by an earlier version of the code or of its numerical libraries{commit}"
+
+
+def read_tables(file: Path) -> list[Row]:
+    """Read tables that ``ctid table --format csv`` wrote."""
+    try:
+        with file.open(encoding="utf-8-sig", newline="") as stream:
+            reader = csv.DictReader(stream)
+            missing = [name for name in NEEDED if name not in (reader.fieldnames or ())]
+            if missing:
+                advice = "write such a file with: ctid table --format csv"
+                raise UsageError(f"{file} has no column {', '.join(missing)}; {advice}")
+            rows = []
+            for line in reader:
+                line.pop(None, None)
+                rows.append(row := plain_row(line))
+                n, converged = row["n"], row["converged"]
+                # An empty field is a cell without a success rule.
+                judged = line["converged"] not in (None, "")
+                if n is None or (judged and not (converged is not None and 0 <= converged <= n)):
+                    raise UsageError(
+                        f"{file}:{reader.line_num}: n and converged must be counts with 0 <= converged <= n, "
+                        f"not {line['n']!r} and {line['converged']!r}"
+                    )
+            return rows
+    except OSError as error:
+        raise UsageError(f"{file} cannot be read: {error.strerror or error}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise UsageError(f"{file} is not a comma-separated text file: {error}") from None
+
+
+def plain_row(row: Mapping[str, Any]) -> Row:
+    """A row in which values are the same whether they come from a CSV file or from results."""
+    plain = {key: _plain(value) for key, value in row.items()}
+    for key in ("n", "failed", "converged"):
+        value = plain.get(key)
+        plain[key] = int(value) if isinstance(value, float) and value.is_integer() else None
+    # Names stay what they are, also where they look like numbers.
+    return plain | {key: row[key] for key in ("table", "experiment", "method")}
+
+
+def _plain(value: Any) -> Any:
+    if value is None or value == "":
+        return None
+    if isinstance(value, list | dict):
+        return json.dumps(value)
+    try:
+        return str(value) if isinstance(value, bool) else float(value)
+    except ValueError:
+        return str(value)
