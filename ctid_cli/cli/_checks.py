@@ -5,18 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import typer
-from typer.core import TyperCommand
 
+from ctid_cli.cli._common import Command
 from ctid_cli.cli.check_accuracy_command import check_accuracy
 from ctid_cli.cli.check_filters_command import check_filters
 
 _further = typer.Typer(rich_markup_mode=None, context_settings={"help_option_names": ["-h", "--help"]})
 # A further check is registered here, under its name.
-_further.command("filters")(check_filters)
-_further.command("accuracy")(check_accuracy)
+_further.command("filters", cls=Command)(check_filters)
+_further.command("accuracy", cls=Command)(check_accuracy)
 
 
-class CheckCommand(TyperCommand):
+class CheckCommand(Command):
     """``ctid check FILE``, which hands over if the first word names a further check: such a file is ``./filters``."""
 
     further = typer.main.get_group(_further).commands

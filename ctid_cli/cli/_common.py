@@ -14,15 +14,46 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
 
 import typer
+from typer.core import TyperCommand
 
 from ctid_cli.errors import CtidError, SpecError, StorageError
+from ctid_cli.signals.treatment import Hold
 
-Command = TypeVar("Command", bound=Callable[..., None])
+Function = TypeVar("Function", bound=Callable[..., None])
 
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder that holds the results.")]
 Json = Annotated[bool, typer.Option("--json", help="Write JSON to stdout instead of text.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the file, e.g. noise.snr_db=15; repeatable."),
+]
+TimeColumn = Annotated[str | None, typer.Option("--time", metavar="NAME", help="Column of the times.")]
+InputColumn = Annotated[str | None, typer.Option("--input", metavar="NAME", help="Column of the input.")]
+OutputColumn = Annotated[str | None, typer.Option("--output", metavar="NAME", help="Column of the output.")]
+InputHold = Annotated[Hold, typer.Option("--hold", help="The input between its samples: held, or straight lines.")]
+From = Annotated[float | None, typer.Option("--from", metavar="TIME", help="First instant to use [unit of the file].")]
+To = Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")]
 
 INTERRUPTED = 130
+
+
+class Command(TyperCommand):
+    """A command that refuses an option given twice, of which all but the last value would be lost."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the command line."""
+        _, _, given = self.make_parser(ctx).parse_args(args=list(args))
+        for option in given:
+            if option.param_type_name == "option" and not option.multiple and given.count(option) > 1:
+                ctx.fail(f"{max(option.opts, key=len)} is given twice.")
+        return super().parse_args(ctx, args)
+
+
+def echo_json(content: object) -> None:
+    """Write one JSON object to stdout."""
+    import json
+
+    typer.echo(json.dumps(content, allow_nan=False))
 
 
 def write_files(files: Mapping[Path, bytes]) -> None:
@@ -35,7 +66,7 @@ def write_files(files: Mapping[Path, bytes]) -> None:
             raise StorageError(f"{error.filename or path} cannot be written: {error.strerror or error}") from error
 
 
-def guarded(command: Command) -> Command:
+def guarded(command: Function) -> Function:
     """Turn the exceptions of a command into one message and an exit code."""
 
     @functools.wraps(command)
@@ -56,7 +87,7 @@ def guarded(command: Command) -> Command:
             typer.echo(f"ctid: unexpected error ({kind}: {_one_line(error)}); please report it with {file}", err=True)
             raise typer.Exit(1) from None
 
-    return cast(Command, wrapper)
+    return cast(Function, wrapper)
 
 
 def _one_line(error: Exception) -> str:

@@ -16,22 +16,23 @@ import typer
 from ctid_cli.reporting.layout import count, seconds
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+    from rich.progress import Progress, ProgressColumn, TaskID
 
     from ctid_cli.running.events import Event
 
 #: Seconds between two lines where stderr is not a terminal.
 LINE_EVERY = 10.0
+#: Seconds before the bar of a single record appears: most are done sooner.
+BAR_AFTER = 1.0
 #: Kernels that are ready sooner than this came from the cache [s].
 QUICK = 2.0
 
 
-class Reporter:
-    """Shows the events of one run on stderr."""
+class _Progress:
+    """A bar on stderr, from when it is started."""
 
-    def __init__(self, experiment: str, clock: Callable[[], float] = time.monotonic) -> None:
-        self.experiment = experiment
-        self.failed = 0
+    def __init__(self, name: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self.name = name
         self._clock = clock
         self._began = self._last = clock()
         self._bar: Progress | None = None
@@ -45,6 +46,52 @@ class Reporter:
     ) -> None:
         if self._bar is not None:
             self._bar.stop()
+
+    def _start(self, total: int, *columns: ProgressColumn, **fields: Any) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+        shown = (TextColumn("{task.description}"), BarColumn(bar_width=20), *columns, TimeRemainingColumn())
+        self._bar = Progress(*shown, console=Console(stderr=True))
+        self._task = self._bar.add_task(self.name.rpartition("/")[2], total=total, **fields)
+        self._bar.start()
+
+    def _update(self, done: int, **fields: Any) -> bool:
+        """Move the bar, if there is one."""
+        if self._bar is None or self._task is None:
+            return False
+        self._bar.update(self._task, completed=done, **fields)
+        return True
+
+    def _say(self, text: str) -> None:
+        line = f"{self.name}: {text}"
+        if self._bar is not None:
+            self._bar.console.print(line, markup=False, highlight=False)
+        else:
+            typer.echo(line, err=True)
+
+
+class RecordProgress(_Progress):
+    """How far a record is done; nothing for one that is done at once."""
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show that so many of all samples are done."""
+        now = self._clock()
+        if sys.stderr.isatty():
+            if self._bar is None and now - self._began > BAR_AFTER:
+                from rich.progress import TaskProgressColumn
+
+                self._start(total, TaskProgressColumn())
+            self._update(done)
+        elif now - self._last >= LINE_EVERY:
+            self._last = now
+            self._say(f"{100 * done / total:.0f} % of the record")
+
+
+class Reporter(_Progress):
+    """Shows the events of one run on stderr."""
+
+    failed = 0
 
     def __call__(self, event: Event) -> None:
         """Show one event."""
@@ -78,22 +125,10 @@ class Reporter:
         self._say(", ".join(parts))
         self._began = self._last = self._clock()
         if event.data_sets and sys.stderr.isatty():
-            self._start_bar(event.data_sets)
+            from rich.progress import MofNCompleteColumn, TextColumn
 
-    def _start_bar(self, total: int) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=20),
-            MofNCompleteColumn(),
-            TextColumn("data sets, {task.fields[rate]}, {task.fields[failed]} failed, ETA"),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-        )
-        self._task = self._bar.add_task(self.experiment.rpartition("/")[2], total=total, rate="-", failed=0)
-        self._bar.start()
+            rate = TextColumn("data sets, {task.fields[rate]}, {task.fields[failed]} failed, ETA")
+            self._start(event.data_sets, MofNCompleteColumn(), rate, rate="-", failed=0)
 
     def _advance(self, event: Any) -> None:
         from ctid_cli.storage.manifest import FAILURES
@@ -102,19 +137,12 @@ class Reporter:
         now = self._clock()
         speed = event.done / max(now - self._began, 1e-9)
         rate = f"{speed:.2g}/s" if speed >= 0.1 else f"{60 * speed:.2g}/min"
-        if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, completed=event.done, rate=rate, failed=self.failed)
-        elif now - self._last >= LINE_EVERY or event.done == event.total:
+        if not self._update(event.done, rate=rate, failed=self.failed) and (
+            now - self._last >= LINE_EVERY or event.done == event.total
+        ):
             self._last = now
             left = f", ETA {seconds((event.total - event.done) / speed)}" if event.done < event.total else ""
             self._say(f"{event.done}/{event.total} data sets, {rate}, {self.failed} failed{left}")
-
-    def _say(self, text: str) -> None:
-        line = f"{self.experiment}: {text}"
-        if self._bar is not None:
-            self._bar.console.print(line, markup=False, highlight=False)
-        else:
-            typer.echo(line, err=True)
 
 
 def json_lines(event: Event) -> list[str]:

@@ -7,16 +7,13 @@ from typing import Annotated
 
 import typer
 
-from ctid_cli.cli._common import Json, guarded
+from ctid_cli.cli._common import Json, Overrides, echo_json, guarded
 
 
 @guarded
 def check_accuracy(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help="Experiment file (YAML).")],
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Replace one value, as for `ctid run`; repeatable."),
-    ] = None,
+    overrides: Overrides = None,
     as_json: Json = False,
 ) -> None:
     """Say how accurate the estimates of an experiment can be, before any data are taken.
@@ -25,14 +22,12 @@ def check_accuracy(
     formula that it comes from. White Gaussian excitation on a regular clock has a limit for long records; otherwise
     the sensitivities of the experiment's first data set count.
     """
-    import json
-
     from ctid_cli.cli._planning import load_plans
     from ctid_cli.reporting.accuracy_report import accuracy_object, accuracy_text
 
     ((_, plan),) = load_plans([config], overrides or [])
     content = accuracy_object(plan)
     if as_json:
-        typer.echo(json.dumps(content, allow_nan=False))
+        echo_json(content)
     else:
         typer.echo(accuracy_text(content))

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from ctid_cli.cli._common import Json, guarded
+from ctid_cli.cli._common import Json, echo_json, guarded
 
 
 @guarded
@@ -29,8 +29,6 @@ def check_filters(
     minimum closer to the true delay. The first line says PASS or NOT PASSED; then come the filters, which of them
     serves which delay error, and how many are sure to suffice. The exit code is 0 either way.
     """
-    import json
-
     from ctid_cli.errors import UsageError
     from ctid_cli.filtering.filter_set import FilterSet
     from ctid_cli.filtering.filter_set import check_filters as verify
@@ -46,6 +44,6 @@ def check_filters(
     except ValueError as error:
         raise UsageError(str(error)) from None
     if as_json:
-        typer.echo(json.dumps(filter_object(chosen, found), allow_nan=False))
+        echo_json(filter_object(chosen, found))
     else:
         typer.echo(filter_text(chosen, found))

@@ -2,36 +2,13 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from ctid_cli.cli._common import Json, guarded, write_files
-
-
-class InitialStateOption(StrEnum):
-    """State of the system before the record."""
-
-    rest = "rest"
-    estimate = "estimate"
-    periodic = "periodic"
-
-
-class OffsetOption(StrEnum):
-    """Constant offset of the output."""
-
-    none = "none"
-    remove = "remove"
-    estimate = "estimate"
-
-
-class HoldOption(StrEnum):
-    """The input between its samples."""
-
-    zoh = "zoh"
-    foh = "foh"
+from ctid_cli.cli._common import From, InputColumn, InputHold, Json, OutputColumn, TimeColumn, To, guarded, write_files
+from ctid_cli.signals.treatment import InitialState, Offset
 
 
 @guarded
@@ -44,16 +21,14 @@ def fit(
     delay: Annotated[
         str, typer.Option("--delay", metavar="LOW:HIGH|VALUE", help="Range to search, or the known delay [time unit].")
     ] = "0",
-    initial_state: Annotated[
-        InitialStateOption, typer.Option("--initial-state", help="State before the record.")
-    ] = InitialStateOption.rest,
-    offset: Annotated[OffsetOption, typer.Option("--offset", help="Constant offset.")] = OffsetOption.none,
-    hold: Annotated[HoldOption, typer.Option("--hold", help="The input between its samples.")] = HoldOption.zoh,
-    time: Annotated[str | None, typer.Option("--time", metavar="NAME", help="Column of the times.")] = None,
-    input: Annotated[str | None, typer.Option("--input", metavar="NAME", help="Column of the input.")] = None,
-    output: Annotated[str | None, typer.Option("--output", metavar="NAME", help="Column of the output.")] = None,
-    start: Annotated[float | None, typer.Option("--from", metavar="TIME", help="First instant to use.")] = None,
-    stop: Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")] = None,
+    initial_state: Annotated[InitialState, typer.Option("--initial-state", help="State before the record.")] = "rest",
+    offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output.")] = "none",
+    hold: InputHold = "zoh",
+    time: TimeColumn = None,
+    input: InputColumn = None,
+    output: OutputColumn = None,
+    start: From = None,
+    stop: To = None,
     validate: Annotated[
         Path | None, typer.Option("--validate", metavar="FILE", help="Judge the model on this record, all of it.")
     ] = None,
@@ -78,12 +53,10 @@ def fit(
     bounds = _delay_bounds(delay)
     try:
         # Every sample: the profile that is drawn is then the cost whose minimum the estimate is.
-        options = DelayProfile(
-            poles, zeros, bounds, initial_state=initial_state.value, offset=offset.value, search="samples"
-        )
+        options = DelayProfile(poles, zeros, bounds, initial_state=initial_state, offset=offset, search="samples")
     except ValueError as error:
         raise UsageError(str(error)) from None
-    read = partial(read_measurement, time=time, input=input, output=output, hold=hold.value)
+    read = partial(read_measurement, time=time, input=input, output=output, hold=hold)
     measurements = [read(file, start=start, stop=stop) for file in files]
     other = None if validate is None else read(validate)
     units = common_units(measurements if other is None else [*measurements, other])

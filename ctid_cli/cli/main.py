@@ -8,6 +8,7 @@ import typer
 
 import ctid_cli
 from ctid_cli.cli._checks import CheckCommand
+from ctid_cli.cli._common import Command
 from ctid_cli.cli.check_command import check
 from ctid_cli.cli.export_command import export
 from ctid_cli.cli.figure_command import figure
@@ -54,7 +55,7 @@ def _root(
 
 app.command(cls=CheckCommand)(check)
 for _command in (fit, track, run, status, table, figure, show, export, validate, schema):
-    app.command()(_command)
+    app.command(cls=Command)(_command)
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ctid_cli.cli._common import Out, guarded
+from ctid_cli.cli._common import Out, Overrides, guarded
 
 if TYPE_CHECKING:
     from ctid_cli.running.engine import RunSummary
@@ -23,12 +23,7 @@ def run(
     runs: Annotated[
         int | None, typer.Option("--runs", min=1, help="Data sets per setting, instead of the file's own number.")
     ] = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="KEY=VALUE", help="Replace one value of the file, e.g. noise.snr_db=15; repeatable."
-        ),
-    ] = None,
+    overrides: Overrides = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and stop.")] = False,
     out: Out = Path("results"),
     fresh: Annotated[bool, typer.Option("--fresh", help="Move older results aside and start anew.")] = False,

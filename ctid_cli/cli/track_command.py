@@ -3,29 +3,21 @@
 from __future__ import annotations
 
 import math
-import sys
-import time as clock
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from ctid_cli.cli._common import Json, guarded, write_files
-from ctid_cli.cli._progress import LINE_EVERY
+from ctid_cli.cli._common import From, Json, TimeColumn, To, echo_json, guarded, write_files
+from ctid_cli.cli._progress import RecordProgress
 from ctid_cli.kinds import KINDS
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
-
     from ctid_cli.signals.sampled_signal import SampledSignal
 
     Method = str
 else:
     Method = Literal[("automatic", *KINDS["frequency_estimator"])]
-
-#: Seconds before a bar appears: most records are done sooner.
-BAR_AFTER = 1.0
 
 
 @guarded
@@ -33,7 +25,7 @@ def track(
     file: Annotated[Path, typer.Argument(metavar="SIGNAL", help="Recorded signal (.csv, .mat, .wav).")],
     tones: Annotated[int, typer.Option("--tones", help="Number of sinusoids, 1 to 8: the strongest ones.")],
     method: Annotated[Method, typer.Option("--method", help="How the frequencies are estimated.")] = "automatic",
-    time: Annotated[str | None, typer.Option("--time", metavar="NAME", help="Column of the times.")] = None,
+    time: TimeColumn = None,
     signal: Annotated[
         str | None, typer.Option("--signal", metavar="NAME", help="Column or channel of the signal.")
     ] = None,
@@ -43,10 +35,8 @@ def track(
     rate: Annotated[
         float | None, typer.Option("--rate", metavar="HERTZ", help="Sampling rate, in place of the interval.")
     ] = None,
-    start: Annotated[
-        float | None, typer.Option("--from", metavar="TIME", help="First instant to use, in the file's unit of time.")
-    ] = None,
-    stop: Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")] = None,
+    start: From = None,
+    stop: To = None,
     every: Annotated[
         float | None,
         typer.Option("--every", metavar="SECONDS", help="One row every so often; about 1000 if not given."),
@@ -55,17 +45,15 @@ def track(
         float | None, typer.Option("--window", metavar="SECONDS", help="Length of the windows, in place of automatic.")
     ] = None,
     as_json: Json = False,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help="Where the track goes (.csv, .h5); the figure lies beside it.")
-    ] = Path("track.csv"),
+    style: Annotated[Literal["csv", "h5"], typer.Option("--format", help="Form of the track.")] = "csv",
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the track and its figure.")] = Path("."),
 ) -> None:
     """Follow the frequencies of a recorded signal that is a sum of sinusoids.
 
     Prints the frequency of each tone, how far it moves, and for how much of the time it can be trusted; writes the
-    frequencies and amplitudes over time to track.csv and track.svg. All the rest is chosen from the record, and said.
+    frequencies and amplitudes over time to track.csv (or track.h5) and track.svg. All the rest is chosen from the
+    record, and said.
     """
-    import json
-
     from ctid_cli.errors import UsageError
     from ctid_cli.frequency.automatic import choose_settings
     from ctid_cli.frequency.record_track import track_record
@@ -73,12 +61,9 @@ def track(
     from ctid_cli.reporting.track_report import track_bytes, track_object, track_table, track_text
     from ctid_cli.signals.sampled_signal import read_sampled_signal
 
-    extension = out.suffix.lower()
-    if extension not in (".csv", ".h5"):
-        raise UsageError(f"--out must end in .csv or .h5, not {out.name!r}")
-    figure = out.with_suffix(".svg")
-    if any(_same(file, written) for written in (out, figure)):
-        raise UsageError(f"{file} would be overwritten by the track; write it elsewhere (--out FILE)")
+    data, figure = out / f"track.{style}", out / "track.svg"
+    if any(_same(file, written) for written in (data, figure)):
+        raise UsageError(f"{file} would be overwritten by the track; write it elsewhere (--out DIR)")
     given = _interval(interval, rate)
     for name, value in (("--from", start), ("--to", stop)):
         if value is not None and not math.isfinite(value):
@@ -90,22 +75,22 @@ def track(
     kind = None if method == "automatic" else method
     try:
         settings = choose_settings(record.samples, record.interval, tones, method=kind, window=window)
-        with _Progress(file.name) as tell:
+        with RecordProgress(file.name) as tell:
             found = track_record(record.samples, record.interval, settings, every=every, on_progress=tell)
     except ValueError as error:
         raise UsageError(str(error)) from None
     title = f"{file.name}: {settings.estimator.kind}"
     write_files(
         {
-            out: track_bytes(track_table(found, record.start), extension, record.unit),
+            data: track_bytes(track_table(found, record.start), style, record.unit),
             figure: track_svg(found, record.start, record.unit, title),
         }
     )
     if as_json:
-        typer.echo(json.dumps(track_object(record, settings, found, [out, figure]), allow_nan=False))
+        echo_json(track_object(record, settings, found, [data, figure]))
     else:
         typer.echo(track_text(record, settings, found))
-        typer.echo(f"\nWritten: {out}, {figure}")
+        typer.echo(f"\nWritten: {data}, {figure}")
 
 
 def _same(one: Path, other: Path) -> bool:
@@ -134,47 +119,3 @@ def _in_seconds(record: SampledSignal) -> SampledSignal:
             "with --interval SECONDS or --rate HERTZ"
         )
     return record.rescaled(SECONDS[unit], "s")
-
-
-class _Progress:
-    """A bar for people, a line now and then for log files; nothing for a record that is done at once."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._began = self._last = clock.monotonic()
-        self._bar: Progress | None = None
-        self._task: TaskID | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def __call__(self, done: int, total: int) -> None:
-        now = clock.monotonic()
-        if sys.stderr.isatty():
-            if self._bar is None and now - self._began > BAR_AFTER:
-                self._start()
-            if self._bar is not None and self._task is not None:
-                self._bar.update(self._task, completed=done, total=total)
-        elif now - self._last >= LINE_EVERY:
-            self._last = now
-            typer.echo(f"{self._name}: {100 * done / total:.0f} % of the record", err=True)
-
-    def _start(self) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=20),
-            TaskProgressColumn(),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-        )
-        self._task = self._bar.add_task(self._name, total=None)
-        self._bar.start()

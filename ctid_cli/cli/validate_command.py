@@ -7,16 +7,13 @@ from typing import Annotated
 
 import typer
 
-from ctid_cli.cli._common import guarded
+from ctid_cli.cli._common import Overrides, guarded
 
 
 @guarded
 def validate(
     configs: Annotated[list[Path], typer.Argument(metavar="CONFIG", help="Experiment files (YAML).")],
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Replace one value, as for `ctid run`; repeatable."),
-    ] = None,
+    overrides: Overrides = None,
 ) -> None:
     """Check experiment files without running them.
 

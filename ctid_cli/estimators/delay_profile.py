@@ -30,9 +30,8 @@ from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_choice, require_integer, require_not_negative, require_positive
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import InitialState, Offset
 
-InitialState = Literal["rest", "estimate", "periodic"]
-Offset = Literal["none", "remove", "estimate"]
 ProfileSearch = Literal["time", "spectral", "samples"]
 
 #: Local minima of the profile that are refined.

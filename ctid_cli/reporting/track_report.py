@@ -170,9 +170,9 @@ def track_table(track: RecordTrack, start: float) -> dict[str, NDArray[Any]]:
     }
 
 
-def track_bytes(table: dict[str, NDArray[Any]], extension: str, unit: str | None = None) -> bytes:
+def track_bytes(table: dict[str, NDArray[Any]], style: str, unit: str | None = None) -> bytes:
     """The file of a track."""
-    if extension == ".csv":
+    if style == "csv":
         lines = [",".join(table)]
         for row in zip(*table.values(), strict=True):
             lines.append(",".join(_cell(value) for value in row))

@@ -195,6 +195,19 @@ def test_usage(ctid, arguments, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("run", "x.yaml", "--jobs", "2", "-j", "3"),
+        ("table", "--format", "md", "--format=md"),
+        ("check", "x.csv", "--time", "a", "--time", "b"),
+        ("check", "filters", "--bandwidth", "1", "--largest-error", "2", "--bandwidth", "1"),
+    ],
+)
+def test_an_option_that_would_keep_its_last_value_only(ctid, arguments):
+    assert re.search(r"^Error: --\w+ is given twice\.$", ctid(*arguments, code=2).stderr, re.MULTILINE)
+
+
 @pytest.mark.parametrize("arguments", [("show", "ffff"), ("export", "tiny"), ("status", "tiny"), ("table", "9")])
 def test_what_does_not_exist(ctid, arguments, tmp_path):
     ctid(*arguments, "--out", tmp_path / "nothing", code=2)

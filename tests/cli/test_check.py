@@ -71,6 +71,7 @@ def test_json_holds_the_same(ctid, rig):
     assert content["delay_early"] <= 1.3 <= content["delay_late"]
     assert content["input_levels"] == [1.0, 3.0]
     assert content["output_quantum"] is None
+    assert json.loads(ctid("check", rig, *NAMED, "--json", "--strict").stdout) == content  # a warning is no problem
 
 
 def test_a_window_and_a_hold(ctid, rig):
@@ -94,6 +95,9 @@ def test_a_record_that_shows_nothing(ctid, tmp_path):
     assert lines[1] == "No model can be identified from this record as it is: 1 problem."
     assert lines[3].startswith("PROBLEM  input   ")
     assert not lines[-1].startswith("next:")
+    strict = ctid("check", path, "--strict", code=7)
+    assert strict.stdout.splitlines() == lines
+    assert strict.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,7 @@ def test_text(chosen):
 
 def test_csv_and_hdf5_hold_the_same():
     table = track_table(make_track(some_invalid()), 5.0)
-    frame = pd.read_csv(io.BytesIO(track_bytes(table, ".csv")), keep_default_na=True)
+    frame = pd.read_csv(io.BytesIO(track_bytes(table, "csv")), keep_default_na=True)
     assert list(frame.columns) == [
         *("t", "omega_1", "omega_2", "frequency_1_hz", "frequency_2_hz"),
         *("amplitude_1", "amplitude_2", "valid", "flags"),
@@ -94,7 +94,7 @@ def test_csv_and_hdf5_hold_the_same():
     assert frame["omega_1"][:10].isna().all()
     assert frame["flags"].fillna("").tolist() == ["gap"] * 10 + ["uncertain complex_roots"] * 2 + [""] * 28
     assert frame["valid"].tolist() == [0] * 12 + [1] * 28
-    with h5py.File(io.BytesIO(track_bytes(table, ".h5", "Pa"))) as store:
+    with h5py.File(io.BytesIO(track_bytes(table, "h5", "Pa"))) as store:
         units = {name: column.attrs.get("unit") for name, column in store.items()}
         assert (units["t"], units["omega_2"], units["frequency_1_hz"]) == ("s", "rad/s", "Hz")
         assert (units["amplitude_1"], units["valid"]) == ("Pa", None)

@@ -1,0 +1,12 @@
+"""How the signals of a record are treated: the words that commands, specifications and options have in common."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+#: The input between its samples: held, or straight lines.
+Hold = Literal["zoh", "foh"]
+#: The state of the system before the record.
+InitialState = Literal["rest", "estimate", "periodic"]
+#: A constant that the output has beside the answer to the input.
+Offset = Literal["none", "remove", "estimate"]
