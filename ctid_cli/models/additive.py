@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
+from ctid_cli.models.transfer_function import ContinuousModel, TransferFunction, sorted_roots
 from ctid_cli.signals.checks import require_integer
 
 #: Poles nearer to each other than this fraction of their magnitude count as one: a double root of rounded coefficients
@@ -69,7 +69,7 @@ class Term:
 
 
 @dataclass(frozen=True, eq=False)
-class Submodel:
+class Submodel(ContinuousModel):
     r"""``G_i(p) = B_i(p) / (p^l A_i(p))``, scaled so that the constant term of ``A_i`` is 1.
 
     Parameters
@@ -187,25 +187,14 @@ class Submodel:
         return TransferFunction(self.numerator, np.concatenate((self.denominator, np.zeros(self.integrators))))
 
     def frequency_response(self, frequencies: ArrayLike) -> ComplexArray:
-        """``G_i(j w)``.
-
-        Parameters
-        ----------
-        frequencies : array_like
-            Angular frequencies w [rad/s].
-
-        Returns
-        -------
-        ndarray
-            Complex gain at each frequency.
-        """
+        """``G_i(j w)``, integrators included."""
         s = 1j * np.asarray(frequencies, dtype=float)
         gain = np.polyval(self.numerator, s) / (s**self.integrators * np.polyval(self.denominator, s))
         return np.asarray(gain, dtype=complex)
 
 
 @dataclass(frozen=True, eq=False)
-class AdditiveModel:
+class AdditiveModel(ContinuousModel):
     r"""``G(p) = (G_1(p) + … + G_K(p)) exp(-delay p)``.
 
     Parameters
@@ -351,18 +340,7 @@ class AdditiveModel:
         return float(sum(submodel.dc_gain for submodel in self.submodels))
 
     def frequency_response(self, frequencies: ArrayLike) -> ComplexArray:
-        """``G(j w)``, delay included.
-
-        Parameters
-        ----------
-        frequencies : array_like
-            Angular frequencies w [rad/s].
-
-        Returns
-        -------
-        ndarray
-            Complex gain at each frequency.
-        """
+        """The sum over all submodels, delay included."""
         w = np.asarray(frequencies, dtype=float)
         total = np.sum([submodel.frequency_response(w) for submodel in self.submodels], axis=0)
         return np.asarray(total * np.exp(-1j * w * self.delay), dtype=complex)

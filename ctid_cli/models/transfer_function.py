@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +12,27 @@ from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 
 
+class ContinuousModel(ABC):
+    """A linear model in continuous time."""
+
+    @abstractmethod
+    def frequency_response(self, frequencies: ArrayLike) -> ComplexArray:
+        """``G(j w)``, delay included.
+
+        Parameters
+        ----------
+        frequencies : array_like
+            Angular frequencies w [rad/s].
+
+        Returns
+        -------
+        ndarray
+            Complex gain at each frequency.
+        """
+
+
 @dataclass(frozen=True, eq=False)
-class TransferFunction:
+class TransferFunction(ContinuousModel):
     r"""``G(s) = B(s)/A(s) exp(-delay s)`` with coefficients in descending powers of s.
 
     Parameters
@@ -92,18 +112,7 @@ class TransferFunction:
         return float(self.numerator[-1] / self.denominator[-1]) if self.denominator[-1] else float("inf")
 
     def frequency_response(self, frequencies: ArrayLike) -> ComplexArray:
-        """``G(j w)``.
-
-        Parameters
-        ----------
-        frequencies : array_like
-            Angular frequencies w [rad/s].
-
-        Returns
-        -------
-        ndarray
-            Complex gain at each frequency.
-        """
+        """``B(j w) / A(j w) exp(-j w delay)``."""
         s = 1j * np.asarray(frequencies, dtype=float)
         gain = np.polyval(self.numerator, s) / np.polyval(self.denominator, s) * np.exp(-s * self.delay)
         return np.asarray(gain, dtype=complex)

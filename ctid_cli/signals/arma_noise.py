@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
 from ctid_cli.signals.checks import require_finite
-from ctid_cli.signals.noise_level import require_one_level, variance_at
+from ctid_cli.signals.noise import Noise, require_one_level, variance_at
 
 
 @dataclass(frozen=True)
-class ArmaNoise:
+class ArmaNoise(Noise):
     r"""Autoregressive moving-average noise ``v = C(q^-1) / D(q^-1) e`` with Gaussian white innovations e.
 
     Parameters
@@ -57,7 +57,6 @@ class ArmaNoise:
     """
 
     kind: ClassVar[str] = "arma"
-    #: Whether samples at different instants are correlated.
     coloured: ClassVar[bool] = True
 
     numerator: tuple[float, ...]
@@ -93,23 +92,7 @@ class ArmaNoise:
         return self.numerator, self.denominator
 
     def innovation_variance_of(self, noise_free: Array | None = None) -> float:
-        """Variance of the innovations.
-
-        Parameters
-        ----------
-        noise_free : ndarray, shape (N,), optional
-            The output without noise [output unit]; needed with a signal-to-noise ratio.
-
-        Returns
-        -------
-        float
-            Variance [output unit^2].
-
-        Raises
-        ------
-        DataError
-            If a signal-to-noise ratio is asked for and the noise-free output is missing or zero throughout.
-        """
+        """What the level asks for, over the variance for unit innovations."""
         if self.innovation_variance is not None:
             return self.innovation_variance
         variance = self.variance
@@ -119,40 +102,11 @@ class ArmaNoise:
         return variance / self._unit_variance
 
     def variance_of(self, noise_free: Array | None = None) -> float:
-        """Variance of the noise.
-
-        Parameters
-        ----------
-        noise_free : ndarray, shape (N,), optional
-            The output without noise [output unit]; needed with a signal-to-noise ratio.
-
-        Returns
-        -------
-        float
-            Variance [output unit^2].
-
-        Raises
-        ------
-        DataError
-            If a signal-to-noise ratio is asked for and the noise-free output is missing or zero throughout.
-        """
+        """That for unit innovations times theirs."""
         return self._unit_variance * self.innovation_variance_of(noise_free)
 
     def autocovariance(self, lags: ArrayLike, noise_free: Array | None = None) -> Array:
-        """Covariance of samples at a distance.
-
-        Parameters
-        ----------
-        lags : array_like of int, shape (M,)
-            Distances [samples], of either sign.
-        noise_free : ndarray, shape (N,), optional
-            The output without noise [output unit]; needed with a signal-to-noise ratio.
-
-        Returns
-        -------
-        ndarray, shape (M,)
-            Covariance [output unit^2].
-        """
+        """From the first state's stationary covariance on, lag by lag."""
         distances = np.abs(np.asarray(lags, dtype=int))
         transition, gain, direct = self._state_space
         covariances = np.zeros(int(distances.max(initial=0)) + 1)
@@ -165,25 +119,7 @@ class ArmaNoise:
         return np.asarray(self.innovation_variance_of(noise_free) * covariances[distances], dtype=float)
 
     def generate(self, noise_free: Array, rng: np.random.Generator) -> Array:
-        """Noise for one record.
-
-        Parameters
-        ----------
-        noise_free : ndarray, shape (N,)
-            The output without noise [output unit]; only its length matters without a signal-to-noise ratio.
-        rng : numpy.random.Generator
-            Source of the standard normal numbers: one for each state of the filter, then N.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Noise [output unit].
-
-        Raises
-        ------
-        DataError
-            If a signal-to-noise ratio is asked for and the noise-free output is zero throughout.
-        """
+        """Filtered innovations; the first state is drawn from its stationary distribution."""
         from scipy.signal import lfilter
 
         initial = self._state_root @ rng.standard_normal(self._state_root.shape[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, get_args
 
@@ -48,6 +49,34 @@ TAPS: dict[int, tuple[int, ...]] = {
 }
 
 
+class Excitation(ABC):
+    """An input: options that generate a held signal."""
+
+    kind: ClassVar[str]
+
+    @abstractmethod
+    def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
+        """The signal over one record.
+
+        Parameters
+        ----------
+        sample_times : ndarray, shape (N,)
+            Sampling instants [s]; the first and the last bound the signal.
+        rng : numpy.random.Generator
+            Source of whatever is random in it.
+
+        Returns
+        -------
+        HeldSignal
+            The signal [input unit] on its own clock.
+
+        Raises
+        ------
+        DataError
+            If the signal cannot be had over these instants.
+        """
+
+
 def maximal_length_sequence(stages: int, length: int, state: int) -> NDArray[np.uint8]:
     """Output of a maximal-length feedback shift register.
 
@@ -69,7 +98,7 @@ def maximal_length_sequence(stages: int, length: int, state: int) -> NDArray[np.
 
 
 @dataclass(frozen=True)
-class Prbs:
+class Prbs(Excitation):
     """Pseudo-random binary sequence from a maximal-length feedback register.
 
     Parameters
@@ -109,27 +138,14 @@ class Prbs:
         require_positive("amplitude", self.amplitude, "input unit")
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """The signal over one record.
-
-        Parameters
-        ----------
-        sample_times : ndarray, shape (N,)
-            Sampling instants [s]; the first and the last bound the signal.
-        rng : numpy.random.Generator
-            Source of the register's initial state.
-
-        Returns
-        -------
-        HeldSignal
-            The signal [input unit] on its clock, the first edge at the first instant.
-        """
+        """The sequence on its clock, the first edge at the first instant; the register's first state is drawn."""
         clock = _clock(sample_times, self.clock_period)
         bits = maximal_length_sequence(self.stages, clock.size, int(rng.integers(1, 2**self.stages)))
         return HeldSignal(clock, np.where(bits == 1, self.amplitude, -self.amplitude))
 
 
 @dataclass(frozen=True)
-class Multisine:
+class Multisine(Excitation):
     """Sum of sinusoids with equal amplitudes and random phases, held between clock instants.
 
     Parameters
@@ -181,25 +197,7 @@ class Multisine:
         return np.linspace(self.lowest_frequency, self.highest_frequency, self.tones)
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """The signal over one record.
-
-        Parameters
-        ----------
-        sample_times : ndarray, shape (N,)
-            Sampling instants [s]; the first and the last bound the signal.
-        rng : numpy.random.Generator
-            Source of the phases.
-
-        Returns
-        -------
-        HeldSignal
-            The signal [input unit].
-
-        Raises
-        ------
-        DataError
-            If the clock is too slow for the highest tone.
-        """
+        """The sum on its clock, which must carry the highest tone; the phases are drawn."""
         clock = _clock(sample_times, self.clock_period)
         mean_period = (clock[-1] - clock[0]) / (clock.size - 1) if clock.size > 1 else math.inf
         limit = math.pi / mean_period
@@ -218,7 +216,7 @@ class Multisine:
 
 
 @dataclass(frozen=True)
-class Gaussian:
+class Gaussian(Excitation):
     """Independent Gaussian values, held between clock instants.
 
     Parameters
@@ -239,26 +237,13 @@ class Gaussian:
         _check_clock(self.clock_period)
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """The signal over one record.
-
-        Parameters
-        ----------
-        sample_times : ndarray, shape (N,)
-            Sampling instants [s]; the first and the last bound the signal.
-        rng : numpy.random.Generator
-            Source of the values.
-
-        Returns
-        -------
-        HeldSignal
-            The signal [input unit].
-        """
+        """Independent values on the clock."""
         clock = _clock(sample_times, self.clock_period)
         return HeldSignal(clock, self.standard_deviation * rng.standard_normal(clock.size))
 
 
 @dataclass(frozen=True)
-class Step:
+class Step(Excitation):
     """A step from zero.
 
     Parameters
@@ -283,25 +268,7 @@ class Step:
         require_not_negative("time", self.time, "s")
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """The signal over one record.
-
-        Parameters
-        ----------
-        sample_times : ndarray, shape (N,)
-            Sampling instants [s]; the first and the last bound the signal.
-        rng : numpy.random.Generator
-            Not used; every excitation takes one.
-
-        Returns
-        -------
-        HeldSignal
-            The signal [input unit].
-
-        Raises
-        ------
-        DataError
-            If the step comes after the last sample.
-        """
+        """The step, which must come before the last instant; nothing is drawn."""
         start, end = float(sample_times[0]), float(sample_times[-1])
         if self.time >= end:
             raise DataError(f"the step at {self.time:g} s comes too late for a record that ends at {end:g} s")
@@ -311,7 +278,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class InputFile:
+class InputFile(Excitation):
     """The user's own input, from a comma-separated file.
 
     Parameters
@@ -344,25 +311,7 @@ class InputFile:
             raise OptionError("input", f"time and input must be two columns; both are {self.time!r}.")
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """The signal over one record.
-
-        Parameters
-        ----------
-        sample_times : ndarray, shape (N,)
-            Sampling instants [s]; the first and the last bound the signal.
-        rng : numpy.random.Generator
-            Not used; every excitation takes one.
-
-        Returns
-        -------
-        HeldSignal
-            The signal [input unit].
-
-        Raises
-        ------
-        DataError
-            If the file cannot be used, or none of it lies before the last sample.
-        """
+        """The file's signal from the first instant on; nothing is drawn."""
         whole = read_held_signal(self.file, time=self.time, input=self.input, hold=self.hold)
         start, end = float(sample_times[0]), float(sample_times[-1])
         if whole.t[0] >= end:
@@ -379,9 +328,6 @@ class InputFile:
             times = np.concatenate(([start], times[inside]))
             values = np.concatenate((whole.at([start]), values[inside]))
         return HeldSignal(times, values, self.hold)
-
-
-Excitation = Prbs | Multisine | Gaussian | Step | InputFile
 
 
 def _clock(sample_times: Array, period: float | None) -> Array:

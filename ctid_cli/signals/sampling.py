@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal, get_args
 
@@ -27,8 +28,32 @@ def geometric_sizes(first: int, last: int, count: int) -> list[int]:
     return sizes
 
 
+class Sampling(ABC):
+    """When the output is sampled, and what the estimator is told of the input."""
+
+    kind: ClassVar[str]
+
+    samples: int
+    input_record: InputRecord
+
+    @abstractmethod
+    def times(self, rng: np.random.Generator) -> Array:
+        """Sampling instants.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+            Source of whatever is random in them.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Instants [s], the first 0.
+        """
+
+
 @dataclass(frozen=True)
-class RegularSampling:
+class RegularSampling(Sampling):
     """Samples at equal intervals, from 0 s.
 
     Parameters
@@ -60,23 +85,12 @@ class RegularSampling:
         require_choice("input_record", self.input_record, get_args(InputRecord))
 
     def times(self, rng: np.random.Generator) -> Array:
-        """Sampling instants.
-
-        Parameters
-        ----------
-        rng : numpy.random.Generator
-            Not used; every sampling scheme takes one.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Instants [s], the first 0.
-        """
+        """The clock; nothing is drawn."""
         return self.interval * np.arange(self.samples, dtype=float)
 
 
 @dataclass(frozen=True)
-class UniformIntervals:
+class UniformIntervals(Sampling):
     """Samples at independent random intervals, each uniform between two bounds, from 0 s.
 
     Parameters
@@ -112,19 +126,5 @@ class UniformIntervals:
         require_choice("input_record", self.input_record, get_args(InputRecord))
 
     def times(self, rng: np.random.Generator) -> Array:
-        """Sampling instants.
-
-        Parameters
-        ----------
-        rng : numpy.random.Generator
-            Source of the intervals.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Instants [s], the first 0.
-        """
+        """Instants at intervals that are drawn."""
         return np.concatenate(([0.0], np.cumsum(rng.uniform(self.low, self.high, self.samples - 1))))
-
-
-Sampling = RegularSampling | UniformIntervals

@@ -11,10 +11,9 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import OptionError
-from ctid_cli.signals.arma_noise import ArmaNoise
 from ctid_cli.signals.checks import require_choice, require_finite, require_positive
 from ctid_cli.signals.held import COINCIDENCE
-from ctid_cli.signals.noise import WhiteNoise
+from ctid_cli.signals.noise import Noise
 
 PhaseAtSteps = Literal["jump", "continuous"]
 
@@ -234,7 +233,7 @@ class SineDisturbance:
         return self.amplitude * np.sin(self.frequency * np.asarray(times, dtype=float) + self.phase)
 
 
-Disturbance = UniformDisturbance | SineDisturbance | WhiteNoise | ArmaNoise
+Disturbance = UniformDisturbance | SineDisturbance | Noise
 
 
 def disturb(signal: Array, times: Array, disturbance: Disturbance | None, rng: np.random.Generator) -> Array:
