@@ -3,24 +3,55 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, IntArray
 from ctid_cli.errors import OptionError
-from ctid_cli.frequency.checks import one_for_each, samples_in
 from ctid_cli.frequency.decoding import flag_uncertain
 from ctid_cli.frequency.flags import GAP, OUT_OF_BOUNDS, STARTING, UNDETERMINED
+from ctid_cli.frequency.inputs import MOST_TONES, one_for_each, samples_in
 from ctid_cli.frequency.moments import factorise, substitute
-from ctid_cli.frequency.regression import MOST_TONES
-from ctid_cli.frequency.tracking import OnlineEstimator, Recursion
+from ctid_cli.frequency.tracking import OnlineEstimator, Output, Recursion
 from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
 
 #: Ridge of the Gauss-Newton matrix, as a fraction of its trace.
 RIDGE = 1e-4
+
+
+class Adaptation(NamedTuple):
+    """Settings of the observer."""
+
+    #: [s]
+    interval: float
+    #: Poles with the sign changed [rad/s], shape (2 n,).
+    poles: Array
+    #: Of forgetting [1/s].
+    rate: float
+    #: Samples without adaptation.
+    hold: int
+    #: Smallest distance of two frequencies, and bounds [rad/s].
+    smallest_gap: float
+    lowest: float
+    highest: float
+
+
+class Observer(NamedTuple):
+    """State of the observer."""
+
+    #: Squared frequencies [rad^2/s^2], shape (n,).
+    squares: Array
+    #: Each tone and its derivative; below, their sensitivities to each squared frequency, shape (n + 1, 2 n).
+    states: Array
+    #: Averaged products of the sensitivities of the prediction, and the squared error, shape (n + 1, n + 1).
+    moments: Array
+    #: The last sample, and how many so far.
+    last: Array
+    #: Frequencies, averaged [rad/s], shape (n,).
+    average: Array
+    seen: IntArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,24 +133,7 @@ class AdaptiveObserver(OnlineEstimator):
                 f"smallest_gap, not {self.initial_frequencies!r}.",
             )
 
-    def recursion(self, interval: float) -> Recursion:
-        """The compiled recursion for a sampling interval.
-
-        Parameters
-        ----------
-        interval : float
-            Sampling interval [s].
-
-        Returns
-        -------
-        Recursion
-            With the state before the first sample.
-
-        Raises
-        ------
-        ValueError
-            If the options make no sense at this sampling interval.
-        """
+    def _recursion(self, interval: float) -> Recursion:
         n = self.tones
         poles = self.pole * self.ratio ** np.arange(2 * n)
         if poles[-1] * interval > 1.0:
@@ -132,24 +146,25 @@ class AdaptiveObserver(OnlineEstimator):
             raise OptionError(
                 "rate", f"rate = {self.rate:g} 1/s needs a sampling interval below {1.0 / self.rate:g} s."
             )
-        constants = (
+        settings = Adaptation(
             float(interval),
-            poles,
+            np.asarray(poles, dtype=np.float64),
             float(self.rate),
             samples_in(self.hold, interval),
             float(self.smallest_gap),
             float(self.lowest_frequency),
             float(self.highest_frequency),
         )
-        state = {
-            "squares": np.asarray(self.initial_frequencies) ** 2,
-            "observer": np.zeros((n + 1, 2 * n)),
-            "moments": np.zeros((n + 1, n + 1)),
-            "last": np.full(1, np.nan),
-            "average": np.asarray(self.initial_frequencies, dtype=float).copy(),
-            "counters": np.zeros(1, np.int64),
-        }
-        return Recursion(advance_observer, constants, state)
+        initial = np.asarray(self.initial_frequencies, dtype=float)
+        state = Observer(
+            initial**2,
+            np.zeros((n + 1, 2 * n)),
+            np.zeros((n + 1, n + 1)),
+            np.full(1, np.nan),
+            initial,
+            np.zeros(1, np.int64),
+        )
+        return Recursion(advance_observer, (settings,), (state,))
 
 
 @njit(cache=True, nogil=True)
@@ -173,6 +188,7 @@ def observer_slope(states: Array, y: float, squares: Array, gains: Array, slope:
     """Time derivative of the observer and of its sensitivities."""
     n = squares.size
     for p in range(n + 1):
+        # The sensitivities obey the same equations, without the signal.
         error = y if p == 0 else 0.0
         for i in range(n):
             error -= states[p, 2 * i]
@@ -180,122 +196,132 @@ def observer_slope(states: Array, y: float, squares: Array, gains: Array, slope:
             slope[p, 2 * i] = states[p, 2 * i + 1] + gains[2 * i] * error
             slope[p, 2 * i + 1] = -squares[i] * states[p, 2 * i] + gains[2 * i + 1] * error
         if p > 0:
+            # Derivative of -w_p^2 s_p with respect to w_p^2 itself.
             slope[p, 2 * p - 1] -= states[0, 2 * p - 2]
 
 
 @njit(cache=True, nogil=True)
-def advance_observer(
-    samples: Array,
-    omega: Array,
-    uncertainty: Array,
-    flags: NDArray[np.uint16],
-    interval: float,
-    poles: Array,
-    rate: float,
-    hold: int,
-    smallest_gap: float,
-    lowest: float,
-    highest: float,
-    squares: Array,
-    observer: Array,
-    moments: Array,
-    last: Array,
-    average: Array,
-    counters: IntArray,
-) -> None:
+def predict(before: float, change: float, interval: float, gains: Array, state: Observer, memory: Array) -> None:
+    """Classical Runge-Kutta step for a signal that changes linearly; ``memory`` has the shape (3, n + 1, 2 n)."""
+    stage, total, slope = memory[0], memory[1], memory[2]
+    states, now, sums, steps = state.states.ravel(), stage.ravel(), total.ravel(), slope.ravel()
+    now[:] = states
+    sums[:] = 0.0
+    for part in range(4):
+        share = 0.0 if part == 0 else (1.0 if part == 3 else 0.5)
+        observer_slope(stage, before + share * change, state.squares, gains, slope)
+        weight = 1.0 if part in (0, 3) else 2.0
+        ahead = 0.5 if part < 2 else 1.0
+        for i in range(states.size):
+            sums[i] += weight * steps[i]
+            now[i] = states[i] + ahead * interval * steps[i]
+    for i in range(states.size):
+        states[i] += interval / 6.0 * sums[i]
+
+
+@njit(cache=True, nogil=True)
+def adapt(
+    y: float,
+    settings: Adaptation,
+    state: Observer,
+    xi: Array,
+    step: Array,
+    matrix: Array,
+    factor: Array,
+    scales: Array,
+) -> int:
+    """Recursive Gauss-Newton step of the squared frequencies; flags a bound that it meets."""
+    n = state.squares.size
+    smoothing = settings.rate * settings.interval
+    states, moments, squares = state.states, state.moments, state.squares
+    # The prediction is the sum of the tones; so are its sensitivities those of theirs.
+    for p in range(n + 1):
+        xi[p] = 0.0
+        for i in range(n):
+            xi[p] += states[p, 2 * i]
+    error = y - xi[0]
+    trace = 0.0
+    for p in range(n):
+        for j in range(p + 1):
+            moments[p, j] += smoothing * (xi[p + 1] * xi[j + 1] - moments[p, j])
+        trace += moments[p, p]
+    moments[n, n] += smoothing * (error * error - moments[n, n])
+    if state.seen[0] < settings.hold:
+        return 0
+    for p in range(n):
+        for j in range(p + 1):
+            matrix[p, j] = moments[p, j]
+        # The ridge bounds the step while the moments are nearly singular, the newest row while they are nearly zero.
+        matrix[p, p] += RIDGE * trace + smoothing * xi[p + 1] * xi[p + 1]
+        step[p] = smoothing * xi[p + 1] * error
+    if not factorise(matrix, 0.0, factor, scales):
+        return 0
+    for p in range(n):
+        step[p] /= scales[p]
+    substitute(factor, step)
+    flag = 0
+    bound = settings.lowest
+    for p in range(n):
+        # From the lowest frequency upwards, each leaves room for those above it: equal ones have no finite gains.
+        wanted = max(squares[p] + step[p] / scales[p], 0.0)
+        ceiling = settings.highest - (n - 1 - p) * settings.smallest_gap
+        frequency = min(max(np.sqrt(wanted), bound), ceiling)
+        allowed = wanted if frequency == np.sqrt(wanted) else frequency * frequency
+        if allowed != wanted:
+            flag = OUT_OF_BOUNDS
+        # The states move with the frequencies, to first order: what they would be, had these been there before.
+        for i in range(2 * n):
+            states[0, i] += states[p + 1, i] * (allowed - squares[p])
+        squares[p] = allowed
+        bound = frequency + settings.smallest_gap
+    return flag
+
+
+@njit(cache=True, nogil=True)
+def advance_observer(samples: Array, output: Output, settings: Adaptation, state: Observer) -> None:
     """Observer, sensitivities and recursive Gauss-Newton steps."""
-    n = squares.size
+    n = state.squares.size
     gains, no_gains, xi = np.empty(2 * n), np.zeros(2 * n), np.empty(n + 1)
-    stage, total, slope = np.empty_like(observer), np.empty_like(observer), np.empty_like(observer)
-    matrix, factor = np.empty((n + 1, n + 1)), np.empty((n, n))
-    step, scales, unit, no_rounding = np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
-    smoothing = rate * interval
+    memory, matrix, factor = np.empty((3, n + 1, 2 * n)), np.empty((n + 1, n + 1)), np.empty((n, n))
+    scales, step, unit, no_rounding = np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
+    last, seen, average, moments = state.last, state.seen, state.average, state.moments
+    smoothing = settings.rate * settings.interval
     for k in range(samples.size):
         y = samples[k]
-        flag = STARTING if counters[0] < hold else 0
+        flag = STARTING if seen[0] < settings.hold else 0
         present = np.isfinite(y) and np.isfinite(last[0])
-        if counters[0] > 0:
-            before, change = 0.0, 0.0
-            if present:
-                place_poles(squares, poles, gains)
-                before, change = last[0], y - last[0]
+        if seen[0] > 0 and present:
+            place_poles(state.squares, settings.poles, gains)
+            predict(last[0], y - last[0], settings.interval, gains, state, memory)
+        elif seen[0] > 0:
             # Without samples the observer runs on by itself.
-            used = gains if present else no_gains
-            for p in range(n + 1):
-                for i in range(2 * n):
-                    stage[p, i] = observer[p, i]
-                    total[p, i] = 0.0
-            for part in range(4):
-                share = 0.0 if part == 0 else (1.0 if part == 3 else 0.5)
-                observer_slope(stage, before + share * change, squares, used, slope)
-                weight = 1.0 if part in (0, 3) else 2.0
-                ahead = 0.5 if part < 2 else 1.0
-                for p in range(n + 1):
-                    for i in range(2 * n):
-                        total[p, i] += weight * slope[p, i]
-                        stage[p, i] = observer[p, i] + ahead * interval * slope[p, i]
-            for p in range(n + 1):
-                for i in range(2 * n):
-                    observer[p, i] += interval / 6.0 * total[p, i]
-        if not np.isfinite(y):
-            flag |= GAP
-        elif not present:
-            flag |= GAP if counters[0] > 0 else STARTING
+            predict(0.0, 0.0, settings.interval, no_gains, state, memory)
+        if present:
+            flag |= adapt(y, settings, state, xi, step, matrix, factor, scales)
         else:
-            for p in range(n + 1):
-                xi[p] = 0.0
-                for i in range(n):
-                    xi[p] += observer[p, 2 * i]
-            error = y - xi[0]
-            trace = 0.0
-            for p in range(n):
-                for j in range(p + 1):
-                    moments[p, j] += smoothing * (xi[p + 1] * xi[j + 1] - moments[p, j])
-                trace += moments[p, p]
-            moments[n, n] += smoothing * (error * error - moments[n, n])
-            if counters[0] >= hold:
-                for p in range(n):
-                    for j in range(p + 1):
-                        matrix[p, j] = moments[p, j]
-                    matrix[p, p] += RIDGE * trace + smoothing * xi[p + 1] * xi[p + 1]
-                    step[p] = smoothing * xi[p + 1] * error
-                if factorise(matrix, 0.0, factor, scales):
-                    for p in range(n):
-                        step[p] /= scales[p]
-                    substitute(factor, step)
-                    bound = lowest
-                    for p in range(n):
-                        wanted = max(squares[p] + step[p] / scales[p], 0.0)
-                        ceiling = highest - (n - 1 - p) * smallest_gap
-                        frequency = min(max(np.sqrt(wanted), bound), ceiling)
-                        allowed = wanted if frequency == np.sqrt(wanted) else frequency * frequency
-                        if allowed != wanted:
-                            flag |= OUT_OF_BOUNDS
-                        change = allowed - squares[p]
-                        squares[p] = allowed
-                        for i in range(2 * n):
-                            observer[0, i] += observer[p + 1, i] * change
-                        bound = frequency + smallest_gap
+            flag |= GAP if seen[0] > 0 or not np.isfinite(y) else STARTING
         last[0] = y
-        counters[0] += 1
+        seen[0] += 1
         determined = factorise(moments, 0.0, factor, scales)
         for p in range(n):
-            omega[k, p] = np.sqrt(squares[p])
-            average[p] += smoothing * (omega[k, p] - average[p])
-            uncertainty[k, p] = np.nan
+            omega = np.sqrt(state.squares[p])
+            average[p] += smoothing * (omega - average[p])
+            output.omega[k, p] = omega
+            output.uncertainty[k, p] = np.nan
             if determined:
+                # Error of w_p that the mean squared residual makes in the worst direction: w_p^2 over 2 w_p.
                 for j in range(n):
                     unit[j] = 0.0
                 unit[p] = 1.0 / scales[p]
                 substitute(factor, unit)
-                misfit = np.sqrt(max(unit[p], 0.0) / scales[p] * moments[n, n]) / (2.0 * omega[k, p])
+                misfit = np.sqrt(max(unit[p], 0.0) / scales[p] * moments[n, n]) / (2.0 * omega)
                 # An estimate that still moves is not where it will be.
-                uncertainty[k, p] = misfit + abs(omega[k, p] - average[p])
+                output.uncertainty[k, p] = misfit + abs(omega - average[p])
         if determined:
             # The effective length of an exponential window, and the delay of the observer.
-            elapsed = counters[0] * interval
-            span = min(elapsed, 2.0 / rate + 1.0 / poles[0])
-            flag |= flag_uncertain(omega[k], uncertainty[k], no_rounding, span, elapsed)
-        elif counters[0] > hold:
+            elapsed = seen[0] * settings.interval
+            span = min(elapsed, 2.0 / settings.rate + 1.0 / settings.poles[0])
+            flag |= flag_uncertain(output.omega[k], output.uncertainty[k], no_rounding, span, elapsed)
+        elif seen[0] > settings.hold:
             flag |= UNDETERMINED
-        flags[k] = flag
+        output.flags[k] = flag

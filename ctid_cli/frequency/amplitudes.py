@@ -9,9 +9,8 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.frequency.checks import LARGEST_SAMPLE
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.regression import MOST_TONES
+from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES, series_of
 from ctid_cli.signals.checks import require_positive
 
 #: Below this ratio of the singular values the sinusoids cannot be told apart.
@@ -120,15 +119,8 @@ def fit_sinusoids(samples: ArrayLike, interval: float, omega: ArrayLike, *, bias
 def present_samples(samples: ArrayLike, interval: float) -> tuple[Array, Array]:
     """Samples that are there, with their instants."""
     require_positive("interval", interval, "s")
-    values = np.asarray(samples)
-    if values.ndim != 1 or values.dtype.kind not in "fiu":
-        raise DataError(
-            f"the samples must be one series of real numbers, not an array of shape {values.shape} "
-            f"and type {values.dtype}."
-        )
-    values = values.astype(np.float64)
-    with np.errstate(invalid="ignore"):
-        places = np.flatnonzero(np.abs(values) <= LARGEST_SAMPLE)
+    values = series_of(samples)
+    places = np.flatnonzero(np.isfinite(values))
     if not places.size:
         raise DataError(f"the record holds no finite sample of a size up to {LARGEST_SAMPLE:g}.")
     return values[places], interval * places.astype(np.float64)

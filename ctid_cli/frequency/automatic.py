@@ -10,15 +10,14 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.adaptive_observer import AdaptiveObserver
-from ctid_cli.frequency.checks import LARGEST_SAMPLE
 from ctid_cli.frequency.decimation import Decimation, low_pass, without_low
 from ctid_cli.frequency.drem_finite_time import DremFiniteTime
 from ctid_cli.frequency.drem_gradient import DremGradient
 from ctid_cli.frequency.drem_window import DremWindow
 from ctid_cli.frequency.esprit import Esprit
 from ctid_cli.frequency.filter_regression import FilterRegression
+from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES
 from ctid_cli.frequency.nonlinear_least_squares import NonlinearLeastSquares
-from ctid_cli.frequency.regression import MOST_TONES
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.frequency.spectrum import Peaks, find_peaks
 from ctid_cli.frequency.windows import estimate_window

@@ -6,13 +6,14 @@ theta belongs to sinusoids at all. Noise can move a pair of roots off the real a
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.filtering.realisation import polynomial_roots, time_scale
-from ctid_cli.frequency.flags import CERTAIN_FRACTION, COMPLEX_ROOTS, OUT_OF_BOUNDS, UNCERTAIN, Flag
+from ctid_cli.frequency.flags import CERTAIN_FRACTION, COMPLEX_ROOTS, OUT_OF_BOUNDS, UNCERTAIN
 
 #: A root must settle within this many Newton steps; simple roots need fewer than ten.
 NEWTON_STEPS = 60
@@ -20,6 +21,38 @@ NEWTON_STEPS = 60
 FIRST_PERIODS = 2.0
 #: Keeps a division from overflowing.
 TINY = 1e-30
+
+
+class Decoding(NamedTuple):
+    """Memory for one decoding."""
+
+    #: Real parts of the roots, within bounds, shape (n,).
+    roots: Array
+    #: Derivatives of the frequencies with respect to their roots, shape (n,).
+    slopes: Array
+    #: What rounding may move the frequencies [rad/s], shape (n,).
+    rounding: Array
+    #: Derivatives of the frequencies with respect to the coefficients, shape (n, n).
+    sensitivities: Array
+    #: Shape (2, n + 1).
+    scratch: Array
+
+
+@njit(cache=True, nogil=True)
+def decoding_memory(tones: int) -> Decoding:
+    """Memory for a number of tones."""
+    square, pair = np.empty((tones, tones)), np.empty((2, tones + 1))
+    return Decoding(np.empty(tones), np.empty(tones), np.empty(tones), square, pair)
+
+
+@njit(cache=True, nogil=True)
+def horner(coefficients: Array, degree: int, x: float) -> tuple[float, float]:
+    """Value and slope of a monic polynomial."""
+    value, slope = 1.0, 0.0
+    for k in range(1, degree + 1):
+        slope = slope * x + value
+        value = value * x + coefficients[k]
+    return value, slope
 
 
 @njit(cache=True, nogil=True)
@@ -33,54 +66,48 @@ def real_roots(coefficients: Array, work: Array, roots: Array) -> bool:
     n = roots.size
     for k in range(n + 1):
         work[k] = coefficients[k]
-    degree = n
-    found = 0
-    while degree > 2:
+    for found in range(n - 2):
+        degree = n - found
+        # Samuelson: no root lies farther from the mean of all than sqrt(degree - 1) of their standard deviations.
         spread = (degree - 1.0) ** 2 * work[1] * work[1] - 2.0 * degree * (degree - 1.0) * work[2]
         if not spread >= 0.0:
             return False
         x = (-work[1] + np.sqrt(spread)) / degree
         settled = False
         for _ in range(NEWTON_STEPS):
-            value, slope = 1.0, 0.0
-            for k in range(1, degree + 1):
-                slope = slope * x + value
-                value = value * x + work[k]
+            value, slope = horner(work, degree, x)
             if value == 0.0:
                 settled = True
                 break
             if not slope > 0.0:
                 return False
             change = value / slope
-            if abs(change) <= 1e-13 * (abs(x) + 1e-3):
-                x -= change
-                settled = True
-                break
-            if change < 0.0:
+            small = abs(change) <= 1e-13 * (abs(x) + 1e-3)
+            if small or change < 0.0:
                 # Rounding may carry the iteration just beyond a root, but no further.
-                settled = abs(change) <= 1e-6 * (abs(x) + 1e-3)
+                settled = small or abs(change) <= 1e-6 * (abs(x) + 1e-3)
                 x -= change
                 break
             x -= change
         if not settled:
             return False
         roots[found] = x
-        found += 1
         for k in range(1, degree):
             work[k] += x * work[k - 1]
-        degree -= 1
-    if degree == 1:
-        roots[found] = -work[1]
+    if n == 1:
+        roots[0] = -work[1]
         return True
     half = -0.5 * work[1]
     discriminant = half * half - work[2]
     if not discriminant >= 0.0:
         return False
+    # The root of larger size first, without cancellation; the other one by Vieta.
     large = half - np.sqrt(discriminant) if half < 0.0 else half + np.sqrt(discriminant)
     other = work[2] / large if large != 0.0 else 0.0
-    roots[found] = max(large, other)
-    roots[found + 1] = min(large, other)
+    roots[n - 2] = max(large, other)
+    roots[n - 1] = min(large, other)
     if n > 2:
+        # Dividing out has spoilt the later roots a little: two more steps on the undivided polynomial.
         for i in range(n):
             gap = np.inf
             if i > 0:
@@ -88,10 +115,7 @@ def real_roots(coefficients: Array, work: Array, roots: Array) -> bool:
             if i < n - 1:
                 gap = min(gap, abs(roots[i] - roots[i + 1]))
             for _ in range(2):
-                value, slope = 1.0, 0.0
-                for k in range(1, n + 1):
-                    slope = slope * roots[i] + value
-                    value = value * roots[i] + coefficients[k]
+                value, slope = horner(coefficients, n, roots[i])
                 if not abs(value) < 1e-3 * gap * abs(slope):
                     break
                 roots[i] -= value / slope
@@ -113,40 +137,36 @@ def root_real_parts(coefficients: Array, work: Array, roots: Array) -> bool:
         work[k] = coefficients[k] * factor
         factor /= scale
     raw = polynomial_roots(work)
-    all_real = True
-    for i in range(n):
-        value = raw[i].real * scale
-        all_real = all_real and raw[i].imag == 0.0
-        place = i
-        while place > 0 and roots[place - 1] < value:
-            roots[place] = roots[place - 1]
-            place -= 1
-        roots[place] = value
-    return all_real
+    roots[:] = np.sort(raw.real * scale)[::-1]
+    return bool(np.all(raw.imag == 0.0))
 
 
 @njit(cache=True, nogil=True)
-def decode(
-    theta: Array, delay: float, top: float, bottom: float, polynomial: Array, work: Array, roots: Array, omega: Array
-) -> int:
-    """Frequencies that belong to the parameters of the delay regression, ascending."""
-    n = theta.size
+def bounded_roots(coefficients: Array, lowest: float, highest: float, work: Decoding) -> int:
+    """Real parts of the roots of ``x^n + a_1 x^(n-1) + ... + a_n``, largest first, within bounds; returns flags."""
+    n = coefficients.size
+    roots, polynomial = work.roots, work.scratch[0]
     polynomial[0] = 1.0
     for k in range(n):
-        if not np.isfinite(theta[k]):
-            for i in range(n):
-                roots[i] = omega[i] = np.nan
+        if not np.isfinite(coefficients[k]):
+            roots[:] = np.nan
             return COMPLEX_ROOTS
-        polynomial[k + 1] = theta[k]
-    flags = 0 if root_real_parts(polynomial, work, roots) else COMPLEX_ROOTS
+        polynomial[k + 1] = coefficients[k]
+    flags = 0 if root_real_parts(polynomial, work.scratch[1], roots) else COMPLEX_ROOTS
     for i in range(n):
-        if roots[i] > top:
-            roots[i] = top
+        if roots[i] < lowest or roots[i] > highest:
+            roots[i] = min(max(roots[i], lowest), highest)
             flags |= OUT_OF_BOUNDS
-        elif roots[i] < bottom:
-            roots[i] = bottom
-            flags |= OUT_OF_BOUNDS
-        omega[i] = np.arccos(roots[i]) / delay
+    return flags
+
+
+@njit(cache=True, nogil=True)
+def decode(theta: Array, delay: float, bottom: float, top: float, work: Decoding, omega: Array) -> int:
+    """Frequencies that belong to the parameters of the delay regression, ascending; flags what was wrong."""
+    flags = bounded_roots(theta, bottom, top, work)
+    # The largest cosine is that of the lowest frequency.
+    for i in range(theta.size):
+        omega[i] = np.arccos(work.roots[i]) / delay
     return flags
 
 
@@ -224,16 +244,3 @@ def flag_uncertain(omega: Array, uncertainty: Array, rounding: Array, span: floa
         if not uncertainty[i] <= CERTAIN_FRACTION * room:
             flag = UNCERTAIN
     return flag
-
-
-def frequencies_of(
-    theta: ArrayLike, delay: float, *, lowest: float = 0.0, highest: float | None = None
-) -> tuple[Array, Flag]:
-    """Frequencies that belong to the parameters of the delay regression."""
-    values = np.ascontiguousarray(theta, dtype=float)
-    n = values.size
-    omega, roots = np.empty(n), np.empty(n)
-    top = float(np.cos(lowest * delay))
-    bottom = -1.0 if highest is None else float(np.cos(highest * delay))
-    flags = decode(values, float(delay), top, bottom, np.empty(n + 1), np.empty(n + 1), roots, omega)
-    return omega, Flag(flags)

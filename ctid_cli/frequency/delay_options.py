@@ -3,39 +3,45 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
-from ctid_cli.frequency.checks import require_bounds
-from ctid_cli.frequency.consistency import second_lag
+from ctid_cli.frequency.consistency import samples_between_verdicts, second_lag
+from ctid_cli.frequency.inputs import MOST_TONES, require_bounds
 from ctid_cli.frequency.prefilter import impulse_response
-from ctid_cli.frequency.regression import MOST_TONES, delay_table, whole_delay
+from ctid_cli.frequency.regression import delay_table, whole_delay
 from ctid_cli.frequency.tracking import OnlineEstimator
 from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
 
 #: A delay that rounding to whole sampling intervals changes by a larger fraction is worth a note.
 NOTEWORTHY_ROUNDING = 0.01
+#: An estimate is valid after this many rows for each tone, and after this fraction of n h: before, the rows are too few
+#: or too much alike to show that they disagree.
+ROWS_PER_TONE = 4
+STARTING_SPAN = 0.25
 
 
-@dataclass(frozen=True)
-class DelayClock:
-    """The delay regression at a sampling interval."""
+class DelayClock(NamedTuple):
+    """The delay regression at a sampling interval, as the kernels take it."""
 
-    lag: int
-    second_lag: int
-    #: The same [s].
-    delay: float
-    second_delay: float
-    #: Cosines of the lowest and of the highest frequency times h [-].
-    top: float
-    bottom: float
     #: Coefficients of the regression, shape (n + 1, 2 n + 1).
     table: Array
-    #: Impulse response of the prefilter, shape (L + 1,).
-    weights: Array
-    notes: tuple[str, ...]
+    #: Sampling interval [s].
+    interval: float
+    #: The delay h in sampling intervals, and in seconds.
+    lag: int
+    delay: float
+    #: A second delay, at which the frequencies are checked.
+    second_lag: int
+    second_delay: float
+    #: Cosines of the highest and of the lowest frequency times h [-].
+    bottom: float
+    top: float
+    #: Samples from one verdict to the next.
+    every: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,39 +60,46 @@ class DelayRegression(OnlineEstimator):
         require_positive("h", self.h, "s")
         require_not_negative("prefilter", self.prefilter, "s")
         require_not_negative("difference", self.difference, "s")
-        require_not_negative("lowest_frequency", self.lowest_frequency, "rad/s")
-        if self.highest_frequency is not None:
-            require_positive("highest_frequency", self.highest_frequency, "rad/s")
-        self._check_bounds(self.h)
+        require_bounds(self.lowest_frequency, self.highest_frequency)
+        self._highest(self.h)
 
-    def clock(self, interval: float) -> DelayClock:
+    def _clock(self, interval: float) -> DelayClock:
         """The regression at a sampling interval."""
         lag = whole_delay("h", self.h, interval)
-        delay = lag * interval
-        highest = self._check_bounds(delay)
-        notes = []
-        if abs(delay - self.h) > NOTEWORTHY_ROUNDING * self.h:
-            notes.append(
-                f"h = {self.h:g} s is no whole number of sampling intervals of {interval:g} s; {delay:g} s is used."
-            )
-        if self.prefilter > 0:
-            whole_delay("prefilter", self.prefilter, interval)
-        if self.difference > 0:
-            whole_delay("difference", self.difference, interval)
-        second = second_lag(lag)
+        delay, second = lag * interval, second_lag(lag)
         return DelayClock(
+            delay_table(self.tones),
+            float(interval),
             lag,
-            second,
             delay,
+            second,
             second * interval,
+            float(np.cos(self._highest(delay) * delay)),
             float(np.cos(self.lowest_frequency * delay)),
-            float(np.cos(highest * delay)),
-            delay_table(self.tones).astype(float),
-            impulse_response(self.prefilter, self.difference, interval),
-            tuple(notes),
+            samples_between_verdicts(lag),
         )
 
-    def _check_bounds(self, delay: float) -> float:
+    def _weights(self, interval: float) -> Array:
+        """Impulse response of the prefilter, shape (L + 1,)."""
+        for name in ("prefilter", "difference"):
+            if getattr(self, name) > 0:
+                whole_delay(name, getattr(self, name), interval)
+        return impulse_response(self.prefilter, self.difference, interval)
+
+    def _notes(self, clock: DelayClock) -> tuple[str, ...]:
+        """What the sampling interval makes of the delay."""
+        if abs(clock.delay - self.h) <= NOTEWORTHY_ROUNDING * self.h:
+            return ()
+        return (
+            f"h = {self.h:g} s is no whole number of sampling intervals of {clock.interval:g} s; "
+            f"{clock.delay:g} s is used.",
+        )
+
+    def _rows_before_valid(self, clock: DelayClock) -> int:
+        """Rows that must have arrived before an estimate can be valid."""
+        return max(ROWS_PER_TONE * self.tones, int(STARTING_SPAN * self.tones * clock.lag))
+
+    def _highest(self, delay: float) -> float:
         """Upper bound of the frequencies at a delay [s], if the bounds make sense."""
         unique = np.pi / delay
         highest = unique if self.highest_frequency is None else float(self.highest_frequency)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ctid_cli.frequency.scalar_regressions import DremOptions, scalar_recursion
-from ctid_cli.frequency.tracking import Recursion
+from ctid_cli.frequency.drem_gradient import DremGradient
 
 
 @dataclass(frozen=True, kw_only=True)
-class DremFiniteTime(DremOptions):
+class DremFiniteTime(DremGradient):
     r"""Frequencies in finite time: the gradient estimate of each mixed regression, without its initial value.
 
     Parameters
@@ -80,23 +79,4 @@ class DremFiniteTime(DremOptions):
     """
 
     kind: ClassVar[str] = "drem_finite_time"
-
-    def recursion(self, interval: float) -> Recursion:
-        """The compiled recursion for a sampling interval.
-
-        Parameters
-        ----------
-        interval : float
-            Sampling interval [s].
-
-        Returns
-        -------
-        Recursion
-            With the state before the first sample.
-
-        Raises
-        ------
-        ValueError
-            If the options make no sense at this sampling interval.
-        """
-        return scalar_recursion(self, interval, finite_time=True)
+    _finite_time: ClassVar[bool] = True

@@ -2,15 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal, NamedTuple
 
-from ctid_cli.frequency.scalar_regressions import DremOptions, scalar_recursion
+import numpy as np
+from numba import njit
+
+from ctid_cli.arrays import Array
+from ctid_cli.frequency.inputs import one_for_each
+from ctid_cli.frequency.mixing import MIXING_ROUNDING, MixingOptions, Work, back_end
+from ctid_cli.frequency.regression import theta_of
 from ctid_cli.frequency.tracking import Recursion
+from ctid_cli.signals.checks import require_integer, require_positive
+
+#: The residuals that show how far an estimate can be trusted are remembered over so many times n h.
+RECENT_SPANS = 2
+
+
+class Gains(NamedTuple):
+    """Settings of the gradient."""
+
+    #: ``gamma_k`` times the sampling interval, shape (n,).
+    gains: Array
+    #: ``theta(0)``, shape (n,).
+    initial: Array
+    #: Whether the part of the initial value is taken out.
+    finite_time: bool
+    #: Number of the largest gain.
+    fastest: int
+    #: What the recent sums keep from one sample to the next.
+    keep: float
+
+
+class Gradient(NamedTuple):
+    """State of the gradient."""
+
+    #: z and q, ``theta = z + (1 - q) theta(0)``, shape (2, n).
+    sums: Array
+    #: Recent sums of the squares of ``Psi_k - Delta theta_k``, of Delta and of its rounding, and of the squared weights
+    #: with which the rows enter q, shape (n + 3,).
+    recent: Array
 
 
 @dataclass(frozen=True, kw_only=True)
-class DremGradient(DremOptions):
+class DremGradient(MixingOptions):
     r"""Frequencies by gradient descent on each mixed regression: exponential convergence from the initial frequencies.
 
     Parameters
@@ -62,23 +98,86 @@ class DremGradient(DremOptions):
     """
 
     kind: ClassVar[str] = "drem_gradient"
+    _finite_time: ClassVar[bool] = False
 
-    def recursion(self, interval: float) -> Recursion:
-        """The compiled recursion for a sampling interval.
+    epsilon: float = 1.0
+    gamma: float | tuple[float, ...] = 1.0
+    initial_frequencies: tuple[float, ...] | None = None
+    power: int | Literal["literal"] = 1
+    gated: bool = True
 
-        Parameters
-        ----------
-        interval : float
-            Sampling interval [s].
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive("epsilon", self.epsilon, "-")
+        if isinstance(self.gamma, Sequence):
+            object.__setattr__(self, "gamma", one_for_each("gamma", self.gamma, self.tones, "-"))
+        else:
+            require_positive("gamma", self.gamma, "-")
+        initial = one_for_each("initial_frequencies", self.initial_frequencies, self.tones, "rad/s")
+        object.__setattr__(self, "initial_frequencies", initial)
+        if self.power != "literal":
+            require_integer("power", self.power, 1)
 
-        Returns
-        -------
-        Recursion
-            With the state before the first sample.
+    def _recursion(self, interval: float) -> Recursion:
+        n, clock = self.tones, self._clock(interval)
+        initial = self.initial_frequencies
+        if initial is None:
+            lowest, highest = np.arccos((clock.top, clock.bottom)) / clock.delay
+            initial = lowest + (highest - lowest) * np.arange(1, n + 1) / (n + 1)
+        theta = theta_of(initial, clock.delay)
+        gains = np.full(n, 1.0) * np.asarray(self.gamma, dtype=float) * interval
+        keep = 1.0 - 1.0 / (RECENT_SPANS * n * clock.lag)
+        return self._mixed(
+            clock,
+            Gradient(np.zeros((2, n)), np.zeros(n + 3)),
+            tuning=Gains(gains, theta, self._finite_time, int(np.argmax(gains)), keep),
+            normalisation=float(self.epsilon) ** (n if self.power == "literal" else int(self.power)),
+            theta=theta,
+            past=np.nan if self.gated else 0.0,
+        )
 
-        Raises
-        ------
-        ValueError
-            If the options make no sense at this sampling interval.
-        """
-        return scalar_recursion(self, interval, finite_time=False)
+
+@njit(cache=True, nogil=True)
+def absorb_gradient(
+    scale: float, count: int, tuning: Gains, back: Gradient, theta: Array, work: Work
+) -> tuple[float, int]:
+    """Exact solution of ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)`` over one interval, Delta and Psi held."""
+    n = theta.size
+    z, q, recent, gains, mixed = back.sums[0], back.sums[1], back.recent, tuning.gains, work.mixed
+    if np.isnan(scale):
+        return recent[n], count
+    delta = mixed[n]
+    recent[n] = tuning.keep * recent[n] + delta * delta
+    recent[n + 1] = tuning.keep * recent[n + 1] + (MIXING_ROUNDING * scale) ** 2
+    x, m, gain = 0.0, 0.0, 0.0
+    for i in range(n):
+        if count > 1:
+            # The residual of what was known before this sample: theta moves only below.
+            recent[i] = tuning.keep * recent[i] + (mixed[i] - delta * theta[i]) ** 2
+        if i == 0 or gains[i] != gains[i - 1]:
+            # m = 1 - exp(-x), the share of the new row; gain = gamma m/x without 0/0 where Delta vanishes.
+            x = gains[i] * delta * delta
+            m = -np.expm1(-x)
+            gain = gains[i] * (m / x if x > 1e-8 else 1.0 - 0.5 * x)
+        if i == tuning.fastest:
+            recent[n + 2] = (1.0 - m) ** 2 * recent[n + 2] + m * m
+        # The part of the rows and that of the initial value are kept apart, so that no difference cancels.
+        z[i] += gain * delta * mixed[i] - m * z[i]
+        q[i] += m * (1.0 - q[i])
+        theta[i] = z[i] / q[i] if tuning.finite_time and q[i] > 0.0 else z[i] + (1.0 - q[i]) * tuning.initial[i]
+    return recent[n], count
+
+
+@njit(cache=True, nogil=True)
+def weigh_gradient(tuning: Gains, back: Gradient, theta: Array, work: Work) -> tuple[float, float]:
+    """Errors of theta that the recent residuals show, rounding of Delta relative to Delta, rows that carry weight."""
+    n = theta.size
+    recent, q = back.recent, back.sums[1, tuning.fastest]
+    for i in range(n):
+        work.errors[i] = np.sqrt(recent[i] / recent[n])
+    # (sum w)^2/sum w^2 for the weights w with which the rows enter the fastest parameter.
+    remembered = q * q / recent[n + 2] if recent[n + 2] > 0.0 else 0.0
+    return np.sqrt(recent[n + 1] / recent[n]), remembered
+
+
+back_end(Gradient, absorb_gradient, weigh_gradient)

@@ -4,27 +4,62 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import comb
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, IntArray
 from ctid_cli.errors import OptionError
 from ctid_cli.filtering.exponential import held_step
-from ctid_cli.frequency.checks import one_for_each, require_bounds, samples_in
-from ctid_cli.frequency.decoding import flag_uncertain, root_real_parts, root_sensitivities
-from ctid_cli.frequency.flags import COMPLEX_ROOTS, GAP, OUT_OF_BOUNDS, STARTING, UNDETERMINED
+from ctid_cli.frequency.decoding import Decoding, bounded_roots, decoding_memory, flag_uncertain, root_sensitivities
+from ctid_cli.frequency.flags import GAP, STARTING, UNDETERMINED
+from ctid_cli.frequency.inputs import MOST_TONES, one_for_each, require_bounds, samples_in
 from ctid_cli.frequency.moments import accumulate_row, factorise, least_squares, moment_uncertainty, squared_residual
-from ctid_cli.frequency.regression import MOST_TONES
-from ctid_cli.frequency.tracking import OnlineEstimator, Recursion
+from ctid_cli.frequency.tracking import OnlineEstimator, Output, Recursion
 from ctid_cli.signals.checks import require_choice, require_integer, require_not_negative, require_positive
 
 Algorithm = Literal["least_squares", "gradient"]
 
 #: The estimate is decoded anew every so many samples.
 REFRESH = 5
+
+
+class Filter(NamedTuple):
+    """Settings of the filters and of the regression."""
+
+    #: The chain over one interval: its transition, and what the last sample and the change since then add to it.
+    step: tuple[Array, Array, Array]
+    #: Rows of the regression from the chain, shape (n + 1, 2 n + 1).
+    derivatives: Array
+    #: What the second moments keep from one sample to the next.
+    keep: float
+    #: Gains of the gradient times the interval, shape (n,); none for least squares.
+    gains: Array
+    #: [s]
+    interval: float
+    #: How far an estimate reaches back, when the first one is shown, and how long a gap empties the chain [samples].
+    memory: float
+    hold: int
+    refill: int
+    #: Bounds of the squared frequencies.
+    lowest: float
+    highest: float
+
+
+class Chain(NamedTuple):
+    """State of the filters and of the regression."""
+
+    #: The newest sample, and it after 1, 2, ... 2 n filters.
+    chain: Array
+    moments: Array
+    #: Coefficients, frequencies and their possible errors, shape (3, n).
+    estimate: Array
+    #: Samples so far, samples until the chain is full again after a gap, rows since the last verdict, verdict (flags).
+    counters: IntArray
+
+
+SEEN, REFILL, NEW, VERDICT = range(4)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,24 +132,7 @@ class FilterRegression(OnlineEstimator):
         for name, unit in (("gains", "-"), ("initial_frequencies", "rad/s")):
             object.__setattr__(self, name, one_for_each(name, getattr(self, name), self.tones, unit))
 
-    def recursion(self, interval: float) -> Recursion:
-        """The compiled recursion for a sampling interval.
-
-        Parameters
-        ----------
-        interval : float
-            Sampling interval [s].
-
-        Returns
-        -------
-        Recursion
-            With the state before the first sample.
-
-        Raises
-        ------
-        ValueError
-            If the options make no sense at this sampling interval.
-        """
+    def _recursion(self, interval: float) -> Recursion:
         n = self.tones
         order = 2 * n
         if self.pole * interval > np.pi:
@@ -126,20 +144,18 @@ class FilterRegression(OnlineEstimator):
         dynamics = self.pole * (np.eye(order, k=-1) - np.eye(order))
         gain = np.zeros(order)
         gain[0] = self.pole
-        transition, from_value, from_change = held_step(dynamics, gain, interval)
         initial = self.initial_frequencies
         if initial is None:
             initial = tuple(self.pole * np.arange(1, n + 1) / n)
         coefficients = np.poly(np.asarray(initial, dtype=float) ** 2)[1:]
-        highest = np.inf if self.highest_frequency is None else self.highest_frequency
-        constants = (
-            transition,
-            from_value,
-            from_change,
+        gains = np.empty(0)
+        if self.algorithm == "gradient":
+            gains = interval * np.asarray(self.gains if self.gains is not None else np.ones(n), dtype=float)
+        settings = Filter(
+            held_step(dynamics, gain, interval),
             derivative_rows(n, self.pole),
             float(np.exp(-self.forgetting * interval)),
-            self.algorithm == "gradient",
-            interval * np.asarray(self.gains if self.gains is not None else np.ones(n), dtype=float),
+            gains,
             float(interval),
             # The effective length of an exponential window, and the mean delay of the filter.
             (2.0 / self.forgetting + order / self.pole) / interval,
@@ -147,15 +163,15 @@ class FilterRegression(OnlineEstimator):
             # A gap empties the filter; it takes about twice its mean delay to fill again.
             samples_in(2 * order / self.pole, interval),
             float(self.lowest_frequency) ** 2,
-            float(highest) ** 2,
+            np.inf if self.highest_frequency is None else float(self.highest_frequency) ** 2,
         )
-        state = {
-            "chain": np.zeros(order + 1),
-            "moments": np.zeros((n + 1, n + 1)),
-            "estimate": np.array([coefficients, np.sort(np.asarray(initial, dtype=float)), np.full(n, np.nan)]),
-            "counters": np.array([0, 0, 0, UNDETERMINED], np.int64),
-        }
-        return Recursion(advance_filter, constants, state)
+        state = Chain(
+            np.zeros(order + 1),
+            np.zeros((n + 1, n + 1)),
+            np.array([coefficients, np.sort(np.asarray(initial, dtype=float)), np.full(n, np.nan)]),
+            np.array([0, 0, 0, UNDETERMINED], np.int64),
+        )
+        return Recursion(advance_filter, (settings,), (state,))
 
 
 def derivative_rows(tones: int, pole: float) -> Array:
@@ -172,121 +188,93 @@ def derivative_rows(tones: int, pole: float) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def decode_squares(
-    coefficients: Array, lowest: float, highest: float, polynomial: Array, work: Array, roots: Array, omega: Array
-) -> int:
-    """Frequencies whose squares are the roots of a polynomial, ascending."""
-    n = coefficients.size
-    polynomial[0] = 1.0
-    for k in range(n):
-        if not np.isfinite(coefficients[k]):
-            for i in range(n):
-                roots[i] = omega[i] = np.nan
-            return COMPLEX_ROOTS
-        polynomial[k + 1] = coefficients[k]
-    flags = 0 if root_real_parts(polynomial, work, roots) else COMPLEX_ROOTS
-    for i in range(n // 2):
-        roots[i], roots[n - 1 - i] = roots[n - 1 - i], roots[i]
-    for i in range(n):
-        if roots[i] < lowest or roots[i] > highest:
-            roots[i] = min(max(roots[i], lowest), highest)
-            flags |= OUT_OF_BOUNDS
-        omega[i] = np.sqrt(roots[i])
-    return flags
+def filter_sample(y: float, step: tuple[Array, Array, Array], chain: Array, moved: Array) -> None:
+    """Chain of filters over one interval, exactly for a signal that is linear between its samples."""
+    transition, from_value, from_change = step
+    for i in range(moved.size):
+        moved[i] = from_value[i] * chain[0] + from_change[i] * (y - chain[0])
+        # Lower triangular: a filter sees only those before it.
+        for j in range(i + 1):
+            moved[i] += transition[i, j] * chain[1 + j]
+    chain[0] = y
+    chain[1:] = moved
 
 
 @njit(cache=True, nogil=True)
-def advance_filter(
-    samples: Array,
-    omega: Array,
-    uncertainty: Array,
-    flags: NDArray[np.uint16],
-    transition: Array,
-    from_value: Array,
-    from_change: Array,
-    derivatives: Array,
-    keep: float,
-    by_gradient: bool,
-    gains: Array,
-    interval: float,
-    memory: float,
-    hold: int,
-    refill: int,
-    lowest: float,
-    highest: float,
-    chain: Array,
-    moments: Array,
-    estimate: Array,
-    counters: IntArray,
-) -> None:
+def take_gradient_step(row: Array, gains: Array, coefficients: Array) -> None:
+    """Implicit step ``a += K phi e/(1 + phi' K phi)``: no gain is too large."""
+    n = coefficients.size
+    residual, size = row[n], 1.0
+    for i in range(n):
+        residual -= row[i] * coefficients[i]
+        size += gains[i] * row[i] * row[i]
+    for i in range(n):
+        coefficients[i] += gains[i] * row[i] * residual / size
+
+
+@njit(cache=True, nogil=True)
+def estimate_frequencies(settings: Filter, state: Chain, factor: Array, scales: Array, work: Decoding) -> int:
+    """Frequencies and their possible errors from the moments, and the flags that follow."""
+    n, moments = scales.size, state.moments
+    coefficients, frequencies, possible_errors = state.estimate[0], state.estimate[1], state.estimate[2]
+    if not factorise(moments, 0.0, factor, scales):
+        return UNDETERMINED
+    if settings.gains.size == 0:
+        least_squares(moments, factor, scales, coefficients)
+    roots, slopes, sensitivities, rounding = work.roots, work.slopes, work.sensitivities, work.rounding
+    verdict = bounded_roots(coefficients, settings.lowest, settings.highest, work)
+    # The roots are squared frequencies: ascending, as frequencies are shown.
+    for i in range(n // 2):
+        roots[i], roots[n - 1 - i] = roots[n - 1 - i], roots[i]
+    for i in range(n):
+        frequencies[i] = np.sqrt(roots[i])
+        slopes[i] = 0.5 / frequencies[i] if frequencies[i] > 0.0 else np.inf
+    root_sensitivities(roots, slopes, sensitivities)
+    misfit = squared_residual(moments, coefficients)
+    moment_uncertainty(moments, factor, scales, misfit, coefficients, sensitivities, possible_errors, rounding)
+    elapsed = state.counters[SEEN] * settings.interval
+    span = min(elapsed, settings.memory * settings.interval)
+    return verdict | flag_uncertain(frequencies, possible_errors, rounding, span, elapsed)
+
+
+@njit(cache=True, nogil=True)
+def advance_filter(samples: Array, output: Output, settings: Filter, state: Chain) -> None:
     """Chain of filters, regression with forgetting, and least squares or gradient steps."""
-    n = omega.shape[1]
-    order = 2 * n
-    row, moved = np.empty(n + 1), np.empty(order)
-    best, slopes, roots, scales, rounding = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    polynomial, work = np.empty(n + 1), np.empty(n + 1)
-    factor, sensitivities = np.empty((n, n)), np.empty((n, n))
-    coefficients, frequencies, possible_errors = estimate[0], estimate[1], estimate[2]
+    n = output.omega.shape[1]
+    row, moved = np.empty(n + 1), np.empty(2 * n)
+    factor, scales, memory = np.empty((n, n)), np.empty(n), decoding_memory(n)
+    chain, counters = state.chain, state.counters
     for k in range(samples.size):
         y = samples[k]
-        flag = STARTING if counters[0] < hold else 0
+        flag = STARTING if counters[SEEN] < settings.hold else 0
         if not np.isfinite(y):
-            counters[1] = refill + 1
+            counters[REFILL] = settings.refill + 1
             flag |= GAP
-        elif counters[1] == refill + 1 or counters[0] == 0:
+        elif counters[REFILL] == settings.refill + 1 or counters[SEEN] == 0:
             # Nothing to interpolate from: the chain begins at rest.
+            chain[:] = 0.0
             chain[0] = y
-            for i in range(order):
-                chain[1 + i] = 0.0
-            flag |= GAP if counters[1] > 0 else STARTING
-            counters[1] = max(counters[1] - 1, 0)
+            flag |= GAP if counters[REFILL] > 0 else STARTING
+            counters[REFILL] = max(counters[REFILL] - 1, 0)
         else:
-            for i in range(order):
-                moved[i] = from_value[i] * chain[0] + from_change[i] * (y - chain[0])
-                for j in range(i + 1):
-                    moved[i] += transition[i, j] * chain[1 + j]
-            chain[0] = y
-            for i in range(order):
-                chain[1 + i] = moved[i]
-            if counters[1] > 0:
-                counters[1] -= 1
+            filter_sample(y, settings.step, chain, moved)
+            if counters[REFILL] > 0:
+                counters[REFILL] -= 1
                 flag |= GAP
             else:
                 for i in range(n + 1):
                     row[i] = 0.0
-                    for j in range(order + 1):
-                        row[i] += derivatives[i, j] * chain[j]
-                accumulate_row(row, moments, keep)
-                if by_gradient:
-                    residual, size = row[n], 1.0
-                    for i in range(n):
-                        residual -= row[i] * coefficients[i]
-                        size += gains[i] * row[i] * row[i]
-                    for i in range(n):
-                        coefficients[i] += gains[i] * row[i] * residual / size
-                counters[2] += 1
-        counters[0] += 1
-        if counters[2] >= REFRESH and counters[0] > hold:
-            counters[2] = 0
-            if factorise(moments, 0.0, factor, scales):
-                least_squares(moments, factor, scales, best)
-                if not by_gradient:
-                    for i in range(n):
-                        coefficients[i] = best[i]
-                verdict = decode_squares(coefficients, lowest, highest, polynomial, work, roots, frequencies)
-                for i in range(n):
-                    slopes[i] = 0.5 / frequencies[i] if frequencies[i] > 0.0 else np.inf
-                root_sensitivities(roots, slopes, sensitivities)
-                misfit = squared_residual(moments, coefficients)
-                moment_uncertainty(
-                    moments, factor, scales, misfit, coefficients, sensitivities, possible_errors, rounding
-                )
-                elapsed = counters[0] * interval
-                span = min(elapsed, memory * interval)
-                counters[3] = verdict | flag_uncertain(frequencies, possible_errors, rounding, span, elapsed)
-            else:
-                counters[3] = UNDETERMINED
+                    for j in range(2 * n + 1):
+                        row[i] += settings.derivatives[i, j] * chain[j]
+                accumulate_row(row, state.moments, settings.keep)
+                if settings.gains.size:
+                    take_gradient_step(row, settings.gains, state.estimate[0])
+                counters[NEW] += 1
+        counters[SEEN] += 1
+        if counters[NEW] >= REFRESH and counters[SEEN] > settings.hold:
+            counters[NEW] = 0
+            counters[VERDICT] = estimate_frequencies(settings, state, factor, scales, memory)
         for i in range(n):
-            omega[k, i] = frequencies[i]
-            uncertainty[k, i] = possible_errors[i]
-        flags[k] = flag | counters[3]
+            output.omega[k, i] = state.estimate[1, i]
+            output.uncertainty[k, i] = state.estimate[2, i]
+        output.flags[k] = flag | counters[VERDICT]

@@ -10,11 +10,10 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.frequency.amplitudes import flag_insignificant, frequency_errors, present_samples
-from ctid_cli.frequency.checks import one_for_each
 from ctid_cli.frequency.decoding import flag_uncertain
 from ctid_cli.frequency.esprit import Esprit
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.regression import MOST_TONES
+from ctid_cli.frequency.inputs import MOST_TONES, one_for_each
 from ctid_cli.frequency.tracking import FrequencyEstimate
 from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
 

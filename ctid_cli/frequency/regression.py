@@ -19,18 +19,17 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, IntArray
 from ctid_cli.errors import OptionError
+from ctid_cli.frequency.inputs import MOST_TONES
 from ctid_cli.signals.checks import require_integer, require_positive
 
-#: More tones than this cannot be told apart in double precision.
-MOST_TONES = 8
 #: Longest delay in sampling intervals: the samples of twice n delays are kept.
 LONGEST_DELAY = 10_000_000
 
 
-def delay_table(tones: int) -> IntArray:
-    """Coefficients of the delay regression."""
+def delay_table(tones: int) -> Array:
+    """Coefficients of the delay regression: ``[phi psi] = table @ [y(t), y(t - h), ... y(t - 2 n h)]``."""
     require_integer("tones", tones, 1, MOST_TONES)
-    table = np.zeros((tones + 1, 2 * tones + 1), np.int64)
+    table = np.zeros((tones + 1, 2 * tones + 1))
     for k in range(1, tones + 1):
         for i in range(tones - k + 1):
             table[k - 1, k + 2 * i] = 2**k * comb(tones - k, i)
@@ -52,18 +51,6 @@ def whole_delay(name: str, delay: float, interval: float) -> int:
     if count < 1:
         raise OptionError(name, f"{name} = {delay:g} s is shorter than half a sampling interval of {interval:g} s.")
     return count
-
-
-def regression_rows(samples: ArrayLike, tones: int, lag: int) -> tuple[Array, Array]:
-    """Regressand and regressors of a whole record."""
-    y = np.asarray(samples, dtype=float)
-    table = delay_table(tones)
-    rows = np.full((y.size, tones + 1), np.nan)
-    span = 2 * tones * lag
-    if y.size > span:
-        delayed = np.column_stack([y[span - j * lag : y.size - j * lag] for j in range(2 * tones + 1)])
-        rows[span:] = delayed @ table.T
-    return rows[:, tones], rows[:, :tones]
 
 
 def theta_of(omega: ArrayLike, delay: float) -> Array:
@@ -105,13 +92,19 @@ def minor_plan(tones: int) -> IntArray:
 
 
 @njit(cache=True, nogil=True)
+def following(place: int, size: int) -> int:
+    """The next place of a ring."""
+    return place + 1 if place + 1 < size else 0
+
+
+@njit(cache=True, nogil=True)
 def form_row(history: Array, newest: int, lag: int, table: Array, row: Array) -> bool:
-    """Regression row at the newest sample."""
+    """Regression row ``[phi psi]`` at the newest sample of a ring; whether no sample of it is missing."""
     count, width = table.shape
-    for k in range(count):
-        row[k] = 0.0
+    row[:count] = 0.0
     place = newest
     complete = True
+    # One delayed sample after the other, from y(t) to y(t - 2 n h).
     for j in range(width):
         value = history[place]
         complete = complete and np.isfinite(value)
@@ -127,7 +120,7 @@ def form_row(history: Array, newest: int, lag: int, table: Array, row: Array) ->
 def mix_rows(
     rows: Array, newest: int, first: int, spacing: int, plan: IntArray, matrix: Array, minors: Array, mixed: Array
 ) -> float:
-    """Determinant and right-hand sides of the scalar regressions at the newest row."""
+    """``[adj(Phi) Psi_f, det Phi]`` of the rows ``first`` to ``first + n - 1`` spacings ago; returns their scale."""
     n = matrix.shape[0]
     size = rows.shape[0]
     place = newest - first * spacing
@@ -142,8 +135,8 @@ def mix_rows(
             square += value * value
         scale *= np.sqrt(square)
         place -= spacing
-    for pattern in range(minors.size):
-        minors[pattern] = 0.0
+    # Laplace expansion along the last row: every minor of the first rows is computed once, and finite though singular.
+    minors[:] = 0.0
     minors[0] = 1.0
     for step in range(plan.shape[0]):
         minors[plan[step, 0]] += plan[step, 4] * matrix[plan[step, 1], plan[step, 2]] * minors[plan[step, 3]]

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, IntArray
 from ctid_cli.errors import OptionError
@@ -17,10 +16,17 @@ from ctid_cli.frequency.consistency import (
     ROUNDING_FLOOR,
     check_consistency,
     observe_second_delay,
-    samples_between_verdicts,
 )
-from ctid_cli.frequency.decoding import FIRST_PERIODS, cosine_sensitivities, decode, flag_uncertain, still_doubtful
-from ctid_cli.frequency.delay_options import DelayRegression
+from ctid_cli.frequency.decoding import (
+    FIRST_PERIODS,
+    Decoding,
+    cosine_sensitivities,
+    decode,
+    decoding_memory,
+    flag_uncertain,
+    still_doubtful,
+)
+from ctid_cli.frequency.delay_options import ROWS_PER_TONE, DelayClock, DelayRegression
 from ctid_cli.frequency.flags import CHANGED, GAP, STARTING, UNDETERMINED
 from ctid_cli.frequency.moments import (
     accumulate_row,
@@ -29,8 +35,8 @@ from ctid_cli.frequency.moments import (
     moment_uncertainty,
     squared_residual,
 )
-from ctid_cli.frequency.regression import form_row
-from ctid_cli.frequency.tracking import Recursion
+from ctid_cli.frequency.regression import following, form_row
+from ctid_cli.frequency.tracking import Output, Recursion
 from ctid_cli.signals.checks import require_choice, require_positive
 
 Solution = Literal["least_squares", "total_least_squares"]
@@ -38,10 +44,8 @@ Solution = Literal["least_squares", "total_least_squares"]
 #: The estimate is computed anew with every row at first, later every so many.
 REFRESH = 10
 EAGER_ROWS = 40
-#: Rows for each tone before the first estimate, and before a valid one; the latter takes this fraction of n h, too.
+#: Rows for each tone before the first estimate.
 FIRST_ROWS_PER_TONE = 2
-ROWS_PER_TONE = 4
-STARTING_SPAN = 0.25
 #: The data that the detector needs before it may raise an alarm: so many h, and so many lengths of the prefilter.
 ARMING_SPAN = 1.43
 ARMING_PREFILTERS = 2
@@ -55,6 +59,57 @@ EXACT = 1e-13
 DEFAULT_MEMORY = 100.0
 #: Fraction of the regressand's second moment that the frequencies may leave at the second delay.
 NEGLIGIBLE = 1e-8
+
+
+class Restarting(NamedTuple):
+    """Settings of the tracker, counted in samples."""
+
+    #: Time constant of the detector.
+    detector: int
+    #: Rows before it may raise an alarm, before the first comparison of halves, and before an estimate can be valid.
+    armed: int
+    compared: int
+    enough: int
+    #: Samples that the delays and the prefilter hold.
+    flush: int
+    memory: float
+    #: Inverse of the lower factor of the noise covariance of a row; empty for plain least squares.
+    whitener: Array
+
+
+class Fit(NamedTuple):
+    """State of the tracker."""
+
+    #: Ring of samples, shape (2 n lag + 1,).
+    samples: Array
+    #: Second moments of the rows since the last comparison of halves, of those before, and at the second delay.
+    newer: Array
+    older: Array
+    check: Array
+    #: theta, frequencies and their possible errors, shape (3, n).
+    estimate: Array
+    #: Rows in ``older`` and in ``newer``, less what was forgotten; newest mean squared residual, and alarm level.
+    levels: Array
+    #: Place of the newest sample, rows since the restart, rows at the next comparison of halves, samples still to
+    #: flush, verdict (flags), whether the residual may be compared with the alarm level.
+    counters: IntArray
+
+
+class Workspace(NamedTuple):
+    """Memory for one sample."""
+
+    row: Array
+    gram: Array
+    factor: Array
+    scales: Array
+    trial: Array
+    trial_omega: Array
+    trial_errors: Array
+    decoding: Decoding
+
+
+OLDER, NEWER, RESIDUAL, ALARM = range(4)
+PLACE, ROWS, NEXT, FLUSH, VERDICT, JUDGES = range(6)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,27 +179,9 @@ class RestartingLeastSquares(DelayRegression):
         if self.memory is not None:
             require_positive("memory", self.memory, "s")
 
-    def recursion(self, interval: float) -> Recursion:
-        """The compiled recursion for a sampling interval.
-
-        Parameters
-        ----------
-        interval : float
-            Sampling interval [s].
-
-        Returns
-        -------
-        Recursion
-            With the state before the first sample.
-
-        Raises
-        ------
-        ValueError
-            If the options make no sense at this sampling interval.
-        """
-        n = self.tones
-        clock = self.clock(interval)
-        length = clock.weights.size - 1
+    def _recursion(self, interval: float) -> Recursion:
+        n, clock, weights = self.tones, self._clock(interval), self._weights(interval)
+        length = weights.size - 1
         memory = DEFAULT_MEMORY * clock.delay if self.memory is None else self.memory
         needed = ROWS_PER_TONE * n
         if memory < needed * interval:
@@ -153,38 +190,30 @@ class RestartingLeastSquares(DelayRegression):
                 f"memory = {memory:g} s holds fewer than the {needed} samples of {interval:g} s that {n} tones need.",
             )
         arming = round(ARMING_SPAN * clock.lag)
-        settings = np.array(
-            [
-                max(1, round(DETECTOR_SPAN * clock.lag)),
-                max(arming, ARMING_PREFILTERS * length, 2 * needed),
-                max(arming, MIXED_PREFILTERS * length, 2 * needed),
-                length + 2 * n * clock.lag + 1,
-                max(needed, int(STARTING_SPAN * n * clock.lag)),
-            ]
-        )
-        covariance = noise_covariance(clock.table, clock.weights, clock.lag)
-        constants = (
-            clock.table,
-            clock.lag,
-            settings,
+        whitener = np.empty((0, 0))
+        if self.solution == "total_least_squares":
+            covariance = noise_covariance(clock.table, weights, clock.lag)
+            whitener = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+        settings = Restarting(
+            max(1, round(DETECTOR_SPAN * clock.lag)),
+            max(arming, ARMING_PREFILTERS * length, 2 * needed),
+            max(arming, MIXED_PREFILTERS * length, 2 * needed),
+            self._rows_before_valid(clock),
+            length + 2 * n * clock.lag + 1,
             memory / interval,
-            np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(covariance))),
-            self.solution == "total_least_squares",
-            float(interval),
-            np.array([clock.delay, clock.top, clock.bottom, clock.second_delay]),
-            clock.second_lag,
-            samples_between_verdicts(clock.lag),
+            whitener,
         )
-        state = {
-            "samples": np.full(2 * n * clock.lag + 1, np.nan),
-            "older": np.zeros((n + 1, n + 1)),
-            "newer": np.zeros((n + 1, n + 1)),
-            "check": np.zeros((n + 1, n + 1)),
-            "estimate": np.full((3, n), np.nan),
-            "levels": np.zeros(4),
-            "counters": np.zeros(6, np.int64),
-        }
-        return Recursion(advance_restarting, constants, state, clock.weights, np.nan, clock.notes)
+        newer, older, check = np.zeros((3, n + 1, n + 1))
+        fit = Fit(
+            np.full(2 * n * clock.lag + 1, np.nan),
+            newer,
+            older,
+            check,
+            np.full((3, n), np.nan),
+            np.zeros(4),
+            np.zeros(6, np.int64),
+        )
+        return Recursion(advance_restarting, (clock, settings), (fit,), weights, notes=self._notes(clock))
 
 
 def noise_covariance(table: Array, weights: Array, lag: int) -> Array:
@@ -222,152 +251,175 @@ def total_least_squares(gram: Array, whitener: Array, theta: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def judge(
-    gram: Array,
-    factor: Array,
-    scales: Array,
-    theta: Array,
-    clock: Array,
-    span: float,
-    elapsed: float,
-    frequencies: Array,
-    possible_errors: Array,
-) -> tuple[int, bool]:
-    """Frequencies that belong to fitted parameters, and how far they can be trusted."""
-    n = theta.size
-    roots, slopes, rounding = np.empty(n), np.empty(n), np.empty(n)
-    sensitivities = np.empty((n, n))
-    flags = decode(theta, clock[0], clock[1], clock[2], np.empty(n + 1), np.empty(n + 1), roots, frequencies)
-    cosine_sensitivities(roots, clock[0], slopes, sensitivities)
-    misfit = squared_residual(gram, theta)
-    moment_uncertainty(gram, factor, scales, misfit, theta, sensitivities, possible_errors, rounding)
-    uncertain = flag_uncertain(frequencies, possible_errors, rounding, span, elapsed)
-    return flags | uncertain, uncertain == 0 or not still_doubtful(frequencies, elapsed / FIRST_PERIODS)
+def add_lower(one: Array, other: Array, total: Array) -> None:
+    """Sum of two matrices of which the lower triangle counts."""
+    for i in range(total.shape[0]):
+        for j in range(i + 1):
+            total[i, j] = one[i, j] + other[i, j]
 
 
 @njit(cache=True, nogil=True)
-def advance_restarting(
-    samples: Array,
+def judge(
+    gram: Array,
+    theta: Array,
+    span: float,
+    elapsed: float,
+    clock: DelayClock,
     omega: Array,
-    uncertainty: Array,
-    flags: NDArray[np.uint16],
-    table: Array,
-    lag: int,
-    settings: IntArray,
-    memory: float,
-    whitener: Array,
-    total: bool,
-    interval: float,
-    clock: Array,
-    check_lag: int,
-    every: int,
-    history: Array,
-    older: Array,
-    newer: Array,
-    check: Array,
-    estimate: Array,
-    levels: Array,
-    counters: IntArray,
-) -> None:
+    errors: Array,
+    work: Workspace,
+) -> tuple[int, bool]:
+    """Frequencies that belong to fitted parameters, flags of how far they can be trusted, and whether they may judge.
+
+    ``gram`` is that of ``work.factor`` and ``work.scales``. An estimate may judge new samples if it is certain, or has
+    been there for so long that a misfit is no beginner's.
+    """
+    memory = work.decoding
+    flags = decode(theta, clock.delay, clock.bottom, clock.top, memory, omega)
+    cosine_sensitivities(memory.roots, clock.delay, memory.slopes, memory.sensitivities)
+    misfit = squared_residual(gram, theta)
+    moment_uncertainty(gram, work.factor, work.scales, misfit, theta, memory.sensitivities, errors, memory.rounding)
+    uncertain = flag_uncertain(omega, errors, memory.rounding, span, elapsed)
+    return flags | uncertain, uncertain == 0 or not still_doubtful(omega, elapsed / FIRST_PERIODS)
+
+
+@njit(cache=True, nogil=True)
+def begin_anew(fit: Fit, compared: int) -> None:
+    """Forget all rows."""
+    fit.older[:] = 0.0
+    fit.newer[:] = 0.0
+    fit.check[:] = 0.0
+    fit.levels[OLDER] = fit.levels[NEWER] = fit.levels[RESIDUAL] = 0.0
+    fit.counters[VERDICT] = 0
+    # The first comparison needs an older half.
+    fit.counters[NEXT] = compared // 2
+
+
+@njit(cache=True, nogil=True)
+def take_row(keep_most: float, clock: DelayClock, fit: Fit, work: Workspace) -> None:
+    """Add ``work.row`` to the newer half; forget exponentially what exceeds the memory."""
+    levels, counters = fit.levels, fit.counters
+    keep = 1.0
+    if levels[OLDER] + levels[NEWER] > keep_most - 0.5:
+        keep = 1.0 - 1.0 / keep_most
+        levels[OLDER] *= keep
+        for i in range(fit.older.shape[0]):
+            for j in range(i + 1):
+                fit.older[i, j] *= keep
+    levels[NEWER] = keep * levels[NEWER] + 1.0
+    accumulate_row(work.row, fit.newer, keep)
+    # The row itself is not needed any more: the one at the second delay takes its place.
+    if counters[PLACE] % clock.every == 0:
+        place = counters[PLACE]
+        observe_second_delay(fit.samples, place, clock.second_lag, clock.table, work.row, fit.check, keep**clock.every)
+
+
+@njit(cache=True, nogil=True)
+def halves_differ(clock: DelayClock, fit: Fit, work: Workspace) -> bool:
+    """Whether the newer half alone fits so much better than the whole that the older one is of another signal."""
+    n = work.scales.size
+    levels, gram, trial = fit.levels, work.gram, work.trial
+    if not factorise(fit.newer, 0.0, work.factor, work.scales):
+        return False
+    least_squares(fit.newer, work.factor, work.scales, trial)
+    alone = squared_residual(fit.newer, trial) / levels[NEWER]
+    span = (2 * n * clock.lag + levels[NEWER]) * clock.interval
+    # A fit to so few rows that it says nothing must not condemn the others, unless it is exact.
+    judges = judge(fit.newer, trial, span, span, clock, work.trial_omega, work.trial_errors, work)[1]
+    judges = judges or alone * levels[NEWER] <= EXACT * fit.newer[n, n]
+    add_lower(fit.older, fit.newer, gram)
+    if not (judges and levels[OLDER] > 0.0 and factorise(gram, 0.0, work.factor, work.scales)):
+        return False
+    least_squares(gram, work.factor, work.scales, trial)
+    weight = levels[OLDER] + levels[NEWER]
+    together = squared_residual(gram, trial) / weight
+    return bool(together > MIXED_RATIO * alone + 1e-14 * gram[n, n] / weight)
+
+
+@njit(cache=True, nogil=True)
+def join_halves(mixed: bool, compared: int, fit: Fit) -> None:
+    """Both halves become the older one, or the newer one alone if they do not belong together."""
+    levels, counters = fit.levels, fit.counters
+    if mixed:
+        counters[ROWS] = int(levels[NEWER])
+        levels[OLDER] = levels[RESIDUAL] = 0.0
+        fit.older[:] = 0.0
+        fit.check[:] = 0.0
+    add_lower(fit.older, fit.newer, fit.older)
+    fit.newer[:] = 0.0
+    levels[OLDER] += levels[NEWER]
+    levels[NEWER] = 0.0
+    # At doubling intervals: whatever is mixed is found at the latest when as much again has arrived.
+    counters[NEXT] = max(compared, 2 * counters[ROWS])
+
+
+@njit(cache=True, nogil=True)
+def refresh(clock: DelayClock, settings: Restarting, fit: Fit, work: Workspace) -> None:
+    """Estimate, alarm level and verdict from all rows."""
+    n = work.scales.size
+    theta, frequencies, levels, counters, gram = fit.estimate[0], fit.estimate[1], fit.levels, fit.counters, work.gram
+    add_lower(fit.older, fit.newer, gram)
+    counters[VERDICT] = UNDETERMINED
+    if not factorise(gram, 0.0, work.factor, work.scales):
+        return
+    if settings.whitener.size:
+        total_least_squares(gram, settings.whitener, theta)
+    else:
+        least_squares(gram, work.factor, work.scales, theta)
+    weight = levels[OLDER] + levels[NEWER]
+    # Residuals of an exact fit are rounding; the floor keeps them from raising an alarm.
+    levels[ALARM] = (ALARM_RATIO * squared_residual(gram, theta) + ROUNDING_FLOOR * gram[n, n]) / weight
+    span = (2 * n * clock.lag + weight) * clock.interval
+    elapsed = (2 * n * clock.lag + counters[ROWS]) * clock.interval
+    verdict, judges = judge(gram, theta, span, elapsed, clock, frequencies, fit.estimate[2], work)
+    counters[JUDGES] = 1 if judges else 0
+    counters[VERDICT] = verdict | check_consistency(fit.check, frequencies, clock.second_delay, NEGLIGIBLE)
+
+
+@njit(cache=True, nogil=True)
+def advance_restarting(samples: Array, output: Output, clock: DelayClock, settings: Restarting, fit: Fit) -> None:
     """Least squares with alarm, flush, restart and comparison with the newer data alone."""
-    n = omega.shape[1]
-    row, check_row = np.empty(n + 1), np.empty(n + 1)
-    scales, trial, trial_omega, trial_errors = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    factor, gram = np.empty((n, n)), np.empty((n + 1, n + 1))
-    theta, frequencies, possible_errors = estimate[0], estimate[1], estimate[2]
-    smoothing = 1.0 / settings[0]
+    n = output.omega.shape[1]
+    row, gram, factor, scales = np.empty(n + 1), np.empty((n + 1, n + 1)), np.empty((n, n)), np.empty(n)
+    work = Workspace(row, gram, factor, scales, np.empty(n), np.empty(n), np.empty(n), decoding_memory(n))
+    levels, counters, theta = fit.levels, fit.counters, fit.estimate[0]
+    smoothing = 1.0 / settings.detector
     for k in range(samples.size):
-        counters[0] = counters[0] + 1 if counters[0] + 1 < history.size else 0
-        history[counters[0]] = samples[k]
-        complete = form_row(history, counters[0], lag, table, row)
+        counters[PLACE] = following(counters[PLACE], fit.samples.size)
+        fit.samples[counters[PLACE]] = samples[k]
+        complete = form_row(fit.samples, counters[PLACE], clock.lag, clock.table, row)
         flag = 0
-        if counters[3] > 0:
-            counters[3] -= 1
+        if counters[FLUSH] > 0:
+            # Samples from before the change are still in the delays: hold the estimate.
+            counters[FLUSH] -= 1
             flag = CHANGED if np.isfinite(samples[k]) else CHANGED | GAP
         elif not complete:
-            flag = GAP if counters[1] > 0 else STARTING
+            flag = GAP if counters[ROWS] > 0 else STARTING
         else:
-            if counters[1] == 0:
-                # The first comparison needs an older half.
-                counters[2] = settings[2] // 2
-                for i in range(n + 1):
-                    for j in range(n + 1):
-                        older[i, j] = newer[i, j] = check[i, j] = 0.0
-                levels[0] = levels[1] = levels[2] = 0.0
-                counters[4] = 0
-            elif counters[1] >= settings[1]:
+            if counters[ROWS] == 0:
+                begin_anew(fit, settings.compared)
+            elif counters[ROWS] >= settings.armed:
+                # The detector sees the row before the fit does.
                 residual = row[n]
                 for i in range(n):
                     residual -= theta[i] * row[i]
-                levels[2] += smoothing * (residual * residual - levels[2])
-            counters[1] += 1
-            keep = 1.0
-            if levels[0] + levels[1] > memory - 0.5:
-                keep = 1.0 - 1.0 / memory
-                levels[0] *= keep
-                for i in range(n + 1):
-                    for j in range(i + 1):
-                        older[i, j] *= keep
-            levels[1] = keep * levels[1] + 1.0
-            accumulate_row(row, newer, keep)
-            if counters[0] % every == 0:
-                observe_second_delay(history, counters[0], check_lag, table, check_row, check, keep**every)
+                levels[RESIDUAL] += smoothing * (residual * residual - levels[RESIDUAL])
+            counters[ROWS] += 1
+            take_row(settings.memory, clock, fit, work)
             mixed = False
-            if counters[1] >= counters[2]:
-                # Does the newer half fit much better than the whole?
-                if factorise(newer, 0.0, factor, scales):
-                    least_squares(newer, factor, scales, trial)
-                    alone = squared_residual(newer, trial) / levels[1]
-                    span = (2 * n * lag + levels[1]) * interval
-                    _, judges = judge(newer, factor, scales, trial, clock, span, span, trial_omega, trial_errors)
-                    judges = judges or alone * levels[1] <= EXACT * newer[n, n]
-                    for i in range(n + 1):
-                        for j in range(i + 1):
-                            gram[i, j] = older[i, j] + newer[i, j]
-                    if judges and levels[0] > 0.0 and factorise(gram, 0.0, factor, scales):
-                        least_squares(gram, factor, scales, trial)
-                        weight = levels[0] + levels[1]
-                        together = squared_residual(gram, trial) / weight
-                        mixed = together > MIXED_RATIO * alone + 1e-14 * gram[n, n] / weight
-                if mixed:
-                    counters[1] = int(levels[1])
-                    levels[0] = levels[2] = 0.0
-                for i in range(n + 1):
-                    for j in range(i + 1):
-                        older[i, j] = newer[i, j] + (0.0 if mixed else older[i, j])
-                        newer[i, j] = 0.0
-                        if mixed:
-                            check[i, j] = 0.0
-                levels[0] += levels[1]
-                levels[1] = 0.0
-                counters[2] = max(settings[2], 2 * counters[1])
-            due = mixed or counters[1] % REFRESH == 0 or counters[1] <= EAGER_ROWS
-            if due and counters[1] >= FIRST_ROWS_PER_TONE * n:
-                for i in range(n + 1):
-                    for j in range(i + 1):
-                        gram[i, j] = older[i, j] + newer[i, j]
-                weight = levels[0] + levels[1]
-                verdict = UNDETERMINED
-                if factorise(gram, 0.0, factor, scales):
-                    if total:
-                        total_least_squares(gram, whitener, theta)
-                    else:
-                        least_squares(gram, factor, scales, theta)
-                    levels[3] = (ALARM_RATIO * squared_residual(gram, theta) + ROUNDING_FLOOR * gram[n, n]) / weight
-                    span, elapsed = (2 * n * lag + weight) * interval, (2 * n * lag + counters[1]) * interval
-                    verdict, judges = judge(
-                        gram, factor, scales, theta, clock, span, elapsed, frequencies, possible_errors
-                    )
-                    counters[5] = 1 if judges else 0
-                    verdict |= check_consistency(check, frequencies, clock[3], NEGLIGIBLE)
-                counters[4] = verdict
-            if counters[1] < settings[4]:
+            if counters[ROWS] >= counters[NEXT]:
+                mixed = halves_differ(clock, fit, work)
+                join_halves(mixed, settings.compared, fit)
+            due = mixed or counters[ROWS] % REFRESH == 0 or counters[ROWS] <= EAGER_ROWS
+            if due and counters[ROWS] >= FIRST_ROWS_PER_TONE * n:
+                refresh(clock, settings, fit, work)
+            if counters[ROWS] < settings.enough:
                 flag = STARTING
-            elif counters[1] >= settings[1] and counters[5] > 0 and levels[2] > levels[3]:
-                counters[3] = settings[3]
-                counters[1] = 0
+            elif counters[ROWS] >= settings.armed and counters[JUDGES] > 0 and levels[RESIDUAL] > levels[ALARM]:
+                counters[FLUSH] = settings.flush
+                counters[ROWS] = 0
                 flag = CHANGED
         for i in range(n):
-            omega[k, i] = frequencies[i]
-            uncertainty[k, i] = possible_errors[i]
-        flags[k] = flag | counters[4]
+            output.omega[k, i] = fit.estimate[1, i]
+            output.uncertainty[k, i] = fit.estimate[2, i]
+        output.flags[k] = flag | counters[VERDICT]

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from numbers import Real
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
-from ctid_cli.frequency.checks import LARGEST_SAMPLE
 from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.inputs import series_of
 from ctid_cli.frequency.prefilter import convolve, fast_convolve
 from ctid_cli.signals.checks import require_positive
 
@@ -75,21 +75,37 @@ class FrequencyTrack:
         """Samples without any flag, shape (N,)."""
         return np.asarray(self.flags == 0)
 
+    def __getitem__(self, row: int) -> FrequencyEstimate:
+        return FrequencyEstimate(self.omega[row].copy(), Flag(int(self.flags[row])), self.uncertainty[row].copy())
+
     @property
     def final(self) -> FrequencyEstimate:
         """The last estimate."""
-        return FrequencyEstimate(self.omega[-1].copy(), Flag(int(self.flags[-1])), self.uncertainty[-1].copy())
+        return self[-1]
 
 
-@dataclass(frozen=True, eq=False)
-class Recursion:
-    """A compiled recursion with everything it needs."""
+class Output(NamedTuple):
+    """Where a kernel puts its rows, one for each sample."""
+
+    #: Frequencies [rad/s], shape (N, n).
+    omega: Array
+    #: What may be wrong with them [rad/s], shape (N, n).
+    uncertainty: Array
+    #: Shape (N,).
+    flags: NDArray[np.uint16]
+
+
+class Recursion(NamedTuple):
+    """A compiled recursion, ``advance(samples, output, *settings, *states)``, with everything it needs."""
 
     advance: Callable[..., None]
-    constants: tuple[Any, ...]
-    state: dict[str, NDArray[Any]]
+    #: Named tuples of what stays the same.
+    settings: tuple[Any, ...]
+    #: Named tuples of arrays, before the first sample; the kernel changes them in place.
+    states: tuple[Any, ...]
     #: Impulse response of the prefilter, newest sample first; one weight for none, shape (L + 1,).
-    weights: Array = field(default_factory=lambda: np.ones(1))
+    weights: Array = np.ones(1)
+    #: What the signal is taken for before the first sample.
     past: float = np.nan
     notes: tuple[str, ...] = ()
 
@@ -101,7 +117,7 @@ class OnlineEstimator:
     online: ClassVar[bool] = True
     tones: int
 
-    def recursion(self, interval: float) -> Recursion:
+    def _recursion(self, interval: float) -> Recursion:
         """The compiled recursion for a sampling interval."""
         raise NotImplementedError
 
@@ -141,16 +157,16 @@ class Tracker:
         require_positive("interval", interval, "s")
         self.options = options
         self.interval = float(interval)
-        self._recursion = options.recursion(self.interval)
-        weights = np.ascontiguousarray(self._recursion.weights)
-        self._weights = weights
-        self._reversed_weights = np.ascontiguousarray(weights[::-1])
+        self._recursion = recursion = options._recursion(self.interval)
+        self._weights = recursion.weights
+        self._reversed_weights = np.ascontiguousarray(recursion.weights[::-1])
         self._state: dict[str, NDArray[Any]] = {
-            "fingerprint": np.frombuffer(_fingerprint(options, self.interval), np.uint8).copy(),
+            "fingerprint": np.frombuffer(_fingerprint(options, self.interval), np.uint8),
             "count": np.zeros(1, np.int64),
-            "unfiltered": np.full(weights.size - 1, self._recursion.past),
-            **self._recursion.state,
+            "unfiltered": np.full(recursion.weights.size - 1, recursion.past),
         }
+        for part in recursion.states:
+            self._state |= part._asdict()
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -170,8 +186,7 @@ class Tracker:
         FrequencyEstimate
             Frequencies at this instant.
         """
-        omega, uncertainty, flags = self._advance(np.array([sample], dtype=float), fft=False)
-        return FrequencyEstimate(omega[0], Flag(int(flags[0])), uncertainty[0])
+        return self._advance(series_of([float(sample)]), fft=False)[0]
 
     def run(self, samples: ArrayLike, *, fft: bool = False) -> FrequencyTrack:
         """Take many samples.
@@ -194,16 +209,7 @@ class Tracker:
         DataError
             If the samples are not a series of real numbers.
         """
-        values = np.asarray(samples)
-        if values.ndim != 1 or values.dtype.kind not in "fiu":
-            raise DataError(
-                f"the samples must be one series of real numbers, not an array of shape {values.shape} "
-                f"and type {values.dtype}."
-            )
-        first = int(self._state["count"][0])
-        omega, uncertainty, flags = self._advance(np.asarray(values, dtype=float), fft=fft)
-        t = self.interval * np.arange(first, first + values.size, dtype=np.float64)
-        return FrequencyTrack(t, omega, flags, uncertainty)
+        return self._advance(series_of(samples), fft=fft)
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Everything that later estimates depend on.
@@ -228,41 +234,39 @@ class Tracker:
         DataError
             If the state is not one of this estimator with these options and this sampling interval.
         """
+        own = self._state
         # Lists, as a state is after its way through a text file, have lost their kind of number.
         arrays = {
-            name: np.asarray(array, dtype=self._state[name].dtype if isinstance(array, list) else None)
+            name: np.asarray(array, dtype=own[name].dtype if isinstance(array, list) and name in own else None)
             for name, array in state.items()
-            if name in self._state
         }
-        same = arrays.keys() == self._state.keys() == state.keys() and all(
-            (arrays[name].shape, arrays[name].dtype) == (own.shape, own.dtype) for name, own in self._state.items()
+        same = arrays.keys() == own.keys() and all(
+            (array.shape, array.dtype) == (own[name].shape, own[name].dtype) for name, array in arrays.items()
         )
-        if not same or not np.array_equal(arrays["fingerprint"], self._state["fingerprint"]):
+        if not same or not np.array_equal(arrays.pop("fingerprint"), own["fingerprint"]):
             raise DataError(
                 f"this is not the state of {self.options!r} at a sampling interval of {self.interval:g} s; "
                 "restore it with the options and the interval that it was saved with."
             )
-        for name, own in self._state.items():
-            own[...] = arrays[name]
+        for name, array in arrays.items():
+            own[name][...] = array
 
-    def _advance(self, samples: Array, *, fft: bool) -> tuple[Array, Array, NDArray[np.uint16]]:
-        state = self._state
-        count, tones = samples.size, self.options.tones
-        with np.errstate(invalid="ignore"):
-            samples = np.where(np.abs(samples) <= LARGEST_SAMPLE, samples, np.nan)
+    def _advance(self, samples: Array, *, fft: bool) -> FrequencyTrack:
+        state, recursion = self._state, self._recursion
+        size, tones = samples.size, self.options.tones
         if self._weights.size > 1:
             everything = np.concatenate((state["unfiltered"], samples))
-            state["unfiltered"][...] = everything[count:]
-            if fft and count:
+            state["unfiltered"][...] = everything[size:]
+            if fft and size:
                 samples = fast_convolve(everything, self._weights)
             else:
                 convolve(everything, self._reversed_weights, samples)
-        omega, uncertainty = np.empty((count, tones)), np.empty((count, tones))
-        flags = np.empty(count, np.uint16)
-        inner = [state[name] for name in self._recursion.state]
-        self._recursion.advance(samples, omega, uncertainty, flags, *self._recursion.constants, *inner)
-        state["count"][0] += count
-        return omega, uncertainty, flags
+        output = Output(np.empty((size, tones)), np.empty((size, tones)), np.empty(size, np.uint16))
+        recursion.advance(samples, output, *recursion.settings, *recursion.states)
+        first = int(state["count"][0])
+        state["count"][0] += size
+        t = self.interval * np.arange(first, first + size, dtype=np.float64)
+        return FrequencyTrack(t, output.omega, output.flags, output.uncertainty)
 
 
 def _fingerprint(options: OnlineEstimator, interval: float) -> bytes:

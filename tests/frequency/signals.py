@@ -1,12 +1,15 @@
-"""Signals for the tests beside this file, and the estimators that they try."""
+"""Signals for the tests beside this file, the estimators that they try, and plain forms of their first steps."""
 
 import numpy as np
 
 from ctid_cli.frequency.adaptive_observer import AdaptiveObserver
+from ctid_cli.frequency.decoding import decode, decoding_memory
 from ctid_cli.frequency.drem_finite_time import DremFiniteTime
 from ctid_cli.frequency.drem_gradient import DremGradient
 from ctid_cli.frequency.drem_window import DremWindow
 from ctid_cli.frequency.filter_regression import FilterRegression
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.regression import delay_table
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 
 INTERVAL = 0.01
@@ -37,3 +40,22 @@ def online_estimators(n=2):
         FilterRegression(tones=n, pole=4.0, initial_frequencies=initial),
         FilterRegression(tones=n, pole=4.0, algorithm="gradient", initial_frequencies=initial),
     ]
+
+
+def regression_rows(y, n, lag):
+    """Regressand and regressors of a whole record; NaN where a sample is missing."""
+    rows = np.full((y.size, n + 1), np.nan)
+    span = 2 * n * lag
+    if y.size > span:
+        delayed = np.column_stack([y[span - j * lag : y.size - j * lag] for j in range(2 * n + 1)])
+        rows[span:] = delayed @ delay_table(n).T
+    return rows[:, n], rows[:, :n]
+
+
+def frequencies_of(theta, delay, *, lowest=0.0, highest=None):
+    """Frequencies that belong to the parameters of the delay regression, and their flags."""
+    theta = np.ascontiguousarray(theta, dtype=float)
+    omega = np.empty(theta.size)
+    bottom = -1.0 if highest is None else np.cos(highest * delay)
+    flags = decode(theta, delay, bottom, np.cos(lowest * delay), decoding_memory(theta.size), omega)
+    return omega, Flag(flags)

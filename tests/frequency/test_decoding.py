@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from ctid_cli.frequency.decoding import (
     cosine_sensitivities,
     flag_uncertain,
-    frequencies_of,
     propagate,
     real_roots,
     root_real_parts,
@@ -16,6 +15,7 @@ from ctid_cli.frequency.decoding import (
 )
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.regression import theta_of
+from tests.frequency.signals import frequencies_of
 
 FREQUENCIES = st.lists(st.floats(0.05, 3.0), min_size=1, max_size=8).map(sorted)
 

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from ctid_cli.frequency.decoding import frequencies_of
 from ctid_cli.frequency.drem_finite_time import DremFiniteTime
 from ctid_cli.frequency.drem_gradient import DremGradient
 from ctid_cli.frequency.drem_window import DremWindow, slide
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.regression import regression_rows, theta_of
-from tests.frequency.signals import INTERVAL, OMEGA, tones
+from ctid_cli.frequency.regression import theta_of
+from tests.frequency.signals import INTERVAL, OMEGA, frequencies_of, regression_rows, tones
 
 H, D = 0.4, 0.3
 LAG, SPACING = 40, 30

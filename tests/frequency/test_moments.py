@@ -16,8 +16,7 @@ from ctid_cli.frequency.moments import (
     moment_uncertainty,
     squared_residual,
 )
-from ctid_cli.frequency.regression import regression_rows
-from tests.frequency.signals import tones
+from tests.frequency.signals import regression_rows, tones
 
 
 def moments_of(rows, keep=1.0):

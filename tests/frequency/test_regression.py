@@ -12,11 +12,10 @@ from ctid_cli.frequency.regression import (
     form_row,
     minor_plan,
     mix_rows,
-    regression_rows,
     theta_of,
     whole_delay,
 )
-from tests.frequency.signals import AMPLITUDES, OMEGA, tones
+from tests.frequency.signals import AMPLITUDES, OMEGA, regression_rows, tones
 
 INTERVAL = 0.002
 LAG, SPACING = 200, 150

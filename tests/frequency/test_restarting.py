@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from ctid_cli.frequency.decoding import frequencies_of
 from ctid_cli.frequency.drem_finite_time import DremFiniteTime
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.regression import delay_table, regression_rows
+from ctid_cli.frequency.regression import delay_table
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares, noise_covariance
-from tests.frequency.signals import INTERVAL, OMEGA, tones
+from tests.frequency.signals import INTERVAL, OMEGA, frequencies_of, regression_rows, tones
 
 H, LAG = 0.4, 40
 

@@ -1,12 +1,18 @@
-"""Options that hold one number for each tone, bounds of frequencies, and times that are counted in samples."""
+"""What every estimator checks: options with one number for each tone, bounds of frequencies, and samples."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ctid_cli.errors import OptionError
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctid_cli.arrays import Array
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.signals.checks import require_not_negative, require_positive
 
+#: More tones than this cannot be told apart in double precision.
+MOST_TONES = 8
 #: A sample larger than this counts as missing: its powers would overflow.
 LARGEST_SAMPLE = 1e30
 
@@ -39,3 +45,16 @@ def require_bounds(lowest: float, highest: float | None) -> None:
             "lowest_frequency",
             f"lowest_frequency ({lowest:g} rad/s) must be below highest_frequency ({highest:g} rad/s).",
         )
+
+
+def series_of(samples: ArrayLike) -> Array:
+    """One series of real numbers, with NaN for whatever counts as missing."""
+    values = np.asarray(samples)
+    if values.ndim != 1 or values.dtype.kind not in "fiu":
+        raise DataError(
+            f"the samples must be one series of real numbers, not an array of shape {values.shape} "
+            f"and type {values.dtype}."
+        )
+    values = values.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        return np.where(np.abs(values) <= LARGEST_SAMPLE, values, np.nan)
