@@ -28,7 +28,7 @@ def check(
     with these data, in words, the worst first. Columns are found by their usual names (t, u, y) unless named.
     """
     from ctid_cli.errors import MismatchError
-    from ctid_cli.inference.record_check import check_record_quality
+    from ctid_cli.reporting.record_findings import check_record_quality
     from ctid_cli.reporting.record_report import record_object, record_text
     from ctid_cli.signals.measurement import read_measurement
 

@@ -7,8 +7,9 @@ import pytest
 from scipy.signal import lfilter
 
 from ctid_cli import HeldSignal, Record, TransferFunction, simulate
+from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.input_moves import input_moves
-from ctid_cli.inference.record_check import check_record_quality, output_bandwidth
+from ctid_cli.reporting.record_findings import check_record_quality
 from ctid_cli.signals.excitation import Prbs
 
 SECOND_ORDER = TransferFunction([2], [0.25, 0.7, 1], delay=8.0)
