@@ -84,12 +84,6 @@ class TooManyFailuresError(CtidError):
     exit_code = 4
 
 
-class StoppedEarlyError(CtidError):
-    """The run stopped before its end and can be resumed."""
-
-    exit_code = 5
-
-
 class StorageError(CtidError):
     """Results could not be written or read back; what was finished before is safe."""
 

@@ -26,7 +26,7 @@ from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class AdditiveFit(Fit):
     """An estimated sum of submodels.
 

@@ -206,7 +206,7 @@ class Profile:
     cutoff: float | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MeasuredFit(Fit):
     """A fit with what belongs to the records.
 

@@ -88,7 +88,7 @@ class Identification:
 
     options: DelayProfile
     fit: MeasuredFit
-    covariance: Array = field(repr=False)
+    covariance: Array
     robust: bool
     estimates: tuple[UncertainValue, ...]
     delay_interval: DelayInterval | None
@@ -99,6 +99,10 @@ class Identification:
     r_t_squared: float
     warnings: tuple[str, ...]
     validation: Validation | None = None
+
+    def __repr__(self) -> str:
+        kind = "robust" if self.robust else "white"
+        return f"Identification: {kind} covariance, {len(self.warnings)} warnings\n{self.fit!r}"
 
 
 def identify(options: DelayProfile, records: Sequence[Record], validation: Record | None = None) -> Identification:

@@ -54,7 +54,7 @@ class FilterPath:
     coefficients: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RedundantFit(Fit):
     """A fit with the search that led to it.
 

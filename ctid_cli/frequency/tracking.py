@@ -70,6 +70,12 @@ class FrequencyTrack:
     flags: NDArray[np.uint16]
     uncertainty: Array
 
+    def __repr__(self) -> str:
+        tones = self.omega.shape[1]
+        return (
+            f"FrequencyTrack({self.t.size} rows of {tones} frequencies, {np.mean(self.flags == 0):.3g} of them valid)"
+        )
+
     @property
     def valid(self) -> BoolArray:
         """Samples without any flag, shape (N,)."""

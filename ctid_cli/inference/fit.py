@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.status import Status
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.text import wrapped
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class IterationRecord:
     numerator: tuple[float, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fit:
     """An estimated model, its accuracy, and how it was reached.
 
@@ -58,7 +59,7 @@ class Fit:
 
     model: TransferFunction
     parameter_names: tuple[str, ...]
-    covariance: Array = field(repr=False)
+    covariance: Array
     status: Status
     cost: float
     fit_percent: float
@@ -66,7 +67,13 @@ class Fit:
     count: int
     iterations: int
     condition_number: float
-    history: Sequence[IterationRecord] = field(default=(), repr=False)
+    history: Sequence[IterationRecord] = ()
+
+    def __repr__(self) -> str:
+        errors = self.standard_errors
+        listed = ", ".join(f"{name} = {value:.6g} ± {errors[name]:.2g}" for name, value in self.parameters.items())
+        head = f"{type(self).__name__}: {self.status.name}, fit {self.fit_percent:.5g} % of {self.count} samples"
+        return f"{head}\n{wrapped(listed, '  ')}"
 
     @property
     def parameters(self) -> dict[str, float]:

@@ -61,6 +61,9 @@ class HeldSignal:
         object.__setattr__(self, "t", t)
         object.__setattr__(self, "values", values)
 
+    def __repr__(self) -> str:
+        return f"HeldSignal({self.t.size} values from {self.t[0]:g} to {self.t[-1]:g} s, {self.hold})"
+
     def at(self, times: ArrayLike) -> Array:
         """Value of the signal at given instants, from the right at a jump.
 

@@ -134,6 +134,13 @@ class Record:
         if self.loop is not None:
             self._require_loop(self.loop, where)
 
+    def __repr__(self) -> str:
+        clock = "irregular clock" if self.interval is None else f"every {self.interval:.6g} s"
+        missing = f", {np.count_nonzero(~self.valid)} missing" if not self.valid.all() else ""
+        loop = ", in a loop" if self.loop else ""
+        name = f"{self.name!r}, " if self.name else ""
+        return f"Record({name}{self.n_samples} samples from {self.t[0]:g} to {self.t[-1]:g} s, {clock}{missing}{loop})"
+
     def _require_loop(self, loop: Loop, where: str) -> None:
         if loop.reference.size != self.t.size:
             raise DataError(f"{where}the reference has {loop.reference.size} values for {self.t.size} samples")

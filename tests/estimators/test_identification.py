@@ -47,6 +47,8 @@ def test_white_residuals_keep_the_classical_covariance():
         if name != "delay":
             assert item.high - item.estimate == pytest.approx(1.959964 * item.standard_error)
     assert result.warnings == ()
+    assert repr(result).startswith("Identification: white covariance, 0 warnings\nMeasuredFit: CONVERGED, fit ")
+    assert len(repr(result).splitlines()) == 3
     assert result.criteria.aic == pytest.approx(1000 * np.log(result.fit.cost) + 6)
     gain = next(row for row in result.derived if row.name == "static_gain")
     assert abs(gain.estimate - 0.5) < 4 * gain.standard_error

@@ -5,11 +5,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ctid_cli.estimators.additive_srivc import AdditiveFit
+from ctid_cli.estimators.delay_profile import MeasuredFit
+from ctid_cli.estimators.useful_redundancy import RedundantFit
+from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.inference.diagnostics import fit_percent, r_squared
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
 
 VALUES = st.lists(st.floats(-100, 100), min_size=3, max_size=20).filter(lambda v: np.ptp(v) > 1e-3)
 
@@ -23,6 +29,22 @@ def test_parameters_and_standard_errors_go_by_name():
     fit = make_fit(TransferFunction([5.0, 6.0], [1.0, 2.0, 3.0], 0.5), ("a1", "a2", "b0", "b1", "delay"))
     assert fit.parameters == {"a1": 2.0, "a2": 3.0, "b0": 5.0, "b1": 6.0, "delay": 0.5}
     assert fit.standard_errors == {"a1": 1.0, "a2": 2.0, "b0": 3.0, "b1": 4.0, "delay": 5.0}
+
+
+def test_results_and_data_are_short_to_read():
+    fit = make_fit(TransferFunction([5.0, 6.0], [1.0, 2.0, 3.0], 0.5), ("a1", "a2", "b0", "b1", "delay"))
+    assert repr(fit) == (
+        "Fit: CONVERGED, fit 90 % of 100 samples\n  a1 = 2 ± 1, a2 = 3 ± 2, b0 = 5 ± 3, b1 = 6 ± 4, delay = 0.5 ± 5"
+    )
+    long = make_fit(TransferFunction([1.0], np.arange(1.0, 14.0)), (*(f"a{k}" for k in range(1, 13)), "b0"))
+    assert max(map(len, repr(long).splitlines())) <= 100
+    assert all(kind.__repr__ is Fit.__repr__ for kind in (AdditiveFit, MeasuredFit, RedundantFit))
+    t = 0.1 * np.arange(1000)
+    record = Record(t, np.where(t == 0, np.nan, t), HeldSignal(t, t, "foh"), name="dryer.csv")
+    assert repr(record) == "Record('dryer.csv', 1000 samples from 0 to 99.9 s, every 0.1 s, 1 missing)"
+    assert repr(record.input) == "HeldSignal(1000 values from 0 to 99.9 s, foh)"
+    track = FrequencyTrack(t, np.ones((1000, 2)), (t < 25).astype(np.uint16), np.ones((1000, 2)))
+    assert repr(track) == "FrequencyTrack(1000 rows of 2 frequencies, 0.75 of them valid)"
 
 
 def test_coefficient_that_vanished_keeps_its_name():
