@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from typing import Any
 
 import numpy as np
@@ -10,13 +9,12 @@ import numpy as np
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.inference.quantile import normal_quantile
 from ctid_cli.reporting.expected_accuracy import expected_accuracy
-from ctid_cli.reporting.layout import count, number, text_table
+from ctid_cli.reporting.layout import Report, Table, count, number
 from ctid_cli.reporting.study_table import setting_text, setting_title
 from ctid_cli.running.plan import DataCell, EstimatorCell, Plan
 from ctid_cli.simulation.dataset import SimulatedSource
+from ctid_cli.text import listed
 
-#: Lines of text are no longer than this.
-WIDTH = 100
 #: Different numbers of samples that are shown, of all that are swept.
 SIZES = 4
 #: Combinations of the other swept settings that are shown.
@@ -88,51 +86,45 @@ def _entry(cell: DataCell, source: SimulatedSource, estimator: EstimatorCell, pl
 
 def accuracy_text(content: dict[str, Any]) -> str:
     """Expected accuracy of every estimator of an experiment for people."""
-    parts = [
-        f"{content['experiment']}: standard errors to expect by theory, before any data are taken. The half width is "
-        "that of an interval of 95 %, 1.96 standard errors."
-    ]
+    # Entries that differ by the number of samples only share a table, and so do estimators that can do the same.
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for entry in content["estimates"]:
+        groups.setdefault((_settings(entry["settings"]), _title(entry)), []).append(entry)
     tables: dict[tuple[str, str], list[str]] = {}
     unknown: dict[str, list[str]] = {}
-    for entries in _by_size(content["estimates"]):
-        first = entries[0]
-        title = _title(first)
-        known = [entry for entry in entries if entry["parameters"]]
-        if known:
-            where = f" at {_settings(first['settings'])}" if first["settings"] else ""
-            tables.setdefault((where, _table(known)), []).append(title)
+    formulas: dict[str, list[dict[str, Any]]] = {}
+    for (settings, title), entries in groups.items():
+        entries.sort(key=lambda entry: int(entry["samples"]))
+        if known := [entry for entry in entries if entry["parameters"]]:
+            tables.setdefault((f" at {settings}" if settings else "", _table(known)), []).append(title)
         for entry in entries:
-            if not entry["parameters"]:
+            if entry["parameters"]:
+                formulas.setdefault(entry["formula"], []).append(entry)
+            else:
                 unknown.setdefault(entry["reason"], []).append(title)
-    # Estimators that can do the same share a table.
-    for (where, table), titles in tables.items():
-        parts.append(f"{_wrapped(f'{_listed(titles)}: standard errors{where}')}\n{table}")
-    parts += [f"{_listed(titles)}: no theory: {reason}." for reason, titles in unknown.items()]
-    parts += _formulas(content["estimates"])
+    parts = [
+        [
+            f"{content['experiment']}: standard errors to expect by theory, before any data are taken. The half width "
+            "is that of an interval of 95 %, 1.96 standard errors."
+        ],
+        *([f"{listed(titles)}: standard errors{where}", table] for (where, table), titles in tables.items()),
+        *([f"{listed(titles)}: no theory: {reason}."] for reason, titles in unknown.items()),
+        *([_formula(formula, entries)] for formula, entries in formulas.items()),
+    ]
     if content["left_out"]:
+        more = count(content["left_out"], "further combination")
         parts.append(
-            f"Not shown: {count(content['left_out'], 'further combination')} of swept settings and numbers of samples; "
-            "--set gives a swept key one value."
+            [f"Not shown: {more} of swept settings and numbers of samples; --set gives a swept key one value."]
         )
     parts.append(
-        "All this is to first order in the noise: it holds where the estimator converges to the right solution and the "
-        "standard errors are small against the parameters. It takes the noise to be as the experiment says and the "
-        "system to be at rest before the first sample; initial states and offsets that an estimator determines besides "
-        "are not counted."
+        [
+            "All this is to first order in the noise: it holds where the estimator converges to the right solution and "
+            "the standard errors are small against the parameters. It takes the noise to be as the experiment says and "
+            "the system to be at rest before the first sample; initial states and offsets that an estimator determines "
+            "besides are not counted."
+        ]
     )
-    return "\n\n".join(part if "\n" in part else _wrapped(part) for part in parts)
-
-
-def _wrapped(text: str) -> str:
-    return textwrap.fill(text, WIDTH, break_on_hyphens=False, break_long_words=False)
-
-
-def _by_size(estimates: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
-    """Entries that differ by the number of samples only, the least first."""
-    groups: dict[str, list[dict[str, Any]]] = {}
-    for entry in estimates:
-        groups.setdefault(repr((entry["settings"], _title(entry))), []).append(entry)
-    return [sorted(group, key=lambda entry: int(entry["samples"])) for group in groups.values()]
+    return Report(parts).draw()
 
 
 def _table(entries: list[dict[str, Any]]) -> str:
@@ -140,33 +132,23 @@ def _table(entries: list[dict[str, Any]]) -> str:
     last = entries[-1]
     rows = [
         [
-            row["name"],
-            number(row["value"]),
+            *(row["name"], number(row["value"])),
             *(number(entry["parameters"][k]["standard_error"], 3) for entry in entries),
-            number(row["relative_percent"], 3),
-            number(row["half_width_95"], 3),
+            *(number(row["relative_percent"], 3), number(row["half_width_95"], 3)),
         ]
         for k, row in enumerate(last["parameters"])
     ]
     sizes = [f"N = {entry['samples']}" for entry in entries]
     header = ["parameter", "true value", *sizes, "relative [%]", "half width"]
-    table = text_table(header, rows, "l" + "r" * (len(header) - 1))
+    table = Table(header, rows, "l" + "r" * (len(header) - 1)).draw()
     return table if len(entries) == 1 else f"{table}\nrelative, half width: of {last['samples']} samples."
 
 
-def _formulas(estimates: list[dict[str, Any]]) -> list[str]:
-    """Each formula once, with the numbers of samples and the estimators that it is for."""
-    used: dict[str, list[dict[str, Any]]] = {}
-    for entry in estimates:
-        if entry["parameters"]:
-            used.setdefault(entry["formula"], []).append(entry)
-    lines = []
-    for formula, entries in used.items():
-        sizes = [str(size) for size in sorted({entry["samples"] for entry in entries})]
-        names = list(dict.fromkeys(entry["estimator"] for entry in entries))
-        scaling = " Standard errors fall with the square root of N." if entries[0]["scales"] else ""
-        lines.append(f"{_listed(names)}, N = {', '.join(sizes)}: {formula}.{scaling}")
-    return lines
+def _formula(formula: str, entries: list[dict[str, Any]]) -> str:
+    """A formula with the numbers of samples and the estimators that it is for."""
+    sizes = ", ".join(map(str, sorted({entry["samples"] for entry in entries})))
+    scaling = " Standard errors fall with the square root of N." if entries[0]["scales"] else ""
+    return f"{listed(entry['estimator'] for entry in entries)}, N = {sizes}: {formula}.{scaling}"
 
 
 def _title(entry: dict[str, Any]) -> str:
@@ -179,8 +161,3 @@ def _title(entry: dict[str, Any]) -> str:
 
 def _settings(settings: dict[str, Any]) -> str:
     return ", ".join(f"{setting_title(key)} {setting_text(key, value)}" for key, value in settings.items())
-
-
-def _listed(names: list[str]) -> str:
-    distinct = list(dict.fromkeys(names))
-    return distinct[0] if len(distinct) == 1 else f"{', '.join(distinct[:-1])} and {distinct[-1]}"

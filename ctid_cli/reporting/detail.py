@@ -12,7 +12,7 @@ from ctid_cli.canonical import plain
 from ctid_cli.errors import MismatchError
 from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.reporting.estimate import as_object, parameter_object, parameter_table, parameters
-from ctid_cli.reporting.layout import delay_label, number, seconds, text_table
+from ctid_cli.reporting.layout import Table, delay_label, number, seconds
 from ctid_cli.reporting.results import out_option
 from ctid_cli.running.plan import build_plan
 from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name, measure_names
@@ -30,107 +30,92 @@ class Repeated:
 
     #: Its accepted iterations: stage, iteration, delay [s], cost [output unit^2], coefficients.
     history: list[dict[str, Any]]
+    #: Largest relative difference from the stored one [-]; None where there is nothing to compare with.
     difference: float | None
-
-    @property
-    def agrees(self) -> bool:
-        """Whether it is the stored estimate."""
-        return self.difference is None or self.difference <= AGREEMENT
-
-
-def parameters_of(found: FoundEstimate) -> list[UncertainValue]:
-    """Parameters of a stored estimate with their uncertainty."""
-    return parameters(found.row, found.estimator.get("delay_bounds"))
 
 
 def detail_object(found: FoundEstimate, again: Repeated | None, out: Path) -> dict[str, Any]:
     """One estimate for ``ctid show --json``."""
     content = as_object(found.row) | {
-        "parameters": [parameter_object(item) for item in parameters_of(found)],
+        "parameters": [parameter_object(item) for item in _parameters(found)],
         "data": found.data,
         "settings": found.estimator,
         "seed": found.seed,
         "origins": [asdict(origin) for origin in found.origins],
-        "redo": redo_command(found, out),
+        "redo": _redo_command(found, out),
     }
-    return content if again is None else content | {"history": again.history, "difference": again.difference}
+    return content if again is None else content | asdict(again)
 
 
 def detail_text(found: FoundEstimate, again: Repeated | None, out: Path) -> str:
     """One estimate as text."""
     row = found.row
-    lines = [
+    head = [
         f"Estimate {row['id']} of {row['experiment']}",
         f"{row['estimator']} ({row['kind']}), data set {row['replicate']}{_start(row)}",
         f"{row['status']}: {row['message']}",
     ]
     if row.get("converged") is not None:
-        lines.append("It meets the success rule." if row["converged"] else "It does not meet the success rule.")
-    if "measures" in row:
-        return "\n".join([*lines, *_measured(found), "", *_origin_of(found), *_repeated(found, again, out)])
-    shown = parameters_of(found)
-    if shown:
-        lines += ["", parameter_table(shown), *_conventions(shown)]
-    if row.get("true_delay") is not None:
-        lines.append(f"True delay: {number(row['true_delay'])} s.")
-    lines += [
-        "",
-        f"fit              {number(row['fit_percent'])} % of the data it was estimated from",
-        *(
-            [f"                 {number(row['validation_fit_percent'])} % of the validation part"]
-            if row.get("validation_fit_percent") is not None
-            else []
-        ),
-        f"cost             {number(row['cost'])} (mean squared output error, output unit^2)",
-        f"iterations       {number(row['iterations'])}",
-        f"condition number {number(row['condition_number'], 3)}",
-        f"time             {seconds(row['seconds'])}",
-        "",
-        *_origin_of(found),
-    ]
-    return "\n".join([*lines, *_repeated(found, again, out)])
-
-
-def _measured(found: FoundEstimate) -> list[str]:
-    """What was measured of the frequencies of a signal."""
-    measures = found.row["measures"] or {}
-    body = [
-        [name, number(measures[name], 8 if name.startswith("omega") else 4), MEASURE_UNITS[base_name(name)[0]]]
-        for name in measure_names([measures])
-    ]
-    table = ["", text_table(["measure", "value", "unit"], body, "lrl")] if body else []
-    return [*table, "", f"time             {seconds(found.row['seconds'])}"]
-
-
-def _origin_of(found: FoundEstimate) -> list[str]:
-    row = found.row
-    return [
+        head.append("It meets the success rule." if row["converged"] else "It does not meet the success rule.")
+    origin = [
         f"Data (cell {row['cell']}, seed {found.seed}, data set {row['replicate']}):",
         *_settings(found.data),
         "Estimator:",
         *_settings(found.estimator),
-        "",
     ]
+    of_signal = "measures" in row
+    what = "frequencies" if of_signal else "parameters"
+    if again is None:
+        every = "" if of_signal else " and see every iteration"
+        last = [f"To make this data set and this estimate again{every}:\n  {_redo_command(found, out)}"]
+    else:
+        last = [_verdict(again, what), *([_history(again)] if again.history else [])]
+    blocks = [head, *(_measured(row) if of_signal else _fitted(found)), origin, *([block] for block in last)]
+    return "\n\n".join("\n".join(block) for block in blocks)
 
 
-def _repeated(found: FoundEstimate, again: Repeated | None, out: Path) -> list[str]:
-    if again is not None:
-        what = "frequencies" if "measures" in found.row else "parameters"
-        return [_verdict(again, what), *(["", _history(again)] if again.history else [])]
-    every = "" if "measures" in found.row else " and see every iteration"
-    return [f"To make this data set and this estimate again{every}:", f"  {redo_command(found, out)}"]
+def _parameters(found: FoundEstimate) -> list[UncertainValue]:
+    return parameters(found.row, found.estimator.get("delay_bounds"))
 
 
-def redo_command(found: FoundEstimate, out: Path) -> str:
-    """The command that repeats an estimate."""
+def _fitted(found: FoundEstimate) -> list[list[str]]:
+    """Parameters of a model, and how well it fits."""
+    row, shown = found.row, _parameters(found)
+    table = [parameter_table(shown), *_conventions(shown)] if shown else []
+    if row.get("true_delay") is not None:
+        table.append(f"True delay: {number(row['true_delay'])} s.")
+    facts = [("fit", f"{number(row['fit_percent'])} % of the data it was estimated from")]
+    if row.get("validation_fit_percent") is not None:
+        facts.append(("", f"{number(row['validation_fit_percent'])} % of the validation part"))
+    facts += [
+        ("cost", f"{number(row['cost'])} (mean squared output error, output unit^2)"),
+        ("iterations", number(row["iterations"])),
+        ("condition number", number(row["condition_number"], 3)),
+        ("time", seconds(row["seconds"])),
+    ]
+    measures = [f"{name:16} {text}" for name, text in facts]
+    return [table, measures] if table else [measures]
+
+
+def _measured(row: Mapping[str, Any]) -> list[list[str]]:
+    """What was measured of the frequencies of a signal."""
+    measures = row["measures"] or {}
+    body = [
+        [name, number(measures[name], 8 if name.startswith("omega") else 4), MEASURE_UNITS[base_name(name)[0]]]
+        for name in measure_names([measures])
+    ]
+    table = [[Table(["measure", "value", "unit"], body, "lrl").draw()]] if body else []
+    return [*table, [f"time             {seconds(row['seconds'])}"]]
+
+
+def _redo_command(found: FoundEstimate, out: Path) -> str:
     return f"ctid show {found.row['id']} --history{out_option(out)}"
 
 
 def repeat(found: FoundEstimate) -> Repeated:
     """Make the data set of an estimate and the estimate once more."""
     row = found.row
-    spec = spec_from_canonical(read_stored(found.folder).manifest["spec"], spec_folder(found.folder))
-    plan = build_plan(spec)
+    plan = build_plan(spec_from_canonical(read_stored(found.folder).manifest["spec"], spec_folder(found.folder)))
     for task in plan.tasks():
         cell = plan.data_cells[task.cell]
         if (cell.hash, task.replicate) != (row["cell"], row["replicate"]):
@@ -141,38 +126,27 @@ def repeat(found: FoundEstimate) -> Repeated:
                 drawn = start.draw(found.seed, task.replicate, data.true_model)
                 fit = estimator.estimator.prepare(data.record).fit(drawn)
                 if isinstance(fit, FrequencyFit) and isinstance(data, SignalDataSet):
-                    return Repeated([], _moved(row.get("measures") or {}, fit.result(data)["measures"]))
-                model = {
-                    "numerator": plain(fit.model.numerator),
-                    "denominator": plain(fit.model.denominator),
-                    "delay": float(fit.model.delay),
-                }
-                return Repeated([plain(asdict(entry)) for entry in fit.history], _difference(row, model))
+                    sides = (row.get("measures") or {}, fit.result(data)["measures"])
+                    then, now = ({k: v for k, v in side.items() if k.startswith("omega")} for side in sides)
+                    return Repeated([], _difference(then, now))
+                model = {name: plain(getattr(fit.model, name)) for name in ("numerator", "denominator", "delay")}
+                then, now = _coefficients(row), _coefficients(model)
+                difference = _difference(then, now) if then.keys() <= now.keys() else float("inf")
+                return Repeated([plain(asdict(entry)) for entry in fit.history], difference)
     raise MismatchError(f"the stored specification of {row['experiment']} does not describe estimate {row['id']}")
 
 
-def _difference(stored: Mapping[str, Any], model: Mapping[str, Any]) -> float | None:
-    if not stored.get("denominator") or not stored.get("numerator"):
-        return None
-    worst = 0.0
-    for name in ("numerator", "denominator", "delay"):
-        then, now = (item if isinstance(item, list) else [item] for item in (stored[name], model[name]))
-        if len(then) != len(now):
-            return float("inf")
-        for a, b in zip(then, now, strict=True):
-            if a is not None and b is not None and a != b:
-                worst = max(worst, abs(a - b) / max(abs(a), abs(b)))
-    return worst
+def _coefficients(model: Mapping[str, Any]) -> dict[str, float | None]:
+    if not model["numerator"] or not model["denominator"]:
+        return {}
+    sides = {"b": model["numerator"], "a": model["denominator"], "delay": [model["delay"]]}
+    return {f"{name}{len(values) - k}": value for name, values in sides.items() for k, value in enumerate(values)}
 
 
-def _moved(stored: Mapping[str, float | None], now: Mapping[str, float | None]) -> float | None:
-    """Largest relative difference between frequencies."""
-    worst = None
-    for name, then in stored.items():
-        value = now.get(name)
-        if name.startswith("omega") and then is not None and value is not None:
-            worst = max(worst or 0.0, abs(value - then) / max(abs(then), abs(value)))
-    return worst
+def _difference(then: Mapping[str, float | None], now: Mapping[str, float | None]) -> float | None:
+    """Largest relative difference of the numbers that both have."""
+    pairs = [(a, b) for name, a in then.items() if a is not None and (b := now.get(name)) is not None]
+    return max((abs(a - b) / max(abs(a), abs(b)) if a != b else 0.0 for a, b in pairs), default=None)
 
 
 def _verdict(again: Repeated, what: str) -> str:
@@ -180,7 +154,7 @@ def _verdict(again: Repeated, what: str) -> str:
         return f"Computed once more; there are no stored {what} to compare with."
     if again.difference == 0:
         return f"Computed once more: the same {what} to the last digit."
-    if again.agrees:
+    if again.difference <= AGREEMENT:
         return f"Computed once more: the same {what}, up to {again.difference:.1e} of their size."
     return (
         f"Computed once more: {what} differ by up to {again.difference:.1e} of their size. "
@@ -194,7 +168,7 @@ def _history(again: Repeated) -> str:
         + [" ".join(number(value, 5) for value in entry[name]) for name in ("numerator", "denominator")]
         for entry in again.history
     ]
-    return text_table(["stage", "iteration", "delay [s]", "cost", "numerator", "denominator"], rows, "lrrrll")
+    return Table(["stage", "iteration", "delay [s]", "cost", "numerator", "denominator"], rows, "lrrrll").draw()
 
 
 def _settings(content: Mapping[str, Any]) -> list[str]:
@@ -204,8 +178,7 @@ def _settings(content: Mapping[str, Any]) -> list[str]:
 def _conventions(shown: list[UncertainValue]) -> list[str]:
     """What the names and columns of a table of parameters mean."""
     interval = "low and high are estimate -+ 1.96 errors."
-    submodels = any(item.name.startswith("g") for item in shown)
-    if not submodels:
+    if not any(item.name.startswith("g") for item in shown):
         return [f"Monic denominator, descending powers; {interval}"]
     lines = [
         "g1: submodel of the least natural frequency; g1_a2: coefficient of p^2 in its denominator, which ends in 1."
@@ -220,5 +193,5 @@ def _start(row: Mapping[str, Any]) -> str:
         return ""
     if row["initial_delay"] is None:
         return f", start {row['start']}"
-    label = delay_label(row["initial_delay"])
-    return f", start {label} ({number(row['start_delay'])} s)" if label == "random" else f", start {label}"
+    drawn = f" ({number(row['start_delay'])} s)" if row["initial_delay"] == "random" else ""
+    return f", start {delay_label(row['initial_delay'])}{drawn}"

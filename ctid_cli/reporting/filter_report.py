@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import textwrap
 from typing import Any
 
 from ctid_cli.filtering.filter_set import FilterCheck, FilterSet, sufficient_number_of_filters
 from ctid_cli.filtering.filter_theory import convergence_region
-from ctid_cli.reporting.layout import count, number, text_table
-
-#: Lines of text are no longer than this.
-WIDTH = 100
+from ctid_cli.reporting.layout import Report, Table, count, number
 
 
 def filter_object(filters: FilterSet, check: FilterCheck) -> dict[str, Any]:
@@ -22,12 +18,12 @@ def filter_object(filters: FilterSet, check: FilterCheck) -> dict[str, Any]:
         "largest_error": check.largest_error,
         "filters": [
             {
-                "filter": k + 1,
+                "filter": k,
                 "period": float(period),
                 "cutoff": float(cutoff),
                 "convergence_region": convergence_region(float(cutoff), exact=check.exact),
             }
-            for k, (period, cutoff) in enumerate(zip(filters.periods, filters.cutoffs, strict=True))
+            for k, (period, cutoff) in enumerate(zip(filters.periods, filters.cutoffs, strict=True), start=1)
         ],
         "intervals": _best(check),
         "gaps": [{"low": low, "high": high} for low, high in check.gaps],
@@ -53,41 +49,38 @@ def filter_text(filters: FilterSet, check: FilterCheck) -> str:
     """A check of a filter set for people."""
     content = filter_object(filters, check)
     top = _time(check.largest_error)
-    parts = [
-        _verdict(content, top),
-        f"{count(filters.count, 'filter')}, periods from {number(filters.beta, 4)} to 1 times "
-        f"{_time(float(filters.periods[-1]))}, that of the bandwidth {number(filters.bandwidth, 4)} rad/s.",
-        text_table(
-            ["filter", "period [s]", "cut-off [rad/s]", "alone from [s]"],
-            [
-                [str(row["filter"]), *(number(row[key], 4) for key in ("period", "cutoff", "convergence_region"))]
-                for row in content["filters"]
-            ],
-            "rrrr",
-        )
-        + "\nalone from: delay errors up to this one lead to zero with this filter alone.",
-        text_table(
-            ["delay error [s]", "filter", "leads to [s]"],
-            [
-                [f"{number(row['low'], 5)} to {number(row['high'], 5)}", str(row["filter"] or "none"), row["text"]]
-                for row in sorted(
-                    [
-                        *({**row, "text": number(row["minimum"], 5)} for row in content["intervals"]),
-                        *({**gap, "filter": None, "text": "nothing closer"} for gap in content["gaps"]),
-                    ],
-                    key=lambda row: float(row["low"]),
-                )
-            ],
-            "lrr",
-        )
-        + "\nfilter: of those that lead closer to zero, the one that leads closest.",
-        _path(content),
-        _sufficient(content, filters.count, top),
-        "Checked is the necessary condition, with the exact extrema of the cost of an ideal low-pass filter: white "
-        "input, rational part known. Real filters, noise and an estimated rational part move the minima.",
+    keys = ("period", "cutoff", "convergence_region")
+    filter_rows = [[str(row["filter"]), *(number(row[key], 4) for key in keys)] for row in content["filters"]]
+    error_rows = [
+        [
+            f"{number(row['low'], 5)} to {number(row['high'], 5)}",
+            str(row.get("filter", "none")),
+            number(row["minimum"], 5) if "minimum" in row else "nothing closer",
+        ]
+        for row in sorted([*content["intervals"], *content["gaps"]], key=lambda row: float(row["low"]))
     ]
-    wrapped = [part if "\n" in part else textwrap.fill(part, WIDTH, break_on_hyphens=False) for part in parts]
-    return "\n\n".join(wrapped)
+    blocks: list[list[str | Table]] = [
+        [_verdict(content, top)],
+        [
+            f"{count(filters.count, 'filter')}, periods from {number(filters.beta, 4)} to 1 times "
+            f"{_time(float(filters.periods[-1]))}, that of the bandwidth {number(filters.bandwidth, 4)} rad/s."
+        ],
+        [
+            Table(["filter", "period [s]", "cut-off [rad/s]", "alone from [s]"], filter_rows, "rrrr"),
+            "alone from: delay errors up to this one lead to zero with this filter alone.",
+        ],
+        [
+            Table(["delay error [s]", "filter", "leads to [s]"], error_rows, "lrr"),
+            "filter: of those that lead closer to zero, the one that leads closest.",
+        ],
+        [_path(content)],
+        [_sufficient(content, top)],
+        [
+            "Checked is the necessary condition, with the exact extrema of the cost of an ideal low-pass filter: white "
+            "input, rational part known. Real filters, noise and an estimated rational part move the minima."
+        ],
+    ]
+    return Report(blocks).draw()
 
 
 def _time(value: float) -> str:
@@ -114,11 +107,11 @@ def _path(content: dict[str, Any]) -> str:
     return f"Path [s] from {number(content['largest_error'], 5)}: {', '.join(steps)}{stuck}."
 
 
-def _sufficient(content: dict[str, Any], n: int, top: str) -> str:
-    enough = content["sufficient_number"]
-    if content["filters"][0]["convergence_region"] >= content["largest_error"]:
+def _sufficient(content: dict[str, Any], top: str) -> str:
+    enough, filters = content["sufficient_number"], content["filters"]
+    if filters[0]["convergence_region"] >= content["largest_error"]:
         return f"One filter suffices: that of the longest period leads from {top} to zero by itself."
-    if enough == 1 or (n >= enough and not content["passes"]):
+    if enough == 1 or (len(filters) >= enough and not content["passes"]):
         return (
             f"Equation (56) asks for {count(enough, 'filter')}, but rests on extrema that are up to 0.15 % off, which "
             "is too much here: a larger beta helps."

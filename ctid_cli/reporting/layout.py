@@ -105,9 +105,7 @@ def number(value: object, digits: int = 6) -> str:
     """A number for people; a dash where there is none."""
     if value is None:
         return "-"
-    if isinstance(value, bool | str):
-        return str(value)
-    if isinstance(value, int | float):
+    if isinstance(value, float):
         return f"{value:.{digits}g}" if math.isfinite(value) else "-"
     return str(value)
 

@@ -30,7 +30,7 @@ def test_failures_are_listed_with_their_reason_but_not_without_end(estimate):
     assert "and 1 more" in text
     assert "11 FAILED" in text
     assert "1 CONVERGED: converged" in text
-    assert "5 stored estimates are left aside" in text
+    assert "5 stored estimates do not count" in text
     assert "ctid table e --out other" in text
 
 
