@@ -121,7 +121,7 @@ class Reporter(_Progress):
         if event.reused:
             parts.append(f"{event.reused} already stored")
         if event.left_aside:
-            parts.append(f"{event.left_aside} stored ones left aside")
+            parts.append(f"{event.left_aside} stored ones set aside")
         self._say(", ".join(parts))
         self._began = self._last = self._clock()
         if event.data_sets and sys.stderr.isatty():

@@ -77,7 +77,7 @@ def run(
 def _intention(ready: PlanReady) -> str:
     from ctid_cli.reporting.layout import count
 
-    left = f", {ready.left_aside} stored ones left aside" if ready.left_aside else ""
+    left = f", {ready.left_aside} stored ones set aside" if ready.left_aside else ""
     return (
         f"{ready.experiment}: would compute {count(ready.estimates, 'estimate')}"
         f" of {count(ready.data_sets, 'data set')} into {ready.folder}; {ready.reused} are already stored{left}"

@@ -20,7 +20,7 @@ def status(
 ) -> None:
     """Say what is stored and what is missing.
 
-    Counts estimates: done, planned, failed, and those that changed settings have left aside.
+    Counts estimates: done, planned, failed, and those that the latest settings set aside.
     """
     import json
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.committed import committed_tables, made_by, plain_row, read_tables
@@ -24,108 +24,48 @@ LEVEL = 0.01
 #: Chance that a difference as large as the one that is called detectable is reported.
 POWER = 0.8
 
-Against = Literal["committed", "paper"]
+Cell = dict[str, Any]
 
-
-@dataclass(frozen=True)
-class ComparedCell:
-    """One table cell, and what it was compared with."""
-
-    against: Against
-    decisive: bool
-    #: The fresh cell.
-    row: Row
-    reference_n: int
-    reference_converged: int
-    #: Two-sided p-value of Fisher's exact test that both percentages are equal [-].
-    p_value: float
-    #: The same after Holm's correction for the number of cells: a difference where it is below the level [-].
-    adjusted_p_value: float
-    #: Smallest difference that would have been reported with 80 % probability [percentage points].
-    detectable: float | None
-
-    @property
-    def percent(self) -> float:
-        """Fresh percentage [%]."""
-        return float(100 * self.row["converged"] / self.row["n"])
-
-    @property
-    def reference_percent(self) -> float:
-        """Percentage of the reference [%]."""
-        return 100 * self.reference_converged / self.reference_n
-
-    @property
-    def identical(self) -> bool:
-        """Whether the counts are those of the reference."""
-        return (self.row["n"], self.row["converged"]) == (self.reference_n, self.reference_converged)
-
-    @property
-    def differs(self) -> bool:
-        """Whether the percentages differ by more than sampling error explains."""
-        return self.adjusted_p_value < LEVEL
-
-    @property
-    def mismatch(self) -> bool:
-        """Whether the difference counts: any from committed tables, but only a lower percentage than the paper's."""
-        return self.decisive and self.differs and (self.against == "committed" or self.percent < self.reference_percent)
-
-    def as_dict(self) -> dict[str, Any]:
-        """The cell of ``ctid table --check --format json``: swept fields are keys of their own."""
-        keys = (
-            "table",
-            "experiment",
-            "sampling",
-            *settings_of([self.row]),
-            "initial_delay",
-            "method",
-            "n",
-            "converged",
-        )
-        return {
-            "against": self.against,
-            **{key: self.row.get(key) for key in keys},
-            "percent": self.percent,
-            "reference_n": self.reference_n,
-            "reference_converged": self.reference_converged,
-            "reference_percent": self.reference_percent,
-            "p_value": self.p_value,
-            "adjusted_p_value": self.adjusted_p_value,
-            "detectable": self.detectable,
-            "differs": self.differs,
-            "decisive": self.decisive,
-            "mismatch": self.mismatch,
-        }
+#: Keys of a compared cell besides those that identify the cell of a table.
+_COMPARED = (
+    *("against", "n", "converged", "percent", "reference_n", "reference_converged", "reference_percent"),
+    *("p_value", "adjusted_p_value", "detectable", "differs", "decisive", "mismatch"),
+)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A finished comparison."""
+    """A finished comparison; its cells have the keys of ``ctid table --check --format json``."""
 
-    cells: tuple[ComparedCell, ...]
+    cells: list[Cell]
     reference: str | None
     not_run: int
     not_in_reference: int
-    notes: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
 
     @property
-    def decisive(self) -> list[ComparedCell]:
+    def decisive(self) -> list[Cell]:
         """Comparisons that decide the exit code."""
-        return [cell for cell in self.cells if cell.decisive]
+        return [cell for cell in self.cells if cell["decisive"]]
 
     @property
-    def mismatches(self) -> list[ComparedCell]:
+    def mismatches(self) -> list[Cell]:
         """Those of them that differ."""
-        return [cell for cell in self.cells if cell.mismatch]
+        return [cell for cell in self.cells if cell["mismatch"]]
 
     @property
-    def differences(self) -> list[ComparedCell]:
+    def differences(self) -> list[Cell]:
         """Differences from the paper that are no mismatch."""
-        return [cell for cell in self.cells if cell.differs and not cell.mismatch]
+        return [cell for cell in self.cells if cell["differs"] and not cell["mismatch"]]
 
     @property
     def identical(self) -> int:
         """Cells with the same counts as in the committed tables."""
-        return sum(cell.identical for cell in self.cells if cell.against == "committed")
+        return sum(
+            (cell["n"], cell["converged"]) == (cell["reference_n"], cell["reference_converged"])
+            for cell in self.cells
+            if cell["against"] == "committed"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """The object of ``ctid table --check --format json``."""
@@ -138,7 +78,7 @@ class Comparison:
             "mismatches": len(self.mismatches),
             "not_run": self.not_run,
             "not_in_reference": self.not_in_reference,
-            "cells": [cell.as_dict() for cell in self.cells],
+            "cells": self.cells,
             "notes": list(self.notes),
         }
 
@@ -191,30 +131,51 @@ def compare(
         if _is_counted(row):
             known.setdefault(_identity(row), row)
 
-    pairs: list[tuple[Against, bool, Row, int, int]] = []
+    # Fresh row, what it is compared with, whether that decides, converged and all data sets of the reference.
+    pairs: list[tuple[Row, str, bool, int, int]] = []
     for identity, row in fresh.items():
         if not _is_counted(row):
             continue
         if identity in known:
-            pairs.append(("committed", True, row, known[identity]["n"], known[identity]["converged"]))
+            pairs.append((row, "committed", True, known[identity]["converged"], known[identity]["n"]))
         if (published := row.get("published_percent")) is not None:
             trials = study.published_data_sets
-            pairs.append(("paper", row["method"] in study.must_reach, row, trials, round(published * trials / 100)))
+            pairs.append((row, "paper", row["method"] in study.must_reach, round(published * trials / 100), trials))
     lacking = sum(_is_counted(row) and key not in known for key, row in fresh.items()) if committed is not None else 0
     tables = {str(row["table"]) for row in fresh.values()}
     asked = {key for key, row in known.items() if not tables.isdisjoint((str(row["table"]), row["experiment"]))}
     asked |= {key for key, row in fresh.items() if row.get("published_percent") is not None}
     not_run = sum(not (key in fresh and fresh[key]["n"]) for key in asked)
-
-    cells: dict[int, ComparedCell] = {}
+    cells: dict[int, Cell] = {}
     for family in (True, False):
-        members = [k for k, pair in enumerate(pairs) if pair[1] is family]
-        p_values = [fisher(pairs[k][2]["converged"], pairs[k][2]["n"], *pairs[k][:2:-1]) for k in members]
+        members = [k for k, (_, _, decisive, *_) in enumerate(pairs) if decisive is family]
+        p_values = [fisher(pairs[k][0]["converged"], pairs[k][0]["n"], *pairs[k][3:]) for k in members]
         for k, p_value, adjusted in zip(members, p_values, holm(p_values), strict=True):
-            against, decisive, row, n, converged = pairs[k]
-            change = smallest_detectable(row["n"], converged, n, LEVEL / len(members), rise=against == "committed")
-            cells[k] = ComparedCell(against, decisive, row, n, converged, p_value, adjusted, change)
-    return Comparison(tuple(cells[k] for k in range(len(pairs))), reference, not_run, lacking, tuple(notes))
+            cells[k] = _compared(*pairs[k], p_value, adjusted, LEVEL / len(members))
+    return Comparison([cells[k] for k in range(len(pairs))], reference, not_run, lacking, notes)
+
+
+def _compared(
+    row: Row, against: str, decisive: bool, converged: int, n: int, p_value: float, adjusted: float, level: float
+) -> Cell:
+    """One cell: any difference from committed tables is a mismatch, from the paper only a lower percentage."""
+    percent, other = 100 * row["converged"] / row["n"], 100 * converged / n
+    differs, committed = adjusted < LEVEL, against == "committed"
+    keys = ("table", "experiment", "sampling", *settings_of([row]), "initial_delay", "method", "n", "converged")
+    return {
+        "against": against,
+        **{key: row.get(key) for key in keys},
+        "percent": percent,
+        "reference_n": n,
+        "reference_converged": converged,
+        "reference_percent": other,
+        "p_value": p_value,
+        "adjusted_p_value": adjusted,
+        "detectable": smallest_detectable(row["n"], converged, n, level, rise=committed),
+        "differs": differs,
+        "decisive": decisive,
+        "mismatch": decisive and differs and (committed or percent < other),
+    }
 
 
 @cache
@@ -271,14 +232,13 @@ def write_comparison(comparison: Comparison, style: str = "text") -> str:
     if style == "json":
         return json.dumps(comparison.as_dict(), indent=1, allow_nan=False)
     if style == "csv":
-        return csv_text([cell.as_dict() for cell in comparison.cells]).rstrip("\n")
+        return csv_text(comparison.cells).rstrip("\n")
     wrong = comparison.mismatches
-    parts: dict[str, list[ComparedCell]] = {
-        f"Other than in {comparison.reference}:": [cell for cell in wrong if cell.against == "committed"],
-        "Lower than in the paper:": [cell for cell in wrong if cell.against == "paper"],
-        "For information, differences from the paper that are no mismatch (reasons: the study's README):": (
-            comparison.differences
-        ),
+    information = "For information, differences from the paper that are no mismatch (reasons: the study's README):"
+    parts = {
+        f"Other than in {comparison.reference}:": [cell for cell in wrong if cell["against"] == "committed"],
+        "Lower than in the paper:": [cell for cell in wrong if cell["against"] == "paper"],
+        information: comparison.differences,
     }
     listings: list[list[str | Table]] = [[title, _listing(cells)] for title, cells in parts.items() if cells]
     return Report([[_verdict(comparison)], *listings], notes=comparison.notes).draw(style)
@@ -293,15 +253,15 @@ def mismatch_sentence(comparison: Comparison) -> str:
 
 def _verdict(comparison: Comparison) -> str:
     cells = comparison.decisive
-    paper = [cell for cell in cells if cell.against == "paper"]
+    paper = [cell for cell in cells if cell["against"] == "paper"]
     parts = []
     if len(paper) < len(cells):
         same = f"{comparison.identical} of them with the same counts"
         parts.append(f"{count(len(cells) - len(paper), 'cell')} with {comparison.reference} ({same})")
     if paper:
-        methods = ", ".join(dict.fromkeys(cell.row["method"] for cell in paper))
+        methods = ", ".join(dict.fromkeys(cell["method"] for cell in paper))
         parts.append(f"{count(len(paper), 'cell')} of {methods} with the paper")
-    least, most = (extreme(cell.row["n"] for cell in cells) for extreme in (min, max))
+    least, most = (extreme(cell["n"] for cell in cells) for extreme in (min, max))
     sizes = count(most, "data set") if least == most else f"{least} to {count(most, 'data set')}"
     text = f"No difference beyond sampling error in {count(len(cells), 'comparison')}"
     text = mismatch_sentence(comparison) if comparison.mismatches else text
@@ -317,9 +277,9 @@ def _verdict(comparison: Comparison) -> str:
     return text
 
 
-def _power(cells: Sequence[ComparedCell]) -> str:
+def _power(cells: Sequence[Cell]) -> str:
     """What the comparisons could have found."""
-    found = [cell.detectable for cell in cells if cell.detectable is not None]
+    found = [cell["detectable"] for cell in cells if cell["detectable"] is not None]
     if not found:
         return "With so few data sets no difference could have been detected, however large."
     ends = " to ".join(dict.fromkeys(f"{end:.0f}" for end in (min(found), max(found))))
@@ -329,16 +289,15 @@ def _power(cells: Sequence[ComparedCell]) -> str:
     return f"{text}; in {count(blind, 'cell')} no difference could have been detected." if blind else f"{text}."
 
 
-def _listing(cells: Sequence[ComparedCell]) -> Table:
-    keys = settings_of(cell.row for cell in cells)
+def _listing(cells: Sequence[Cell]) -> Table:
+    keys = [key for key in settings_of(cells) if key not in _COMPARED]
     titles = ["table", "sampling", *map(setting_title, keys), "initial delay", "method"]
     body = [
         [
-            *(str(cell.row["table"]), cell.row.get("sampling") or "-"),
-            *(setting_text(key, cell.row.get(key)) for key in keys),
-            *(delay_label(cell.row["initial_delay"]), cell.row["method"]),
-            *(percent(cell.percent, cell.row["n"]), str(cell.row["n"])),
-            *(percent(cell.reference_percent, cell.reference_n), str(cell.reference_n), number(cell.p_value, 2)),
+            *(str(cell["table"]), cell["sampling"] or "-", *(setting_text(key, cell.get(key)) for key in keys)),
+            *(delay_label(cell["initial_delay"]), cell["method"], percent(cell["percent"], cell["n"]), str(cell["n"])),
+            *(percent(cell["reference_percent"], cell["reference_n"]), str(cell["reference_n"])),
+            number(cell["p_value"], 2),
         ]
         for cell in cells
     ]

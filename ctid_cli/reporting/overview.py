@@ -34,7 +34,7 @@ def overview_text(found: Sequence[ExperimentStatus]) -> str:
         [item.experiment, *map(number, (item.done, item.planned, item.failed, item.left_aside)), _remark(item)]
         for item in found
     ]
-    return Table(["experiment", "done", "planned", "failed", "left aside", ""], rows, "lrrrrl").draw()
+    return Table(["experiment", "done", "planned", "failed", "set aside", ""], rows, "lrrrrl").draw()
 
 
 def status_text(status: ExperimentStatus, estimates: Sequence[Mapping[str, Any]], out: Path) -> str:
@@ -66,7 +66,7 @@ def status_text(status: ExperimentStatus, estimates: Sequence[Mapping[str, Any]]
     blocks += ["\n".join(lines)] if lines else []
     if status.left_aside:
         blocks.append(
-            f"{status.left_aside} stored estimates do not count: the latest run asked for other settings or fewer "
+            f"{status.left_aside} stored estimates are set aside: the latest run asked for other settings or fewer "
             "data sets."
         )
     command = f"ctid table {status.experiment}{out_option(out)}"

@@ -62,11 +62,11 @@ def test_run_tells_what_it_does_and_what_to_do_next(ctid, tiny, tmp_path):
     assert f"next: ctid table tiny --out {out}" in done.stdout
     # another setting leaves the old estimates aside and says so
     done = ctid("run", tiny, "--runs", 1, "--jobs", 1, "--set", "noise.snr_db=10", "--out", out)
-    assert "3 stored ones left aside" in done.stderr
-    assert "3 stored estimates are left aside: " in ctid("status", "tiny", "--out", out).stdout
+    assert "3 stored ones set aside" in done.stderr
+    assert "3 stored estimates are set aside: " in ctid("status", "tiny", "--out", out).stdout
     done = ctid("run", tiny, "--runs", 1, "--set", "noise.snr_db=30", "--dry-run", "--out", out)
     assert "would compute 3 estimates of 1 data set" in done.stdout
-    assert "6 stored ones left aside" in done.stdout
+    assert "6 stored ones set aside" in done.stdout
 
 
 def test_an_experiment_that_fails_wholly_does_not_stop_the_next_one(ctid, tiny, measured, tmp_path, monkeypatch):

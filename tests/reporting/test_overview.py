@@ -30,7 +30,7 @@ def test_failures_are_listed_with_their_reason_but_not_without_end(estimate):
     assert "and 1 more" in text
     assert "11 FAILED" in text
     assert "1 CONVERGED: converged" in text
-    assert "5 stored estimates do not count" in text
+    assert "5 stored estimates are set aside" in text
     assert "ctid table e --out other" in text
 
 
@@ -43,5 +43,5 @@ def test_a_run_that_goes_on_is_not_called_unfinished():
 
 def test_counts_stand_under_their_titles():
     header, _, row = overview_text([progress(left_aside=None, mixed=False)]).splitlines()
-    assert header.split() == ["experiment", "done", "planned", "failed", "left", "aside"]
+    assert header.split() == ["experiment", "done", "planned", "failed", "set", "aside"]
     assert row.split() == ["e", "12", "30", "11", "-", "unfinished"]
