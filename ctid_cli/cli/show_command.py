@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ctid_cli.cli._common import Json, Out, guarded
+from ctid_cli.cli._common import Json, Out, echo_json, guarded
 
 
 @guarded
@@ -24,14 +24,12 @@ def show(
     Its parameters with their uncertainty, its status, the data it comes from, and how to redo it.
     `ctid export EXPERIMENT` lists the identifiers, `ctid status EXPERIMENT` those of failed estimates.
     """
-    import json
-
     from ctid_cli.reporting.detail import detail_object, detail_text, repeat
     from ctid_cli.storage.store import find_estimate
 
     found = find_estimate(out, id)
     again = repeat(found) if history else None
     if as_json:
-        typer.echo(json.dumps(detail_object(found, again, out), allow_nan=False))
+        echo_json(detail_object(found, again, out))
     else:
         typer.echo(detail_text(found, again, out))

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ctid_cli.cli._common import Json, Out, guarded
+from ctid_cli.cli._common import Json, Out, echo_json, guarded
 
 
 @guarded
@@ -22,8 +22,6 @@ def status(
 
     Counts estimates: done, planned, failed, and those that the latest settings set aside.
     """
-    import json
-
     from ctid_cli.reporting.overview import overview_text, status_object, status_text
     from ctid_cli.reporting.results import experiments_in, read_results
     from ctid_cli.storage.store import experiment_status
@@ -32,7 +30,7 @@ def status(
         found = [experiment_status(out / name) for name in experiments_in(out)]
         if as_json:
             for item in found:
-                typer.echo(json.dumps(status_object(item, None), allow_nan=False))
+                echo_json(status_object(item, None))
         elif found:
             typer.echo(overview_text(found))
         else:
@@ -44,6 +42,6 @@ def status(
     # A first run that is still going on has nothing to read yet.
     rows = read_results(out, experiment).rows if one.done else []
     if as_json:
-        typer.echo(json.dumps(status_object(one, rows), allow_nan=False))
+        echo_json(status_object(one, rows))
     else:
         typer.echo(status_text(one, rows, out))

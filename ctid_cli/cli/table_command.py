@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from ctid_cli.cli._common import Out, guarded
-
-
-class TableFormat(StrEnum):
-    """Forms of a table."""
-
-    text = "text"
-    md = "md"
-    csv = "csv"
-    json = "json"
 
 
 @guarded
@@ -26,7 +16,9 @@ def table(
         list[str] | None,
         typer.Argument(metavar="[NAME]...", help="Table (1, useful-redundancy/3) or experiment (quickstart)."),
     ] = None,
-    style: Annotated[TableFormat, typer.Option("--format", help="Form of the output.")] = TableFormat.text,
+    style: Annotated[
+        Literal["text", "md", "csv", "json"], typer.Option("--format", help="Form of the output.")
+    ] = "text",
     check: Annotated[
         bool,
         typer.Option("--check", help="Compare with the committed tables and the paper; exit code 7 if they differ."),
@@ -53,11 +45,9 @@ def table(
     if not out.is_dir():
         typer.echo(f"ctid: there is no folder {out}, so nothing was run yet (--out names the results folder)", err=True)
     if not check:
-        typer.echo(
-            write_reports(build_tables(names or [], out, style.value, committed=out == Path("results")), style.value)
-        )
+        typer.echo(write_reports(build_tables(names or [], out, style, committed=out == Path("results")), style))
         return
     comparison = check_tables(names or [], out, reference)
-    typer.echo(write_comparison(comparison, style.value))
+    typer.echo(write_comparison(comparison, style))
     if comparison.mismatches:
         raise MismatchError(mismatch_sentence(comparison))
