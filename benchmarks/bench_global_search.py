@@ -14,7 +14,7 @@ from bench_measured import exact_zoh, multi_start
 
 from ctid_cli.estimation.common import Start
 from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.spec import load_spec
+from ctid_cli.specification.load import load_spec
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "useful_redundancy"
 METHODS = ("delay_profile", "profile_spectral", "proposed", "proposed_spectral")

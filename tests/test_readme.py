@@ -25,7 +25,7 @@ def test_the_python_example_prints_what_is_shown():
 
 def test_the_specifications_are_valid(tmp_path):
     from ctid_cli.running.plan import build_plan
-    from ctid_cli.specification.spec import load_spec
+    from ctid_cli.specification.load import load_spec
 
     first, second = block("yaml")
     file = tmp_path / "my-first.yaml"

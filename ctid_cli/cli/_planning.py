@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def load_plans(configs: Sequence[Path], overrides: Sequence[str], runs: int | None = None) -> list[tuple[Path, Plan]]:
     """Read and check experiment files; warnings go to stderr."""
     from ctid_cli.running.plan import build_plan
-    from ctid_cli.specification.spec import load_spec
+    from ctid_cli.specification.load import load_spec
 
     problems: list[Problem] = []
     plans: list[tuple[Path, Plan]] = []

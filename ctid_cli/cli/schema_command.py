@@ -12,6 +12,6 @@ def schema() -> None:
     """Print the JSON Schema of experiment files."""
     import json
 
-    from ctid_cli.specification.spec import json_schema
+    from ctid_cli.specification.load import json_schema
 
     typer.echo(json.dumps(json_schema(), indent=2))

@@ -17,7 +17,7 @@ from ctid_cli.reporting.results import out_option
 from ctid_cli.running.plan import build_plan
 from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name, measure_names
 from ctid_cli.simulation.frequency_runs import FrequencyFit, SignalDataSet
-from ctid_cli.specification.spec import spec_from_canonical
+from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.store import FoundEstimate, read_stored, spec_folder
 
 #: A repeated estimate agrees if no parameter moved by more than this fraction; other processors give other last bits.

@@ -20,7 +20,7 @@ from ctid_cli.inference.quantile import normal_quantile
 from ctid_cli.reporting.parameter_theory import long_record_variances
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.spec import spec_from_canonical
+from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.manifest import FAILURES, true_parameters
 from ctid_cli.storage.summary import wilson_interval
 

@@ -153,7 +153,7 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
     if runs is not None and runs < 1:
         raise UsageError(f"the number of data sets must be 1 or more, not {runs}")
     count = 1
-    if spec.data is None:
+    if spec.data is None and spec.monte_carlo is not None:
         spec = spec if runs is None else spec.with_runs(runs)
         assert spec.monte_carlo is not None
         count = spec.monte_carlo.runs
@@ -239,17 +239,21 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
 
 def _simulated(chosen: Mapping[str, Variant], loop: LoopOptions | None, folder: Path, spec: Spec) -> SimulatedSource:
     """Source of the data sets of one combination of the sections' variants."""
-    assert spec.monte_carlo is not None
     pinned = chosen["excitation"].values if loop is None else chosen["loop"].values["reference"]
     return SimulatedSource(
         system=chosen["system"].options,
         excitation=located(chosen["excitation"].options, folder) if loop is None else None,
         sampling=chosen["sampling"].options,
         noise=chosen["noise"].options if "noise" in chosen else None,
-        seed=spec.monte_carlo.seed,
+        seed=_seed(spec),
         input_sha256=pinned.get("sha256"),
         loop=None if loop is None else dataclasses.replace(loop, reference=located(loop.reference, folder)),
     )
+
+
+def _seed(spec: Spec) -> int:
+    """The seed; any one will do where nothing is random."""
+    return 0 if spec.monte_carlo is None else spec.monte_carlo.seed
 
 
 def _measuring(spec: Spec) -> Measuring:
@@ -264,11 +268,8 @@ def _measuring(spec: Spec) -> Measuring:
 
 def _of_signal(chosen: Mapping[str, Variant], spec: Spec, measuring: Measuring) -> SignalSource:
     """Source of the data sets of one combination of the sections' variants."""
-    assert spec.monte_carlo is not None
     disturbance = chosen["disturbance"].options if "disturbance" in chosen else None
-    return SignalSource(
-        chosen["signal"].options, disturbance, chosen["sampling"].options, spec.monte_carlo.seed, measuring
-    )
+    return SignalSource(chosen["signal"].options, disturbance, chosen["sampling"].options, _seed(spec), measuring)
 
 
 def _estimator_cell(name: str, variant: Variant, names: Mapping[KeyPath, str]) -> EstimatorCell:

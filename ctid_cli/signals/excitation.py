@@ -255,6 +255,8 @@ class Step(Excitation):
     """
 
     kind: ClassVar[str] = "step"
+    #: No random number is drawn.
+    deterministic: ClassVar[bool] = True
 
     amplitude: float = 1.0
     time: float = 0.0
@@ -299,6 +301,8 @@ class InputFile(Excitation):
     """
 
     kind: ClassVar[str] = "file"
+    #: No random number is drawn.
+    deterministic: ClassVar[bool] = True
 
     file: str
     time: str = "t"

@@ -74,6 +74,8 @@ class RegularSampling(Sampling):
     """
 
     kind: ClassVar[str] = "regular"
+    #: No random number is drawn.
+    deterministic: ClassVar[bool] = True
 
     interval: float
     samples: int = field(metadata={"geometric": True})

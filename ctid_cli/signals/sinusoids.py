@@ -207,6 +207,8 @@ class SineDisturbance:
     """
 
     kind: ClassVar[str] = "sine"
+    #: No random number is drawn.
+    deterministic: ClassVar[bool] = True
 
     amplitude: float
     frequency: float

@@ -2,85 +2,82 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.kinds import KINDS
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.dataset import LoopOptions, located
-from ctid_cli.specification.sections import Complaint, Section, Variant, grouped, variants
+from ctid_cli.specification.messages import Complaint
+from ctid_cli.specification.sections import Section, Variant, over, variants
 from ctid_cli.specification.signal_checks import signal_complaints, signal_warnings, world_complaints
+from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.start_points import additive_form
 from ctid_cli.specification.start_sections import RelativeStart, StartsSection, UniformStart
 from ctid_cli.specification.yaml_source import KeyPath
 
-if TYPE_CHECKING:
-    from ctid_cli.specification.spec import Spec
-
 #: Samples, or clock periods of the input, of the longest record; ten times this would not fit in memory.
 MAX_SAMPLES = 10_000_000
-#: Combinations that are tried out when a specification is checked, of sections whose faults show only together.
+#: Combinations that are tried when a specification is checked, of sections whose faults show only together.
 MAX_TRIALS = 64
 
-Failure = tuple[KeyPath, str, Mapping[KeyPath, Any]]
 
-
+@dataclass(frozen=True, eq=False)
 class _Extent:
     """How long a record is, and how many of its samples are left after a delay."""
 
-    def __init__(self, combination: Mapping[KeyPath, Any], interval: float, samples: int, times: Any = None) -> None:
-        self.combination = combination
-        self.duration = interval * (samples - 1)
-        self._interval = interval
-        self._samples = samples
-        self._times = times
+    interval: float
+    samples: int
+    #: Instants of the samples of a measured record [s].
+    times: Array | None = None
+    sampling: Any = None
+
+    @property
+    def duration(self) -> float:
+        return self.interval * (self.samples - 1)
 
     def samples_after(self, delay: float) -> int:
-        if self._times is not None:
-            return int(np.count_nonzero(self._times >= delay))
-        return max(self._samples - math.ceil(delay / self._interval), 0)
+        if self.times is not None:
+            return int(np.count_nonzero(self.times >= delay))
+        return max(self.samples - math.ceil(delay / self.interval), 0)
 
 
 def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool) -> Iterator[Complaint]:
     """What the sections of a specification have against each other."""
     yield from world_complaints(spec, broken)
+    samplings = variants(spec.sampling)
+    key = "duration" if hasattr(spec.sampling, "duration") else "samples"
+    too_long = over({(): samplings}, partial(_too_long, ("sampling", key)))
     if spec.signal is not None:
-        too_long = list(too_long_complaints(variants(spec.sampling) if spec.sampling is not None else []))
         yield from too_long or signal_complaints(spec)
         return
-    extents = _extents(spec) if files_are_good else []
-    estimators = {
-        name: section
-        for name, section in spec.estimators.items()
-        if getattr(section, "kind", None) not in KINDS["frequency_estimator"]
-    }
-    for name, section in estimators.items():
+    extents = _extents(spec, samplings) if files_are_good else []
+    for name, section in spec.estimators.items():
+        if section.kind in KINDS["frequency_estimator"]:
+            continue
+        at = ("estimators", name)
         cases = variants(section)
-        failures = [
-            (("estimators", name, *path), message, {**variant.swept, **extent.combination})
-            for variant in cases
-            for extent in extents
-            for path, message in _record_complaints(variant.options, extent)
-        ]
-        yield from grouped(failures, len(cases) * len(extents))
+        yield from over({(): cases, ("sampling",): extents}, partial(_of_record, at))
         if spec.loop is None and not broken & {"loop", "data", "excitation"}:
-            yield from grouped(_instrument_failures(name, cases), len(cases))
+            yield from over({(): cases}, partial(_of_instruments, at))
         if spec.starts is not None:
-            yield from grouped(_delay_failures(spec.starts, name, cases), len(cases))
+            yield from over({(): cases}, partial(_of_delays, name, spec.starts.delays))
     if spec.starts is not None:
-        yield from _start_complaints(spec, spec.starts)
+        yield from _start_complaints(spec, spec.starts, broken)
     yield from _success_complaints(spec)
     if spec.loop is not None and spec.data is None:
         yield from _loop_complaints(spec, spec.loop)
     if files_are_good:
-        yield from _simulation_complaints(spec, extents)
+        yield from too_long or _simulation_complaints(spec, extents)
 
 
 def joint_warnings(spec: Spec) -> list[Complaint]:
@@ -90,18 +87,7 @@ def joint_warnings(spec: Spec) -> list[Complaint]:
     warnings: list[Complaint] = []
     if spec.system is not None and spec.sampling is not None:
         fastest = float(np.abs(variants(spec.system)[0].options.poles).max(initial=0.0))
-        slow = []
-        cases = variants(spec.sampling)
-        for variant in cases:
-            interval = _mean_interval(variant.options)
-            if interval * fastest > math.pi:
-                key: KeyPath = ("sampling", "interval") if hasattr(variant.options, "interval") else ("sampling",)
-                message = (
-                    f"sampling every {interval:g} s is slower than twice the fastest pole ({fastest:.4g} rad/s, "
-                    f"{fastest / (2 * math.pi):.4g} Hz): intervals below {math.pi / fastest:.4g} s see it"
-                )
-                slow.append((key, message, variant.swept))
-        warnings += grouped(slow, len(cases))
+        warnings += over({(): variants(spec.sampling)}, partial(_slow, fastest))
     if spec.data is not None and spec.monte_carlo is not None and spec.monte_carlo.runs > 1:
         warnings.append((("monte_carlo", "runs"), "a measured record is one data set; it is run once"))
     if spec.starts is not None:
@@ -118,27 +104,40 @@ def joint_warnings(spec: Spec) -> list[Complaint]:
 # Length of the records
 
 
-def _extents(spec: Spec) -> list[_Extent]:
+def _extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
     if spec.measured is not None:
         record = spec.measured.dataset(0).record
         interval = record.duration / max(record.n_samples - 1, 1)
-        return [_Extent({}, interval, record.n_samples, (record.t - record.t[0])[record.valid])]
+        return [Variant({}, {}, _Extent(interval, record.n_samples, (record.t - record.t[0])[record.valid]))]
     return [
         # Random intervals stand for themselves at their mean.
-        _Extent(_prefixed(("sampling",), variant.swept), _mean_interval(variant.options), variant.options.samples)
-        for variant in (variants(spec.sampling) if spec.sampling is not None else [])
+        Variant({}, case.swept, _Extent(_mean_interval(case.options), case.options.samples, sampling=case.options))
+        for case in samplings
     ]
-
-
-def _prefixed(section: KeyPath, combination: Mapping[KeyPath, Any]) -> dict[KeyPath, Any]:
-    return {(*section, *path): value for path, value in combination.items()}
 
 
 def _mean_interval(sampling: Any) -> float:
     return float(sampling.interval) if hasattr(sampling, "interval") else 0.5 * float(sampling.low + sampling.high)
 
 
-def _record_complaints(options: Any, extent: _Extent) -> Iterator[Complaint]:
+def _slow(fastest: float, sampling: Any) -> Iterator[Complaint]:
+    interval = _mean_interval(sampling)
+    if interval * fastest > math.pi:
+        key: KeyPath = ("sampling", "interval") if hasattr(sampling, "interval") else ("sampling",)
+        yield (
+            key,
+            f"sampling every {interval:g} s is slower than twice the fastest pole ({fastest:.4g} rad/s, "
+            f"{fastest / (2 * math.pi):.4g} Hz): intervals below {math.pi / fastest:.4g} s see it",
+        )
+
+
+def _too_long(at: KeyPath, sampling: Any) -> Iterator[Complaint]:
+    if sampling.samples > MAX_SAMPLES:
+        yield at, f"more than {MAX_SAMPLES} samples in a record are not supported"
+
+
+def _of_record(at: KeyPath, options: Any, extent: _Extent) -> Iterator[Complaint]:
+    """Say that an estimator has too few samples of a record."""
     bounds = getattr(options, "delay_bounds", None)
     key = "delay" if bounds is None else "delay_bounds"
     latest = float(getattr(options, "delay", 0.0) if bounds is None else bounds[1])
@@ -148,14 +147,14 @@ def _record_complaints(options: Any, extent: _Extent) -> Iterator[Complaint]:
     total, left = extent.samples_after(0.0), extent.samples_after(latest)
     if latest >= extent.duration and latest > 0:
         yield (
-            (key,),
+            (*at, key),
             f"a delay of {latest:g} s is not shorter than the record ({extent.duration:g} s), so no sample would be "
             "left to use; lower it, or take more samples",
         )
     elif left <= parameters:
         masked = f" after the first {latest:g} s" if left < total else ""
         yield (
-            (),
+            at,
             f"{left} samples{masked} are too few for {parameters} parameters; "
             "take more samples, fewer poles or zeros, or a smaller largest delay",
         )
@@ -165,38 +164,36 @@ def _record_complaints(options: Any, extent: _Extent) -> Iterator[Complaint]:
 # Estimators, starts and success
 
 
-def _instrument_failures(name: str, cases: Sequence[Variant]) -> Iterator[Failure]:
-    for variant in cases:
-        if getattr(variant.options, "instruments", None) == "closed_loop":
-            message = (
-                "closed-loop instruments are made of the reference and the controller, and both are missing: give "
-                "loop to simulate, or data.reference and loop.controller for a measured record"
-            )
-            yield ("estimators", name, "instruments"), message, variant.swept
+def _of_instruments(at: KeyPath, options: Any) -> Iterator[Complaint]:
+    if getattr(options, "instruments", None) == "closed_loop":
+        yield (
+            (*at, "instruments"),
+            "closed-loop instruments are made of the reference and the controller, and both are missing: give "
+            "loop to simulate, or data.reference and loop.controller for a measured record",
+        )
 
 
-def _delay_failures(starts: StartsSection, name: str, cases: Sequence[Variant]) -> Iterator[Failure]:
-    for variant in cases:
-        if not (variant.options.start_from == "delay" and hasattr(variant.options, "delay_bounds")):
-            continue
-        low, high = variant.options.delay_bounds
-        for k, point in enumerate(starts.delays):
-            ends = point.uniform if isinstance(point, UniformStart) else [point]
-            outside = [end for end in ends if not low <= end <= high]
-            if outside:
-                message = f"{outside[0]:g} s is outside the delay bounds [{low:g}, {high:g}] s of estimator {name!r}"
-                yield ("starts", "initial_delay", k), message, variant.swept
+def _of_delays(name: str, delays: Sequence[float | UniformStart], options: Any) -> Iterator[Complaint]:
+    if options.start_from != "delay" or not hasattr(options, "delay_bounds"):
+        return
+    low, high = options.delay_bounds
+    for k, point in enumerate(delays):
+        ends = point.uniform if isinstance(point, UniformStart) else [point]
+        outside = [end for end in ends if not low <= end <= high]
+        if outside:
+            message = f"{outside[0]:g} s is outside the delay bounds [{low:g}, {high:g}] s of estimator {name!r}"
+            yield ("starts", "initial_delay", k), message
 
 
-def _start_complaints(spec: Spec, starts: StartsSection) -> Iterator[Complaint]:
+def _start_complaints(spec: Spec, starts: StartsSection, broken: frozenset[str]) -> Iterator[Complaint]:
     random = [k for k, point in enumerate(starts.delays) if isinstance(point, UniformStart)]
-    if spec.data is not None and random and spec.monte_carlo is None:
+    if random and spec.monte_carlo is None and "monte_carlo" not in broken:
         yield ("starts", "initial_delay", random[0]), "a random start needs a seed; add monte_carlo: {runs: 1, seed: 1}"
     drawn = [k for k, parameters in enumerate(starts.parameter_sets) if isinstance(parameters, RelativeStart)]
     for k, parameters in enumerate(starts.parameter_sets):
         path = ("starts", "parameters", k)
         if not isinstance(parameters, RelativeStart):
-            yield from _structure_complaints(spec, path, variants(parameters)[0].options)
+            yield from _structure_complaints(spec, path, parameters.options())
         elif k != drawn[0]:
             continue  # all of them have the structure of the system
         elif spec.data is not None:
@@ -213,31 +210,27 @@ def _start_complaints(spec: Spec, starts: StartsSection) -> Iterator[Complaint]:
 def _structure_complaints(spec: Spec, path: KeyPath, model: AdditiveModel) -> Iterator[Complaint]:
     """Say which estimators cannot start from a model."""
     for name, section in spec.estimators.items():
-        cases = variants(section)
-        failures = [
-            (path, f"{message} of estimator {name!r}", variant.swept)
-            for variant in cases
-            if getattr(variant.options, "start_from", None) == "parameters"
-            for message in _mismatch(model, variant.options)
-        ]
-        yield from grouped(failures, len(cases))
+        yield from over({(): variants(section)}, partial(_of_structure, name, model, path))
 
 
-def _mismatch(model: AdditiveModel, options: Any) -> Iterator[str]:
-    """Say that a start has another structure than the estimator."""
+def _of_structure(name: str, model: AdditiveModel, path: KeyPath, options: Any) -> Iterator[Complaint]:
+    if options.start_from != "parameters":
+        return
     if hasattr(options, "terms"):
         if model.terms != tuple(options.terms):
             yield (
+                path,
                 f"the start has the submodels {_terms_text(model.terms)}, which are not, in this order, the terms "
-                f"{_terms_text(options.terms)}"
+                f"{_terms_text(options.terms)} of estimator {name!r}",
             )
         return
     fraction = unfactored(model)
     zeros = fraction.numerator.size - 1
     if fraction.order != options.poles or zeros > options.zeros:
         yield (
+            path,
             f"the start has {fraction.order} poles and {zeros} zeros as one fraction, which are not the "
-            f"{options.poles} poles and {options.zeros} zeros"
+            f"{options.poles} poles and {options.zeros} zeros of estimator {name!r}",
         )
 
 
@@ -250,18 +243,19 @@ def _terms_text(terms: Sequence[Term]) -> str:
 
 
 def _success_complaints(spec: Spec) -> Iterator[Complaint]:
-    if spec.success is None:
+    rule, other = spec.success, "use fit_percent, or leave it out"
+    if rule is None:
         return
-    if spec.success.delay_relative_error is not None:
+    if rule.delay_relative_error is not None:
         path = ("success", "delay_relative_error")
         if spec.data is not None:
-            yield path, "the true delay of a measured record is not known; use fit_percent, or leave it out"
+            yield path, f"the true delay of a measured record is not known; {other}"
         elif spec.system is not None and 0.0 in np.atleast_1d(spec.system.delay):
-            yield path, "a relative error needs a true delay above zero; use fit_percent, or leave it out"
-    if spec.success.parameter_relative_error is not None:
+            yield path, f"a relative error needs a true delay above zero; {other}"
+    if rule.parameter_relative_error is not None:
         path = ("success", "parameter_relative_error")
         if spec.data is not None:
-            yield path, "the parameters of a measured record are not known; use fit_percent, or leave it out"
+            yield path, f"the parameters of a measured record are not known; {other}"
         elif spec.system is not None:
             model = variants(spec.system)[0].options
             if not isinstance(model, AdditiveModel):
@@ -277,118 +271,85 @@ def _success_complaints(spec: Spec) -> Iterator[Complaint]:
 
 def _loop_complaints(spec: Spec, section: Section) -> Iterator[Complaint]:
     """What noise, sampling and system have against a loop."""
-    noises = variants(spec.noise) if spec.noise is not None else []
-    ratio = [
-        (
-            ("noise", "snr_db"),
-            "in a loop the noise feeds back into the output, so no output is known before it; give the noise's "
-            "variance" + (", or its innovation_variance" if variant.options.coloured else ""),
-            {} if ("snr_db",) in variant.swept else variant.swept,
-        )
-        for variant in noises
-        if variant.options.snr_db is not None
-    ]
-    yield from grouped(ratio, len(noises))
-    samplings = variants(spec.sampling) if spec.sampling is not None else []
+    yield from over({(): variants(spec.noise)}, _of_ratio)
+    samplings = variants(spec.sampling)
     if any(not hasattr(variant.options, "interval") for variant in samplings):
         yield (
             ("sampling", "kind"),
             "must be regular in a loop: the controller is discrete and acts at every sample, at equal intervals",
         )
         return
-    if spec.system is None:
-        return
-    intervals = {variant.options.interval: variant for variant in samplings}
-    pairs = list(itertools.product(variants(spec.system), variants(section), intervals.values()))[:MAX_TRIALS]
-    failures = []
-    for system, loop, sampling in pairs:
-        message = _unstable(system.options, loop.options, sampling.options.interval)
-        if message:
-            interval: dict[KeyPath, Any] = {path: v for path, v in sampling.swept.items() if path == ("interval",)}
-            combination = {
-                **_prefixed(("system",), system.swept),
-                **_prefixed(("loop",), loop.swept),
-                **_prefixed(("sampling",), interval),
-            }
-            failures.append((("loop", "controller"), message, combination))
-    yield from grouped(failures, len(pairs))
+    clocks = {}
+    for case in samplings:  # how many samples there are makes no difference
+        swept: dict[KeyPath, Any] = {path: value for path, value in case.swept.items() if path == ("interval",)}
+        clocks[case.options.interval] = Variant({}, swept, case.options)
+    parts: dict[KeyPath, list[Variant]] = {("system",): variants(spec.system), ("loop",): variants(section)}
+    parts["sampling",] = list(clocks.values())
+    yield from over(parts, _of_stability, MAX_TRIALS)
 
 
-def _unstable(system: Any, loop: LoopOptions, interval: float) -> str:
-    """Why a loop cannot be simulated; empty if it can."""
+def _of_ratio(noise: Any) -> Iterator[Complaint]:
+    if noise.snr_db is not None:
+        yield (
+            ("noise", "snr_db"),
+            "in a loop the noise feeds back into the output, so no output is known before it; give the noise's "
+            "variance" + (", or its innovation_variance" if noise.coloured else ""),
+        )
+
+
+def _of_stability(system: Any, loop: LoopOptions, sampling: Any) -> Iterator[Complaint]:
+    """Say why a loop cannot be simulated."""
     from ctid_cli.filtering.loop import loop_radius
 
+    path, interval = ("loop", "controller"), sampling.interval
     try:
         with np.errstate(all="ignore"):
             radius = loop_radius(system, loop.controller, interval)
     except DataError as error:
-        return str(error)
-    except np.linalg.LinAlgError:
-        return (
-            f"the loop cannot be simulated: its numbers overflow at intervals of {interval:g} s; scale the coefficients"
-        )
-    if radius < 1.0:
-        return ""
-    return (
-        f"the loop of the true system and this controller is unstable: at intervals of {interval:g} s its largest pole "
-        f"has the magnitude {radius:.6g}, which must be below 1; lower the gain"
-    )
-
-
-def too_long_complaints(samplings: Sequence[Variant]) -> Iterator[Complaint]:
-    """Say that a record has too many samples."""
-    too_long: list[Failure] = [
-        (
-            ("sampling", "duration" if "duration" in variant.values else "samples"),
-            f"more than {MAX_SAMPLES} samples in a record are not supported",
-            {},
-        )
-        for variant in samplings
-        if variant.options.samples > MAX_SAMPLES
-    ]
-    yield from grouped(too_long, 1)
-
-
-def _simulation_complaints(spec: Spec, extents: Sequence[_Extent]) -> Iterator[Complaint]:
-    """What the sections that data are simulated from have against each other."""
-    samplings = variants(spec.sampling) if spec.sampling is not None else []
-    too_long = list(too_long_complaints(samplings))
-    if too_long:
-        yield from too_long
+        yield path, str(error)
         return
-    if spec.system is not None:
-        delays = variants(spec.system)
-        late = [
-            (
-                ("system", "delay"),
-                f"a delay of {variant.options.delay:g} s is not shorter than the record ({extent.duration:g} s); "
-                "the output would be noise alone",
-                {**_prefixed(("system",), variant.swept), **extent.combination},
-            )
-            for variant in delays
-            for extent in extents
-            if variant.options.delay >= extent.duration
-        ]
-        yield from grouped(late, len(delays) * len(extents))
+    except np.linalg.LinAlgError:
+        overflow = f"its numbers overflow at intervals of {interval:g} s; scale the coefficients"
+        yield path, f"the loop cannot be simulated: {overflow}"
+        return
+    if not radius < 1.0:
+        yield (
+            path,
+            f"the loop of the true system and this controller is unstable: at intervals of {interval:g} s its largest "
+            f"pole has the magnitude {radius:.6g}, which must be below 1; lower the gain",
+        )
+
+
+def _simulation_complaints(spec: Spec, extents: Sequence[Variant]) -> Iterator[Complaint]:
+    """What the sections that data are simulated from have against each other."""
+    yield from over({("system",): variants(spec.system), ("sampling",): extents}, _of_delay)
     if spec.generator is None:
         return
     place, section = spec.generator
-    generators = variants(section)
+    seed = spec.monte_carlo.seed if spec.monte_carlo is not None else 0
+
     # Some faults show only where an excitation meets a sampling scheme: a step after the end, a tone that the clock
     # cannot carry. One data set of each pair tells; pairs beyond the first ones repeat what these say.
-    failures: list[Failure] = []
-    pairs = list(itertools.product(generators, zip(samplings, extents, strict=False)))[:MAX_TRIALS]
-    seed = spec.monte_carlo.seed if spec.monte_carlo is not None else 0
-    for generator, (sampling, extent) in pairs:
-        combination = {**_prefixed(place, generator.swept), **extent.combination}
-        clock = getattr(generator.options, "clock_period", None)
+    def tried(excitation: Any, extent: _Extent) -> Iterator[Complaint]:
+        clock = getattr(excitation, "clock_period", None)
         if clock is not None and extent.duration / clock > MAX_SAMPLES:
             message = f"a record of {extent.duration:g} s has more than {MAX_SAMPLES} clock periods of {clock:g} s"
-            failures.append(((*place, "clock_period"), message, combination))
-            continue
+            yield (*place, "clock_period"), message
+            return
         try:
-            times = sampling.options.times(stream(seed, "sampling", 0))
-            located(generator.options, spec.folder).generate(times, stream(seed, "input", 0))
+            times = extent.sampling.times(stream(seed, "sampling", 0))
+            located(excitation, spec.folder).generate(times, stream(seed, "input", 0))
         except DataError as error:
-            failures.append((place, str(error), combination))
-    yield from grouped(failures, len(pairs))
+            yield place, str(error)
+
+    if spec.data is None:
+        yield from over({place: variants(section), ("sampling",): extents}, tried, MAX_TRIALS)
+
+
+def _of_delay(system: Any, extent: _Extent) -> Iterator[Complaint]:
+    if system.delay >= extent.duration:
+        yield (
+            ("system", "delay"),
+            f"a delay of {system.delay:g} s is not shorter than the record ({extent.duration:g} s); "
+            "the output would be noise alone",
+        )

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
 
 import numpy as np
 
-from ctid_cli.errors import DataError, OptionError
+from ctid_cli.errors import DataError
 from ctid_cli.frequency.drem_window import DremWindow
 from ctid_cli.frequency.esprit import Esprit
 from ctid_cli.kinds import KINDS
 from ctid_cli.signals.sampling import RegularSampling
-from ctid_cli.signals.sinusoids import SineDisturbance
+from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
 from ctid_cli.simulation.frequency_measures import true_frequencies
-from ctid_cli.specification.sections import Complaint, Variant, grouped, variants
+from ctid_cli.specification.messages import Complaint
+from ctid_cli.specification.sections import over, variants
+from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.yaml_source import KeyPath
-
-if TYPE_CHECKING:
-    from ctid_cli.specification.spec import Spec
-
-Failure = tuple[KeyPath, str, Mapping[KeyPath, Any]]
 
 #: Success rules of systems and of signals.
 _OF_SYSTEMS = ("delay_relative_error", "fit_percent", "parameter_relative_error")
@@ -35,7 +32,7 @@ def world_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
     if not on_signal and ("signal" in broken or (spec.system is None and spec.data is None)):
         return
     for name, section in spec.estimators.items():
-        kind = str(getattr(section, "kind"))  # noqa: B009 - every section of an estimator has one
+        kind = section.kind
         if on_signal and kind not in KINDS["frequency_estimator"]:
             message = f"{kind} identifies a system from its input and output, and this experiment has a signal"
             yield ("estimators", name, "kind"), f"{message}; allowed: {', '.join(KINDS['frequency_estimator'])}"
@@ -52,96 +49,90 @@ def world_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
 
 def signal_complaints(spec: Spec) -> Iterator[Complaint]:
     """What the sections of an experiment on a signal have against each other."""
-    clocks = variants(spec.sampling) if spec.sampling is not None else []
+    clocks = variants(spec.sampling)
     if any(not isinstance(clock.options, RegularSampling) for clock in clocks):
         yield ("sampling", "kind"), "must be regular: estimators of frequencies compare samples at fixed delays"
         return
-    signals = variants(spec.signal) if spec.signal is not None else []
-    pairs = list(itertools.product(signals, clocks))
-    yield from grouped([failure for pair in pairs for failure in _of_clock(spec, *pair)], len(pairs))
-    disturbances = [None] if spec.disturbance is None else [case.options for case in variants(spec.disturbance)]
+    signals = variants(spec.signal)
+    yield from over({("signal",): signals, ("sampling",): clocks}, partial(_of_clock, spec))
+    disturbances = [case.options for case in variants(spec.disturbance)] or [None]
     for name, section in spec.estimators.items():
-        if str(getattr(section, "kind")) not in KINDS["frequency_estimator"]:  # noqa: B009
+        if section.kind not in KINDS["frequency_estimator"]:
             continue
+        at = ("estimators", name)
         cases = variants(section)
-        failures: list[Failure] = []
-        for case, clock in itertools.product(cases, clocks):
-            combination = {**case.swept, **_prefixed("sampling", clock.swept)}
-            for path, message in _of_estimator(case.options, clock.options):
-                failures.append((("estimators", name, *path), message, combination))
-        yield from grouped(failures, len(cases) * len(clocks))
-        for case in cases[:1] if not signals else cases:
-            if signals and not _fits(case.options, signals[0].options, disturbances):
-                count = len(signals[0].options.tones)
-                sine = any(isinstance(item, SineDisturbance) for item in disturbances)
-                more = ", or one more for the sinusoid that disturbs it" if sine else ""
-                message = f"must be {count}, as many as the signal has{more}, not {case.options.tones}"
-                yield ("estimators", name, "tones"), message
-                break
+        yield from over({(): cases, ("sampling",): clocks}, partial(_of_estimator, at))
+        yield from over({(): cases, ("signal",): signals[:1]}, partial(_of_tones, at, disturbances))
 
 
 def signal_warnings(spec: Spec) -> list[Complaint]:
     """What is allowed but unwise in an experiment on a signal."""
-    if spec.signal is None:
-        return []
     signal = variants(spec.signal)[0].options
-    clocks = variants(spec.sampling) if spec.sampling is not None else []
     warnings: list[Complaint] = []
     for name, section in spec.estimators.items():
         cases = variants(section)
-        aliased = [
-            (
-                ("estimators", name, "h"),
-                f"with h = {case.options.h:g} s, frequencies above pi/h = {math.pi / case.options.h:.4g} rad/s are "
-                f"seen as lower ones, and the signal has {signal.highest_frequency:g} rad/s",
-                case.swept,
-            )
-            for case in cases
-            if hasattr(case.options, "h") and signal.highest_frequency > math.pi / case.options.h
-        ]
-        warnings += grouped(aliased, len(cases))
-        rounded = [
-            (("estimators", name, "h"), note, {**case.swept, **_prefixed("sampling", clock.swept)})
-            for case, clock in itertools.product(cases, clocks)
-            if case.options.online
-            for note in case.options.start(clock.options.interval).notes
-        ]
-        warnings += grouped(rounded, len(cases) * len(clocks))
+        at = ("estimators", name)
+        warnings += over({(): cases}, partial(_aliased, at, signal.highest_frequency))
+        warnings += over({(): cases, ("sampling",): variants(spec.sampling)}, partial(_rounded, at))
         if not cases[0].options.online and signal.frequency_steps:
-            message = "gives one estimate of the whole record, in which a frequency steps"
-            warnings.append((("estimators", name, "kind"), message))
+            warnings.append(((*at, "kind"), "gives one estimate of the whole record, in which a frequency steps"))
     return warnings
 
 
-def _of_clock(spec: Spec, signal: Variant, clock: Variant) -> Iterator[Failure]:
-    combination = {**_prefixed("signal", signal.swept), **_prefixed("sampling", clock.swept)}
-    interval = float(clock.options.interval)
-    duration = interval * clock.options.samples
-    highest = signal.options.highest_frequency
+def _aliased(at: KeyPath, highest: float, options: Any) -> Iterator[Complaint]:
+    if hasattr(options, "h") and highest > math.pi / options.h:
+        yield (
+            (*at, "h"),
+            f"with h = {options.h:g} s, frequencies above pi/h = {math.pi / options.h:.4g} rad/s are seen as lower "
+            f"ones, and the signal has {highest:g} rad/s",
+        )
+
+
+def _rounded(at: KeyPath, options: Any, clock: RegularSampling) -> Iterator[Complaint]:
+    for note in options.start(clock.interval).notes if options.online else ():
+        yield (*at, "h"), note
+
+
+def _of_tones(at: KeyPath, disturbances: list[Any], options: Any, signal: SumOfSinusoids) -> Iterator[Complaint]:
+    try:
+        for disturbance in disturbances:
+            true_frequencies(signal, disturbance, options.tones, np.zeros(1))
+    except ValueError:
+        sine = any(isinstance(item, SineDisturbance) for item in disturbances)
+        more = ", or one more for the sinusoid that disturbs it" if sine else ""
+        message = f"must be {len(signal.tones)}, as many as the signal has{more}, not {options.tones}"
+        yield (*at, "tones"), message
+
+
+def _of_clock(spec: Spec, signal: SumOfSinusoids, clock: RegularSampling) -> Iterator[Complaint]:
+    interval = float(clock.interval)
+    duration = interval * clock.samples
+    highest = signal.highest_frequency
     if highest >= math.pi / interval:
         message = f"samples every {interval:g} s show frequencies below {math.pi / interval:.4g} rad/s, and the signal "
-        yield ("sampling", "interval"), f"{message}has {highest:g} rad/s", combination
-    for step in signal.options.steps:
+        yield ("sampling", "interval"), f"{message}has {highest:g} rad/s"
+    for step in signal.steps:
         if step >= duration - interval:
             message = f"a step at {step:g} s comes after the last sample, at {duration - interval:g} s"
-            yield ("signal", "tones"), message, combination
+            yield ("signal", "tones"), message
     if spec.tracks is not None:
         if spec.tracks.interval < interval * (1.0 - 1e-9) or spec.tracks.interval > duration:
             message = f"must lie between the sampling interval, {interval:g} s, and the length of the record, "
-            yield ("tracks", "interval"), f"{message}{duration:g} s", combination
+            yield ("tracks", "interval"), f"{message}{duration:g} s"
         window = spec.tracks.window
         if window is not None and (window[1] > duration * (1 + 1e-9) or window[1] - window[0] < interval):
-            message = f"must hold samples of the record, which ends at {duration:g} s"
-            yield ("tracks", "window"), message, combination
+            yield ("tracks", "window"), f"must hold samples of the record, which ends at {duration:g} s"
     by = None if spec.success is None else spec.success.by
     if by is not None and by > duration:
-        yield ("success", "by"), f"{by:g} s come after the end of the record, {duration:g} s", combination
+        yield ("success", "by"), f"{by:g} s come after the end of the record, {duration:g} s"
 
 
-def _of_estimator(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
-    if not options.online:
-        yield from _of_batch(options, clock)
-        return
+def _of_estimator(at: KeyPath, options: Any, clock: RegularSampling) -> Iterator[Complaint]:
+    for path, message in (_of_online if options.online else _of_batch)(options, clock):
+        yield (*at, *path), message
+
+
+def _of_online(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
     duration = clock.interval * clock.samples
     # First of all, since the estimator would keep all the samples of such a time.
     for name in ("prefilter", "difference", "d", "hold", *(("memory",) if options.kind == DremWindow.kind else ())):
@@ -153,18 +144,16 @@ def _of_estimator(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
     filled = 2 * options.tones * getattr(options, "h", 0.0) + rows * getattr(options, "d", 0.0)
     filled += getattr(options, "prefilter", 0.0) + getattr(options, "difference", 0.0)
     if filled >= duration:
-        yield (
-            ("h",),
-            f"its delays are filled after {filled:g} s, and the record ends at {duration:g} s; take a smaller h",
-        )
+        message = f"its delays are filled after {filled:g} s, and the record ends at {duration:g} s; take a smaller h"
+        yield ("h",), message
         return
     try:
         with np.errstate(all="ignore"):
             options.start(clock.interval)
-    except OptionError as error:
-        yield ((error.field,) if hasattr(options, error.field) else ()), str(error)
     except ArithmeticError:
         yield (), "these values are too large or too small to compute with"
+    except ValueError as error:
+        yield _field(error, options), str(error)
 
 
 def _of_batch(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
@@ -172,26 +161,17 @@ def _of_batch(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
     if initial is not None:
         highest = math.pi / clock.interval
         if max(initial) >= highest:
-            yield (
-                ("initial_frequencies",),
-                f"initial_frequencies must be below {highest:.4g} rad/s, pi over the sampling interval",
-            )
+            message = f"initial_frequencies must be below {highest:.4g} rad/s, pi over the sampling interval"
+            yield ("initial_frequencies",), message
         return
     start = options if isinstance(options, Esprit) else Esprit(tones=options.tones, averaging=options.averaging)
     try:
         start.blocks(clock.samples, clock.interval)
-    except (OptionError, DataError) as error:
-        yield ((error.field,) if hasattr(options, error.field) else ()), str(error)
+    except (ValueError, DataError) as error:
+        yield _field(error, options), str(error)
 
 
-def _fits(options: Any, signal: Any, disturbances: list[Any]) -> bool:
-    for disturbance in disturbances:
-        try:
-            true_frequencies(signal, disturbance, options.tones, np.zeros(1))
-        except ValueError:
-            return False
-    return True
-
-
-def _prefixed(section: str, combination: Mapping[KeyPath, Any]) -> dict[KeyPath, Any]:
-    return {(section, *path): value for path, value in combination.items()}
+def _field(error: Exception, options: Any) -> KeyPath:
+    """The option that an error is about, if it is about one of them."""
+    field = getattr(error, "field", "")
+    return (field,) if hasattr(options, field) else ()

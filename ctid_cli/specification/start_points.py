@@ -97,7 +97,7 @@ def start_points(section: StartsSection | None) -> tuple[AnyStart, ...]:
             spread = parameters.relative_uniform
             points.append(ParameterStart(f"parameters({_percent(spread)}%)", spread))
         else:
-            points.append(ParameterStart(f"given {content_hash(values)[:8]}", model=parameters.build(values)))
+            points.append(ParameterStart(f"given {content_hash(values)[:8]}", model=parameters.options()))
     return tuple(points)
 
 

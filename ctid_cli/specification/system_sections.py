@@ -2,54 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, ClassVar
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
 
+from ctid_cli.arrays import ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.specification.sections import (
-    Complaint,
-    RefusedOptionsError,
-    Section,
-    checked,
-    list_of,
-    number,
-    several_wrong,
-    swept,
-    variants,
-    whole,
-)
+from ctid_cli.specification.fields import Coefficients, NotNegative, Swept
+from ctid_cli.specification.messages import Complaint
+from ctid_cli.specification.sections import RefusedOptionsError, Section, with_key
 
 #: Highest order that the simulation handles to its stated accuracy.
 MAX_ORDER = 12
-
-_COEFFICIENTS = list_of(number(), "a list of coefficients in descending powers of s")
-_DELAY = swept(number("s", at_least=0.0))
 
 
 class SystemSection(Section):
     """The system to simulate: ``G(s) = B(s)/A(s) exp(-delay s)``, strictly proper and stable."""
 
     target: ClassVar[type | None] = TransferFunction
-    sweepable: ClassVar[frozenset[str]] = frozenset({"delay"})
 
-    numerator: Annotated[list[float], checked(_COEFFICIENTS)] = Field(
-        description="Coefficients of B in descending powers of s"
-    )
-    denominator: Annotated[list[float], checked(_COEFFICIENTS)] = Field(
-        description="Coefficients of A in descending powers of s"
-    )
-    delay: Annotated[float | list[float], checked(_DELAY)] = Field(default=0.0, description="Pure delay [s]")
+    numerator: Coefficients = Field(description="coefficients of B in descending powers of s")
+    denominator: Coefficients = Field(description="coefficients of A in descending powers of s")
+    delay: Annotated[float | list[float], Swept(NotNegative)] = Field(default=0.0, description="Pure delay [s]")
 
     def complaints(self) -> Iterator[Complaint]:
         """Say why the system cannot be simulated."""
         problems = list(super().complaints())
-        yield from problems
         if problems:
+            yield from problems
             return
         with np.errstate(all="ignore"):
             model = TransferFunction(self.numerator, self.denominator)
@@ -76,23 +60,19 @@ class SubmodelSection(Section):
 
     target: ClassVar[type | None] = Submodel
 
-    numerator: Annotated[list[float], checked(_COEFFICIENTS)] = Field(
-        description="Coefficients of B_i in descending powers of s"
+    numerator: Coefficients = Field(description="coefficients of B_i in descending powers of s")
+    denominator: Coefficients = Field(
+        description="coefficients of A_i in descending powers of s, without the integrators"
     )
-    denominator: Annotated[list[float], checked(_COEFFICIENTS)] = Field(
-        description="Coefficients of A_i in descending powers of s, without the integrators"
-    )
-    integrators: Annotated[int, checked(whole(at_least=0))] = Field(
-        default=0, description="Number l of further poles at the origin"
-    )
+    integrators: int = Field(default=0, ge=0, description="Number l of further poles at the origin")
 
     def complaints(self) -> Iterator[Complaint]:
         """Say why this is no submodel."""
         problems = list(super().complaints())
-        yield from problems
         if problems:
+            yield from problems
             return
-        submodel = variants(self)[0].options
+        submodel = self.options()
         if not (np.isfinite(submodel.numerator).all() and np.isfinite(submodel.denominator).all()):
             yield ("denominator",), "its last coefficient is too small for the others; scale the coefficients"
         elif not submodel.numerator.any():
@@ -104,36 +84,38 @@ class AdditiveSection(Section):
 
     target: ClassVar[type | None] = AdditiveModel
 
-    additive: Annotated[
-        list[SubmodelSection],
-        checked(list_of(SubmodelSection.model_validate, "a list of submodels {numerator: […], denominator: […]}")),
-    ] = Field(description="The submodels")
+    additive: Annotated[list[SubmodelSection], Field(min_length=1)] = Field(
+        description="submodels {numerator: […], denominator: […]}"
+    )
 
-    def build(self, values: Mapping[str, Any]) -> AdditiveModel:
+    def build(self) -> AdditiveModel:
         """The sum."""
-        submodels = [part.build(item) for part, item in zip(self.additive, values["additive"], strict=True)]
         try:
-            return AdditiveModel(submodels, values.get("delay", 0.0))
+            return AdditiveModel(self.part("additive"), getattr(self, "delay", 0.0))
         except DataError as error:
             raise RefusedOptionsError(("additive",), str(error)) from None
+
+
+_TWICE = "gives the system a second time, 'additive' has it already; keep one of the two forms"
 
 
 class AdditiveSystemSection(AdditiveSection):
     """The system to simulate as a sum of stable submodels, which may have integrators."""
 
-    sweepable: ClassVar[frozenset[str]] = frozenset({"delay"})
+    elsewhere = {"numerator": _TWICE, "denominator": _TWICE}  # noqa: RUF012 - of the base class
 
-    delay: Annotated[float | list[float], checked(_DELAY)] = Field(
+    delay: Annotated[float | list[float], Swept(NotNegative)] = Field(
         default=0.0, description="Pure delay [s], common to all submodels"
     )
 
     def complaints(self) -> Iterator[Complaint]:
         """Say why the system cannot be simulated."""
         problems = list(super().complaints())
-        yield from problems
         if problems:
+            yield from problems
             return
-        for k, submodel in enumerate(variants(self)[0].options.submodels):
+        for k, section in enumerate(self.additive):
+            submodel = section.options()
             if submodel.order > MAX_ORDER:
                 yield ("additive", k), f"{submodel.order} poles are too many; at most {MAX_ORDER} can be simulated"
             elif not submodel.is_stable:
@@ -142,26 +124,15 @@ class AdditiveSystemSection(AdditiveSection):
                 yield ("additive", k), f"the submodel is unstable and cannot be simulated: {_unstable(poles)}"
 
 
-def system_section(value: Any) -> Section:
-    """Check of the system, in whichever of its two forms it is given."""
-    if isinstance(value, AdditiveSystemSection):
-        return value
-    if not isinstance(value, Mapping) or "additive" not in value:
-        return SystemSection.model_validate(value)
-    twice = [name for name in ("numerator", "denominator") if name in value]
-    if twice:
-        message = "gives the system a second time, 'additive' has it already; keep one of the two forms"
-        raise several_wrong("system", [((name,), message, True) for name in twice])
-    return AdditiveSystemSection.model_validate(value)
+if TYPE_CHECKING:
+    AnySystemSection = SystemSection | AdditiveSystemSection
+else:
+    AnySystemSection = with_key("additive", AdditiveSystemSection, SystemSection)
 
 
-def _unstable(poles: np.ndarray[Any, np.dtype[np.complex128]]) -> str:
-    offending = [_complex_text(pole) for pole in poles if not pole.real < 0]
+def _unstable(poles: ComplexArray) -> str:
+    offending = [
+        f"{pole.real:.4g}{pole.imag:+.4g}j" if pole.imag else f"{pole.real:.4g}" for pole in poles if not pole.real < 0
+    ]
     noun = "pole" if len(offending) == 1 else "poles"
     return f"{noun} at {', '.join(offending)} rad/s; every pole needs a negative real part"
-
-
-def _complex_text(value: complex) -> str:
-    if value.imag == 0:
-        return f"{value.real:.4g}"
-    return f"{value.real:.4g}{value.imag:+.4g}j"

@@ -15,7 +15,7 @@ from ctid_cli.reporting.figures.finite_time_frequency import CONFIGS, DERIVED, G
 from ctid_cli.reporting.results import Results, find_results
 from ctid_cli.running.plan import Plan, build_plan
 from ctid_cli.simulation.frequency_runs import SignalSource
-from ctid_cli.specification.spec import spec_from_canonical
+from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.store import read_tracks
 from experiments.finite_time_frequency.acceptance import Check, at_most, cramer_rao, settle
 

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from ctid_cli.reporting.study import load_study
 from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.spec import load_spec
+from ctid_cli.specification.load import load_spec
 from experiments.useful_redundancy import publish
 
 ROOT = Path(__file__).resolve().parents[2]

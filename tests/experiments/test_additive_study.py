@@ -11,7 +11,7 @@ from ctid_cli.reporting.figures.additive import CONFIGS
 from ctid_cli.reporting.parameter_errors import parameter_errors
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.spec import load_spec
+from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.sealed import seal_image
 from experiments.additive import acceptance, publish
 from tests.reporting.ideal_results import ideal_results

@@ -9,7 +9,7 @@ import pytest
 from ctid_cli.reporting.figures.finite_time_frequency import CONFIGS, DERIVED
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.spec import load_spec
+from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.store import read_tracks
 from experiments.finite_time_frequency import acceptance, as_printed, measured, publish
 from experiments.finite_time_frequency.acceptance import Check

@@ -4,7 +4,7 @@ from ctid_cli.reporting.figures.finite_time_frequency import CONFIGS
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
 from ctid_cli.running.worker import Job, run_job
-from ctid_cli.specification.spec import load_spec
+from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.sealed import seal_image
 from ctid_cli.storage.version import Origin
 

@@ -5,7 +5,7 @@ import numpy as np
 from ctid_cli.reporting.parameter_theory import long_record_variances
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.spec import load_spec
+from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.manifest import Key, true_parameters
 from ctid_cli.storage.store import Stored
 from ctid_cli.storage.version import Origin

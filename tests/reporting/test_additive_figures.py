@@ -19,7 +19,7 @@ from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
-from ctid_cli.specification.spec import load_spec
+from ctid_cli.specification.load import load_spec
 from tests.reporting.ideal_results import TWO_MODES, ideal_results, plan_of
 
 METHODS = (Method("additive", "the sum"), Method("srivc", "the fraction"))

@@ -15,7 +15,7 @@ from ctid_cli.reporting.figures.registry import find_figures, require_results
 from ctid_cli.reporting.results import read_results
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.spec import load_spec
+from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.store import read_tracks
 from tests.reporting.frequency_results import config, run_here
 

@@ -7,7 +7,7 @@ from ctid_cli.reporting.percentages import experiment_rows, measures_of
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
 from ctid_cli.running.worker import failed
-from ctid_cli.specification.spec import load_spec
+from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.manifest import slots
 from ctid_cli.storage.store import Stored
 from ctid_cli.storage.version import Origin

@@ -15,7 +15,7 @@ from ctid_cli.reporting.parameter_theory import long_record_variances
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.spec import load_spec
+from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.summary import wilson_interval
 from tests.reporting.ideal_results import TWO_MODES, estimate, ideal_results, plan_of, results_of
 

@@ -19,7 +19,7 @@ from ctid_cli.signals.noise import WhiteNoise
 from ctid_cli.signals.sampling import RegularSampling, UniformIntervals
 from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.dataset import LoopOptions, MeasuredSource, SimulatedSource, file_sha256
-from ctid_cli.specification.spec import load_spec
+from ctid_cli.specification.load import load_spec
 
 MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
 SYSTEMS = {

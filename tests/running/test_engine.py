@@ -22,7 +22,7 @@ from ctid_cli.errors import DataError, RefusedError, StorageError
 from ctid_cli.running import engine, events
 from ctid_cli.running.engine import RunSummary, preview, run_experiment
 from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.spec import load_spec
+from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import folder, journal
 from ctid_cli.storage.manifest import RESULT_FIELDS, Key, slots
 from ctid_cli.storage.store import experiment_status, load_estimates

@@ -11,7 +11,7 @@ from ctid_cli.errors import DataError, UsageError
 from ctid_cli.running.plan import StartPoint, Task, build_plan
 from ctid_cli.signals.csv_file import read_record
 from ctid_cli.signals.streams import stream
-from ctid_cli.specification.spec import load_spec, spec_from_canonical
+from ctid_cli.specification.load import load_spec, spec_from_canonical
 
 SPEC = """\
 experiment: toy

@@ -26,7 +26,7 @@ from ctid_cli.simulation.frequency_measures import (
     thinned,
     unpack_track,
 )
-from ctid_cli.specification.spec import load_spec, spec_from_canonical
+from ctid_cli.specification.load import load_spec, spec_from_canonical
 from ctid_cli.storage.store import load_estimates, read_stored, read_tracks
 from ctid_cli.storage.summary import export_rows
 
@@ -231,7 +231,7 @@ from pathlib import Path
 from ctid_cli.running import events
 from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.spec import load_spec
+from ctid_cli.specification.load import load_spec
 
 def tell(event):
     if isinstance(event, events.DataSetDone):

@@ -15,7 +15,7 @@ from ctid_cli.canonical import canonical_json, content_hash
 from ctid_cli.errors import SpecError, UsageError
 from ctid_cli.kinds import KINDS, classes
 from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.spec import json_schema, load_spec, spec_from_canonical
+from ctid_cli.specification.load import json_schema, load_spec, spec_from_canonical
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
@@ -98,8 +98,10 @@ BROKEN = {
     "name with a blank": ("study/one", "study one", 1, 13, "experiment", "letters, digits"),
     "absolute name": ("study/one", "/study", 1, 13, "experiment", "letters, digits"),
     "section is a text": ("{kind: white, snr_db: [5, 15]}", "white", 8, 8, "noise", "must be a mapping"),
-    "list that cannot be swept": ("[0, 15]", "[[0, 15]]", 14, 19, "estimators.one.delay_bounds", "2 numbers [s]"),
-    "number for a list": ("numerator: [2]", "numerator: 2", 2, 21, "system.numerator", "list of coefficients"),
+    "list that cannot be swept": ("[0, 15]", "[[0, 15]]", 14, 20, "estimators.one.delay_bounds[0]",
+                                  "a number [s], not a list"),
+    "number for a list": ("numerator: [2]", "numerator: 2", 2, 21, "system.numerator",
+                          "a list, not 2: coefficients of B"),
     "empty sweep": ("[5, 15]", "[]", 8, 30, "noise.snr_db", "sweeps nothing"),
     "value twice in a sweep": ("[5, 15]", "[5, 15, 5.0]", 8, 38, "noise.snr_db[2]", "twice"),
     "bad value in a sweep": ("[5, 15]", "[5, loud]", 8, 34, "noise.snr_db[1]", "a number [dB]"),
@@ -449,7 +451,7 @@ def test_the_schema_knows_every_option_and_its_unit():
             }
     interval = schema["$defs"]["RegularSampling"]["properties"]["interval"]
     assert interval["description"] == "Sampling interval [s]."
-    assert interval["anyOf"] == [{"type": "number"}, {"type": "array", "items": {"type": "number"}}]
+    assert interval["oneOf"] == [{"type": "number"}, {"type": "array", "items": {"type": "number"}}]
     bounds = schema["$defs"]["TdSrivc"]["properties"]["delay_bounds"]
     assert (bounds["type"], bounds["minItems"], bounds["maxItems"]) == ("array", 2, 2)
 

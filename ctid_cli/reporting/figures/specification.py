@@ -5,7 +5,7 @@ from __future__ import annotations
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import Plan, build_plan
-from ctid_cli.specification.spec import load_spec
+from ctid_cli.specification.load import load_spec
 
 
 def published_plan(config: str) -> Plan:

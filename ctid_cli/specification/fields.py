@@ -1,0 +1,123 @@
+"""Types of the values in a specification: numbers, lists to sweep, and what may be written in several ways."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Union
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    Discriminator,
+    Field,
+    GetCoreSchemaHandler,
+    Tag,
+)
+from pydantic_core import CoreSchema
+
+from ctid_cli.specification.messages import HINT, TAG, several_wrong, shown, wrong
+
+#: Whole numbers beyond this fit no column of a table or archive.
+MAX_WHOLE = 2**63 - 1
+
+
+def _representable(value: int) -> int:
+    if abs(value) > MAX_WHOLE:
+        raise wrong(f"must be a whole number of at most {MAX_WHOLE}, not {value}")
+    return value
+
+
+#: -0.0 and 0.0 are one value and must have one text.
+_OneZero = AfterValidator(lambda value: value + 0.0)
+#: Finite numbers.
+Number = Annotated[float, Field(allow_inf_nan=False), _OneZero]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False), _OneZero]
+Whole = Annotated[int, AfterValidator(_representable)]
+Text = Annotated[str, Field(min_length=1)]
+Coefficients = Annotated[list[Number], Field(min_length=1)]
+
+
+def matching(pattern: str, rule: str) -> AfterValidator:
+    """Refuse a text that does not match a pattern as a whole."""
+
+    def check(value: str) -> str:
+        if not re.fullmatch(pattern, value):
+            raise wrong(f"{value!r} cannot be used here: {rule}")
+        return value
+
+    return AfterValidator(check)
+
+
+def one_of(choose: Callable[[Any], str | None], forms: Mapping[str, Any], error: str = "", allowed: str = "") -> Any:
+    """One of several forms, by the name that `choose` gives to a value; None is refused, with the error named."""
+    tagged = [Annotated[form, Tag(TAG + name)] for name, form in forms.items()]
+
+    def chosen(value: Any) -> str | None:
+        name = choose(value)
+        return None if name is None else TAG + name
+
+    named = Discriminator(
+        chosen,
+        custom_error_type=error or None,
+        custom_error_message="{allowed}" if error else None,
+        custom_error_context={"allowed": allowed} if error else None,
+    )
+    return Annotated[Any, _Union(tuple(tagged), named)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Union:
+    """Annotation of a value that has one of several tagged forms."""
+
+    forms: tuple[Any, ...]
+    named: Discriminator
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return handler.generate_schema(Annotated[Union[self.forms], self.named])  # noqa: UP007 - built at run time
+
+
+def by_shape(usual: Any, hint: str = "", **others: Any) -> Any:
+    """The usual form, or the one for a value that is a list, a mapping or a text."""
+    name = HINT.removeprefix(TAG) + f" {hint}" if hint else "usual"
+
+    def choose(value: Any) -> str:
+        kinds: dict[str, Any] = {"list": list, "text": str, "mapping": (Mapping, BaseModel)}
+        shape = next((shape for shape, kind in kinds.items() if isinstance(value, kind)), "")
+        return shape if shape in others else name
+
+    return one_of(choose, {name: usual, **others})
+
+
+@dataclass(frozen=True, eq=False)
+class Swept:
+    """Annotation of a field that may be a list of values to sweep, or a mapping that stands for such a list."""
+
+    one: Any
+    mapping: Any = None
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        several = Annotated[list[self.one], AfterValidator(_different)]  # type: ignore[name-defined]
+        spaced = {} if self.mapping is None else {"mapping": self.mapping}
+        return handler.generate_schema(by_shape(self.one, list=several, **spaced))
+
+
+def _different(values: list[Any]) -> list[Any]:
+    if not values:
+        raise wrong("an empty list sweeps nothing; give one value, or a list of at least one")
+    return without_copies(values, shown)
+
+
+def without_copies(values: list[Any], called: Callable[[Any], str] = lambda item: "this start") -> list[Any]:
+    """The values, if none is there twice."""
+    for k, item in enumerate(values):
+        if item in values[:k]:
+            raise several_wrong("list", [((k,), f"{called(item)} is in this list twice; keep one of them", False)])
+    return values
+
+
+#: Mark of a field that the canonical form leaves out at its default, so that what was stored before the field existed
+#: keeps its identity.
+LATER = "added later"

@@ -1,0 +1,144 @@
+"""From a YAML file to a checked specification; everything that is wrong with it is reported at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError, create_model
+
+from ctid_cli.errors import DataError, Problem, SpecError
+from ctid_cli.simulation.dataset import check_input_file, file_sha256, joined, located
+from ctid_cli.specification.joint_checks import joint_complaints, joint_warnings
+from ctid_cli.specification.messages import Complaint, Located, explained, shown
+from ctid_cli.specification.option_sections import EstimatorSection
+from ctid_cli.specification.sections import variants
+from ctid_cli.specification.spec import Spec
+from ctid_cli.specification.yaml_source import OVERRIDE_FILE, KeyPath, apply_overrides, path_text, read_yaml
+
+
+class _PartialSpec(Spec):
+    """What is left of a specification when the broken sections are taken out."""
+
+    @classmethod
+    def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
+        yield from ()
+
+
+# Same fields, none of them required.
+_Remainder = create_model(
+    "_Remainder", __base__=_PartialSpec, experiment=(str | None, None), estimators=(dict[str, EstimatorSection], {})
+)
+
+
+def load_spec(path: Path, overrides: Sequence[str] = ()) -> Spec:
+    """Read and check a specification.
+
+    Sampling is called slow, which is a warning and no error, if its (mean) interval exceeds pi / max |p| over the
+    poles p [rad/s] of the system: its rate is then below twice the frequency of the fastest pole.
+    """
+    source = read_yaml(Path(path))
+    apply_overrides(source, overrides)
+    tree = source.tree
+    if not isinstance(tree, dict):
+        message = f"the file must hold a mapping that begins with 'experiment: name', not {shown(tree)}"
+        raise SpecError([Problem(source.file, 1, 1, "", "the file is empty" if tree is None else message)])
+    spec, complaints = _validated(tree)
+    spec._folder = Path(path).parent
+    spec, about_files = _with_files(spec)
+    broken = frozenset(str(where[0]) for where, _, _ in complaints if where)
+    joint = joint_complaints(spec, broken, files_are_good=not about_files)
+    complaints += [(where, message, False) for where, message in (*about_files, *joint)]
+    if complaints:
+        problems = {source.problem(where, message, key=at_key) for where, message, at_key in complaints}
+        in_order = sorted(problems, key=lambda p: (p.file == OVERRIDE_FILE, p.line, p.column, p.key, p.message))
+        raise SpecError(in_order)
+    spec._warnings = tuple(str(source.problem(where, message)) for where, message in joint_warnings(spec))
+    spec._text = Path(path).read_text(encoding="utf-8-sig")
+    return spec
+
+
+def spec_from_canonical(canonical: Mapping[str, Any], folder: Path | None = None) -> Spec:
+    """A specification from its canonical form."""
+    spec, complaints = _validated(dict(canonical))
+    if complaints:
+        name = "(canonical specification)"
+        raise SpecError([Problem(name, 1, 1, path_text(path), message) for path, message, _ in complaints])
+    spec._folder = folder or Path()
+    return spec
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON Schema of specifications, for editors."""
+    schema = Spec.model_json_schema()
+    schema["anyOf"] = [
+        {"required": list(names)}
+        for names in (
+            ("data",),
+            ("system", "excitation", "sampling"),
+            ("system", "loop", "sampling"),
+            ("signal", "sampling"),
+        )
+    ]
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "ctid experiment"}
+
+
+def _validated(tree: dict[str, Any]) -> tuple[Spec, list[Located]]:
+    """A specification and what is wrong with it; if anything is, the specification is what remains without it."""
+    try:
+        return Spec.model_validate(tree), []
+    except ValidationError as error:
+        complaints = [explained(detail, {}) for detail in error.errors(include_url=False)]
+    good = {key: value for key, value in tree.items() if key in Spec.model_fields}
+    for path, _, _ in complaints:
+        if path[:1] == ("estimators",) and len(path) > 1 and isinstance(good.get("estimators"), dict):
+            good["estimators"] = {name: item for name, item in good["estimators"].items() if name != path[1]}
+        elif path:
+            good.pop(str(path[0]), None)
+    if not good.get("estimators"):
+        good.pop("estimators", None)
+    return _Remainder.model_validate(good), complaints
+
+
+def _with_files(spec: Spec) -> tuple[Spec, list[Complaint]]:
+    """The specification with content hashes filled in, and what is wrong with the files."""
+    problems: list[Complaint] = []
+    if spec.data is not None:
+        data = _pinned(spec.data, ("data",), spec.folder, problems)
+        spec = spec.model_copy(update={"data": data})
+        if not problems:
+            try:
+                if spec.measured is not None:
+                    spec.measured.dataset(0)
+            except DataError as error:
+                problems.append((("data", "file"), str(error)))
+    elif spec.generator is not None:
+        path, section = spec.generator
+        pinned = _pinned(section, path, spec.folder, problems)
+        if path == ("excitation",):
+            spec = spec.model_copy(update={"excitation": pinned})
+        elif spec.loop is not None:
+            spec = spec.model_copy(update={"loop": spec.loop.model_copy(update={"reference": pinned})})
+        if not problems and hasattr(pinned, "sha256"):
+            try:
+                check_input_file(located(variants(pinned)[0].options, spec.folder))
+            except DataError as error:
+                problems.append(((*path, "file"), str(error)))
+    return spec, problems
+
+
+def _pinned(section: Any, path: KeyPath, folder: Path, problems: list[Complaint]) -> Any:
+    """A section with the content hash of its file, if it names one; what is wrong with the file goes to `problems`."""
+    if not hasattr(section, "sha256"):
+        return section
+    file = joined(folder, section.file)
+    try:
+        content = file_sha256(file)
+    except DataError as error:
+        problems.append(((*path, "file"), str(error)))
+        return section
+    if section.sha256 not in (None, content):
+        problems.append(((*path, "sha256"), f"the SHA-256 of {file} is {content}; is it another file?"))
+        return section
+    return section.model_copy(update={"sha256": content})

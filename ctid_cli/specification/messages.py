@@ -1,0 +1,126 @@
+"""What is wrong with a value, in sentences: the one table from pydantic's errors to our own."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+
+from ctid_cli.specification.yaml_source import KeyPath
+from ctid_cli.text import did_you_mean
+
+#: Key path inside a section, and what is wrong there.
+Complaint = tuple[KeyPath, str]
+#: The same, and whether it is about the key more than about its value.
+Located = tuple[KeyPath, str, bool]
+
+#: Begins the tags of unions, which pydantic puts into the places of errors; no text from YAML holds it.
+TAG = "\0"
+#: Begins a tag that goes on with what else is allowed there.
+HINT = TAG + ";"
+
+#: Sentence for every error type that a specification can meet.
+SENTENCES = {
+    "bool_type": "must be true or false, not {shown}",
+    "float_type": "must be a number{unit}, not {shown}",
+    "finite_number": "must be a number{unit} that is finite, not {shown}",
+    "int_type": "must be a whole number{unit}, not {shown}",
+    "string_type": "must be a text, not {shown}",
+    "string_too_short": "must not be empty",
+    "literal_error": "must be one of {expected}, not {shown}",
+    "greater_than": "must be a number{unit} above {gt:.15g}, not {shown}",
+    "greater_than_equal": "must be a number{unit} of at least {ge:.15g}, not {shown}",
+    "less_than": "must be a number{unit} below {lt:.15g}, not {shown}",
+    "less_than_equal": "must be a number{unit} of at most {le:.15g}, not {shown}",
+    "list_type": "must be a list, not {shown}{meaning}",
+    "dict_type": "must be a mapping, not {shown}{meaning}",
+    "too_short": "must be a list of at least {min_length}, not {shown}{meaning}",
+    "too_long": "must be a list of at most {max_length}, not {shown}{meaning}",
+    "model_type": "must be a mapping with the keys {keys}, not {shown}",
+    "extra_forbidden": "there is no such key here{near} allowed: {keys}",
+    "missing": "is missing; add it{meaning}",
+    "no_kind": "must be one of {allowed}, not {shown}",
+    "kind_missing": "is missing; allowed: {allowed}",
+    "no_form": "must be {allowed}, not {shown}",
+}
+
+
+def wrong(message: str) -> PydanticCustomError:
+    """An error whose text reaches the user as it is."""
+    return PydanticCustomError("said", "{message}", {"message": message})
+
+
+def several_wrong(title: str, problems: Iterable[Located]) -> ValidationError:
+    """One validation error that holds several problems."""
+    details = [
+        InitErrorDetails(
+            type=PydanticCustomError("said", "{message}", {"message": message, "at_key": at_key}), loc=path, input=None
+        )
+        for path, message, at_key in problems
+    ]
+    return ValidationError.from_exception_data(title, details)
+
+
+def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Located:
+    """Place and sentence of an error in a section whose fields have the given descriptions."""
+    path = tuple(part for part in error["loc"] if not str(part).startswith(TAG) and part != "[key]")
+    kind, value, context = error["type"], error["input"], error.get("ctx", {})
+    at_key = context.get("at_key", False) or kind in ("missing", "extra_forbidden") or "[key]" in error["loc"]
+    if kind == "no_kind":
+        if isinstance(value, Mapping):
+            path, kind, value = (*path, "kind"), "no_kind" if "kind" in value else "kind_missing", value.get("kind")
+        else:
+            kind, context = "no_form", {"allowed": f"a mapping with a 'kind' (one of {context['allowed']})"}
+    if kind not in SENTENCES:
+        return path, error["msg"], at_key
+    if kind == "float_type" and isinstance(value, int) and not isinstance(value, bool):
+        kind, value = "finite_number", float("inf")  # an integer beyond all floating-point numbers
+    description = descriptions.get(str(path[0]), "") if path else ""
+    unit = re.search(r" \[[^\]-][^\]]*\]", description)
+    keys = ", ".join(descriptions)
+    words = {
+        "shown": shown(value),
+        "unit": unit[0] if unit else "",
+        "meaning": f": {description}" if description else "",
+        "keys": keys,
+        "near": did_you_mean(str(path[-1]), descriptions) or ";" if path else "",
+        **context,
+    }
+    if kind == "literal_error":
+        words["expected"] = context["expected"].replace(" or ", ", ")
+    hints = [tag.removeprefix(TAG) for tag in map(str, error["loc"]) if tag.startswith(HINT)]
+    return path, SENTENCES[kind].format(**words) + _hint(kind, value, words) + "".join(hints), at_key
+
+
+def _hint(kind: str, value: Any, words: Mapping[str, Any]) -> str:
+    """What to write in the place of a value, where that can be guessed."""
+    if kind in ("float_type", "int_type") and isinstance(value, (list, tuple)):
+        return "; this key cannot be swept"
+    if kind == "float_type" and isinstance(value, str) and re.match(r"\s*[-+]?\.?[0-9]", value):
+        return "; write it without quotes, underscores or a unit"
+    if kind == "int_type" and isinstance(value, float) and value.is_integer() and abs(value) < 2**63:
+        return f"; write {int(value)}"
+    if kind == "string_type" and isinstance(value, (bool, int, float)):
+        return f"; write it in quotes: '{shown(value)}'"
+    if kind in ("literal_error", "no_kind") and isinstance(value, str):
+        allowed = words["allowed"] if kind == "no_kind" else words["expected"]
+        return did_you_mean(value, allowed.replace("'", "").split(", "))
+    return ""
+
+
+def shown(value: Any) -> str:
+    """A value from a YAML file in the words of a message."""
+    if value is None:
+        return "nothing (null)"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return f"the text {value if len(value) <= 40 else value[:37] + '...'!r}"
+    if isinstance(value, (list, tuple)):
+        return f"a list of {len(value)}" if value else "an empty list"
+    if isinstance(value, Mapping):
+        return "a mapping"
+    return repr(value)
