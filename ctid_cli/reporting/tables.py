@@ -13,7 +13,7 @@ from ctid_cli.reporting.percentages import study_rows
 from ctid_cli.reporting.results import Results, differences, experiments_in, find_results, out_option, shown_path
 from ctid_cli.reporting.study import Study, data_folder, load_study
 from ctid_cli.reporting.study_table import study_blocks
-from ctid_cli.specification.spec import load_spec
+from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.folder import InUseError
 from ctid_cli.text import did_you_mean
 
