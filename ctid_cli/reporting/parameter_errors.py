@@ -8,8 +8,10 @@ did not converge, stands beside every number.
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -122,41 +124,41 @@ class PairedRatio:
 def parameter_estimates(results: Results) -> list[ParameterEstimates]:
     """Sort the estimates of an experiment by estimator, data cell and start."""
     manifest = results.manifest
-    cells = {cell["hash"]: cell for cell in manifest["data_cells"]}
-    truths = {key: true_parameters(cell) for key, cell in cells.items()}
-    if any(truth is None for truth in truths.values()):
-        raise UsageError(
-            f"{results.experiment}: errors of parameters need their true values, and the data are not simulated from "
-            "a sum of submodels (system: additive)"
-        )
     # By place, not by hash: a later version may write the same specification with more defaults.
-    cell_places = {cell["hash"]: k for k, cell in enumerate(manifest["data_cells"])}
-    places = {(part["name"], *_items(part["swept"])): k for k, part in enumerate(manifest["estimators"])}
-    across = list(dict.fromkeys(name for part in manifest["estimators"] for name in part["swept"]))
-    variances = long_record_variances(build_plan(spec_from_canonical(results.settings)))
+    cells = {cell["hash"]: (k, cell, true_parameters(cell)) for k, cell in enumerate(manifest["data_cells"])}
+    places = {(part["name"], *part["swept"].items()): k for k, part in enumerate(manifest["estimators"])}
+    across = results.swept("estimators")
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in results.rows:
-        swept = tuple(row.get(name) for name in across)
-        groups.setdefault((row["estimator"], swept, row["cell"], row["start"]), []).append(row)
+        own = ((name, row[name]) for name in across if row.get(name) is not None)
+        groups.setdefault((row["cell"], row["start"], row["estimator"], *own), []).append(row)
+    variances = None
     found = []
-    for (estimator, swept, cell_hash, start), rows in groups.items():
-        own = {name: value for name, value in zip(across, swept, strict=True) if value is not None}
-        cell, truth = cells[cell_hash], truths[cell_hash]
-        assert truth is not None
+    for (cell_hash, start, *part), rows in groups.items():
+        place, cell, truth = cells[cell_hash]
+        if truth is None:
+            raise UsageError(
+                f"{results.experiment}: errors of parameters need their true values, and the data are not simulated "
+                "from a sum of submodels (system: additive)"
+            )
+        if variances is None:
+            variances = long_record_variances(build_plan(spec_from_canonical(results.settings)))
         names = tuple(truth)
-        theory = variances.get((cell_places[cell_hash], places[estimator, *_items(own)]))
-        samples = lookup(cell["content"], "sampling.samples")
+        theory = variances.get((place, places[tuple(part)]))
+        values = _matrix([row["parameters"] for row in rows], names)
+        # All parameters count the same data sets.
+        values[~np.isfinite(values).all(axis=1)] = np.nan
         failed = sum(row["status"] in FAILURES for row in rows)
         found.append(
             ParameterEstimates(
                 experiment=results.experiment,
-                estimator=estimator,
+                estimator=part[0],
                 start=start,
-                settings={name: value for name, value in cell["swept"].items() if name != "samples"} | own,
-                samples=int(samples),
+                settings={name: value for name, value in cell["swept"].items() if name != "samples"} | dict(part[1:]),
+                samples=int(lookup(cell["content"], "sampling.samples")),
                 names=names,
-                truth=np.array([truth[name] for name in names]),
-                values=_complete([row["parameters"] for row in rows], names),
+                truth=np.array([*truth.values()]),
+                values=values,
                 standard_errors=_matrix([row["standard_errors"] for row in rows], names),
                 failed=failed,
                 not_converged=sum(row["status"] != "CONVERGED" for row in rows) - failed,
@@ -169,57 +171,42 @@ def parameter_estimates(results: Results) -> list[ParameterEstimates]:
 
 def parameter_errors(estimates: Iterable[ParameterEstimates]) -> list[ParameterErrors]:
     """Errors of every parameter."""
-    return [row for group in estimates for row in _errors_of(group)]
+    return [_errors_of(group, k) for group in estimates for k in range(len(group.names))]
 
 
-def _errors_of(group: ParameterEstimates) -> list[ParameterErrors]:
-    complete = np.isfinite(group.values).all(axis=1)
-    errors = group.values[complete] - group.truth
-    widths = group.standard_errors[complete]
-    counted = len(errors)
-    rows = []
-    for k, name in enumerate(group.names):
-        error, width = errors[:, k], widths[:, k]
-        theory = None if group.theory is None else float(group.theory[k])
-        mse, scatter = _mean(error**2), _deviation(error**2)
-        bias, deviation = _mean(error), _deviation(error)
-        n_mse = None if mse is None else group.samples * mse
-        n_error = None if scatter is None else group.samples * scatter / np.sqrt(counted)
-        with_error = int(np.isfinite(width).sum())
-        covered = int((np.abs(error) <= QUANTILE * width).sum())
-        low, high = wilson_interval(covered, counted)
-        typical = float(np.sqrt(np.nanmean(width**2))) if with_error else None
-        rows.append(
-            ParameterErrors(
-                experiment=group.experiment,
-                estimator=group.estimator,
-                start=group.start,
-                samples=group.samples,
-                settings=group.settings,
-                parameter=name,
-                true=float(group.truth[k]),
-                runs=group.runs,
-                failed=group.failed,
-                not_converged=group.not_converged,
-                counted=counted,
-                mse=mse,
-                n_mse=n_mse,
-                theory=theory,
-                ratio=_quotient(n_mse, theory),
-                ratio_error=_quotient(n_error, theory),
-                bias=bias,
-                deviation=deviation,
-                bias_per_deviation=_quotient(bias, deviation),
-                bias_per_error=_quotient(bias, None if deviation is None else deviation / np.sqrt(counted)),
-                with_error=with_error,
-                covered=covered,
-                coverage=100.0 * covered / counted if with_error else None,
-                low=100.0 * low if with_error else None,
-                high=100.0 * high if with_error else None,
-                error_ratio=_quotient(typical, deviation),
-            )
-        )
-    return rows
+def _errors_of(group: ParameterEstimates, k: int) -> ParameterErrors:
+    """Errors of one of the parameters."""
+    complete = np.isfinite(group.values[:, k])
+    error, width = group.values[complete, k] - group.truth[k], group.standard_errors[complete, k]
+    counted, with_error = len(error), int(np.isfinite(width).sum())
+    theory = None if group.theory is None else float(group.theory[k])
+    mse, scatter, bias, deviation = _mean(error**2), _deviation(error**2), _mean(error), _deviation(error)
+    n_mse = None if mse is None else group.samples * mse
+    covered = int((np.abs(error) <= QUANTILE * width).sum())
+    shares = (covered / counted, *wilson_interval(covered, counted)) if with_error else ()
+    coverage, low, high = (100.0 * share for share in shares) if shares else (None, None, None)
+    shared = ("experiment", "estimator", "start", "samples", "settings", "runs", "failed", "not_converged")
+    return ParameterErrors(
+        **{name: getattr(group, name) for name in shared},
+        parameter=group.names[k],
+        true=float(group.truth[k]),
+        counted=counted,
+        mse=mse,
+        n_mse=n_mse,
+        theory=theory,
+        ratio=_quotient(n_mse, theory),
+        ratio_error=_quotient(None if scatter is None else group.samples * scatter / np.sqrt(counted), theory),
+        bias=bias,
+        deviation=deviation,
+        bias_per_deviation=_quotient(bias, deviation),
+        bias_per_error=_quotient(bias, None if deviation is None else deviation / np.sqrt(counted)),
+        with_error=with_error,
+        covered=covered,
+        coverage=coverage,
+        low=low,
+        high=high,
+        error_ratio=_quotient(float(np.sqrt(np.nanmean(width**2))) if with_error else None, deviation),
+    )
 
 
 def mse_ratio(one: Sequence[ParameterEstimates], other: Sequence[ParameterEstimates], parameter: str) -> PairedRatio:
@@ -232,38 +219,30 @@ def mse_ratio(one: Sequence[ParameterEstimates], other: Sequence[ParameterEstima
 
     .. math:: s^2 = \frac{n-1}{n} \sum_i \left(r_{(i)} - \frac1n \sum_j r_{(j)}\right)^2.
     """
+    import pandas as pd
+
     if not one or [(g.experiment, g.samples) for g in one] != [(g.experiment, g.samples) for g in other]:
         raise ValueError(
             "a ratio on the same data sets needs estimates of one experiment at the same numbers of samples"
         )
-    sums: list[dict[int, float]] = []
-    for side in (one, other):
-        squares = [_squares(group, parameter) for group in side]
-        complete = set.intersection(*(set(found) for found in squares))
-        sums.append({replicate: sum(found[replicate] for found in squares) for replicate in complete})
-    pairs = sorted(sums[0].keys() & sums[1].keys())
-    n = len(pairs)
+
+    def squares(group: ParameterEstimates) -> pd.Series[float]:
+        k = group.column(parameter)
+        return pd.Series(group.samples * (group.values[:, k] - group.truth[k]) ** 2, list(group.replicates))
+
+    # N times the squared error by data set, summed over its lengths, where all of them have one.
+    sides = [reduce(operator.add, map(squares, side)) for side in (one, other)]
+    parts = pd.concat(sides, axis=1).dropna().sort_index().to_numpy()
+    n = len(parts)
     if n < 2:
         raise UsageError(
             f"{one[0].experiment}: {one[0].estimator} and {other[0].estimator} have {n} estimates on the same data "
             "sets, too few for a ratio"
         )
-    parts = np.array([[side[replicate] for side in sums] for replicate in pairs])
     above, below = parts.sum(axis=0)
     without = (above - parts[:, 0]) / (below - parts[:, 1])
     error = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
     return PairedRatio(parameter, tuple(group.samples for group in one), float(above / below), error, n)
-
-
-def _squares(group: ParameterEstimates, parameter: str) -> dict[int, float]:
-    """N times the squared error by replicate."""
-    k = group.column(parameter)
-    squares = group.samples * (group.values[:, k] - group.truth[k]) ** 2
-    return {
-        replicate: float(square)
-        for replicate, square in zip(group.replicates, squares, strict=True)
-        if np.isfinite(square)
-    }
 
 
 def _mean(values: Array) -> float | None:
@@ -278,17 +257,6 @@ def _quotient(one: float | None, other: float | None) -> float | None:
     return float(one / other) if one is not None and other else None
 
 
-def _items(swept: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    return list(swept.items())
-
-
-def _matrix(rows: Sequence[Mapping[str, float | None] | None], names: Sequence[str]) -> Array:
+def _matrix(rows: Iterable[Mapping[str, float | None] | None], names: Sequence[str]) -> Array:
     """Values by row and name; NaN where there is none."""
     return np.array([[(row or {}).get(name) for name in names] for row in rows], dtype=float).reshape(-1, len(names))
-
-
-def _complete(rows: Sequence[Mapping[str, float | None] | None], names: Sequence[str]) -> Array:
-    """The same with NaN throughout a row that lacks a value, so that all parameters count the same data sets."""
-    values = _matrix(rows, names)
-    values[~np.isfinite(values).all(axis=1)] = np.nan
-    return values
