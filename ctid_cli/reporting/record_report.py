@@ -11,7 +11,8 @@ from typing import Any
 
 from ctid_cli.inference.record_check import RecordReport
 from ctid_cli.reporting.layout import count, number
-from ctid_cli.signals.measurement import ROLES, USUAL_NAMES, Measurement, split_header
+from ctid_cli.signals.measurement import ROLES, USUAL_NAMES, Measurement
+from ctid_cli.signals.table import split_header
 
 #: Lines of text are no longer than this.
 WIDTH = 100

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from ctid_cli.signals.csv_file import read_csv_table
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.mat_file import read_mat_table
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.table import Table, listing, refuse_missing, refuse_nameless, wrong_separator
+from ctid_cli.signals.table import Table, listing, refuse_nameless, refuse_one_column, split_header
 from ctid_cli.text import closest, listed
 
 Role = Literal["time", "input", "output"]
@@ -69,16 +68,11 @@ def read_measurement(
     left behind is estimated with the model where that is asked for.
     """
     require_choice("hold", hold, get_args(Hold))
-    extension = Path(path).suffix.lower()
-    if extension == ".mat":
-        table = read_mat_table(path)
-    elif extension in TEXT_EXTENSIONS:
-        table = read_csv_table(path)
-    else:
-        raise DataError(
-            f"{os.fspath(path)}: files ending in {extension} are not read; export the record as comma-separated text "
-            "(.csv) whose first line names the columns, or from MATLAB as vectors (.mat)"
-        )
+    table = read_table(
+        path,
+        "export the record as comma-separated text (.csv) whose first line names the columns, or from MATLAB as "
+        "vectors (.mat)",
+    )
     asked: dict[Role, str | None] = {"time": time, "input": input, "output": output}
     columns, notes = _choose(table, asked)
     unit = {role: (units or {}).get(role) or split_header(name)[1] for role, name in columns.items()}
@@ -88,8 +82,10 @@ def read_measurement(
     t = table.numbers(columns["time"])
     label = unit["time"] or "s"
     if t.size == 1 and y.size > 1:
-        t, note = _clock(table, columns["time"], float(t[0]), y.size, label)
-        notes.append(note)
+        interval = table.lone_interval(columns["time"], float(t[0]))
+        t = interval * np.arange(y.size, dtype=float)
+        note = f"{columns['time']!r} is one number: it was taken as the sampling interval"
+        notes.append(f"{note}, {interval:g} {label}, from 0 {label} on.")
     for role, values in (("time", t), ("input", u)):
         if values.size != y.size:
             raise DataError(
@@ -121,12 +117,22 @@ def read_measurement(
     )
 
 
+def read_table(path: str | os.PathLike[str], otherwise: str) -> Table:
+    """Columns of a comma-separated or MATLAB file; ``otherwise`` is the advice for all others."""
+    extension = Path(path).suffix.lower()
+    if extension == ".mat":
+        return read_mat_table(path)
+    if extension in TEXT_EXTENSIONS:
+        return read_csv_table(path)
+    raise DataError(f"{os.fspath(path)}: files ending in {extension} are not read; {otherwise}")
+
+
 def _choose(table: Table, asked: Mapping[Role, str | None]) -> tuple[dict[Role, str], list[str]]:
     """The column of each role, and what was assumed."""
     chosen: dict[Role, str] = {}
     for role in ROLES:
         if (wanted := asked[role]) is not None:
-            chosen[role] = _named(table, wanted)
+            chosen[role] = table.named(wanted)
     refuse_nameless(table)
     by_position: list[Role] = []
     for role in ROLES:
@@ -140,7 +146,7 @@ def _choose(table: Table, asked: Mapping[Role, str | None]) -> tuple[dict[Role, 
     if by_position:
         left = [name for name in table.names if name not in chosen.values()]
         # A column with a usual name is not put in another place than its name says.
-        named = any(_leaf(table, name).lower() in names for name in left for names in USUAL_NAMES.values())
+        named = any(table.leaf(name).lower() in names for name in left for names in USUAL_NAMES.values())
         if table.lines is None or len(table.names) != 3 or len(left) != len(by_position) or named:
             _refuse_unrecognised(table, by_position[0], chosen)
         chosen.update(zip(by_position, left, strict=True))
@@ -162,22 +168,12 @@ def _role(name: str) -> Role:
     return next(role for role in ROLES if role == name)
 
 
-def _named(table: Table, wanted: str) -> str:
-    """The column whose header is ``wanted``, with or without its unit."""
-    if wanted in table.names:
-        return wanted
-    matching = [name for name in table.names if split_header(name)[0] == wanted]
-    if len(matching) != 1:
-        refuse_missing(table, wanted)
-    return matching[0]
-
-
 def _recognised(table: Table, role: Role, chosen: Mapping[Role, str]) -> str | None:
     """The column with the most telling of the usual names of a role."""
     homes = {name.rpartition(".")[0] for name in chosen.values()}
     candidates = [name for name in table.names if name not in chosen.values()]
     for usual in USUAL_NAMES[role]:
-        matching = [name for name in candidates if _leaf(table, name).lower() == usual]
+        matching = [name for name in candidates if table.leaf(name).lower() == usual]
         # What lies in the same struct as the columns that are known belongs to them.
         close = [name for name in matching if table.lines is None and name.rpartition(".")[0] in homes]
         matching = close or matching
@@ -191,28 +187,14 @@ def _recognised(table: Table, role: Role, chosen: Mapping[Role, str]) -> str | N
     return None
 
 
-def _leaf(table: Table, name: str) -> str:
-    return split_header(name)[0] if table.lines is not None else name.rpartition(".")[2]
-
-
-def split_header(header: str) -> tuple[str, str | None]:
-    """Name and unit in the header of a column."""
-    found = re.fullmatch(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))", header)
-    if found is None:
-        return header, None
-    name, square, round_ = found.groups()
-    return name, (square or round_ or "").strip() or None
-
-
 def _refuse_unrecognised(table: Table, role: Role, chosen: Mapping[Role, str]) -> NoReturn:
-    if separated := wrong_separator(table):
-        raise DataError(f"{table.head}: the file has one column. {separated}")
+    refuse_one_column(table)
     if len(table.names) < len(ROLES) and not table.hint:
         raise DataError(
             f"{table.head}: {listing(table)} and nothing else; a record needs a time, an input and an output"
         )
     usual = " or ".join(map(repr, USUAL_NAMES[role][:2]))
-    other = "other " if any(_leaf(table, name).lower() in USUAL_NAMES[role] for name in chosen.values()) else ""
+    other = "other " if any(table.leaf(name).lower() in USUAL_NAMES[role] for name in chosen.values()) else ""
     message = (
         f"{table.head}: no {other}{table.noun} is called {usual}; {listing(table)}. "
         f"Say which one is the {role} (option {role})"
@@ -222,13 +204,6 @@ def _refuse_unrecognised(table: Table, role: Role, chosen: Mapping[Role, str]) -
     if table.hint:
         message += f". {table.hint}"
     raise DataError(message)
-
-
-def _clock(table: Table, name: str, interval: float, samples: int, unit: str) -> tuple[Array, str]:
-    if not (np.isfinite(interval) and interval > 0):
-        raise DataError(f"{table.file}: {name!r} is {interval:g}; a sampling interval must be a positive number")
-    note = f"{name!r} is one number: it was taken as the sampling interval, {interval:g} {unit}, from 0 {unit} on."
-    return interval * np.arange(samples, dtype=float), note
 
 
 def _window(table: Table, t: Array, start: float | None, stop: float | None, unit: str) -> tuple[int, int]:

@@ -12,25 +12,14 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import require_positive
-from ctid_cli.signals.csv_file import read_csv_table, require_file
-from ctid_cli.signals.mat_file import read_mat_table
-from ctid_cli.signals.measurement import TEXT_EXTENSIONS, USUAL_NAMES, split_header
-from ctid_cli.signals.table import Table, listing, refuse_missing, refuse_nameless, wrong_separator
+from ctid_cli.signals.csv_file import require_file
+from ctid_cli.signals.measurement import USUAL_NAMES, read_table
+from ctid_cli.signals.table import Table, listing, refuse_nameless, refuse_one_column, split_header
 
 #: Names by which the signal is recognised when nobody says which column it is, the most telling first.
 SIGNAL_NAMES = (
-    "y",
-    "signal",
-    "output",
-    "value",
-    "values",
-    "x",
-    "amplitude",
-    "data",
-    "audio",
-    "sound",
-    "wave",
-    "voltage",
+    *("y", "signal", "output", "value", "values", "x"),
+    *("amplitude", "data", "audio", "sound", "wave", "voltage"),
 )
 #: How the names of sound files end.
 SOUND_EXTENSIONS = (".wav", ".wave")
@@ -79,24 +68,17 @@ def read_sampled_signal(
     """Signal from a comma-separated, MATLAB or sound file."""
     if interval is not None:
         require_positive("interval", interval, "s")
-    extension = Path(path).suffix.lower()
     notes: list[str] = []
-    if extension in SOUND_EXTENSIONS:
+    if Path(path).suffix.lower() in SOUND_EXTENSIONS:
         table, rate, note = _read_sound(path)
         interval = 1.0 / rate if interval is None else interval
         notes.append(note)
-    elif extension == ".mat":
-        table = read_mat_table(path)
-    elif extension in TEXT_EXTENSIONS:
-        table = read_csv_table(path)
     else:
-        raise DataError(
-            f"{os.fspath(path)}: files ending in {extension} are not read; a signal is read from comma-separated text "
-            "(.csv), MATLAB vectors (.mat) or sound (.wav)"
-        )
+        sources = "comma-separated text (.csv), MATLAB vectors (.mat) or sound (.wav)"
+        table = read_table(path, f"a signal is read from {sources}")
     times, column, more = _columns(table, time, signal, interval is not None)
     notes += more
-    name, unit = split_header(column)[0], split_header(column)[1]
+    name, unit = split_header(column)
     values = table.numbers(column)
     values = np.where(np.isfinite(values), values, np.nan)
     time_unit: str | None = "s"
@@ -104,9 +86,7 @@ def read_sampled_signal(
         time_unit = split_header(times)[1]
         clock = table.numbers(times)
         if clock.size == 1 and values.size > 1:
-            interval, first, time_unit = float(clock[0]), 0.0, time_unit or "s"
-            if not (np.isfinite(interval) and interval > 0):
-                raise DataError(f"{table.file}: {times!r} is {interval:g}; a sampling interval must be positive")
+            interval, first, time_unit = table.lone_interval(times, float(clock[0])), 0.0, time_unit or "s"
             notes.append(f"{times!r} is one number and was taken as the sampling interval.")
         else:
             if clock.size != values.size:
@@ -135,15 +115,14 @@ def read_sampled_signal(
 def _columns(table: Table, time: str | None, signal: str | None, clocked: bool) -> tuple[str | None, str, list[str]]:
     """Columns of the times and of the signal, and what was assumed."""
     refuse_nameless(table)
-    if separated := wrong_separator(table):
-        raise DataError(f"{table.head}: the file has one column. {separated}")
-    times = _named(table, time) if time is not None else _usual(table, USUAL_NAMES["time"], signal)
+    refuse_one_column(table)
+    times = table.named(time) if time is not None else _usual(table, USUAL_NAMES["time"], signal)
     if times is None and not clocked:
         raise DataError(
             f"{table.head}: no {table.noun} is called 't' or 'time'; {listing(table)}. Say which one holds the times "
             "(--time), or give the clock (--interval SECONDS or --rate HERTZ)"
         )
-    column = _named(table, signal) if signal is not None else _usual(table, SIGNAL_NAMES, times)
+    column = table.named(signal) if signal is not None else _usual(table, SIGNAL_NAMES, times)
     left = [name for name in table.names if name != times]
     notes = []
     if column is None:
@@ -161,22 +140,9 @@ def _columns(table: Table, time: str | None, signal: str | None, clocked: bool) 
     return times, column, notes
 
 
-def _named(table: Table, wanted: str) -> str:
-    matching = [name for name in table.names if name == wanted or split_header(name)[0] == wanted]
-    if wanted in table.names:
-        return wanted
-    if len(matching) != 1:
-        refuse_missing(table, wanted)
-    return matching[0]
-
-
 def _usual(table: Table, usual: tuple[str, ...], taken: str | None) -> str | None:
-    for word in usual:
-        for name in table.names:
-            leaf = split_header(name)[0] if table.lines is not None else name.rpartition(".")[2]
-            if leaf.lower() == word and taken not in (name, leaf):
-                return name
-    return None
+    found = [name for word in usual for name in table.names if table.leaf(name).lower() == word]
+    return next((name for name in found if taken not in (name, table.leaf(name))), None)
 
 
 def _on_grid(table: Table, name: str, t: Array, values: Array, unit: str) -> tuple[Array, float, str]:

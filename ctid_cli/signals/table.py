@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NoReturn
@@ -47,6 +48,25 @@ class Table:
         if name not in self.names:
             refuse_missing(self, name)
 
+    def named(self, wanted: str) -> str:
+        """The column whose header is ``wanted``, with or without its unit."""
+        if wanted in self.names:
+            return wanted
+        matching = [name for name in self.names if split_header(name)[0] == wanted]
+        if len(matching) != 1:
+            refuse_missing(self, wanted)
+        return matching[0]
+
+    def leaf(self, name: str) -> str:
+        """A name without its unit, or without the struct that it belongs to."""
+        return split_header(name)[0] if self.lines is not None else name.rpartition(".")[2]
+
+    def lone_interval(self, name: str, value: float) -> float:
+        """The one number that stands for all times."""
+        if not (np.isfinite(value) and value > 0):
+            raise DataError(f"{self.file}: {name!r} is {value:g}; a sampling interval must be a positive number")
+        return value
+
     def times(self, name: str, unit: str = "s") -> Array:
         """The column of the instants."""
         return self.check_times(name, self.numbers(name), unit)
@@ -91,6 +111,15 @@ class Table:
         return y
 
 
+def split_header(header: str) -> tuple[str, str | None]:
+    """Name and unit in the header of a column."""
+    found = re.fullmatch(r"(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))", header)
+    if found is None:
+        return header, None
+    name, square, round_ = found.groups()
+    return name, (square or round_ or "").strip() or None
+
+
 def refuse_missing(table: Table, wanted: str) -> NoReturn:
     """Say which columns there are in place of one that there is not."""
     refuse_nameless(table)
@@ -117,6 +146,12 @@ def wrong_separator(table: Table) -> str:
             if sign in table.names[0]:
                 return f"Its columns seem to be separated by {word}; separate them by commas"
     return ""
+
+
+def refuse_one_column(table: Table) -> None:
+    """Refuse a file whose columns are not separated by commas."""
+    if separated := wrong_separator(table):
+        raise DataError(f"{table.head}: the file has one column. {separated}")
 
 
 def listing(table: Table) -> str:
