@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.reporting.estimate import Units
+from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, svg
 from ctid_cli.signals.measurement import Measurement
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: Experiments that are drawn; the others would leave no room.
 MOST_DRAWN = 3
-#: Colours that differ in lightness too, so that a grey print can be read.
-MEASURED, SIMULATED, BAND = "#b0b0b0", "#08306b", "#d9d9d9"
 
 
 def identification_svg(result: Identification, measurements: Sequence[Measurement], units: Units) -> bytes:
     """Figure of a fit; the same fit always gives the same bytes."""
-    import matplotlib
-    from matplotlib.figure import Figure
-
     drawn = measurements[:MOST_DRAWN]
-    style: dict[Any, Any] = {"svg.hashsalt": "ctid", "font.size": 9.0, "axes.grid": True, "grid.color": "#eeeeee"}
-    with matplotlib.rc_context(style):
-        figure = Figure(figsize=(8.0, 3.4 * len(drawn) + 2.8), layout="constrained")
+
+    def draw(figure: Figure) -> None:
         grid = figure.add_gridspec(2 * len(drawn) + 1, 2, height_ratios=[2, 1.2] * len(drawn) + [2])
         for k, measurement in enumerate(drawn):
             output = figure.add_subplot(grid[2 * k, :])
@@ -37,9 +34,8 @@ def identification_svg(result: Identification, measurements: Sequence[Measuremen
                 output.set_title(f"experiment {k + 1} of {len(measurements)}", loc="left")
         _draw_correlation(figure.add_subplot(grid[-1, 0]), result, measurements)
         _draw_profile(figure.add_subplot(grid[-1, 1]), result, units)
-        file = io.BytesIO()
-        figure.savefig(file, format="svg", metadata={"Date": None})
-    return file.getvalue()
+
+    return svg(8.0, 3.4 * len(drawn) + 2.8, draw)
 
 
 def _draw_record(
@@ -47,17 +43,15 @@ def _draw_record(
 ) -> None:
     record, use = measurement.record, result.fit.used[k]
     residuals = result.fit.residuals[k]
-    output.plot(record.t, record.y, color=MEASURED, linewidth=2.2, label="measured")
-    output.plot(
-        *_with_gaps(record.t, use, record.y[use] - residuals), color=SIMULATED, linewidth=0.9, label="simulated"
-    )
+    output.plot(record.t, record.y, color=LIGHT, linewidth=2.2, label="measured")
+    output.plot(*_with_gaps(record.t, use, record.y[use] - residuals), color=DARK, linewidth=0.9, label="simulated")
     output.set_ylabel(f"{measurement.output} [{units.output}]")
     output.legend(loc="lower right", ncols=2, fontsize=8)
     output.tick_params(labelbottom=False)
     output.margins(x=0.0)
     low, high = output.get_ylim()
     output.set_ylim(low - 0.18 * (high - low), high)  # room for the legend below the curves
-    error.plot(*_with_gaps(record.t, use, residuals), color=SIMULATED, linewidth=0.7)
+    error.plot(*_with_gaps(record.t, use, residuals), color=DARK, linewidth=0.7)
     error.axhline(0.0, color="black", linewidth=0.6)
     error.set_ylabel(f"residual [{units.output}]")
     error.set_xlabel(f"{measurement.time} [{units.time}]")
@@ -80,7 +74,7 @@ def _draw_correlation(axes: Any, result: Identification, measurements: Sequence[
     for k, (test, style) in enumerate(zip(result.tests[:MOST_DRAWN], styles, strict=False), start=1):
         lags = np.arange(1, test.lags + 1)
         label = f"experiment {k}" if len(measurements) > 1 else None
-        axes.plot(lags, test.autocorrelation, style, color=SIMULATED, markersize=3, linewidth=0.8, label=label)
+        axes.plot(lags, test.autocorrelation, style, color=DARK, markersize=3, linewidth=0.8, label=label)
     band = result.tests[0].autocorrelation_band
     axes.axhspan(-band, band, color=BAND, zorder=0, label=f"{100 * result.tests[0].level:.3g} % band if white")
     axes.axhline(0.0, color="black", linewidth=0.6)
@@ -94,9 +88,9 @@ def _draw_profile(axes: Any, result: Identification, units: Units) -> None:
     axes.set_xlabel(f"delay [{units.time}]")
     axes.set_ylabel(f"cost [({units.output})²]")
     if profile is None:
-        axes.plot([delay], [result.fit.cost], "o", color=SIMULATED, label=f"known delay {delay:.4g} {units.time}")
+        axes.plot([delay], [result.fit.cost], "o", color=DARK, label=f"known delay {delay:.4g} {units.time}")
     else:
-        axes.plot(profile.delays, profile.costs, ".-", color=SIMULATED, linewidth=0.8, markersize=4, label="profile")
+        axes.plot(profile.delays, profile.costs, ".-", color=DARK, linewidth=0.8, markersize=4, label="profile")
         label = f"minimum at {delay:.4g} {units.time}"
         axes.plot([delay], [result.fit.cost], "v", color="black", markersize=7, label=label)
     low, high = axes.get_ylim()

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 import shlex
-import textwrap
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ctid_cli.canonical import plain
 from ctid_cli.inference.record_check import RecordReport
 from ctid_cli.reporting.layout import count, number
 from ctid_cli.signals.measurement import ROLES, USUAL_NAMES, Measurement
 from ctid_cli.signals.table import split_header
+from ctid_cli.text import wrapped
 
-#: Lines of text are no longer than this.
-WIDTH = 100
 #: How the levels of findings are printed, the worst in capitals.
 LABELS = {"problem": "PROBLEM", "warning": "warning", "note": "note", "ok": "ok"}
 
@@ -24,61 +23,28 @@ def record_object(measurement: Measurement, report: RecordReport) -> dict[str, A
     """A report as JSON-able content."""
     content = asdict(report)
     columns = {
-        role: {"column": column, "unit": unit}
-        for role, column, unit in (
-            ("time", measurement.time, measurement.time_unit),
-            ("input", measurement.input, measurement.input_unit),
-            ("output", measurement.output, measurement.output_unit),
-        )
+        role: {"column": getattr(measurement, role), "unit": getattr(measurement, f"{role}_unit")} for role in ROLES
     }
-    found: dict[str, Any] = _finite(
-        {"file": content.pop("name"), "columns": columns, "notes": measurement.notes, "worst": report.worst, **content}
-    )
+    head = {"file": content.pop("name"), "columns": columns, "notes": measurement.notes, "worst": report.worst}
+    found: dict[str, Any] = plain({**head, **content})
     return found
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def record_text(measurement: Measurement, report: RecordReport) -> str:
     """A report for people."""
-    columns = ", ".join(
-        f"{role} {column!r}"
-        for role, column in (
-            ("time", measurement.time),
-            ("input", measurement.input),
-            ("output", measurement.output),
-        )
-    )
-    head = f"{report.name}: {count(report.n_samples, 'sample')} in {number(report.duration)} {_time(measurement)}"
+    columns = ", ".join(f"{role} {getattr(measurement, role)!r}" for role in ROLES)
+    duration = f"{number(report.duration)} {measurement.time_unit or 's'}"
+    head = f"{report.name}: {count(report.n_samples, 'sample')} in {duration}"
     parts = [f"{head} ({columns})", _verdict(report), *measurement.notes, ""]
     labels = max(len(LABELS[finding.level]) for finding in report.findings)
     topics = max(len(finding.topic) for finding in report.findings)
     for finding in report.findings:
         first = f"{LABELS[finding.level].ljust(labels)}  {finding.topic.ljust(topics)}  "
-        parts.append(
-            textwrap.fill(
-                finding.sentence,
-                WIDTH,
-                initial_indent=first,
-                subsequent_indent=" " * len(first),
-                break_long_words=False,
-                break_on_hyphens=False,
-            )
-        )
+        parts.append(wrapped(finding.sentence, first, " " * len(first)))
     parts += ["", *_numbers(measurement, report)]
     if report.worst != "problem":
         parts += ["", "next: " + _next_command(measurement, report)]
     return "\n".join(parts)
-
-
-def _time(measurement: Measurement) -> str:
-    return measurement.time_unit or "s"
 
 
 def _verdict(report: RecordReport) -> str:
@@ -91,70 +57,50 @@ def _verdict(report: RecordReport) -> str:
     return "Nothing is wrong with this record."
 
 
-def _numbers(measurement: Measurement, report: RecordReport) -> list[str]:
-    """Aligned rows: what, value and unit, remark."""
-    time, u, y = _time(measurement), measurement.input_unit or "", measurement.output_unit or ""
-    w = f"rad/{time}"
-    r = report
+def _numbers(measurement: Measurement, r: RecordReport) -> list[str]:
+    """Aligned rows: what, value and unit, remark; those whose numbers the record does not show are left out."""
+    time = measurement.time_unit or "s"
+    rows: list[tuple[str, str, str]] = []
 
-    def spread(low: float, high: float, unit: str) -> str:
-        return f"from {number(low, 4)} to {number(high, 4)} {unit}".rstrip()
+    def row(what: str, value: str, remark: str, known: float = 0.0) -> None:
+        if math.isfinite(known):
+            rows.append((what, value.strip(), remark.rstrip()))
 
-    def mean(value: float, deviation: float) -> str:
+    def span(low: float, high: float, unit: str) -> str:
+        return f"from {number(low, 4)} to {number(high, 4)} {unit}"
+
+    def plain_digits(x: float) -> str:
+        return f"{float(f'{x:.3g}'):.12g}"
+
+    clock = "regular" if r.regular else span(r.interval_min, r.interval_max, time)
+    row("sampling interval", f"{number(r.interval, 4)} {time}", clock)
+    for signal, unit in (("input", measurement.input_unit or ""), ("output", measurement.output_unit or "")):
+        mean, deviation, low, high = (getattr(r, f"{signal}_{name}") for name in ("mean", "deviation", "low", "high"))
         # What subtracting a mean leaves is rounding.
-        return number(0.0 if abs(value) < 1e-9 * deviation else value, 4)
-
-    clock = "regular" if r.regular else spread(r.interval_min, r.interval_max, time)
-    rows = [
-        ("sampling interval", number(r.interval, 4), time, clock),
-        (
-            "input, mean",
-            mean(r.input_mean, r.input_deviation),
-            u,
-            f"standard deviation {number(r.input_deviation, 4)} {u}".rstrip(),
-        ),
-        ("input, range", "", "", spread(r.input_low, r.input_high, u)),
-        (
-            "output, mean",
-            mean(r.output_mean, r.output_deviation),
-            y,
-            f"standard deviation {number(r.output_deviation, 4)} {y}".rstrip(),
-        ),
-        ("output, range", "", "", spread(r.output_low, r.output_high, y)),
-        ("signal-to-noise ratio", number(r.snr_db, 3), "dB", "of the part that follows the input linearly, at least"),
-        (
-            "bandwidth of the answer",
-            f"{float(f'{r.output_bandwidth:.3g}'):.12g}",
-            w,
-            f"Nyquist frequency {float(f'{r.nyquist:.3g}'):.12g} {w}",
-        ),
-        ("delay", "", "", spread(r.delay_early, r.delay_late, time)),
+        shown = number(0.0 if abs(mean) < 1e-9 * deviation else mean, 4)
+        row(f"{signal}, mean", f"{shown} {unit}", f"standard deviation {number(deviation, 4)} {unit}")
+        row(f"{signal}, range", "", span(low, high, unit))
+    remark = "of the part that follows the input linearly, at least"
+    row("signal-to-noise ratio", f"{number(r.snr_db, 3)} dB", remark, r.snr_db)
+    row(
+        "bandwidth of the answer",
+        f"{plain_digits(r.output_bandwidth)} rad/{time}",
+        f"Nyquist frequency {plain_digits(r.nyquist)} rad/{time}",
+        r.explained if r.input_kind != "steps" else 1.0,
+    )
+    row("delay", "", span(r.delay_early, r.delay_late, time), r.delay_late)
+    width, wide = (max(len(cells[k]) for cells in rows) for k in (0, 1))
+    return [
+        f"{what.ljust(width)}  {value.ljust(wide)}  {remark}" if value else f"{what.ljust(width)}  {remark}"
+        for what, value, remark in rows
     ]
-    shown = [
-        row
-        for row, known in zip(
-            rows,
-            (True, True, True, True, True, r.snr_db, r.explained if r.input_kind != "steps" else 1.0, r.delay_late),
-            strict=True,
-        )
-        if known is True or (isinstance(known, float) and math.isfinite(known))
-    ]
-    width = max(len(row[0]) for row in shown)
-    values = [f"{value} {unit}".strip() for _, value, unit, _ in shown]
-    wide = max(map(len, values))
-    lines = []
-    for (what, _, _, remark), value in zip(shown, values, strict=True):
-        lines.append(
-            f"{what.ljust(width)}  {remark}" if not value else f"{what.ljust(width)}  {value.ljust(wide)}  {remark}"
-        )
-    return [line.rstrip() for line in lines]
 
 
 def _next_command(measurement: Measurement, report: RecordReport) -> str:
     """The fit that the findings suggest."""
     words = ["ctid", "fit", report.name]
-    for role, column in zip(ROLES, (measurement.time, measurement.input, measurement.output), strict=True):
-        name = split_header(column)[0]
+    for role in ROLES:
+        name = split_header(getattr(measurement, role))[0]
         if name.lower() not in USUAL_NAMES[role][:2] and Path(report.name).suffix.lower() != ".mat":
             words += [f"--{role}", name]
     words += ["--poles", "1", "--zeros", "0"]
