@@ -62,4 +62,4 @@ def free_response(
             place += term.order
         place_theta += term.size
         place_free += term.order
-    return rows @ modes.output[: rows.shape[1]], by_theta, by_free
+    return rows @ modes.output[0, : rows.shape[1]], by_theta, by_free

@@ -9,7 +9,7 @@ from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.filtering.filter_data import plain_array
-from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT, modal_condition
+from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT, modal_condition, pole_slopes
 from ctid_cli.filtering.realisation import polynomial_roots, scaled_denominator, time_scale
 
 
@@ -49,143 +49,27 @@ def _add_mode(mapping: Array, row: int, column: int, paired: bool, weight: compl
         mapping[row, column] += weight.real
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def pooled_modes(
-    theta: Array, degrees: IntArray, closed: bool
-) -> tuple[float, ComplexArray, IntArray, ComplexArray, Array, int, float, int, Array, Array, Array]:
-    """Partial fractions of all submodels, and the rows of psi and phi as maps of the rows of the pass."""
-    submodels = degrees.shape[0]
-    n, order_at_origin, origin_owner, direct_owner = 0, 0, 0, 0
-    for i in range(submodels):
-        n += degrees[i, 0]
-        if degrees[i, 2] > 0:
-            order_at_origin = degrees[i, 2]
-            origin_owner = i
-    value = 2 * n + order_at_origin
-    error = 3 * n + order_at_origin + 1
-    extra = error + 1
-    q = extra + (n + order_at_origin + 1 if closed else 0)
-    u_modes = extra if closed else 0
-    u_integrals = extra + n if closed else 2 * n
-    u_value = extra + n + order_at_origin if closed else value
-    poles, residues = np.zeros(n, np.complex128), np.zeros(n, np.complex128)
-    owner = np.zeros(n, np.int64)
-    origin = np.zeros(order_at_origin)
-    direct, condition = 0.0, 1.0
-    instruments, regressors, output = np.zeros((theta.size, q)), np.zeros((theta.size, q)), np.zeros((1, q))
-    mode, place, offset = 0, 0, 0
-    for i in range(submodels):
-        own, zeros, poles_at_origin = degrees[i, 0], degrees[i, 1], degrees[i, 2]
-        a = theta[offset : offset + own]
-        b = theta[offset + own : offset + own + zeros + 1]
-        first_b = offset + own
-        highest = a[own - 1] if own > 0 else 1.0
-        if highest == 0.0:
-            condition = np.inf
-            break
-        monic = np.ones(own + 1)
-        for k in range(own):
-            monic[k + 1] = (a[own - 2 - k] if k < own - 1 else 1.0) / highest
-        w0 = time_scale(monic)
-        roots = polynomial_roots(scaled_denominator(monic, w0)) * w0
-        slopes, curvatures = np.zeros(own, np.complex128), np.zeros(own, np.complex128)
-        for j in range(own):
-            slope, curvature = complex(1.0, 0.0), complex(0.0, 0.0)
-            for m in range(own):
-                if m != j:
-                    slope *= roots[j] - roots[m]
-                    if roots[m] != roots[j]:
-                        curvature += 2.0 / (roots[j] - roots[m])
-            slopes[j], curvatures[j] = slope, curvature
-            if slope == 0.0 or roots[j] == 0.0:
-                condition = np.inf
-        if not condition < np.inf:
-            break
-        if own > 1:
-            condition = max(condition, modal_condition(roots, slopes, curvatures))
-        phi_from = place  # the first row of this submodel's modes
-        # The partial fractions at the poles of A.
-        for j in range(own):
-            pole = roots[j]
-            if pole.imag < 0.0:
-                continue
-            paired = pole.imag > 0.0
-            slope = slopes[j] * highest
-            squared = slope * slope
-            numerator, numerator_slope = complex(0.0, 0.0), complex(0.0, 0.0)
-            for k in range(zeros, -1, -1):
-                numerator_slope = numerator_slope * pole + numerator
-                numerator = numerator * pole + b[k]
-            reciprocal = 1.0 / pole**poles_at_origin
-            poles[mode], owner[mode] = pole, i
-            residues[mode] = numerator * reciprocal / slope * (2.0 if paired else 1.0)
-            _add_mode(output, 0, place, paired, numerator * reciprocal / slope)
-            power = reciprocal  # p^(k - l)
-            for k in range(max(own, zeros) + 1):
-                if 1 <= k <= own:
-                    f = power * numerator
-                    f_slope = power * (numerator_slope + (k - poles_at_origin) * numerator / pole)
-                    _add_mode(instruments, offset + k - 1, n + place, paired, -f / squared)
-                    _add_mode(instruments, offset + k - 1, place, paired, -(f_slope - f * curvatures[j]) / squared)
-                    weight = power / reciprocal / slope
-                    _add_mode(regressors, offset + k - 1, value + 1 + place, paired, -weight)
-                if k <= zeros:
-                    _add_mode(instruments, first_b + k, place, paired, power / slope)
-                    _add_mode(regressors, first_b + k, u_modes + place, paired, power / slope)
-                power *= pole
-            place += 2 if paired else 1
-            mode += 1
-        # The pole at the origin.
-        if poles_at_origin > 0:
-            single = _taylor_of_reciprocal(a, order_at_origin)
-            model = _product(b, single, order_at_origin)
-            sensitivity = _product(model, single, order_at_origin)
-            for order in range(order_at_origin):  # the weight of 1/p^(order + 1)
-                origin[order] = model[order_at_origin - 1 - order]
-                output[0, 2 * n + order] += origin[order]
-                for k in range(order_at_origin - order):
-                    if 1 <= k <= own:
-                        instruments[offset + k - 1, 2 * n + order] -= sensitivity[order_at_origin - 1 - order - k]
-                    if k <= zeros:
-                        instruments[first_b + k, 2 * n + order] += single[order_at_origin - 1 - order - k]
-                        regressors[first_b + k, u_integrals + order] += single[order_at_origin - 1 - order - k]
-        # Direct feed-through.
-        if zeros == own + poles_at_origin:
-            direct, direct_owner = b[zeros] / highest, i
-            output[0, value] += direct
-            instruments[first_b + zeros, value] += 1.0 / highest
-            regressors[first_b + zeros, u_value] += 1.0 / highest
-            if own > 0:
-                instruments[offset + own - 1, value] -= direct / highest
-        # p^n/A has a direct part always: what the other submodels leave of the output itself.
-        if own > 0:
-            row = offset + own - 1
-            regressors[row, error] -= 1.0 / highest
-            for j in range(place - phi_from):
-                regressors[row, u_modes + phi_from + j] -= output[0, phi_from + j] / highest
-            if poles_at_origin > 0:
-                for order in range(order_at_origin):
-                    regressors[row, u_integrals + order] -= origin[order] / highest
-            if zeros == own + poles_at_origin:
-                regressors[row, u_value] -= direct / highest
-        offset = first_b + zeros + 1
-    return (
-        condition,
-        poles[:mode].copy(),
-        owner[:mode].copy(),
-        residues[:mode].copy(),
-        origin,
-        origin_owner,
-        direct,
-        direct_owner,
-        instruments,
-        regressors,
-        output[0].copy(),
-    )
+class RowLayout(NamedTuple):
+    """Places of the rows of the compiled pass.
+
+    They are ``z, w, integrals of v, v, e, y - x``, and in closed loop ``z_u, integrals of u, u``; the first of each.
+    """
+
+    #: Rows of z, as many as of w, e and z_u: one for a real pole, two for a pair.
+    modes: int
+    #: Integrals of the input, 1/p … 1/p^l.
+    integrals: int
+    value: int
+    error: int
+    #: In open loop v is u, and these are its rows.
+    u_modes: int
+    u_integrals: int
+    u_value: int
+    width: int
 
 
 class PooledModes(NamedTuple):
-    """Partial fractions of all submodels, see :func:`pooled_modes`."""
+    """Partial fractions of all submodels, and the rows of psi and phi as maps of the rows of the pass."""
 
     #: Amplification of rounding [-].
     condition: float
@@ -199,22 +83,198 @@ class PooledModes(NamedTuple):
     origin: Array
     #: Submodel that integrates.
     origin_owner: int
-    #: Direct feed-through.
+    #: Direct feed-through, and the submodel that has it.
     direct: float
-    #: Submodel with direct feed-through.
     direct_owner: int
+    layout: RowLayout
     #: psi from the rows of the pass, shape (p, q).
     instruments: Array
     #: phi from the rows of the pass, shape (p, q).
     regressors: Array
-    #: Model output driven by z from the rows of the pass, shape (q,).
+    #: Model output driven by z from the rows of the pass, shape (1, q).
     output: Array
+
+
+class _Part(NamedTuple):
+    """One submodel ``B/(p^l A)``: coefficients in rising powers, A without its 1, and their places in theta."""
+
+    a: Array
+    b: Array
+    #: Coefficient of the highest power of A.
+    highest: float
+    integrators: int
+    first_a: int
+    first_b: int
+
+
+@njit(cache=True, nogil=True)
+def _row_layout(degrees: IntArray, closed: bool) -> RowLayout:
+    n, integrals = degrees[:, 0].sum(), degrees[:, 2].sum()
+    extra = 3 * n + integrals + 2
+    if closed:
+        return RowLayout(
+            n,
+            integrals,
+            2 * n + integrals,
+            extra - 1,
+            extra,
+            extra + n,
+            extra + n + integrals,
+            extra + n + integrals + 1,
+        )
+    return RowLayout(n, integrals, 2 * n + integrals, extra - 1, 0, 2 * n, 2 * n + integrals, extra)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _map_pole(part: _Part, pole: complex, slope: complex, curvature: complex, row: int, modes: PooledModes) -> complex:
+    """Write the partial fractions of a submodel at one of its poles; returns the residue of the model output.
+
+    ``slope`` is A' and ``curvature`` A''/A' there; ``row`` is the row of the mode among those of z.
+    """
+    layout = modes.layout
+    own, zeros = part.a.size, part.b.size - 1
+    paired = pole.imag > 0.0
+    squared = slope * slope
+    numerator, numerator_slope = complex(0.0, 0.0), complex(0.0, 0.0)
+    for k in range(zeros, -1, -1):
+        numerator_slope = numerator_slope * pole + numerator
+        numerator = numerator * pole + part.b[k]
+    reciprocal = 1.0 / pole**part.integrators
+    _add_mode(modes.output, 0, row, paired, numerator * reciprocal / slope)
+    power = reciprocal  # p^(k - l)
+    for k in range(max(own, zeros) + 1):
+        if 1 <= k <= own:
+            # psi_a = -p^k B/(p^l A^2) v, a double pole: -f/A'^2 of w and -(f' - f A''/A')/A'^2 of z, f = p^(k-l) B.
+            a_row = part.first_a + k - 1
+            f = power * numerator
+            f_slope = power * (numerator_slope + (k - part.integrators) * numerator / pole)
+            _add_mode(modes.instruments, a_row, layout.modes + row, paired, -f / squared)
+            _add_mode(modes.instruments, a_row, row, paired, -(f_slope - f * curvature) / squared)
+            # phi_a = -p^k/A of what the others leave of the output.
+            _add_mode(modes.regressors, a_row, layout.value + 1 + row, paired, -(power / reciprocal / slope))
+        if k <= zeros:
+            # psi_b and phi_b = p^k/(p^l A) of v and of u.
+            _add_mode(modes.instruments, part.first_b + k, row, paired, power / slope)
+            _add_mode(modes.regressors, part.first_b + k, layout.u_modes + row, paired, power / slope)
+        power *= pole
+    return numerator * reciprocal / slope * (2.0 if paired else 1.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _map_origin(part: _Part, modes: PooledModes) -> None:
+    """Write the partial fractions at the origin: Taylor coefficients of ``1/A``, ``B/A`` and ``B/A^2`` there."""
+    layout, integrators = modes.layout, part.integrators
+    single = _taylor_of_reciprocal(part.a, integrators)
+    model = _product(part.b, single, integrators)
+    sensitivity = _product(model, single, integrators)
+    for order in range(integrators):  # the weight of 1/p^(order + 1)
+        column = 2 * layout.modes + order
+        modes.origin[order] = model[integrators - 1 - order]
+        modes.output[0, column] += modes.origin[order]
+        for k in range(integrators - order):
+            if 1 <= k <= part.a.size:
+                modes.instruments[part.first_a + k - 1, column] -= sensitivity[integrators - 1 - order - k]
+            if k < part.b.size:
+                modes.instruments[part.first_b + k, column] += single[integrators - 1 - order - k]
+                modes.regressors[part.first_b + k, layout.u_integrals + order] += single[integrators - 1 - order - k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _map_direct(part: _Part, direct: float, first: int, last: int, modes: PooledModes) -> None:
+    """Write what acts without a pole: the feed-through, and the direct part that p^n/A always has.
+
+    The modes of the submodel have the rows ``first … last - 1`` among those of z.
+    """
+    layout, own, zeros = modes.layout, part.a.size, part.b.size - 1
+    biproper = zeros == own + part.integrators
+    if biproper:
+        modes.output[0, layout.value] += direct
+        modes.instruments[part.first_b + zeros, layout.value] += 1.0 / part.highest
+        modes.regressors[part.first_b + zeros, layout.u_value] += 1.0 / part.highest
+    if own == 0:
+        return
+    # What the others leave of the output is the error and the submodel's own output, -1/a_n of it here.
+    row = part.first_a + own - 1
+    if biproper:
+        modes.instruments[row, layout.value] -= direct / part.highest
+        modes.regressors[row, layout.u_value] -= direct / part.highest
+    modes.regressors[row, layout.error] -= 1.0 / part.highest
+    for j in range(first, last):
+        modes.regressors[row, layout.u_modes + j] -= modes.output[0, j] / part.highest
+    if part.integrators > 0:
+        for order in range(layout.integrals):
+            modes.regressors[row, layout.u_integrals + order] -= modes.origin[order] / part.highest
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def pooled_modes(theta: Array, degrees: IntArray, closed: bool) -> PooledModes:
+    """Partial fractions of all submodels; ``degrees`` holds poles, zeros and integrators of each."""
+    layout = _row_layout(degrees, closed)
+    n = layout.modes
+    poles, residues, owner = np.zeros(n, np.complex128), np.zeros(n, np.complex128), np.zeros(n, np.int64)
+    origin, origin_owner, direct, direct_owner, condition = np.zeros(layout.integrals), 0, 0.0, 0, 1.0
+    instruments, regressors = np.zeros((theta.size, layout.width)), np.zeros((theta.size, layout.width))
+    output = np.zeros((1, layout.width))
+    # The arrays are filled in place; the numbers behind them follow at the end.
+    modes = PooledModes(1.0, poles, owner, residues, origin, 0, 0.0, 0, layout, instruments, regressors, output)
+    mode, row, offset = 0, 0, 0
+    for i in range(degrees.shape[0]):
+        own, zeros, integrators = degrees[i, 0], degrees[i, 1], degrees[i, 2]
+        first_b = offset + own
+        a, b = theta[offset:first_b], theta[first_b : first_b + zeros + 1]
+        highest = a[own - 1] if own > 0 else 1.0
+        if highest == 0.0:
+            condition = np.inf  # theta has lost a pole
+            break
+        part = _Part(a, b, highest, integrators, offset, first_b)
+        monic = np.ones(own + 1)
+        for k in range(own):
+            monic[k + 1] = (a[own - 2 - k] if k < own - 1 else 1.0) / highest
+        w0 = time_scale(monic)
+        roots = polynomial_roots(scaled_denominator(monic, w0)) * w0
+        simple, slopes, curvatures = pole_slopes(roots)
+        if not simple:
+            condition = np.inf
+            break
+        if own > 1:
+            condition = max(condition, modal_condition(roots, slopes, curvatures))
+        first_row = row
+        for j in range(own):
+            if roots[j].imag < 0.0:
+                continue
+            poles[mode], owner[mode] = roots[j], i
+            residues[mode] = _map_pole(part, roots[j], slopes[j] * highest, curvatures[j], row, modes)
+            row += 2 if roots[j].imag > 0.0 else 1
+            mode += 1
+        if integrators > 0:
+            origin_owner = i
+            _map_origin(part, modes)
+        own_direct = 0.0
+        if zeros == own + integrators:
+            own_direct = b[zeros] / highest
+            direct, direct_owner = own_direct, i
+        _map_direct(part, own_direct, first_row, row, modes)
+        offset = first_b + zeros + 1
+    return PooledModes(
+        condition,
+        poles[:mode].copy(),
+        owner[:mode].copy(),
+        residues[:mode].copy(),
+        origin,
+        origin_owner,
+        direct,
+        direct_owner,
+        layout,
+        instruments,
+        regressors,
+        output,
+    )
 
 
 def simple_modes(theta: Array, degrees: IntArray, closed: bool) -> PooledModes | None:
     """Partial fractions where they are well conditioned."""
     try:
-        modes = PooledModes(*pooled_modes(plain_array(theta), degrees, closed))
+        modes = pooled_modes(plain_array(theta), degrees, closed)
     except (ZeroDivisionError, np.linalg.LinAlgError):
         return None
     return modes if modes.condition < MODAL_CONDITION_LIMIT else None

@@ -20,36 +20,20 @@ from typing import Literal
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray, ComplexArray
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
 from ctid_cli.filtering.free_response import free_response, free_response_size
 from ctid_cli.filtering.loop import simulate_loop
+from ctid_cli.filtering.row_sink import RowSink, row_sink
 from ctid_cli.filtering.submodel_map import PooledModes, simple_modes
-from ctid_cli.filtering.submodel_pass import submodel_pass
+from ctid_cli.filtering.submodel_pass import LoopData, submodel_pass
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.controller import DiscreteController
 
 #: State of the filters at the first sample.
 InitialState = Literal["rest", "periodic", "estimated"]
-
-
-@dataclass(frozen=True, eq=False)
-class LoopData:
-    """The feedback around a record, laid out for the compiled pass."""
-
-    #: Reference at the sampling instants; empty in open loop, shape (N,).
-    reference: Array
-    #: Controller in descending powers of q, monic, both of one length, shape (nc + 1,).
-    numerator: Array
-    denominator: Array
-    at_controller: bool
-
-    @property
-    def closed(self) -> bool:
-        """Whether there is feedback."""
-        return self.reference.size > 0
 
 
 #: No feedback.
@@ -176,76 +160,40 @@ class SubmodelFilter:
         """The compiled pass: maps, rows and moments; None where it does not apply."""
         if data.interval == 0.0:
             return None
-        loop = self.loop
-        modes = simple_modes(theta, self.degrees, loop.closed)
+        modes = simple_modes(theta, self.degrees, self.loop.closed)
         if modes is None:
             return None
-        maps = np.concatenate((modes.instruments, modes.regressors, modes.output[None]))
-        width = maps.shape[1]
-        rows = np.zeros((data.count if want_rows else 0, width))
-        gram = np.zeros((0, 0) if want_rows else (width, width))
-        state = np.zeros((modes.poles.size, 4), dtype=np.complex128)
+        maps = np.concatenate((modes.instruments, modes.regressors, modes.output))
+        states = np.zeros((modes.poles.size, 4), dtype=np.complex128)
         if self.periodic:
-            state = self._periodic_state(data, modes)
-        self._pass(data, modes, state, data.y, data.use, rows, gram)
-        return maps, rows, gram
+            states = self._periodic_states(data, modes)
+        sink = self._pass(data, modes, states, want_rows)
+        return maps, sink.rows, sink.gram
 
-    def _pass(
-        self,
-        data: FilterData,
-        modes: PooledModes,
-        state: ComplexArray,
-        y: Array,
-        use: BoolArray,
-        rows: Array,
-        gram: Array,
-    ) -> None:
-        """One pass; ``state`` is overwritten with the state at the end."""
+    def _pass(self, data: FilterData, modes: PooledModes, states: ComplexArray, want_rows: bool) -> RowSink:
+        """One pass; ``states`` is overwritten with the states at the end."""
         shift, fraction = split_delay(self.delay, data.interval)
-        submodel_pass(
-            modes.poles,
-            modes.owner,
-            modes.residues,
-            modes.origin,
-            modes.origin_owner,
-            modes.direct,
-            modes.direct_owner,
-            len(self.terms),
-            data.interval,
-            0 if self.periodic else shift,
-            fraction,
-            self._u,
-            data.input_foh,
-            y,
-            data.y_foh,
-            use,
-            self.loop.reference,
-            self.loop.numerator,
-            self.loop.denominator,
-            self.loop.at_controller,
-            state,
-            np.zeros((2, modes.origin.size)),
-            rows,
-            gram,
-        )
+        sink: RowSink = row_sink(modes.layout.width, data.use, want_rows)
+        shift = 0 if self.periodic else shift
+        submodel_pass(modes, len(self.terms), self.loop, shift, fraction, data._replace(u=self._u), states, sink)
+        return sink
 
-    def _periodic_state(self, data: FilterData, modes: PooledModes) -> ComplexArray:
-        """State of the pass that comes back after one period."""
+    def _periodic_states(self, data: FilterData, modes: PooledModes) -> ComplexArray:
+        """States of the pass that come back after one period."""
         count = data.y.size
         period = data.interval * count
         initial = np.zeros((modes.poles.size, 4), dtype=np.complex128)
-        empty = np.zeros((0, 0))
         decay = np.exp(modes.poles * period)
-        state = initial.copy()
-        self._pass(data, modes, state, data.y, np.zeros(count, dtype=bool), empty, empty)
-        initial[:, 0] = state[:, 0] / (1.0 - decay)
-        initial[:, 1] = (state[:, 1] + period * decay * initial[:, 0]) / (1.0 - decay)
+        states = initial.copy()
+        self._pass(data._replace(use=np.zeros(count, dtype=bool)), modes, states, True)
+        initial[:, 0] = states[:, 0] / (1.0 - decay)
+        initial[:, 1] = (states[:, 1] + period * decay * initial[:, 0]) / (1.0 - decay)
         # What filters see of the output depends on the output of the model, so it comes second; and once round, back at
         # the first sample.
-        state = initial.copy()
+        states = initial.copy()
         once_round = plain_array(np.append(data.y, data.y[0]))
-        self._pass(data, modes, state, once_round, np.zeros(count + 1, dtype=bool), empty, empty)
-        initial[:, 2] = state[:, 2] / (1.0 - decay)
+        self._pass(data._replace(y=once_round, use=np.zeros(count + 1, dtype=bool)), modes, states, True)
+        initial[:, 2] = states[:, 2] / (1.0 - decay)
         return initial
 
     def _general_rows(self, data: FilterData, theta: Array) -> tuple[Array, Array, Array, Array] | None:
