@@ -14,7 +14,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.problems import is_hurwitz, reflect_unstable
 from ctid_cli.estimation.refined_iv import Equations
 from ctid_cli.filtering.filter_data import FilterData, plain_array
-from ctid_cli.filtering.submodel_pass import LoopData
+from ctid_cli.filtering.submodel_blocks import LoopData
 from ctid_cli.filtering.submodels import OPEN_LOOP, InitialState, SubmodelFilter
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController

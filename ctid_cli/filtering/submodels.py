@@ -20,15 +20,15 @@ from typing import Literal
 
 import numpy as np
 
-from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
 from ctid_cli.filtering.free_response import free_response, free_response_size
 from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.filtering.row_sink import RowSink, row_sink
-from ctid_cli.filtering.submodel_map import PooledModes, simple_modes
-from ctid_cli.filtering.submodel_pass import LoopData, submodel_pass
+from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT
+from ctid_cli.filtering.submodel_blocks import LoopData
+from ctid_cli.filtering.submodel_pass import filtered_submodels
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.controller import DiscreteController
 
@@ -74,7 +74,7 @@ class SubmodelFilter:
     ) -> None:
         self.data = data
         self.terms = tuple(terms)
-        self.delay = delay
+        self.delay = float(delay)
         self.loop = loop
         self.periodic = initial_state == "periodic"
         self.free = free_response_size(terms) if initial_state == "estimated" else 0
@@ -110,9 +110,8 @@ class SubmodelFilter:
         if fast is None:
             rows = self._general_rows(self.data, theta)
             return None if rows is None else _moments_of_rows(*rows)
-        maps, _, gram = fast
+        row, maps, gram = fast
         products = maps[:p] @ gram
-        row = self._error_row
         return SubmodelMoments(
             products @ maps[p : 2 * p].T,
             products[:, row].copy(),
@@ -149,52 +148,22 @@ class SubmodelFilter:
         fast = self._run(data, theta, True)
         if fast is None:
             return self._general_rows(data, theta)
-        maps, rows, _ = fast
-        return rows @ maps[:p].T, rows @ maps[p : 2 * p].T, rows[:, self._error_row].copy(), rows @ maps[2 * p]
+        row, maps, rows = fast
+        return rows @ maps[:p].T, rows @ maps[p : 2 * p].T, rows[:, row].copy(), rows @ maps[2 * p]
 
-    @property
-    def _error_row(self) -> int:
-        return int(3 * self.degrees[:, 0].sum() + self.degrees[:, 2].sum() + 1)
-
-    def _run(self, data: FilterData, theta: Array, want_rows: bool) -> tuple[Array, Array, Array] | None:
-        """The compiled pass: maps, rows and moments; None where it does not apply."""
+    def _run(self, data: FilterData, theta: Array, want_rows: bool) -> tuple[int, Array, Array] | None:
+        """The compiled pass: row of the error, maps, and rows or moments; None where it does not apply."""
         if data.interval == 0.0:
             return None
-        modes = simple_modes(theta, self.degrees, self.loop.closed)
-        if modes is None:
-            return None
-        maps = np.concatenate((modes.instruments, modes.regressors, modes.output))
-        states = np.zeros((modes.poles.size, 4), dtype=np.complex128)
         if self.periodic:
-            states = self._periodic_states(data, modes)
-        sink = self._pass(data, modes, states, want_rows)
-        return maps, sink.rows, sink.gram
-
-    def _pass(self, data: FilterData, modes: PooledModes, states: ComplexArray, want_rows: bool) -> RowSink:
-        """One pass; ``states`` is overwritten with the states at the end."""
-        shift, fraction = split_delay(self.delay, data.interval)
-        sink: RowSink = row_sink(modes.layout.width, data.use, want_rows)
-        shift = 0 if self.periodic else shift
-        submodel_pass(modes, len(self.terms), self.loop, shift, fraction, data._replace(u=self._u), states, sink)
-        return sink
-
-    def _periodic_states(self, data: FilterData, modes: PooledModes) -> ComplexArray:
-        """States of the pass that come back after one period."""
-        count = data.y.size
-        period = data.interval * count
-        initial = np.zeros((modes.poles.size, 4), dtype=np.complex128)
-        decay = np.exp(modes.poles * period)
-        states = initial.copy()
-        self._pass(data._replace(use=np.zeros(count, dtype=bool)), modes, states, True)
-        initial[:, 0] = states[:, 0] / (1.0 - decay)
-        initial[:, 1] = (states[:, 1] + period * decay * initial[:, 0]) / (1.0 - decay)
-        # What filters see of the output depends on the output of the model, so it comes second; and once round, back at
-        # the first sample.
-        states = initial.copy()
-        once_round = plain_array(np.append(data.y, data.y[0]))
-        self._pass(data._replace(y=once_round, use=np.zeros(count + 1, dtype=bool)), modes, states, True)
-        initial[:, 2] = states[:, 2] / (1.0 - decay)
-        return initial
+            data = data._replace(u=self._u)
+        try:
+            condition, row, maps, found = filtered_submodels(
+                plain_array(theta), self.degrees, self.loop, self.delay, self.periodic, data, want_rows
+            )
+        except (ZeroDivisionError, np.linalg.LinAlgError):
+            return None
+        return (row, maps, found) if condition < MODAL_CONDITION_LIMIT else None
 
     def _general_rows(self, data: FilterData, theta: Array) -> tuple[Array, Array, Array, Array] | None:
         """psi, phi, eps and the model output driven by z, submodel by submodel; any clock, repeated poles."""

@@ -10,7 +10,7 @@ from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.filtering.row_sink import BLOCK
 from ctid_cli.filtering.sampled import simulate_additive
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.filtering.submodel_pass import LoopData
+from ctid_cli.filtering.submodel_blocks import LoopData
 from ctid_cli.filtering.submodels import OPEN_LOOP, SubmodelFilter
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController
