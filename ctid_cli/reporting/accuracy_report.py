@@ -29,38 +29,31 @@ def accuracy_object(plan: Plan) -> dict[str, Any]:
             f"{plan.experiment} is about a measured record, whose true system is not known; "
             "its estimates carry their standard errors: ctid fit, or ctid run and ctid table"
         )
-    shown = _shown([cell for cell, _ in cells])
-    estimates = [
-        _entry(cell, source, estimator, plan)
-        for cell, source in cells
-        if cell in shown
-        for estimator in plan.estimators
-    ]
+    shown = _shown(cells)
+    estimates = [_entry(cell, source, estimator, plan) for cell, source in shown for estimator in plan.estimators]
     return {"experiment": plan.experiment, "left_out": len(cells) - len(shown), "estimates": estimates}
 
 
-def _shown(cells: list[DataCell]) -> list[DataCell]:
+def _own(cell: DataCell) -> dict[str, Any]:
+    """Swept settings besides the number of samples."""
+    return {name: value for name, value in cell.swept.items() if name.split(".")[-1] != "samples"}
+
+
+def _shown(cells: list[tuple[DataCell, SimulatedSource]]) -> list[tuple[DataCell, SimulatedSource]]:
     """Data cells of the first settings, each at a few numbers of samples from the least to the greatest."""
-    by_settings: dict[str, dict[int, DataCell]] = {}
-    for cell in cells:
-        settings = {name: value for name, value in cell.swept.items() if not _is_samples(name)}
-        by_settings.setdefault(repr(settings), {})[cell.source.sampling.samples] = cell  # type: ignore[union-attr]
-    shown = []
-    for sizes in list(by_settings.values())[:SETTINGS]:
-        ordered = sorted(sizes)
-        places = np.unique(np.linspace(0, len(ordered) - 1, SIZES).round().astype(int))
-        shown += [sizes[ordered[k]] for k in places]
-    return shown
-
-
-def _is_samples(name: str) -> bool:
-    return name.split(".")[-1] == "samples"
+    by_settings: dict[str, dict[int, int]] = {}
+    for k, (cell, source) in enumerate(cells):
+        by_settings.setdefault(repr(_own(cell)), {})[source.sampling.samples] = k
+    shown: list[int] = []
+    for places in list(by_settings.values())[:SETTINGS]:
+        some = np.unique(np.linspace(0, len(places) - 1, SIZES).round().astype(int))
+        shown += (places[sorted(places)[k]] for k in some)
+    return [cells[k] for k in sorted(shown)]
 
 
 def _entry(cell: DataCell, source: SimulatedSource, estimator: EstimatorCell, plan: Plan) -> dict[str, Any]:
-    own = {name: value for name, value in cell.swept.items() if not _is_samples(name)}
     entry: dict[str, Any] = {
-        "settings": own,
+        "settings": _own(cell),
         "samples": source.sampling.samples,
         "estimator": estimator.name,
         "options": dict(estimator.swept),

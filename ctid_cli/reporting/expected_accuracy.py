@@ -1,7 +1,8 @@
-"""How accurate an estimator of a simulated experiment can be, by theory, and by which formula."""
+"""How accurate an estimator of a simulated experiment can be, by theory, by which formula, and in the long run."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.arrays import Array
+from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.inference.accuracy import ParameterAccuracy, estimated_parameters
@@ -26,6 +28,7 @@ from ctid_cli.inference.finite_record import (
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import factored, unfactored
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.running.plan import Plan
 from ctid_cli.signals.excitation import Gaussian
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.sampling import RegularSampling
@@ -86,19 +89,15 @@ def _estimated(system: AdditiveModel | TransferFunction, estimator: Any) -> _Est
     if estimator.kind == "svf":
         raise DataError("svf is the least-squares start of other estimators; noise biases it, by an unknown amount")
     delay_from = None
-    bounds = getattr(estimator, "delay_bounds", None)
+    bounds, wrong = getattr(estimator, "delay_bounds", None), ""
     if bounds is not None:
-        if not bounds[0] <= system.delay <= bounds[1]:
-            raise DataError(
-                f"the delay is sought from {bounds[0]:g} to {bounds[1]:g} s and the true one is {system.delay:g} s: "
-                "the estimate is biased"
-            )
         delay_from = bounds[1] if bounds[0] < bounds[1] else None
+        if not bounds[0] <= system.delay <= bounds[1]:
+            wrong = f"the delay is sought from {bounds[0]:g} to {bounds[1]:g} s"
     elif abs(estimator.delay - system.delay) > SAME_DELAY * system.delay:
-        raise DataError(
-            f"the estimator takes the delay as {estimator.delay:g} s and the true one is {system.delay:g} s: the "
-            "estimate is biased"
-        )
+        wrong = f"the estimator takes the delay as {estimator.delay:g} s"
+    if wrong:
+        raise DataError(f"{wrong} and the true one is {system.delay:g} s: the estimate is biased")
     instruments = getattr(estimator, "instruments", "open_loop")
     if hasattr(estimator, "terms"):
         return _Estimated(_in_terms(system, estimator.terms), None, delay_from, instruments)
@@ -177,35 +176,33 @@ def _of_long_records(source: SimulatedSource, estimated: _Estimated) -> Expected
     signal = source.excitation if loop is None else loop.reference
     assert isinstance(signal, Gaussian)
     options: dict[str, Any] = {"noise_filter": noise.filter, "samples": sampling.samples, "zeros": estimated.zeros}
+    place, deviation = (estimated.model, sampling.interval), signal.standard_deviation
     if loop is None:
-        power = output_variance(estimated.model, sampling.interval, input_standard_deviation=signal.standard_deviation)
+        power = output_variance(*place, input_standard_deviation=deviation)
         parameters = open_loop_accuracy(
-            estimated.model,
-            sampling.interval,
-            input_standard_deviation=signal.standard_deviation,
+            *place,
+            input_standard_deviation=deviation,
             # A level relative to the output counts from its mean square.
             innovation_variance=noise.innovation_variance_of(np.sqrt([power])),
             **options,
         )
     else:
         parameters = closed_loop_accuracy(
-            estimated.model,
-            sampling.interval,
+            *place,
             loop.controller,
-            reference_standard_deviation=signal.standard_deviation,
+            reference_standard_deviation=deviation,
             innovation_variance=noise.innovation_variance_of(),
             enters=loop.enters,
             instruments="closed_loop" if estimated.instruments == "closed_loop" else "open_loop",
             **options,
         )
-    matrices = "M = E psi psi'"
+    product, matrices = "sigma^2 M^-1", "M = E psi psi'"
     if noise.coloured:
+        product = "M^-1 Sigma M^-1"
         matrices += ", Sigma = sigma_e^2 cov(H psi), H the filter and sigma_e^2 the innovation variance of the noise"
-    drive = "input" if loop is None else "reference"
     formula = (
-        f"the limit for long records, {'M^-1 Sigma M^-1' if noise.coloured else 'sigma^2 M^-1'} / N with {matrices}, "
-        f"psi {_sensitivities(source, estimated)}; by discrete Lyapunov equations, as the {drive} is white Gaussian "
-        "noise"
+        f"the limit for long records, {product} / N with {matrices}, psi {_sensitivities(source, estimated)}; by "
+        f"discrete Lyapunov equations, as the {'input' if loop is None else 'reference'} is white Gaussian noise"
     )
     return ExpectedAccuracy(parameters, sampling.samples, True, formula)
 
@@ -260,3 +257,33 @@ def _sensitivities(source: SimulatedSource, estimated: _Estimated) -> str:
     if source.loop is None:
         return text
     return f"{text} in the {'noise-free loop' if estimated.instruments == 'closed_loop' else 'loop, noise included'}"
+
+
+def long_record_variances(plan: Plan) -> dict[tuple[int, int], dict[str, float]]:
+    """Variances that the parameters of submodels approach on long records, by place of data cell and estimator.
+
+    The limit is taken whatever the number of samples of the cell: short records do not reach it.
+    """
+    found: dict[tuple[int, int], dict[str, float]] = {}
+    # Cells that differ in the number of samples or the seed have the same limit.
+    known: dict[str, dict[str, float]] = {}
+    for (k, cell), (j, part) in itertools.product(enumerate(plan.data_cells), enumerate(plan.estimators)):
+        sampling = {key: value for key, value in (cell.content.get("sampling") or {}).items() if key != "samples"}
+        content = {key: value for key, value in cell.content.items() if key != "seed"} | {"sampling": sampling}
+        same = content_hash([content, part.content])
+        if same not in known:
+            known[same] = _limit(cell.source, part.estimator, plan.terms)
+        if known[same]:
+            found[k, j] = known[same]
+    return found
+
+
+def _limit(source: Any, estimator: Any, terms: tuple[Term, ...] | None) -> dict[str, float]:
+    if not isinstance(source, SimulatedSource) or not isinstance(source.sampling, RegularSampling):
+        return {}
+    try:
+        expected = expected_accuracy(replace(source, sampling=replace(source.sampling, samples=LONG)), estimator, terms)
+    except DataError:
+        return {}
+    variances = (expected.samples * expected.parameters.covariance).diagonal()
+    return dict(zip(expected.parameters.names, variances.tolist(), strict=True)) if expected.limit else {}

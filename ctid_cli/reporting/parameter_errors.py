@@ -7,7 +7,6 @@ did not converge, stands beside every number.
 
 from __future__ import annotations
 
-import dataclasses
 import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.quantile import normal_quantile
-from ctid_cli.reporting.parameter_theory import long_record_variances
+from ctid_cli.reporting.expected_accuracy import long_record_variances
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import spec_from_canonical
@@ -103,9 +102,8 @@ class ParameterErrors:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data, with a key for every swept field."""
-        content = {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
-        settings = content.pop("settings")
-        return {"experiment": content.pop("experiment"), **settings, **content}
+        content = dict(vars(self))
+        return {"experiment": content.pop("experiment"), **content.pop("settings"), **content}
 
 
 @dataclass(frozen=True)

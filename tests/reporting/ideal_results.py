@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ctid_cli.reporting.parameter_theory import long_record_variances
+from ctid_cli.reporting.expected_accuracy import long_record_variances
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec

@@ -10,8 +10,8 @@ import pytest
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.asymptotic import open_loop_accuracy
 from ctid_cli.models.factoring import unfactored
+from ctid_cli.reporting.expected_accuracy import long_record_variances
 from ctid_cli.reporting.parameter_errors import mse_ratio, parameter_errors, parameter_estimates
-from ctid_cli.reporting.parameter_theory import long_record_variances
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
