@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri
 
 #: The rise of the cost two standard errors away is called quadratic if its square root is right to this share.
 QUADRATIC_TOLERANCE = 0.1
@@ -52,7 +52,7 @@ def profile_likelihood_interval(
     freedom = count - parameters
     if freedom <= 0 or not np.isfinite(inflation) or not squared_error >= 0:
         return DelayInterval(float("nan"), float("nan"), False, False)
-    allowed = inflation * float(f_distribution.ppf(level, 1, freedom)) / freedom
+    allowed = inflation * float(fdtri(1, freedom, level)) / freedom
 
     def excess(delay: float) -> float:
         value = squared_error_at(delay)

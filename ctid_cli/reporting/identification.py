@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
 from ctid_cli.reporting.layout import count, number, text_table
 from ctid_cli.signals.measurement import Measurement
-from ctid_cli.text import wrapped
+from ctid_cli.text import warning_lines, wrapped
 
 FIT_DEFINITION = "100 (1 - ||y - x|| / ||y - mean y||)"
 R2_DEFINITION = "1 - ||y - x||^2 / ||y - mean y||^2"
@@ -168,12 +168,6 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
     # What the line of the residuals says need not be said again.
     told = tuple(test.sentence for test in result.tests)
     return "\n".join([*lines, *warning_lines(warning for warning in result.warnings if not warning.endswith(told))])
-
-
-def warning_lines(warnings: Iterable[str]) -> list[str]:
-    """Warnings as the end of a text; nothing where there are none."""
-    lines = [wrapped(f"- {warning}", hanging="  ") for warning in warnings]
-    return ["", "Warnings:", *lines] if lines else []
 
 
 def _record_line(measurement: Measurement, used: int, units: Units) -> str:

@@ -15,8 +15,9 @@ from ctid_cli.canonical import plain
 from ctid_cli.frequency.automatic import Settings
 from ctid_cli.frequency.flags import MEANINGS, Flag
 from ctid_cli.frequency.record_track import RecordTrack
-from ctid_cli.reporting.layout import count, number, text_table, wrapped
+from ctid_cli.reporting.layout import count, number, text_table
 from ctid_cli.signals.sampled_signal import SampledSignal
+from ctid_cli.text import warning_lines, wrapped
 
 _UNITS = {"t": "s", "omega": "rad/s", "frequency": "Hz"}
 #: A smaller share of valid time is worth a warning.
@@ -43,21 +44,18 @@ class ToneSummary:
 
 def summarise(track: RecordTrack) -> list[ToneSummary]:
     """One line for each tone."""
-    valid = track.valid
-    share = 100.0 * float(valid.mean()) if valid.size else 0.0
+    share = 100.0 * float(track.valid.mean()) if track.valid.size else 0.0
     found = []
     for k in range(track.omega.shape[1]):
-        omega = track.omega[valid, k]
-        amplitudes = track.amplitudes[valid, k]
+        omega, amplitudes = track.omega[track.valid, k], track.amplitudes[track.valid, k]
         amplitudes = amplitudes[np.isfinite(amplitudes)]
         amplitude = float(np.median(amplitudes)) if amplitudes.size else None
-        if omega.size:
-            middle = float(np.median(omega))
-            low, high = np.percentile(omega, [16.0, 84.0]) / (2.0 * np.pi)
-            summary = ToneSummary(k + 1, middle / (2.0 * np.pi), middle, float(high - low) / 2.0, amplitude, share)
-        else:
-            summary = ToneSummary(k + 1, None, None, None, None, share)
-        found.append(summary)
+        if not omega.size:
+            found.append(ToneSummary(k + 1, None, None, None, None, share))
+            continue
+        middle = float(np.median(omega))
+        low, high = np.percentile(omega, [16.0, 84.0]) / (2.0 * np.pi)
+        found.append(ToneSummary(k + 1, middle / (2.0 * np.pi), middle, float(high - low) / 2.0, amplitude, share))
     return found
 
 
@@ -116,14 +114,12 @@ def track_text(signal: SampledSignal, settings: Settings, track: RecordTrack) ->
     """A track for people, within 100 columns."""
     end = signal.start + (signal.samples.size - 1) * signal.interval
     gaps = f", {count(signal.missing, 'sample')} missing" if signal.missing else ""
-    lines = wrapped(
+    head = (
         f"{signal.file}: {count(signal.samples.size, 'sample')} of {signal.column!r} from {signal.start:.6g} to "
         f"{end:.6g} s, every {signal.interval:.6g} s ({1.0 / signal.interval:.6g} Hz){gaps}"
     )
-    for note in signal.notes:
-        lines += wrapped(note, "  ")
-    for reason in settings.reasons:
-        lines += wrapped(f"- {reason}", "", 2)
+    lines = [wrapped(head), *(wrapped(note, "  ") for note in signal.notes)]
+    lines += [wrapped(f"- {reason}", hanging="  ") for reason in settings.reasons]
     unit = f"amplitude [{signal.unit}]" if signal.unit else "amplitude"
     cells = [
         [
@@ -137,19 +133,10 @@ def track_text(signal: SampledSignal, settings: Settings, track: RecordTrack) ->
         for tone in summarise(track)
     ]
     header = ["tone", "frequency [Hz]", "spread [Hz]", "[rad/s]", unit, "valid"]
-    lines += [
-        "",
-        text_table(header, cells, "rrrrrr"),
-        *wrapped(
-            f"Medians over the valid ones of {count(track.t.size, 'row')}, one every {track.every:.4g} s; the spread "
-            "is half the width of the central 68 %."
-        ),
-    ]
-    warnings = track_warnings(track, settings)
-    if warnings:
-        lines += ["", "Warnings:"]
-        lines += [line for warning in warnings for line in wrapped(f"- {warning}", "", 2)]
-    return "\n".join(lines)
+    rows = f"{count(track.t.size, 'row')}, one every {track.every:.4g} s"
+    foot = f"Medians over the valid ones of {rows}; the spread is half the width of the central 68 %."
+    lines += ["", text_table(header, cells, "rrrrrr"), wrapped(foot)]
+    return "\n".join([*lines, *warning_lines(track_warnings(track, settings))])
 
 
 def flag_words(flags: int) -> str:
@@ -173,10 +160,10 @@ def track_table(track: RecordTrack, start: float) -> dict[str, NDArray[Any]]:
 def track_bytes(table: dict[str, NDArray[Any]], style: str, unit: str | None = None) -> bytes:
     """The file of a track."""
     if style == "csv":
-        lines = [",".join(table)]
-        for row in zip(*table.values(), strict=True):
-            lines.append(",".join(_cell(value) for value in row))
-        return ("\n".join(lines) + "\n").encode()
+        import pandas as pd
+
+        frame = pd.DataFrame(table).replace([np.inf, -np.inf], np.nan).astype({"valid": int})
+        return frame.to_csv(index=False, float_format="%.12g", lineterminator="\n").encode()
     import h5py
 
     file = io.BytesIO()
@@ -190,14 +177,6 @@ def track_bytes(table: dict[str, NDArray[Any]], style: str, unit: str | None = N
             if column_unit is not None:
                 column.attrs["unit"] = column_unit
     return file.getvalue()
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, bool | np.bool_):
-        return "1" if value else "0"
-    if isinstance(value, str):
-        return value
-    return f"{value:.12g}" if math.isfinite(value) else ""
 
 
 def _to_spread(value: float | None, spread: float | None) -> str:
