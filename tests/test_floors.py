@@ -1,0 +1,58 @@
+"""No two modules of the package import each other in a circle, imports for the type checker and in functions included."""
+
+import ast
+from pathlib import Path
+
+import ctid_cli
+
+ROOT = Path(ctid_cli.__file__).parent
+
+
+def modules():
+    """Name of every module to the text of its file."""
+    return {
+        ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__"): path.read_text("utf-8")
+        for path in sorted(ROOT.rglob("*.py"))
+    }
+
+
+def imported(text, names):
+    """Modules among the names that a text imports, wherever in it."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            inner = {f"{node.module}.{alias.name}" for alias in node.names} & names
+            yield from inner or {node.module} & names
+
+
+def circle(graph):
+    """The names of a circle, its first one at both ends; empty if there is none."""
+    clear = set()
+
+    def walk(name, path):
+        if name in path:
+            return [*path[path.index(name) :], name]
+        if name in clear:
+            return []
+        found = next(filter(None, (walk(other, [*path, name]) for other in sorted(graph[name]))), [])
+        clear.add(name)
+        return found
+
+    return next(filter(None, (walk(name, []) for name in sorted(graph))), [])
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    texts = modules()
+    graph = {name: set(imported(text, texts.keys())) - {name} for name, text in texts.items()}
+    assert len(graph) > 150
+    assert sum(map(len, graph.values())) > 600
+    found = circle(graph)
+    assert not found, " -> ".join(found)
+
+
+def test_the_check_sees_every_kind_of_import():
+    text = "import a\nfrom b import x\nfrom b import c\nif TYPE_CHECKING:\n    from d import y\ndef f():\n    import e.g\n"
+    assert sorted(imported(text, {"a", "b", "b.c", "d", "e.g"})) == ["a", "b", "b.c", "d", "e.g"]
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
+    assert circle({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
