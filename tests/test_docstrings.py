@@ -16,6 +16,7 @@ from ctid_cli.signals.excitation import Excitation
 from ctid_cli.signals.noise import Noise
 from ctid_cli.signals.sampling import Sampling
 from ctid_cli.signals.sinusoids import Piece, SumOfSinusoids, Tone
+from ctid_cli.simulation.dataset import MeasuredSource
 
 
 def members_of(name, member):
@@ -43,7 +44,7 @@ def public_callables():
                 yield from members_of(kind, member)
     for contract in (ContinuousModel, Excitation, Noise, Sampling):
         yield from members_of(contract.__name__, contract)
-    for member in (Piece, SumOfSinusoids, Tone):  # the section `signal` has no kinds
+    for member in (MeasuredSource, Piece, SumOfSinusoids, Tone):  # sections without a kind
         yield member.__name__, member
 
 

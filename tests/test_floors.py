@@ -1,4 +1,4 @@
-"""No two modules of the package import each other in a circle, imports for the type checker and in functions included."""
+"""No two modules of the package import each other in a circle, by imports of every kind."""
 
 import ast
 from pathlib import Path
@@ -52,7 +52,9 @@ def test_no_modules_import_each_other_in_a_circle():
 
 
 def test_the_check_sees_every_kind_of_import():
-    text = "import a\nfrom b import x\nfrom b import c\nif TYPE_CHECKING:\n    from d import y\ndef f():\n    import e.g\n"
+    text = (
+        "import a\nfrom b import x\nfrom b import c\nif TYPE_CHECKING:\n    from d import y\ndef f():\n    import e.g\n"
+    )
     assert sorted(imported(text, {"a", "b", "b.c", "d", "e.g"})) == ["a", "b", "b.c", "d", "e.g"]
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
     assert circle({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []

@@ -228,7 +228,7 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
         elif spec.data is not None:
             # The seed decides where random starts lie; the record itself is in the content as a hash.
             content = {"data": _without_place(spec.data.model_dump(mode="json")), **content, "seed": seed}
-            source = spec.data.source(folder, loop)
+            source = dataclasses.replace(located(spec.data.options(), folder), loop=loop)
         else:
             content |= {"noise": content.get("noise"), "seed": seed}
             source = _simulated(chosen, loop, folder, spec)

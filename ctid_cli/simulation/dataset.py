@@ -5,17 +5,18 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.errors import DataError
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.csv_file import Offset, read_held_signal, read_record
 from ctid_cli.signals.excitation import Excitation, InputFile
 from ctid_cli.signals.held import HeldSignal, Hold
@@ -100,25 +101,56 @@ class SimulatedSource:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSource:
-    """The data set of a measured record."""
+    """A measured record in place of a simulated one.
+
+    Parameters
+    ----------
+    file : str
+        Comma-separated file, relative to the folder of the specification.
+    sha256 : str, optional
+        SHA-256 of the file.
+    time : str, default "t"
+        Column of the instants [s].
+    input : str, default "u"
+        Column of the input [input unit].
+    output : str, default "y"
+        Column of the output [output unit]; empty or NaN is a missing sample.
+    hold : {"zoh", "foh"}, default "zoh"
+        How the input behaves between its samples.
+    offset : {"remove", "none"}, default "none"
+        What is done to the means of input and output over the samples for estimation.
+    estimation_samples : int, optional
+        Identify on the first so many samples and judge on the rest; null identifies on all.
+    reference : str, optional
+        Column of the reference, if the record was taken in a loop; loop has the controller.
+    loop : LoopOptions, optional
+        The loop.
+    """
 
     file: str
-    sha256: str
-    #: Columns of the instants [s], the input [input unit] and the output [output unit].
+    sha256: str | None = None
     time: str = "t"
     input: str = "u"
     output: str = "y"
     hold: Hold = "zoh"
     offset: Offset = "none"
     estimation_samples: int | None = None
-    reference: str | None = None
+    reference: str | None = field(default=None, metadata={"added_later": True})
     loop: LoopOptions | None = None
+
+    def __post_init__(self) -> None:
+        if self.estimation_samples is not None:
+            require_integer("estimation_samples", self.estimation_samples, 2)
+        if self.reference is not None and self.hold != "zoh":
+            message = "must be zoh in a loop: a discrete controller holds the input between its samples"
+            raise OptionError("hold", message)
 
     def dataset(self, replicate: int) -> DataSet:
         """The record."""
         if replicate != 0:
             raise ValueError(f"a measured record has replicate 0 only, not {replicate}")
-        require_content(self.file, self.sha256)
+        if self.sha256 is not None:
+            require_content(self.file, self.sha256)
         whole = read_record(self.file, time=self.time, input=self.input, output=self.output, hold=self.hold)
         t, u, y = whole.t, whole.input.values, whole.y
         count = t.size if self.estimation_samples is None else self.estimation_samples
@@ -165,10 +197,8 @@ def joined(folder: Path, file: str) -> str:
 
 
 def located(options: Any, folder: Path) -> Any:
-    """An excitation with the name of its file, if it reads one, as seen from the working directory."""
-    if not isinstance(options, InputFile):
-        return options
-    return dataclasses.replace(options, file=joined(folder, options.file))
+    """Options with the name of the file that they read, if any, as seen from the working directory."""
+    return dataclasses.replace(options, file=joined(folder, options.file)) if hasattr(options, "file") else options
 
 
 def file_sha256(path: str) -> str:

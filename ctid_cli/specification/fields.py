@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any, Union
 
 from pydantic import (
@@ -51,57 +50,43 @@ def matching(pattern: str, rule: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-def one_of(choose: Callable[[Any], str | None], forms: Mapping[str, Any], error: str = "", allowed: str = "") -> Any:
-    """One of several forms, by the name that `choose` gives to a value; None is refused, with the error named."""
-    tagged = [Annotated[form, Tag(TAG + name)] for name, form in forms.items()]
+class OneOf:
+    """Annotation of a value with one of several forms, by the name that `choose` gives to it; None is refused."""
 
-    def chosen(value: Any) -> str | None:
-        name = choose(value)
-        return None if name is None else TAG + name
+    def __init__(
+        self, choose: Callable[[Any], str | None], forms: Mapping[str, Any], error: str = "", allowed: str = ""
+    ) -> None:
+        def chosen(value: Any) -> str | None:
+            name = choose(value)
+            return None if name is None else TAG + name
 
-    named = Discriminator(
-        chosen,
-        custom_error_type=error or None,
-        custom_error_message="{allowed}" if error else None,
-        custom_error_context={"allowed": allowed} if error else None,
-    )
-    return Annotated[Any, _Union(tuple(tagged), named)]
-
-
-@dataclass(frozen=True, eq=False)
-class _Union:
-    """Annotation of a value that has one of several tagged forms."""
-
-    forms: tuple[Any, ...]
-    named: Discriminator
+        refusal = ("{allowed}", {"allowed": allowed}) if error else (None, None)
+        named = Discriminator(chosen, error or None, *refusal)
+        tagged = tuple(Annotated[form, Tag(TAG + name)] for name, form in forms.items())
+        self._form = Annotated[Union[tagged], named]  # noqa: UP007 - built at run time
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return handler.generate_schema(Annotated[Union[self.forms], self.named])  # noqa: UP007 - built at run time
+        return handler.generate_schema(self._form)
 
 
-def by_shape(usual: Any, hint: str = "", **others: Any) -> Any:
-    """The usual form, or the one for a value that is a list, a mapping or a text."""
-    name = HINT.removeprefix(TAG) + f" {hint}" if hint else "usual"
+class ByShape(OneOf):
+    """Annotation of a value with a usual form, and another one if it is a list, a mapping or a text."""
 
-    def choose(value: Any) -> str:
+    def __init__(self, usual: Any, hint: str = "", **others: Any) -> None:
+        name = HINT.removeprefix(TAG) + f" {hint}" if hint else "usual"
         kinds: dict[str, Any] = {"list": list, "text": str, "mapping": (Mapping, BaseModel)}
-        shape = next((shape for shape, kind in kinds.items() if isinstance(value, kind)), "")
-        return shape if shape in others else name
+        shapes = {shape: kinds[shape] for shape in others}
+        super().__init__(
+            lambda value: next((shape for shape, kind in shapes.items() if isinstance(value, kind)), name),
+            {name: usual, **others},
+        )
 
-    return one_of(choose, {name: usual, **others})
 
-
-@dataclass(frozen=True, eq=False)
-class Swept:
+class Swept(ByShape):
     """Annotation of a field that may be a list of values to sweep, or a mapping that stands for such a list."""
 
-    one: Any
-    mapping: Any = None
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        several = Annotated[list[self.one], AfterValidator(_different)]  # type: ignore[name-defined]
-        spaced = {} if self.mapping is None else {"mapping": self.mapping}
-        return handler.generate_schema(by_shape(self.one, list=several, **spaced))
+    def __init__(self, one: Any, **others: Any) -> None:
+        super().__init__(one, list=Annotated[list[one], AfterValidator(_different)], **others)
 
 
 def _different(values: list[Any]) -> list[Any]:

@@ -13,9 +13,9 @@ from ctid_cli.simulation.dataset import check_input_file, file_sha256, joined, l
 from ctid_cli.specification.joint_checks import joint_complaints, joint_warnings
 from ctid_cli.specification.messages import Complaint, Located, explained, shown
 from ctid_cli.specification.option_sections import EstimatorSection
-from ctid_cli.specification.sections import variants
+from ctid_cli.specification.sections import replaced, variants
 from ctid_cli.specification.spec import Spec
-from ctid_cli.specification.yaml_source import OVERRIDE_FILE, KeyPath, apply_overrides, path_text, read_yaml
+from ctid_cli.specification.yaml_source import OVERRIDE_FILE, apply_overrides, path_text, read_yaml
 
 
 class _PartialSpec(Spec):
@@ -102,43 +102,22 @@ def _validated(tree: dict[str, Any]) -> tuple[Spec, list[Located]]:
 
 
 def _with_files(spec: Spec) -> tuple[Spec, list[Complaint]]:
-    """The specification with content hashes filled in, and what is wrong with the files."""
-    problems: list[Complaint] = []
-    if spec.data is not None:
-        data = _pinned(spec.data, ("data",), spec.folder, problems)
-        spec = spec.model_copy(update={"data": data})
-        if not problems:
-            try:
-                if spec.measured is not None:
-                    spec.measured.dataset(0)
-            except DataError as error:
-                problems.append((("data", "file"), str(error)))
-    elif spec.generator is not None:
-        path, section = spec.generator
-        pinned = _pinned(section, path, spec.folder, problems)
-        if path == ("excitation",):
-            spec = spec.model_copy(update={"excitation": pinned})
-        elif spec.loop is not None:
-            spec = spec.model_copy(update={"loop": spec.loop.model_copy(update={"reference": pinned})})
-        if not problems and hasattr(pinned, "sha256"):
-            try:
-                check_input_file(located(variants(pinned)[0].options, spec.folder))
-            except DataError as error:
-                problems.append(((*path, "file"), str(error)))
-    return spec, problems
-
-
-def _pinned(section: Any, path: KeyPath, folder: Path, problems: list[Complaint]) -> Any:
-    """A section with the content hash of its file, if it names one; what is wrong with the file goes to `problems`."""
+    """The specification with the content hash of its file filled in, and what is wrong with the file."""
+    place: tuple[str, ...]
+    section: Any
+    place, section = (("data",), spec.data) if spec.data is not None else spec.generator or ((), None)
     if not hasattr(section, "sha256"):
-        return section
-    file = joined(folder, section.file)
+        return spec, []
+    file = joined(spec.folder, section.file)
     try:
         content = file_sha256(file)
+        if section.sha256 not in (None, content):
+            return spec, [((*place, "sha256"), f"the SHA-256 of {file} is {content}; is it another file?")]
+        spec = replaced(spec, (*place, "sha256"), content)
+        if spec.measured is not None:
+            spec.measured.dataset(0)
+        else:
+            check_input_file(located(variants(section)[0].options, spec.folder))
     except DataError as error:
-        problems.append(((*path, "file"), str(error)))
-        return section
-    if section.sha256 not in (None, content):
-        problems.append(((*path, "sha256"), f"the SHA-256 of {file} is {content}; is it another file?"))
-        return section
-    return section.model_copy(update={"sha256": content})
+        return spec, [((*place, "file"), str(error))]
+    return spec, []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
@@ -13,7 +13,7 @@ from ctid_cli.simulation.dataset import LoopOptions
 from ctid_cli.specification.fields import Coefficients, Number, Swept
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.option_sections import ExcitationSection
-from ctid_cli.specification.sections import Section, variants, with_key
+from ctid_cli.specification.sections import Section, WithKey, variants
 
 
 class ControllerSection(Section):
@@ -55,18 +55,14 @@ class PidControllerSection(Section):
         return DiscreteController.from_pid(**self.pid.model_dump())
 
 
-if TYPE_CHECKING:
-    AnyController = ControllerSection | PidControllerSection
-else:
-    AnyController = with_key("pid", PidControllerSection, ControllerSection)
-
-
 class LoopSection(Section):
     """What makes the input: a controller that is fed the output, and a reference."""
 
     target: ClassVar[type | None] = LoopOptions
 
-    controller: AnyController = Field(description="Discrete-time controller, acting at every sample")
+    controller: Annotated[
+        ControllerSection | PidControllerSection, WithKey("pid", PidControllerSection, ControllerSection)
+    ] = Field(description="Discrete-time controller, acting at every sample")
     reference: ExcitationSection | None = Field(
         default=None, description="The reference; for a measured record it is a column, data.reference"
     )
@@ -76,7 +72,5 @@ class LoopSection(Section):
 
     def complaints(self) -> Iterator[Complaint]:
         """Say that the controller does nothing."""
-        problems = list(super().complaints())
-        yield from problems
-        if not problems and not all(variant.options.controller.numerator.any() for variant in variants(self)):
+        if not all(variant.options.controller.numerator.any() for variant in variants(self)):
             yield ("controller",), "the controller is zero, so there is no loop; give it a gain, or give excitation"

@@ -14,7 +14,8 @@ import math
 import types
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from pydantic import (
@@ -33,7 +34,7 @@ from pydantic.functional_validators import ModelWrapValidatorHandler
 from ctid_cli.errors import CtidError
 from ctid_cli.kinds import classes
 from ctid_cli.signals.sampling import geometric_sizes
-from ctid_cli.specification.fields import LATER, Number, Swept, Text, Whole, by_shape, one_of
+from ctid_cli.specification.fields import LATER, ByShape, Number, OneOf, Swept, Text, Whole
 from ctid_cli.specification.messages import Complaint, explained, several_wrong
 from ctid_cli.specification.option_docs import OptionDoc, option_docs
 from ctid_cli.specification.yaml_source import KeyPath
@@ -42,6 +43,7 @@ from ctid_cli.specification.yaml_source import KeyPath
 MAX_COMBINATIONS = 10_000
 
 #: A complaint, and the swept values that it is about.
+AnySection = TypeVar("AnySection", bound="Section")
 Failure = tuple[KeyPath, str, Mapping[KeyPath, Any]]
 
 
@@ -86,7 +88,8 @@ class Section(BaseModel):
         except ValidationError as error:
             problems += [explained(detail, descriptions) for detail in error.errors(include_url=False)]
         if section is not None and not problems:
-            problems = [(path, message, False) for path, message in section.complaints()]
+            found = list(_option_complaints(section)) if cls.target is not None else []
+            problems = [(path, message, False) for path, message in found or section.complaints()]
         if problems or section is None:
             other = cls.elsewhere
             said = [(at, other.get(str(at[0]), text) if at else text, key) for at, text, key in problems]
@@ -99,9 +102,8 @@ class Section(BaseModel):
         yield from ()
 
     def complaints(self) -> Iterator[Complaint]:
-        """What is wrong with the section although every value is allowed by itself."""
-        if self.target is not None:
-            yield from _option_complaints(self)
+        """What is wrong with the section although every value, and the option dataclass if any, is right by itself."""
+        yield from ()
 
     def build(self) -> Any:
         """The options that the section describes, where nothing is swept."""
@@ -161,53 +163,65 @@ class Geometric(Section):
 
 
 def section_for(
-    target: type, *, kind: str | None = None, extra: Mapping[str, Any] | None = None, sweeping: bool = True
+    target: type,
+    kind: str = "",
+    extra: Mapping[str, Any] = MappingProxyType({}),
+    *,
+    sweeping: bool = True,
+    without: str = "",
 ) -> type[Section]:
     """Section of an option dataclass."""
     hints, docs = get_type_hints(target), option_docs(target)
     fields: dict[str, Any] = {}
-    if kind is not None:
+    if kind:
         fields["kind"] = (Literal[kind], Field(description="Which one it is"))
     for option in dataclasses.fields(target):
-        if not option.init:
+        if not option.init or option.name == without:
             continue
         form, scalar = _form(hints[option.name], f"{target.__name__}.{option.name}")
         if scalar and sweeping:
-            spaced = Annotated[Geometric, AfterValidator(Geometric.values)]
-            form = Annotated[Any, Swept(form, spaced if option.metadata.get("geometric") else None)]
+            spaced = {"mapping": Annotated[Geometric, AfterValidator(Geometric.values)]}
+            form = Annotated[Any, Swept(form, **(spaced if option.metadata.get("geometric") else {}))]
         if option.metadata.get("added_later"):
             form = Annotated[form, LATER]
         description = docs.get(option.name, OptionDoc()).text or None
         fields[option.name] = (form, Field(**_default(option), description=description))
     summary = (target.__doc__ or target.__name__).strip().splitlines()[0]
-    section = create_model(target.__name__, __base__=Section, __doc__=summary, **fields, **(extra or {}))
+    section = create_model(target.__name__, __base__=Section, __doc__=summary, **(fields | dict(extra)))
     section.target = target
     return section
 
 
-def kind_section(name: str, extra: Mapping[str, Mapping[str, Any]] | None = None) -> Any:
+class Kinds(OneOf):
     """Annotation of a section that is one of several, told apart by its ``kind``; `extra` fields by kind."""
-    sections = {
-        kind: section_for(target, kind=kind, extra=(extra or {}).get(kind))
-        for part in name.split()
-        for kind, target in classes(part).items()
-    }
 
-    def choose(value: Any) -> str | None:
-        kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
-        return kind if isinstance(kind, str) and kind in sections else None
+    def __init__(self, *names: str, **extra: Mapping[str, Any]) -> None:
+        targets = {kind: target for name in names for kind, target in classes(name).items()}
+        sections = {kind: section_for(target, kind, extra.get(kind, {})) for kind, target in targets.items()}
 
-    return one_of(choose, sections, "no_kind", ", ".join(sections))
+        def choose(value: Any) -> str | None:
+            kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
+            return kind if isinstance(kind, str) and kind in sections else None
+
+        super().__init__(choose, sections, "no_kind", ", ".join(sections))
 
 
-def with_key(key: str, form: Any, otherwise: Any, **also: Any) -> Any:
-    """Annotation of a section that has one form with a key (and other values) and another one without it."""
+class Options(OneOf):
+    """Annotation of the section of an option dataclass."""
 
-    def choose(value: Any) -> str:
-        given = isinstance(value, Mapping) and key in value and all(value.get(k) == v for k, v in also.items())
-        return key if given or key in getattr(type(value), "model_fields", {}) else "otherwise"
+    def __init__(self, target: type, **settings: Any) -> None:
+        super().__init__(lambda _: "options", {"options": section_for(target, **settings)})
 
-    return one_of(choose, {key: form, "otherwise": otherwise})
+
+class WithKey(OneOf):
+    """Annotation of a section that has one form with a key (and other values), and another one without it."""
+
+    def __init__(self, key: str, form: Any, otherwise: Any, **also: Any) -> None:
+        def choose(value: Any) -> str:
+            given = isinstance(value, Mapping) and key in value and all(value.get(k) == v for k, v in also.items())
+            return key if given or key in getattr(type(value), "model_fields", {}) else "otherwise"
+
+        super().__init__(choose, {key: form, "otherwise": otherwise})
 
 
 def _form(hint: Any, name: str) -> tuple[Any, bool]:
@@ -226,9 +240,8 @@ def _form(hint: Any, name: str) -> tuple[Any, bool]:
         return form | None, scalar
     if origin in (Union, types.UnionType) and len(arguments) == 2:
         (usual, _), (other, word) = (_form(argument, name) for argument in arguments)
-        return by_shape(usual, "a word is allowed too", text=other) if word else by_shape(
-            usual, "a list is allowed too", list=other
-        ), word
+        hint, shape = ("a word is allowed too", "text") if word else ("a list is allowed too", "list")
+        return Annotated[Any, ByShape(usual, hint, **{shape: other})], word
     if origin is tuple and arguments[1:] == (Ellipsis,) and dataclasses.is_dataclass(arguments[0]):
         # A list of such lists would say too little about which of them belong together, so that nothing in it is swept.
         item = section_for(arguments[0], sweeping=False)  # type: ignore[arg-type]
@@ -286,13 +299,14 @@ def _combinations(section: Section) -> Iterator[tuple[dict[KeyPath, Any], Sectio
         swept = {path: value for (path, _), value in zip(axes, point, strict=True)}
         one = section
         for path, value in swept.items():
-            one = _replaced(one, path, value)
+            one = replaced(one, path, value)
         yield swept, one
 
 
-def _replaced(section: Section, path: KeyPath, value: Any) -> Section:
+def replaced(section: AnySection, path: KeyPath, value: Any) -> AnySection:
+    """A section with another value at a place in it."""
     name = str(path[0])
-    inner = value if len(path) == 1 else _replaced(getattr(section, name), path[1:], value)
+    inner = value if len(path) == 1 else replaced(getattr(section, name), path[1:], value)
     return section.model_copy(update={name: inner})
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -13,7 +13,7 @@ from ctid_cli.signals.sinusoids import SumOfSinusoids
 from ctid_cli.specification.fields import NotNegative, Positive, Swept
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.option_sections import DisturbanceSection, SamplingSection
-from ctid_cli.specification.sections import Section, section_for, with_key
+from ctid_cli.specification.sections import Options, Section, WithKey
 
 
 class RegularDurationSection(Section):
@@ -38,16 +38,11 @@ class RegularDurationSection(Section):
         return RegularSampling(interval, int(min(round(duration / interval), 2**62)))
 
 
-if TYPE_CHECKING:
-    SignalSection = Section
-    DisturbanceOrNone = Section
-    AnySamplingSection = Section
-else:
-    SignalSection = section_for(SumOfSinusoids)
-    DisturbanceOrNone = Annotated[
-        DisturbanceSection | None, BeforeValidator(lambda value: None if value == "none" else value)
-    ]
-    AnySamplingSection = with_key("duration", RegularDurationSection, SamplingSection, kind="regular")
+SignalSection = Annotated[Section, Options(SumOfSinusoids)]
+DisturbanceOrNone = Annotated[
+    DisturbanceSection | None, BeforeValidator(lambda value: None if value == "none" else value)
+]
+AnySamplingSection = Annotated[Section, WithKey("duration", RegularDurationSection, SamplingSection, kind="regular")]
 
 
 class TracksSection(Section):

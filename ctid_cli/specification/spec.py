@@ -7,19 +7,20 @@ identity of data and estimators.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, PrivateAttr
 
 from ctid_cli.canonical import canonical_json
 from ctid_cli.kinds import KINDS, resolve
-from ctid_cli.simulation.dataset import LoopOptions, MeasuredSource, file_sha256, joined
+from ctid_cli.simulation.dataset import MeasuredSource, located
 from ctid_cli.specification.fields import LATER, MAX_WHOLE, Positive, Text, matching
 from ctid_cli.specification.loop_section import LoopSection
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.option_sections import SHA256, EstimatorSection, ExcitationSection, NoiseSection, Sha256
-from ctid_cli.specification.sections import Section, variants
+from ctid_cli.specification.sections import Options, Section, variants
 from ctid_cli.specification.signal_sections import AnySamplingSection, DisturbanceOrNone, SignalSection, TracksSection
 from ctid_cli.specification.start_sections import StartsSection
 from ctid_cli.specification.system_sections import AnySystemSection
@@ -34,37 +35,10 @@ _SIMULATED = ("system", "excitation", "sampling")
 _OF_SYSTEMS = ("system", "excitation", "loop", "noise", "data", "starts")
 
 
-class MeasuredSection(Section):
-    """A measured record in place of a simulated one."""
-
-    file: Text = Field(description="Comma-separated file, relative to the folder of the specification")
-    sha256: Sha256 = SHA256
-    time: Text = Field(default="t", description="Column of the instants [s]")
-    input: Text = Field(default="u", description="Column of the input [input unit]")
-    output: Text = Field(
-        default="y", description="Column of the output [output unit]; empty or NaN is a missing sample"
-    )
-    hold: Literal["zoh", "foh"] = Field(default="zoh", description="How the input behaves between its samples")
-    offset: Literal["remove", "none"] = Field(
-        default="none", description="What is done to the means of input and output over the samples for estimation"
-    )
-    estimation_samples: Annotated[int, Field(ge=2)] | None = Field(
-        default=None, description="Identify on the first so many samples and judge on the rest; null identifies on all"
-    )
-    reference: Annotated[Text | None, LATER] = Field(
-        default=None, description="Column of the reference, if the record was taken in a loop; loop has the controller"
-    )
-
-    def complaints(self) -> Iterator[Complaint]:
-        """Say that a loop does not have such an input."""
-        if self.reference is not None and self.hold != "zoh":
-            yield ("hold",), "must be zoh in a loop: a discrete controller holds the input between its samples"
-
-    def source(self, folder: Path, loop: LoopOptions | None = None) -> MeasuredSource:
-        """Reader of the record."""
-        file = joined(folder, self.file)
-        own = {"file": file, "sha256": self.sha256 or file_sha256(file), "loop": loop}
-        return MeasuredSource(**(self.model_dump() | own))
+#: A measured record in place of a simulated one.
+MeasuredSection = Annotated[
+    Any, Options(MeasuredSource, extra={"sha256": (Sha256, SHA256)}, without="loop", sweeping=False)
+]
 
 
 class MonteCarloSection(Section):
@@ -181,7 +155,8 @@ class Spec(Section):
         if self.data is None:
             return None
         loop = None if self.loop is None else variants(self.loop)[0].options
-        return self.data.source(self.folder, loop)
+        source: MeasuredSource = replace(located(self.data.options(), self.folder), loop=loop)
+        return source
 
     @property
     def generator(self) -> tuple[tuple[str, ...], Section] | None:

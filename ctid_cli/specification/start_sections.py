@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
-from ctid_cli.specification.fields import LATER, NotNegative, by_shape, one_of, without_copies
+from ctid_cli.specification.fields import LATER, ByShape, NotNegative, OneOf, without_copies
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import Section
 from ctid_cli.specification.system_sections import AdditiveSection
@@ -46,35 +46,31 @@ def _form(value: Any) -> str | None:
     return found[0] if len(found) == 1 else None
 
 
-def _several(one: Any) -> Any:
-    """A start or a list of different ones, kept as a list."""
-    several = Annotated[list[one], Field(min_length=1), AfterValidator(without_copies)]
-    listed = AfterValidator(lambda value: value if isinstance(value, list) else [value])
-    return Annotated[by_shape(one, list=several), listed] | None
+def _several(one: OneOf) -> ByShape:
+    """A start or a list of different ones."""
+    item = Annotated[Any, one]
+    return ByShape(item, list=Annotated[list[item], Field(min_length=1), AfterValidator(without_copies)])
 
 
-if TYPE_CHECKING:
-    DelayStarts = list[float | UniformStart] | None
-    ParameterStarts = list[RelativeStart | GivenStart] | None
-else:
-    DelayStarts = _several(by_shape(NotNegative, "{uniform: [low, high]} is allowed too", mapping=UniformStart))
-    ParameterStarts = _several(
-        one_of(
-            _form,
-            {"relative_uniform": RelativeStart, "additive": GivenStart},
-            "no_form",
-            "{relative_uniform: fraction} or {additive: [submodels]}",
-        )
+_DELAYS = _several(ByShape(NotNegative, "{uniform: [low, high]} is allowed too", mapping=UniformStart))
+_PARAMETERS = _several(
+    OneOf(
+        _form,
+        {"relative_uniform": RelativeStart, "additive": GivenStart},
+        "no_form",
+        "{relative_uniform: fraction} or {additive: [submodels]}",
     )
+)
+_LISTED = AfterValidator(lambda value: value if isinstance(value, list) else [value])
 
 
 class StartsSection(Section):
     """Where estimators start that need, or take, an initial delay or initial parameters."""
 
-    initial_delay: DelayStarts = Field(
+    initial_delay: Annotated[list[float | UniformStart], _DELAYS, _LISTED] | None = Field(
         default=None, description="Initial delays [s]; {uniform: [low, high]} draws one for every data set"
     )
-    parameters: Annotated[ParameterStarts, LATER] = Field(
+    parameters: Annotated[Annotated[list[RelativeStart | GivenStart], _PARAMETERS, _LISTED] | None, LATER] = Field(
         default=None,
         description="Initial parameters, drawn around those of the simulated system or given; by default every "
         "estimator makes its own",

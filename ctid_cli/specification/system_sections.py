@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -14,7 +14,7 @@ from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.specification.fields import Coefficients, NotNegative, Swept
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.sections import RefusedOptionsError, Section, with_key
+from ctid_cli.specification.sections import RefusedOptionsError, Section, WithKey
 
 #: Highest order that the simulation handles to its stated accuracy.
 MAX_ORDER = 12
@@ -31,10 +31,6 @@ class SystemSection(Section):
 
     def complaints(self) -> Iterator[Complaint]:
         """Say why the system cannot be simulated."""
-        problems = list(super().complaints())
-        if problems:
-            yield from problems
-            return
         with np.errstate(all="ignore"):
             model = TransferFunction(self.numerator, self.denominator)
         if not (np.isfinite(model.numerator).all() and np.isfinite(model.denominator).all()):
@@ -68,10 +64,6 @@ class SubmodelSection(Section):
 
     def complaints(self) -> Iterator[Complaint]:
         """Say why this is no submodel."""
-        problems = list(super().complaints())
-        if problems:
-            yield from problems
-            return
         submodel = self.options()
         if not (np.isfinite(submodel.numerator).all() and np.isfinite(submodel.denominator).all()):
             yield ("denominator",), "its last coefficient is too small for the others; scale the coefficients"
@@ -110,10 +102,6 @@ class AdditiveSystemSection(AdditiveSection):
 
     def complaints(self) -> Iterator[Complaint]:
         """Say why the system cannot be simulated."""
-        problems = list(super().complaints())
-        if problems:
-            yield from problems
-            return
         for k, section in enumerate(self.additive):
             submodel = section.options()
             if submodel.order > MAX_ORDER:
@@ -124,10 +112,9 @@ class AdditiveSystemSection(AdditiveSection):
                 yield ("additive", k), f"the submodel is unstable and cannot be simulated: {_unstable(poles)}"
 
 
-if TYPE_CHECKING:
-    AnySystemSection = SystemSection | AdditiveSystemSection
-else:
-    AnySystemSection = with_key("additive", AdditiveSystemSection, SystemSection)
+AnySystemSection = Annotated[
+    SystemSection | AdditiveSystemSection, WithKey("additive", AdditiveSystemSection, SystemSection)
+]
 
 
 def _unstable(poles: ComplexArray) -> str:

@@ -345,7 +345,7 @@ def test_a_measured_record(tmp_path):
     spec = load(tmp_path, MEASURED)
     # as it was written: results must not depend on where the command was typed
     assert (spec.data.file, spec.folder) == ("record.csv", tmp_path)
-    assert spec.data.source(spec.folder).file == (tmp_path / "record.csv").as_posix()
+    assert spec.measured.file == (tmp_path / "record.csv").as_posix()
     assert len(spec.data.sha256) == 64
     assert spec.warnings == ()
 
