@@ -135,7 +135,7 @@ class AdaptiveObserver(OnlineEstimator):
 
     def _recursion(self, interval: float) -> Recursion:
         n = self.tones
-        poles = self.pole * self.ratio ** np.arange(2 * n)
+        poles: Array = self.pole * self.ratio ** np.arange(2 * n, dtype=float)
         if poles[-1] * interval > 1.0:
             raise OptionError(
                 "pole",
@@ -146,24 +146,11 @@ class AdaptiveObserver(OnlineEstimator):
             raise OptionError(
                 "rate", f"rate = {self.rate:g} 1/s needs a sampling interval below {1.0 / self.rate:g} s."
             )
-        settings = Adaptation(
-            float(interval),
-            np.asarray(poles, dtype=np.float64),
-            float(self.rate),
-            samples_in(self.hold, interval),
-            float(self.smallest_gap),
-            float(self.lowest_frequency),
-            float(self.highest_frequency),
-        )
+        limits = (float(self.smallest_gap), float(self.lowest_frequency), float(self.highest_frequency))
+        settings = Adaptation(interval, poles, float(self.rate), samples_in(self.hold, interval), *limits)
         initial = np.asarray(self.initial_frequencies, dtype=float)
-        state = Observer(
-            initial**2,
-            np.zeros((n + 1, 2 * n)),
-            np.zeros((n + 1, n + 1)),
-            np.full(1, np.nan),
-            initial,
-            np.zeros(1, np.int64),
-        )
+        states, moments = np.zeros((n + 1, 2 * n)), np.zeros((n + 1, n + 1))
+        state = Observer(initial**2, states, moments, np.full(1, np.nan), initial, np.zeros(1, np.int64))
         return Recursion(advance_observer, (settings,), (state,))
 
 
@@ -207,11 +194,9 @@ def predict(before: float, change: float, interval: float, gains: Array, state: 
     states, now, sums, steps = state.states.ravel(), stage.ravel(), total.ravel(), slope.ravel()
     now[:] = states
     sums[:] = 0.0
-    for part in range(4):
-        share = 0.0 if part == 0 else (1.0 if part == 3 else 0.5)
+    # Where in the interval a slope is taken, its weight, and how far it leads to the next one.
+    for share, weight, ahead in ((0.0, 1.0, 0.5), (0.5, 2.0, 0.5), (0.5, 2.0, 1.0), (1.0, 1.0, 1.0)):
         observer_slope(stage, before + share * change, state.squares, gains, slope)
-        weight = 1.0 if part in (0, 3) else 2.0
-        ahead = 0.5 if part < 2 else 1.0
         for i in range(states.size):
             sums[i] += weight * steps[i]
             now[i] = states[i] + ahead * interval * steps[i]
@@ -221,14 +206,7 @@ def predict(before: float, change: float, interval: float, gains: Array, state: 
 
 @njit(cache=True, nogil=True)
 def adapt(
-    y: float,
-    settings: Adaptation,
-    state: Observer,
-    xi: Array,
-    step: Array,
-    matrix: Array,
-    factor: Array,
-    scales: Array,
+    y: float, settings: Adaptation, state: Observer, xi: Array, step: Array, matrix: Array, factor: Array, scales: Array
 ) -> int:
     """Recursive Gauss-Newton step of the squared frequencies; flags a bound that it meets."""
     n = state.squares.size
@@ -310,8 +288,7 @@ def advance_observer(samples: Array, output: Output, settings: Adaptation, state
             output.uncertainty[k, p] = np.nan
             if determined:
                 # Error of w_p that the mean squared residual makes in the worst direction: w_p^2 over 2 w_p.
-                for j in range(n):
-                    unit[j] = 0.0
+                unit[:] = 0.0
                 unit[p] = 1.0 / scales[p]
                 substitute(factor, unit)
                 misfit = np.sqrt(max(unit[p], 0.0) / scales[p] * moments[n, n]) / (2.0 * omega)

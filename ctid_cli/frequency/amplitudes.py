@@ -9,8 +9,10 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
+from ctid_cli.frequency.decoding import flag_uncertain
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES, series_of
+from ctid_cli.frequency.tracking import FrequencyEstimate
 from ctid_cli.signals.checks import require_positive
 
 #: Below this ratio of the singular values the sinusoids cannot be told apart.
@@ -126,17 +128,10 @@ def present_samples(samples: ArrayLike, interval: float) -> tuple[Array, Array]:
     return values[places], interval * places.astype(np.float64)
 
 
-def harmonic_design(t: Array, omega: Array, *, bias: bool) -> Array:
-    """Sines, cosines and, if asked for, a constant."""
+def fit_amplitudes(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[Array, Array, Array]:
+    """Sines, cosines and, if asked for, a constant by least squares: columns, coefficients, residual."""
     angles = t[:, None] * omega
-    columns = [np.sin(angles), np.cos(angles)]
-    if bias:
-        columns.append(np.ones((t.size, 1)))
-    return np.hstack(columns)
-
-
-def solve_design(design: Array, y: Array) -> Array:
-    """Least squares that refuses what the samples do not determine."""
+    design = np.hstack([np.sin(angles), np.cos(angles), np.ones((t.size, int(bias)))])
     count, unknowns = design.shape
     if count < unknowns:
         raise DataError(f"{count} samples cannot determine {unknowns} amplitudes; use a longer record.")
@@ -146,13 +141,6 @@ def solve_design(design: Array, y: Array) -> Array:
             "the samples cannot tell the sinusoids apart: two frequencies are too close to each other, "
             "or one of them to zero or to a multiple of the sampling frequency, for so short a record."
         )
-    return np.asarray(coefficients)
-
-
-def fit_amplitudes(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[Array, Array, Array]:
-    """Sines and cosines of known frequencies, by least squares."""
-    design = harmonic_design(t, omega, bias=bias)
-    coefficients = solve_design(design, y)
     return design, coefficients, y - design @ coefficients
 
 
@@ -177,19 +165,23 @@ def frequency_errors(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[A
     return step, np.linalg.norm(inverse, axis=1) / scales * np.sqrt(misfit + floor), misfit
 
 
-def flag_insignificant(y: Array, t: Array, omega: Array, *, bias: bool) -> Flag:
-    r"""Compare the weakest tone with the strongest that white noise of the residual's size would seem to have.
+def estimate_of(y: Array, t: Array, omega: Array, uncertainty: Array, flags: Flag, *, bias: bool) -> FrequencyEstimate:
+    r"""The estimate of a whole record, with the flags that its uncertainties and its amplitudes call for.
 
-    Each of the N/2 ordinates of the periodogram of white noise of variance s^2 exceeds ``N A^2/4 = g s^2`` with the
-    probability ``exp(-g)``, the largest with ``N/2 exp(-g)`` (R. A. Fisher, "Tests of significance in harmonic
-    analysis", *Proc. Royal Society A* 125 (1929) 54-59, for many samples).
+    The weakest tone is compared with the strongest that white noise of the residual's size would seem to have: each of
+    the N/2 ordinates of the periodogram of white noise of variance s^2 exceeds ``N A^2/4 = g s^2`` with the probability
+    ``exp(-g)``, the largest with ``N/2 exp(-g)`` (R. A. Fisher, "Tests of significance in harmonic analysis", *Proc.
+    Royal Society A* 125 (1929) 54-59, for many samples).
     """
+    n, length = omega.size, float(t[-1] - t[0])
+    flags |= Flag(flag_uncertain(omega, uncertainty, np.zeros(n), length, length))
     try:
         _, coefficients, residual = fit_amplitudes(y, t - 0.5 * (t[0] + t[-1]), omega, bias=bias)
     except DataError:
-        return Flag.UNDETERMINED
-    n = omega.size
+        return FrequencyEstimate(omega, flags | Flag.UNDETERMINED, uncertainty)
     variance = float(residual @ residual) / max(y.size - coefficients.size - n, 1)
     weakest = float((coefficients[:n] ** 2 + coefficients[n : 2 * n] ** 2).min())
     strongest_of_noise = 4.0 * variance / y.size * np.log(0.5 * y.size / FALSE_TONE)
-    return Flag(0) if weakest > strongest_of_noise else Flag.UNDETERMINED
+    if not weakest > strongest_of_noise:
+        flags |= Flag.UNDETERMINED
+    return FrequencyEstimate(omega, flags, uncertainty)

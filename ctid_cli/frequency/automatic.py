@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,21 +10,16 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.frequency.adaptive_observer import AdaptiveObserver
 from ctid_cli.frequency.decimation import Decimation, low_pass, without_low
-from ctid_cli.frequency.drem_finite_time import DremFiniteTime
-from ctid_cli.frequency.drem_gradient import DremGradient
-from ctid_cli.frequency.drem_window import DremWindow
-from ctid_cli.frequency.esprit import Esprit
-from ctid_cli.frequency.filter_regression import FilterRegression
 from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES
-from ctid_cli.frequency.nonlinear_least_squares import NonlinearLeastSquares
-from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.frequency.spectrum import Peaks, find_peaks
 from ctid_cli.frequency.windows import estimate_window
-from ctid_cli.kinds import KINDS
+from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.signals.checks import require_choice, require_integer, require_positive
 
+#: Estimators that take windows of the record, and those that integrate; the others delay.
+BATCH = ("esprit", "nonlinear_least_squares")
+INTEGRATING = ("adaptive_observer", "filter_regression")
 #: Samples in a period of the highest tone, for estimators that take windows, that delay, and that integrate.
 WINDOW_SAMPLES = 4
 DELAY_SAMPLES = 12
@@ -88,11 +84,6 @@ class Settings:
     warnings: tuple[str, ...]
 
     @property
-    def wanted(self) -> Array:
-        """Where the spectrum shows the wanted tones [rad/s], ascending."""
-        return np.sort(self.expected[: self.tones])
-
-    @property
     def window_seconds(self) -> float:
         """Length of a window [s]."""
         return self.window * self.interval
@@ -103,15 +94,14 @@ class Settings:
         return 0.5 * (self.decimation.weights.size - 1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Band:
-    """Which tones the estimator gets, and how the others are kept away."""
+    """Which tones the estimator gets, the wanted ones first, and how the others are kept away."""
 
     expected: Array
     amplitudes: Array
     decimation: Decimation
-    sentences: tuple[str, ...]
-    resolution: float
+    sentences: list[str]
 
 
 def choose_settings(
@@ -140,39 +130,46 @@ def choose_settings(
             "move too fast, the record is shorter than two periods, or too much of it is missing; use a longer record, "
             "or another part of it"
         )
-    warnings = list(_doubts(peaks, tones, interval))
     offset = _offset(samples, float(peaks.amplitudes[:tones][-1]))
     bridge = int(BRIDGED * 2.0 * np.pi / (peaks.omega[:tones].max() * interval))
     gaps = bool((~np.isfinite(samples)).any())
-    chosen = method
-    if chosen is None:
-        chosen = NonlinearLeastSquares.kind if gaps else Esprit.kind
-    batch = chosen in (Esprit.kind, NonlinearLeastSquares.kind)
+    chosen = method or ("nonlinear_least_squares" if gaps else "esprit")
     band = _choose_band(samples, interval, tones, peaks, chosen, bridge, gaps)
     thinned = band.decimation.apply(samples - offset)
     thin = interval * band.decimation.factor
     if method is None and gaps and np.isfinite(thinned).all():
-        chosen = Esprit.kind
+        chosen = "esprit"
     if np.isfinite(thinned).sum() < SAMPLES_PER_TONE * tones:
         raise DataError(
             f"the record is too short or has too many gaps: {samples.size * interval:.4g} s are hardly more than "
             f"the {band.decimation.weights.size * interval:.4g} s of the filter before the estimator; use a longer one"
         )
-    reasons = [_tones_sentence(peaks, tones), *_preparation(offset, bridge if gaps else 0, interval), *band.sentences]
-    length, sentence = _choose_window(thinned, thin, tones, band, peaks, chosen if batch else Esprit.kind, window)
+    shown = np.sort(peaks.omega[:tones]) / (2.0 * np.pi)
+    reasons = [
+        ("The strongest tone" if shown.size == 1 else f"The {shown.size} strongest tones")
+        + f" for most of the record: {_listed(shown)} Hz (median spectrum of segments of {peaks.segment:.4g} s)."
+    ]
+    if offset:
+        reasons.append(f"The mean, {offset:.4g}, is subtracted.")
+    if gaps and bridge:
+        reasons.append(f"Gaps of up to {bridge * interval:.3g} s are bridged by straight lines.")
+    reasons += band.sentences
+    batch = chosen in BATCH
+    length, sentence = _choose_window(thinned, thin, tones, band, chosen if batch else "esprit", window)
     estimator, how = _estimator(chosen, band, tones, thin, length)
     if method is None:
-        why = (
-            "nonlinear least squares, since samples are missing"
-            if chosen == NonlinearLeastSquares.kind
-            else "ESPRIT, the most exact one for a whole record without gaps"
-        )
+        why = "ESPRIT, the most exact one for a whole record without gaps"
+        if chosen != "esprit":
+            why = "nonlinear least squares, since samples are missing"
         reasons.append(f"Method: {chosen}: {why}.")
     reasons += [how] if how else []
     reasons.append(sentence if batch else f"Amplitudes are found from the last {length * thin:.4g} s before each row.")
-    return Settings(
-        estimator, tones, band.expected, offset, band.decimation, thin, length, tuple(reasons), tuple(warnings)
-    )
+    warnings = tuple(_doubts(peaks, tones, interval))
+    return Settings(estimator, tones, band.expected, offset, band.decimation, thin, length, tuple(reasons), warnings)
+
+
+def _listed(frequencies: Array) -> str:
+    return ", ".join(f"{frequency:.5g}" for frequency in frequencies)
 
 
 def _refuse_unusable(samples: Array, tones: int) -> None:
@@ -194,20 +191,18 @@ def _refuse_unusable(samples: Array, tones: int) -> None:
         )
 
 
-def _doubts(peaks: Peaks, tones: int, interval: float) -> list[str]:
-    found = []
+def _doubts(peaks: Peaks, tones: int, interval: float) -> Iterator[str]:
     if peaks.omega.size < tones:
-        found.append(
+        yield (
             f"Only {peaks.omega.size} of {tones} tones stand out of the spectrum; the others may be noise, or tones "
             f"closer than {peaks.resolution / (2 * np.pi):.4g} Hz: use fewer tones or a longer record."
         )
     highest = float(peaks.omega[:tones].max())
     if highest > SUSPICIOUS * np.pi / interval:
-        found.append(
+        yield (
             f"The tone at {highest / (2 * np.pi):.6g} Hz is close to the Nyquist frequency, {0.5 / interval:.6g} Hz: "
             "it may be the image of a tone above it. A record with a shorter sampling interval would tell."
         )
-    return found
 
 
 def _offset(samples: Array, weakest: float) -> float:
@@ -216,22 +211,6 @@ def _offset(samples: Array, weakest: float) -> float:
     window = np.where(present, np.sin(np.pi * (np.arange(samples.size) + 0.5) / samples.size) ** 2, 0.0)
     mean = float(window @ np.where(present, samples, 0.0) / window.sum())
     return mean if abs(mean) > HARMLESS_OFFSET * weakest else 0.0
-
-
-def _tones_sentence(peaks: Peaks, tones: int) -> str:
-    shown = np.sort(peaks.omega[:tones]) / (2.0 * np.pi)
-    names = ", ".join(f"{frequency:.5g}" for frequency in shown)
-    which = "The strongest tone" if shown.size == 1 else f"The {shown.size} strongest tones"
-    return f"{which} for most of the record: {names} Hz (median spectrum of segments of {peaks.segment:.4g} s)."
-
-
-def _preparation(offset: float, bridge: int, interval: float) -> list[str]:
-    found = []
-    if offset:
-        found.append(f"The mean, {offset:.4g}, is subtracted.")
-    if bridge:
-        found.append(f"Gaps of up to {bridge * interval:.3g} s are bridged by straight lines.")
-    return found
 
 
 def _choose_band(
@@ -246,9 +225,9 @@ def _choose_band(
     loud = peaks.amplitudes[tones:] > HARMLESS * weakest
     others, loudness = peaks.omega[tones:][loud], peaks.amplitudes[tones:][loud]
 
-    if kind in (Esprit.kind, NonlinearLeastSquares.kind):
+    if kind in BATCH:
         per_period, most = WINDOW_SAMPLES, MOST_TONES
-    elif kind in (AdaptiveObserver.kind, FilterRegression.kind):
+    elif kind in INTEGRATING:
         per_period, most = INTEGRATION_SAMPLES, tones + INTEGRATION_SPARES
     else:
         per_period, most = DELAY_SAMPLES, tones + DELAY_SPARES
@@ -260,19 +239,17 @@ def _choose_band(
         stop_edge = min(stop_edge, float(above.min()))
     sentences = []
     weights = np.ones(1)
-    unfiltered = gaps and kind == NonlinearLeastSquares.kind and factor <= MOST_UNTHINNED
+    unfiltered = gaps and kind == "nonlinear_least_squares" and factor <= MOST_UNTHINNED
     if unfiltered:
         factor = 1
     elif (factor > 1 or above.size) and stop_edge > pass_edge:
         weights = low_pass(pass_edge, stop_edge, STOP_BAND, interval)
-        hertz = 2.0 * np.pi
-        text = (
-            f"A low-pass keeps what is below {pass_edge / hertz:.4g} Hz and stops what is above "
-            f"{stop_edge / hertz:.4g} Hz; it is {weights.size * interval:.3g} s long."
+        sentences.append(
+            f"A low-pass keeps what is below {pass_edge / (2.0 * np.pi):.4g} Hz and stops what is above "
+            f"{stop_edge / (2.0 * np.pi):.4g} Hz; it is {weights.size * interval:.3g} s long."
         )
         if factor > 1:
-            text += f" One of {factor} samples is kept, every {factor * interval:.4g} s."
-        sentences.append(text)
+            sentences[-1] += f" One of {factor} samples is kept, every {factor * interval:.4g} s."
         others, loudness = others[others < STOP * top], loudness[others < STOP * top]
     high_pass = 2.0 * np.pi * (LOW_STOP_BAND - 7.95) / (2.285 * 2.0 * np.pi * (LOW_PASS - LOW_STOP) * low)
     below = others <= LOW_PASS * low
@@ -286,8 +263,8 @@ def _choose_band(
         others, loudness = others[~reached], loudness[~reached]
     spares = others[: max(0, min(most, MOST_TONES) - tones)]
     if spares.size:
-        names = ", ".join(f"{frequency:.5g}" for frequency in np.sort(spares) / (2.0 * np.pi))
-        sentences.append(f"Estimated too, since they disturb, but not shown: tones at {names} Hz.")
+        hertz = _listed(np.sort(spares) / (2.0 * np.pi))
+        sentences.append(f"Estimated too, since they disturb, but not shown: tones at {hertz} Hz.")
     missing = tones - wanted.size
     # Tones that the spectrum does not tell apart are somewhere beside the strongest one.
     guessed = peaks.omega[0] + peaks.resolution / (missing + 1.0) * np.arange(1, missing + 1)
@@ -295,13 +272,12 @@ def _choose_band(
         np.concatenate((wanted, guessed, spares)),
         np.concatenate((peaks.amplitudes[:tones], np.full(missing, weakest), loudness[: spares.size])),
         Decimation(weights, factor, bridge),
-        tuple(sentences),
-        peaks.resolution,
+        sentences,
     )
 
 
 def _choose_window(
-    thinned: Array, thin: float, tones: int, band: _Band, peaks: Peaks, kind: str, window: float | None
+    thinned: Array, thin: float, tones: int, band: _Band, kind: str, window: float | None
 ) -> tuple[int, str]:
     """Samples in a window, and why."""
     count = band.expected.size
@@ -317,25 +293,20 @@ def _choose_window(
         return length, f"Windows of {length * thin:.4g} s, as asked for."
     closest = _closest(band.expected, tones, thin)
     lowest = closest >= float(band.expected[:tones].min()) * (1.0 - 1e-12)
-    of_what = "periods of the lowest tone" if lowest else "beats of the closest tones"
+    of_what = f"{BEATS:g} {'periods of the lowest tone' if lowest else 'beats of the closest tones'}"
     length = max(least, int(np.ceil(BEATS * 2.0 * np.pi / (closest * thin))))
     if length >= LARGEST_SHARE * thinned.size:
-        length = thinned.size if length >= thinned.size else length
-        return length, (
-            f"Windows of {length * thin:.4g} s, "
-            + ("the whole record" if length == thinned.size else f"{BEATS:g} {of_what}")
-            + ": there is no room for longer ones."
-        )
-    estimator = _batch(kind, count)
+        if length >= thinned.size:
+            length, of_what = thinned.size, "the whole record"
+        return length, f"Windows of {length * thin:.4g} s, {of_what}: there is no room for longer ones."
+    estimator = resolve("frequency_estimator", kind)(tones=count)
     best, best_share = length, -1.0
     for _ in range(DOUBLINGS + 1):
         if length > LARGEST_SHARE * thinned.size:
             break
         firsts = np.linspace(0, thinned.size - length, TRIALS).astype(int)
-        valid = [
-            estimate_window(estimator, thinned[k : k + length], thin, band.expected, tones).flags == 0 for k in firsts
-        ]
-        share = float(np.mean(valid))
+        parts = [thinned[first : first + length] for first in firsts]
+        share = float(np.mean([not estimate_window(estimator, y, thin, band.expected, tones).flags for y in parts]))
         if share > best_share:
             best, best_share = length, share
         if share >= CERTAIN_SHARE:
@@ -357,52 +328,52 @@ def _closest(expected: Array, tones: int, thin: float) -> float:
     return float(min(distance.min(), 2.0 * (np.pi / thin - expected[:tones].max())))
 
 
-def _batch(kind: str, tones: int) -> Any:
-    return NonlinearLeastSquares(tones=tones) if kind == NonlinearLeastSquares.kind else Esprit(tones=tones)
-
-
 def _estimator(kind: str, band: _Band, wanted: int, thin: float, length: int) -> tuple[Any, str]:
     """The estimator, and a sentence about its options."""
-    tones = band.expected.size
-    if kind in (Esprit.kind, NonlinearLeastSquares.kind):
-        return _batch(kind, tones), ""
+    options, told = _options(kind, band, wanted, thin, length * thin)
+    return resolve("frequency_estimator", kind)(tones=band.expected.size, **options), told
+
+
+def _options(kind: str, band: _Band, wanted: int, thin: float, window: float) -> tuple[dict[str, Any], str]:
+    """Options of an estimator for windows of a length [s], and a sentence about them."""
+    if kind in BATCH:
+        return {}, ""
     expected = np.sort(band.expected)
+    start = {"initial_frequencies": tuple(expected)}
     low, top = float(expected[0]), float(expected[-1])
-    window = length * thin
-    if kind == AdaptiveObserver.kind:
-        gap = 0.3 * float(np.diff(np.concatenate(([0.0], expected))).min())
-        ratio = min(1.2, (0.5 / (low * thin)) ** (1.0 / max(1, 2 * tones - 1)))
+    if kind == "adaptive_observer":
+        ratio = min(1.2, (0.5 / (low * thin)) ** (1.0 / max(1, 2 * expected.size - 1)))
         rate = min(0.1 * low, 3.0 / window)
-        return AdaptiveObserver(
-            tones=tones,
-            initial_frequencies=tuple(expected),
-            pole=low,
-            ratio=max(1.0, ratio),
-            rate=rate,
-            hold=2.0 * np.pi / low,
-            smallest_gap=gap,
-            lowest_frequency=0.1 * low,
-            highest_frequency=2.0 * top,
-        ), f"Slowest pole {low:.4g} rad/s, adaptation rate {rate:.4g} 1/s; it starts from the spectrum's frequencies."
-    if kind == FilterRegression.kind:
+        return start | {
+            "pole": low,
+            "ratio": max(1.0, ratio),
+            "rate": rate,
+            "hold": 2.0 * np.pi / low,
+            "smallest_gap": 0.3 * float(np.diff(expected, prepend=0.0).min()),
+            "lowest_frequency": 0.1 * low,
+            "highest_frequency": 2.0 * top,
+        }, f"Slowest pole {low:.4g} rad/s, adaptation rate {rate:.4g} 1/s; it starts from the spectrum's frequencies."
+    if kind == "filter_regression":
         pole = float(np.sqrt(low * top))
-        return FilterRegression(
-            tones=tones, pole=pole, forgetting=2.0 / window, initial_frequencies=tuple(expected), hold=0.5 * window
-        ), f"Filter pole {pole:.4g} rad/s, the middle of the tones; data older than {0.5 * window:.4g} s are forgotten."
+        told = (
+            f"Filter pole {pole:.4g} rad/s, the middle of the tones; data older than {window / 2:.4g} s are forgotten."
+        )
+        return start | {"pole": pole, "forgetting": 2.0 / window, "hold": 0.5 * window}, told
     h = _best_delay(band.expected, band.amplitudes, wanted, thin)
-    common: dict[str, Any] = {"tones": tones, "h": h, "prefilter": PREFILTER_DELAYS * h}
+    common = {"h": h, "prefilter": PREFILTER_DELAYS * h}
     told = f"Delay h = {h:.4g} s ({h * top:.3g} rad of the highest tone), prefilter {PREFILTER_DELAYS * h:.4g} s"
-    if kind == RestartingLeastSquares.kind:
-        return RestartingLeastSquares(**common, memory=window), f"{told}, memory {window:.4g} s."
+    if kind == "restarting_least_squares":
+        return common | {"memory": window}, f"{told}, memory {window:.4g} s."
     spacing, square = _best_spacing(band.expected, band.amplitudes, h, thin)
+    common |= {"d": spacing, "first_row": 0}
     told += f", rows d = {spacing:.4g} s apart"
-    if kind == DremWindow.kind:
-        return DremWindow(**common, d=spacing, memory=window, first_row=0), f"{told}, window {window:.4g} s."
+    if kind == "drem_window":
+        return common | {"memory": window}, f"{told}, window {window:.4g} s."
     rate = 5.0 / window
-    options = {**common, "d": spacing, "epsilon": float(square**-0.5), "gamma": rate, "first_row": 0}
-    options["initial_frequencies"] = tuple(expected)
-    told += f", gain for a rate of {rate:.4g} 1/s."
-    return (DremGradient if kind == DremGradient.kind else DremFiniteTime)(**options), told
+    return common | start | {
+        "epsilon": float(square**-0.5),
+        "gamma": rate,
+    }, f"{told}, gain for a rate of {rate:.4g} 1/s."
 
 
 def _best_delay(omega: Array, amplitudes: Array, wanted: int, thin: float) -> float:

@@ -130,9 +130,9 @@ class DremGradient(MixingOptions):
         return self._mixed(
             clock,
             Gradient(np.zeros((2, n)), np.zeros(n + 3)),
+            theta,
             tuning=Gains(gains, theta, self._finite_time, int(np.argmax(gains)), keep),
             normalisation=float(self.epsilon) ** (n if self.power == "literal" else int(self.power)),
-            theta=theta,
             past=np.nan if self.gated else 0.0,
         )
 

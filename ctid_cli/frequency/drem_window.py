@@ -92,7 +92,7 @@ class DremWindow(MixingOptions):
             )
         size = 2 * n + 3
         back = Window(np.zeros((length, size)), np.zeros(size), np.zeros(size), np.zeros(1, np.int64))
-        return self._mixed(clock, back, most_rows=length)
+        return self._mixed(clock, back, np.full(n, np.nan), most_rows=length)
 
 
 @njit(cache=True, nogil=True)

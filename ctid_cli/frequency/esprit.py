@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.frequency.amplitudes import flag_insignificant, frequency_errors, present_samples
-from ctid_cli.frequency.decoding import flag_uncertain
+from ctid_cli.frequency.amplitudes import estimate_of, frequency_errors, present_samples
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.inputs import MOST_TONES, require_bounds
-from ctid_cli.frequency.tracking import FrequencyEstimate
+from ctid_cli.frequency.tracking import BatchEstimator, FrequencyEstimate
 from ctid_cli.signals.checks import require_integer, require_not_negative
 
 #: Rows of the Hankel matrix as a fraction of the samples, and the largest number of them.
@@ -26,7 +25,7 @@ RANK_TOLERANCE = 1e-11
 
 
 @dataclass(frozen=True, kw_only=True)
-class Esprit:
+class Esprit(BatchEstimator):
     r"""Frequencies of a whole record by ESPRIT, a reference for the online estimators.
 
     Parameters
@@ -67,7 +66,6 @@ class Esprit:
     """
 
     kind: ClassVar[str] = "esprit"
-    online: ClassVar[bool] = False
 
     tones: int
     averaging: float = 0.0
@@ -133,27 +131,7 @@ class Esprit:
         return block, rows, highest
 
     def estimate(self, samples: ArrayLike, interval: float) -> FrequencyEstimate:
-        """Estimate the frequencies of a record.
-
-        Parameters
-        ----------
-        samples : array_like, shape (N,)
-            Signal on a regular clock, without gaps [signal unit].
-        interval : float
-            Sampling interval [s].
-
-        Returns
-        -------
-        FrequencyEstimate
-            The frequencies.
-
-        Raises
-        ------
-        DataError
-            If samples are missing, or too few are there.
-        ValueError
-            If the bounds do not fit to the averaging.
-        """
+        """Rotation of the signal space of the averaged record, which must have no gaps."""
         y, t = present_samples(samples, interval)
         if y.size < np.asarray(samples).size:
             raise DataError(
@@ -183,7 +161,4 @@ class Esprit:
         except DataError:
             uncertainty = np.full(n, np.nan)
             flags |= Flag.UNDETERMINED
-        length = float(t[-1] - t[0])
-        flags |= Flag(flag_uncertain(bounded, uncertainty, np.zeros(n), length, length))
-        flags |= flag_insignificant(y, t, bounded, bias=False)
-        return FrequencyEstimate(bounded, flags, uncertainty)
+        return estimate_of(y, t, bounded, uncertainty, flags, bias=False)

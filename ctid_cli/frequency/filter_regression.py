@@ -165,12 +165,9 @@ class FilterRegression(OnlineEstimator):
             float(self.lowest_frequency) ** 2,
             np.inf if self.highest_frequency is None else float(self.highest_frequency) ** 2,
         )
-        state = Chain(
-            np.zeros(order + 1),
-            np.zeros((n + 1, n + 1)),
-            np.array([coefficients, np.sort(np.asarray(initial, dtype=float)), np.full(n, np.nan)]),
-            np.array([0, 0, 0, UNDETERMINED], np.int64),
-        )
+        estimate = np.array([coefficients, np.sort(np.asarray(initial, dtype=float)), np.full(n, np.nan)])
+        counters = np.array([0, 0, 0, UNDETERMINED], np.int64)
+        state = Chain(np.zeros(order + 1), np.zeros((n + 1, n + 1)), estimate, counters)
         return Recursion(advance_filter, (settings,), (state,))
 
 

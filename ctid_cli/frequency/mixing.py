@@ -48,7 +48,7 @@ NEGLIGIBLE = 1e-4
 
 
 class Mixing(NamedTuple):
-    """How rows become scalar regressions, and how long the checks of the estimate remember."""
+    """How rows become scalar regressions."""
 
     #: Order in which the minors are built up, shape (m, 5).
     plan: IntArray
@@ -59,11 +59,6 @@ class Mixing(NamedTuple):
     normalisation: float
     #: Rows that an estimate needs before it can be valid.
     enough: int
-    #: What the second moments at the second delay keep from one look to the next.
-    keep: float
-    #: Shares of a new squared residual in the average of the newest ones, and in the usual one.
-    fast: float
-    slow: float
 
 
 class Front(NamedTuple):
@@ -120,38 +115,22 @@ class MixingOptions(DelayRegression):
         self,
         clock: DelayClock,
         back: Any,
+        theta: Array,
         *,
         tuning: Any = None,
         normalisation: float = 1.0,
-        theta: Array | None = None,
         past: float = np.nan,
-        most_rows: int | None = None,
+        most_rows: int = LONG_AGO,
     ) -> Recursion:
-        """The recursion of a back end, given its state and its settings."""
-        n, interval, lag = self.tones, clock.interval, clock.lag
+        """The recursion of a back end, given its state, the first theta and its settings."""
+        n, interval = self.tones, clock.interval
         spacing = whole_delay("d", self.d, interval)
-        enough = self._rows_before_valid(clock)
-        mixing = Mixing(
-            minor_plan(n),
-            self.first_row,
-            spacing,
-            normalisation,
-            enough if most_rows is None else min(enough, most_rows),
-            1.0 - clock.every / (CHECK_SPANS * n * lag),
-            1.0 / max(1.0, DETECTOR_SPAN * lag),
-            1.0 / (USUAL_SPANS * n * lag),
-        )
-        front = Front(
-            np.full(2 * n * lag + 1, past),
-            np.full(((self.first_row + n - 1) * spacing + 1, n + 1), past),
-            np.full(n, np.nan) if theta is None else theta.copy(),
-            np.zeros((n + 1, n + 1)),
-            np.zeros(3, np.int64),
-            np.array([0, 0, LONG_AGO], np.int64),
-            np.zeros(4),
-            np.full(n, np.nan),
-        )
-        settings = (clock, mixing, tuning)
+        enough = min(self._rows_before_valid(clock), most_rows)
+        samples = np.full(2 * n * clock.lag + 1, past)
+        rows = np.full(((self.first_row + n - 1) * spacing + 1, n + 1), past)
+        check, counters, doubts = np.zeros((n + 1, n + 1)), np.zeros(3, np.int64), np.array([0, 0, LONG_AGO], np.int64)
+        front = Front(samples, rows, theta.copy(), check, counters, doubts, np.zeros(4), np.full(n, np.nan))
+        settings = (clock, Mixing(minor_plan(n), self.first_row, spacing, normalisation, enough), tuning)
         return Recursion(advance_mixed, settings, (front, back), self._weights(interval), past, self._notes(clock))
 
 
@@ -181,7 +160,7 @@ def back_end(state: type, absorbing: Callable[..., Any], weighing: Callable[...,
 
 
 @njit(cache=True, nogil=True)
-def mix_next(sample: float, clock: DelayClock, mixing: Mixing, front: Front, work: Work) -> float:
+def mix_next(sample: float, keep: float, clock: DelayClock, mixing: Mixing, front: Front, work: Work) -> float:
     """Scalar regressions at the newest sample, in ``work.mixed``; their scale, NaN if they cannot be used."""
     counters, mixed = front.counters, work.mixed
     counters[PLACE] = following(counters[PLACE], front.samples.size)
@@ -189,9 +168,7 @@ def mix_next(sample: float, clock: DelayClock, mixing: Mixing, front: Front, wor
     front.samples[counters[PLACE]] = sample
     # The second delay comes first: it leaves its own row in work.row.
     if counters[PLACE] % clock.every == 0:
-        observe_second_delay(
-            front.samples, counters[PLACE], clock.second_lag, clock.table, work.row, front.check, mixing.keep
-        )
+        observe_second_delay(front.samples, counters[PLACE], clock.second_lag, clock.table, work.row, front.check, keep)
     form_row(front.samples, counters[PLACE], clock.lag, clock.table, work.row)
     for i in range(mixed.size):
         front.rows[counters[ROW], i] = work.row[i]
@@ -233,10 +210,13 @@ def advance_mixed(
     row, matrix, minors, mixed = np.empty(n + 1), np.empty((n, n + 1)), np.empty(2 ** (n + 1)), np.empty(n + 1)
     work = Work(row, matrix, minors, mixed, np.empty(n), decoding_memory(n))
     theta, counters, doubts = front.theta, front.counters, front.doubts
+    # The check at the second delay, the newest residuals and the usual ones forget over different times.
+    keep = 1.0 - clock.every / (CHECK_SPANS * n * clock.lag)
+    fast, slow = 1.0 / max(1.0, DETECTOR_SPAN * clock.lag), 1.0 / (USUAL_SPANS * n * clock.lag)
     # How far the rows of one mixed regression reach back [samples].
     reach = front.rows.shape[0] + 2 * n * clock.lag
     for k in range(samples.size):
-        scale = mix_next(samples[k], clock, mixing, front, work)
+        scale = mix_next(samples[k], keep, clock, mixing, front, work)
         flag = 0
         if np.isnan(scale):
             flag = GAP if counters[USED] > 0 else STARTING
@@ -252,7 +232,7 @@ def advance_mixed(
             omega[:] = np.nan
         if weight > 0.0:
             # A residual unlike the ones before is doubted at once; otherwise a verdict is given now and then.
-            contradicted = started and contradicts(row, theta, front.levels, mixing.fast, mixing.slow)
+            contradicted = started and contradicts(row, theta, front.levels, fast, slow)
             if doubts[SINCE_VERDICT] == 0 or contradicted:
                 relative, remembered = weigh(tuning, back, theta, work)
                 span, elapsed = (reach + remembered) * clock.interval, (reach + counters[USED]) * clock.interval

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.frequency.amplitudes import flag_insignificant, frequency_errors, present_samples
-from ctid_cli.frequency.decoding import flag_uncertain
+from ctid_cli.frequency.amplitudes import estimate_of, frequency_errors, present_samples
 from ctid_cli.frequency.esprit import Esprit
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.inputs import MOST_TONES, one_for_each
-from ctid_cli.frequency.tracking import FrequencyEstimate
+from ctid_cli.frequency.tracking import BatchEstimator, FrequencyEstimate
 from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
 
 #: Halvings of a step that raises the cost by more than these fractions of itself and of the signal's square.
@@ -24,7 +23,7 @@ SIGNAL_ROUNDING = 1e-26
 
 
 @dataclass(frozen=True, kw_only=True)
-class NonlinearLeastSquares:
+class NonlinearLeastSquares(BatchEstimator):
     r"""Frequencies by nonlinear least squares on the whole record, a reference for the online estimators.
 
     Parameters
@@ -61,7 +60,6 @@ class NonlinearLeastSquares:
     """
 
     kind: ClassVar[str] = "nonlinear_least_squares"
-    online: ClassVar[bool] = False
 
     tones: int
     initial_frequencies: tuple[float, ...] | None = None
@@ -84,25 +82,7 @@ class NonlinearLeastSquares:
         object.__setattr__(self, "initial_frequencies", initial)
 
     def estimate(self, samples: ArrayLike, interval: float) -> FrequencyEstimate:
-        """Estimate the frequencies of a record.
-
-        Parameters
-        ----------
-        samples : array_like, shape (N,)
-            Signal on a regular clock [signal unit]; NaN where missing.
-        interval : float
-            Sampling interval [s].
-
-        Returns
-        -------
-        FrequencyEstimate
-            The frequencies.
-
-        Raises
-        ------
-        DataError
-            If too few samples are there, or some are missing and no start was given.
-        """
+        """Gauss-Newton steps from the given frequencies, or from those of ESPRIT if no sample is missing."""
         y, t = present_samples(samples, interval)
         n = self.tones
         if y.size < 3 * n + self.bias:
@@ -140,7 +120,4 @@ class NonlinearLeastSquares:
         except DataError:
             flags |= Flag.UNDETERMINED
         order = np.argsort(omega)
-        omega, uncertainty = omega[order], uncertainty[order]
-        flags |= Flag(flag_uncertain(omega, uncertainty, np.zeros(n), float(length), float(length)))
-        flags |= flag_insignificant(y, t, omega, bias=self.bias)
-        return FrequencyEstimate(omega, flags, uncertainty)
+        return estimate_of(y, t, omega[order], uncertainty[order], flags, bias=self.bias)

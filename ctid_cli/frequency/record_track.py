@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.frequency.automatic import Settings
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.tracking import FrequencyEstimate
-from ctid_cli.frequency.windows import amplitudes_of, estimate_window, wanted_tones
+from ctid_cli.frequency.windows import WindowEstimate, amplitudes_of, estimate_window, wanted_tones
 
 #: Rows of a track if nobody says how many.
 USUAL_ROWS = 1000
@@ -66,56 +65,56 @@ def track_record(
     elif not settings.estimator.online:
         wanted_step = max(wanted_step, min(OVERLAP * settings.window_seconds, thinned.size * thin / FEWEST_WINDOWS))
     step = max(1, round(min(wanted_step / thin, float(thinned.size))))
-    tell = on_progress or (lambda done, total: None)
     follow = _online if settings.estimator.online else _windows
-    places, omega, amplitudes, flags, uncertainty = follow(thinned, settings, step, tell)
-    t = places * thin + settings.lag * interval
-    if settings.estimator.online:
-        t += settings.lag * interval
+    rows = [
+        (place, found, amplitudes_of(part, thin, found.omega, found.everything))
+        for place, found, part in follow(thinned, settings, step, on_progress or (lambda done, total: None))
+    ]
+    omega = np.array([found.omega for _, found, _ in rows])
     with np.errstate(invalid="ignore"):
         gain = settings.decimation.gain(omega.ravel(), interval).reshape(omega.shape)
-        amplitudes = np.where(gain > 0.0, amplitudes / np.where(gain > 0.0, gain, 1.0), np.nan)
-    return RecordTrack(t, omega, amplitudes, flags, uncertainty, step * thin)
+        amplitudes = np.where(gain > 0.0, np.array([row[2] for row in rows]) / np.where(gain > 0.0, gain, 1.0), np.nan)
+    # The middle of the filter lies before its newest sample; an online estimate is that of the newest sample.
+    t = np.array([place for place, _, _ in rows]) * thin + settings.lag * interval
+    if settings.estimator.online:
+        t += settings.lag * interval
+    return RecordTrack(
+        t,
+        omega,
+        amplitudes,
+        np.array([int(found.flags) for _, found, _ in rows], np.uint16),
+        np.array([found.uncertainty for _, found, _ in rows]),
+        step * thin,
+    )
 
 
-_Rows = tuple[Array, Array, Array, NDArray[np.uint16], Array]
+_Follow = Iterator[tuple[float, WindowEstimate, Array]]
 
 
-def _windows(thinned: Array, settings: Settings, step: int, tell: Callable[[int, int], None]) -> _Rows:
-    length, n = settings.window, settings.tones
-    firsts = np.arange(0, thinned.size - length + 1, step)
+def _windows(thinned: Array, settings: Settings, step: int, tell: Callable[[int, int], None]) -> _Follow:
+    """Middle of each window, what is estimated, and the samples that its amplitudes are found from."""
+    length, total = settings.window, thinned.size
     middle = max(1, int(MIDDLE * length))
-    omega, amplitudes, uncertainty = (np.full((firsts.size, n), np.nan) for _ in range(3))
-    flags = np.zeros(firsts.size, np.uint16)
-    for row, first in enumerate(firsts):
+    for first in range(0, total - length + 1, step):
         part = thinned[first : first + length]
-        found = estimate_window(settings.estimator, part, settings.interval, settings.expected, n)
-        omega[row], uncertainty[row], flags[row] = found.omega, found.uncertainty, int(found.flags)
-        amplitudes[row] = amplitudes_of(part, settings.interval, found.omega, found.everything)
+        found = estimate_window(settings.estimator, part, settings.interval, settings.expected, settings.tones)
         if not np.isfinite(part[(length - middle) // 2 :][:middle]).any():
-            flags[row] |= int(Flag.GAP)
-        tell(int(first) + length, thinned.size)
-    tell(thinned.size, thinned.size)
-    return np.asarray(firsts + 0.5 * (length - 1), dtype=np.float64), omega, amplitudes, flags, uncertainty
+            found = replace(found, flags=found.flags | Flag.GAP)
+        yield first + 0.5 * (length - 1), found, part
+        tell(first + length, total)
+    tell(total, total)
 
 
-def _online(thinned: Array, settings: Settings, step: int, tell: Callable[[int, int], None]) -> _Rows:
+def _online(thinned: Array, settings: Settings, step: int, tell: Callable[[int, int], None]) -> _Follow:
+    """Every so many samples what is estimated, and the samples that its amplitudes are found from."""
     tracker = settings.estimator.start(settings.interval)
-    length, n = settings.window, settings.tones
-    places = np.arange(step - 1, thinned.size, step)
-    omega, amplitudes, uncertainty = (np.full((places.size, n), np.nan) for _ in range(3))
-    flags = np.zeros(places.size, np.uint16)
     for first in range(0, thinned.size, PIECE):
         track = tracker.run(thinned[first : first + PIECE], fft=True)
         last = first + track.flags.size
-        here = (places >= first) & (places < last)
-        for row in np.flatnonzero(here):
-            place = places[row] - first
-            estimate = FrequencyEstimate(track.omega[place], Flag(int(track.flags[place])), track.uncertainty[place])
-            found = wanted_tones(estimate, settings.expected, n)
-            omega[row], uncertainty[row], flags[row] = found.omega, found.uncertainty, int(found.flags)
-            if not found.flags & (Flag.STARTING | Flag.GAP | Flag.CHANGED):
-                part = thinned[max(0, places[row] + 1 - length) : places[row] + 1]
-                amplitudes[row] = amplitudes_of(part, settings.interval, found.omega, found.everything)
+        for place in range(first + (-first - 1) % step, last, step):
+            found = wanted_tones(track[place - first], settings.expected, settings.tones)
+            begin = max(0, place + 1 - settings.window)
+            if found.flags & (Flag.STARTING | Flag.GAP | Flag.CHANGED):
+                begin = place + 1
+            yield float(place), found, thinned[begin : place + 1]
         tell(last, thinned.size)
-    return places.astype(np.float64), omega, amplitudes, flags, uncertainty

@@ -66,17 +66,13 @@ def determinant_from_tones(components: ArrayLike, omega: ArrayLike, lag: int, sp
     ``w_i d`` are multiples of pi of one parity.
     """
     parts = np.asarray(components, dtype=float)
-    n_samples, tones = parts.shape
+    count, tones = parts.shape
     c = np.cos(np.asarray(omega, dtype=float) * lag * interval)
     vandermonde = np.prod([c[i] - c[j] for i in range(tones) for j in range(i + 1, tones)])
-    stacked = np.full((n_samples, tones, tones), np.nan)
-    for j in range(tones):
-        shift = tones * lag + j * spacing
-        if shift < n_samples:
-            stacked[shift:, j, :] = parts[: n_samples - shift]
-    result = np.full(n_samples, np.nan)
-    first = 2 * tones * lag + (tones - 1) * spacing
-    result[first:] = 2.0 ** (tones * tones) * vandermonde * np.linalg.det(stacked[first:])
+    result = np.full(count, np.nan)
+    instants = np.arange(2 * tones * lag + (tones - 1) * spacing, count)
+    stacked = parts[instants[:, None] - tones * lag - spacing * np.arange(tones)]
+    result[instants] = 2.0 ** (tones * tones) * vandermonde * np.linalg.det(stacked)
     return result
 
 

@@ -102,9 +102,8 @@ class Workspace(NamedTuple):
     gram: Array
     factor: Array
     scales: Array
+    #: As the estimate of the state, shape (3, n).
     trial: Array
-    trial_omega: Array
-    trial_errors: Array
     decoding: Decoding
 
 
@@ -203,27 +202,17 @@ class RestartingLeastSquares(DelayRegression):
             memory / interval,
             whitener,
         )
+        samples, estimate = np.full(2 * n * clock.lag + 1, np.nan), np.full((3, n), np.nan)
         newer, older, check = np.zeros((3, n + 1, n + 1))
-        fit = Fit(
-            np.full(2 * n * clock.lag + 1, np.nan),
-            newer,
-            older,
-            check,
-            np.full((3, n), np.nan),
-            np.zeros(4),
-            np.zeros(6, np.int64),
-        )
+        fit = Fit(samples, newer, older, check, estimate, np.zeros(4), np.zeros(6, np.int64))
         return Recursion(advance_restarting, (clock, settings), (fit,), weights, notes=self._notes(clock))
 
 
 def noise_covariance(table: Array, weights: Array, lag: int) -> Array:
     """Covariance of the regression rows of filtered white noise."""
-    width = table.shape[1]
-    correlation = [
-        float(weights[j * lag :] @ weights[: weights.size - j * lag]) if j * lag < weights.size else 0.0
-        for j in range(width)
-    ]
-    R = np.array([[correlation[abs(i - j)] for j in range(width)] for i in range(width)]) / correlation[0]
+    places = np.arange(table.shape[1])
+    correlation = np.array([weights[j * lag :] @ weights[: max(weights.size - j * lag, 0)] for j in places])
+    R = correlation[np.abs(places[:, None] - places)] / correlation[0]
     return np.ascontiguousarray(table @ R @ table.T)
 
 
@@ -251,30 +240,15 @@ def total_least_squares(gram: Array, whitener: Array, theta: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def add_lower(one: Array, other: Array, total: Array) -> None:
-    """Sum of two matrices of which the lower triangle counts."""
-    for i in range(total.shape[0]):
-        for j in range(i + 1):
-            total[i, j] = one[i, j] + other[i, j]
-
-
-@njit(cache=True, nogil=True)
 def judge(
-    gram: Array,
-    theta: Array,
-    span: float,
-    elapsed: float,
-    clock: DelayClock,
-    omega: Array,
-    errors: Array,
-    work: Workspace,
+    gram: Array, theta: Array, span: float, elapsed: float, clock: DelayClock, found: Array, work: Workspace
 ) -> tuple[int, bool]:
     """Frequencies that belong to fitted parameters, flags of how far they can be trusted, and whether they may judge.
 
-    ``gram`` is that of ``work.factor`` and ``work.scales``. An estimate may judge new samples if it is certain, or has
-    been there for so long that a misfit is no beginner's.
+    ``gram`` is that of ``work.factor`` and ``work.scales``; ``found`` takes the frequencies and their errors. An estimate
+    may judge new samples if it is certain, or has been there for so long that a misfit is no beginner's.
     """
-    memory = work.decoding
+    memory, omega, errors = work.decoding, found[0], found[1]
     flags = decode(theta, clock.delay, clock.bottom, clock.top, memory, omega)
     cosine_sensitivities(memory.roots, clock.delay, memory.slopes, memory.sensitivities)
     misfit = squared_residual(gram, theta)
@@ -303,9 +277,7 @@ def take_row(keep_most: float, clock: DelayClock, fit: Fit, work: Workspace) -> 
     if levels[OLDER] + levels[NEWER] > keep_most - 0.5:
         keep = 1.0 - 1.0 / keep_most
         levels[OLDER] *= keep
-        for i in range(fit.older.shape[0]):
-            for j in range(i + 1):
-                fit.older[i, j] *= keep
+        fit.older[:] *= keep
     levels[NEWER] = keep * levels[NEWER] + 1.0
     accumulate_row(work.row, fit.newer, keep)
     # The row itself is not needed any more: the one at the second delay takes its place.
@@ -321,18 +293,18 @@ def halves_differ(clock: DelayClock, fit: Fit, work: Workspace) -> bool:
     levels, gram, trial = fit.levels, work.gram, work.trial
     if not factorise(fit.newer, 0.0, work.factor, work.scales):
         return False
-    least_squares(fit.newer, work.factor, work.scales, trial)
-    alone = squared_residual(fit.newer, trial) / levels[NEWER]
+    least_squares(fit.newer, work.factor, work.scales, trial[0])
+    alone = squared_residual(fit.newer, trial[0]) / levels[NEWER]
     span = (2 * n * clock.lag + levels[NEWER]) * clock.interval
     # A fit to so few rows that it says nothing must not condemn the others, unless it is exact.
-    judges = judge(fit.newer, trial, span, span, clock, work.trial_omega, work.trial_errors, work)[1]
+    judges = judge(fit.newer, trial[0], span, span, clock, trial[1:], work)[1]
     judges = judges or alone * levels[NEWER] <= EXACT * fit.newer[n, n]
-    add_lower(fit.older, fit.newer, gram)
+    gram[:] = fit.older + fit.newer
     if not (judges and levels[OLDER] > 0.0 and factorise(gram, 0.0, work.factor, work.scales)):
         return False
-    least_squares(gram, work.factor, work.scales, trial)
+    least_squares(gram, work.factor, work.scales, trial[0])
     weight = levels[OLDER] + levels[NEWER]
-    together = squared_residual(gram, trial) / weight
+    together = squared_residual(gram, trial[0]) / weight
     return bool(together > MIXED_RATIO * alone + 1e-14 * gram[n, n] / weight)
 
 
@@ -345,7 +317,7 @@ def join_halves(mixed: bool, compared: int, fit: Fit) -> None:
         levels[OLDER] = levels[RESIDUAL] = 0.0
         fit.older[:] = 0.0
         fit.check[:] = 0.0
-    add_lower(fit.older, fit.newer, fit.older)
+    fit.older[:] += fit.newer
     fit.newer[:] = 0.0
     levels[OLDER] += levels[NEWER]
     levels[NEWER] = 0.0
@@ -358,7 +330,7 @@ def refresh(clock: DelayClock, settings: Restarting, fit: Fit, work: Workspace) 
     """Estimate, alarm level and verdict from all rows."""
     n = work.scales.size
     theta, frequencies, levels, counters, gram = fit.estimate[0], fit.estimate[1], fit.levels, fit.counters, work.gram
-    add_lower(fit.older, fit.newer, gram)
+    gram[:] = fit.older + fit.newer
     counters[VERDICT] = UNDETERMINED
     if not factorise(gram, 0.0, work.factor, work.scales):
         return
@@ -371,7 +343,7 @@ def refresh(clock: DelayClock, settings: Restarting, fit: Fit, work: Workspace) 
     levels[ALARM] = (ALARM_RATIO * squared_residual(gram, theta) + ROUNDING_FLOOR * gram[n, n]) / weight
     span = (2 * n * clock.lag + weight) * clock.interval
     elapsed = (2 * n * clock.lag + counters[ROWS]) * clock.interval
-    verdict, judges = judge(gram, theta, span, elapsed, clock, frequencies, fit.estimate[2], work)
+    verdict, judges = judge(gram, theta, span, elapsed, clock, fit.estimate[1:], work)
     counters[JUDGES] = 1 if judges else 0
     counters[VERDICT] = verdict | check_consistency(fit.check, frequencies, clock.second_delay, NEGLIGIBLE)
 
@@ -381,7 +353,7 @@ def advance_restarting(samples: Array, output: Output, clock: DelayClock, settin
     """Least squares with alarm, flush, restart and comparison with the newer data alone."""
     n = output.omega.shape[1]
     row, gram, factor, scales = np.empty(n + 1), np.empty((n + 1, n + 1)), np.empty((n, n)), np.empty(n)
-    work = Workspace(row, gram, factor, scales, np.empty(n), np.empty(n), np.empty(n), decoding_memory(n))
+    work = Workspace(row, gram, factor, scales, np.empty((3, n)), decoding_memory(n))
     levels, counters, theta = fit.levels, fit.counters, fit.estimate[0]
     smoothing = 1.0 / settings.detector
     for k in range(samples.size):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from numbers import Real
@@ -116,16 +117,48 @@ class Recursion(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-class OnlineEstimator:
-    """Base of the options of all online estimators."""
+class BatchEstimator(ABC):
+    """Options of an estimator that takes whole records."""
+
+    kind: ClassVar[str]
+    online: ClassVar[bool] = False
+    tones: int
+
+    @abstractmethod
+    def estimate(self, samples: ArrayLike, interval: float) -> FrequencyEstimate:
+        """Estimate the frequencies of a record.
+
+        Parameters
+        ----------
+        samples : array_like, shape (N,)
+            Signal on a regular clock [signal unit]; NaN where missing.
+        interval : float
+            Sampling interval [s].
+
+        Returns
+        -------
+        FrequencyEstimate
+            The frequencies.
+
+        Raises
+        ------
+        DataError
+            If too few samples are there, or some are missing and the estimator needs them all.
+        ValueError
+            If the options do not fit to the sampling interval.
+        """
+
+
+class OnlineEstimator(ABC):
+    """Options of an estimator that takes sample after sample."""
 
     kind: ClassVar[str]
     online: ClassVar[bool] = True
     tones: int
 
+    @abstractmethod
     def _recursion(self, interval: float) -> Recursion:
         """The compiled recursion for a sampling interval."""
-        raise NotImplementedError
 
     def start(self, interval: float) -> Tracker:
         """Begin before the first sample."""
@@ -164,7 +197,6 @@ class Tracker:
         self.options = options
         self.interval = float(interval)
         self._recursion = recursion = options._recursion(self.interval)
-        self._weights = recursion.weights
         self._reversed_weights = np.ascontiguousarray(recursion.weights[::-1])
         self._state: dict[str, NDArray[Any]] = {
             "fingerprint": np.frombuffer(_fingerprint(options, self.interval), np.uint8),
@@ -260,11 +292,11 @@ class Tracker:
     def _advance(self, samples: Array, *, fft: bool) -> FrequencyTrack:
         state, recursion = self._state, self._recursion
         size, tones = samples.size, self.options.tones
-        if self._weights.size > 1:
+        if recursion.weights.size > 1:
             everything = np.concatenate((state["unfiltered"], samples))
             state["unfiltered"][...] = everything[size:]
             if fft and size:
-                samples = fast_convolve(everything, self._weights)
+                samples = fast_convolve(everything, recursion.weights)
             else:
                 convolve(everything, self._reversed_weights, samples)
         output = Output(np.empty((size, tones)), np.empty((size, tones)), np.empty(size, np.uint16))

@@ -48,7 +48,7 @@ def test_total_least_squares_is_the_smallest_generalised_eigenvector(prefilter):
     n, y = 2, noisy(2, 1500, 0.2)
     run = tracker(n, prefilter=prefilter, solution="total_least_squares")
     track = run.run(y)
-    weights = run._weights
+    weights = run._recursion.weights
     filtered = np.convolve(y, weights, mode="valid")
     rows = rows_of(filtered, n)
     rows = rows[: rows.shape[0] // 10 * 10]
@@ -59,7 +59,7 @@ def test_total_least_squares_is_the_smallest_generalised_eigenvector(prefilter):
 
 @pytest.mark.parametrize("length", [0.0, 0.3, 1.0])
 def test_noise_covariance_is_that_of_the_rows_of_filtered_noise(length):
-    weights = tracker(prefilter=length)._weights
+    weights = tracker(prefilter=length)._recursion.weights
     noise = np.convolve(np.random.default_rng(0).standard_normal(400_000), weights, mode="valid")
     rows = rows_of(noise / np.linalg.norm(weights), 2)
     C = noise_covariance(delay_table(2).astype(float), weights, LAG)
