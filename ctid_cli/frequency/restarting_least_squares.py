@@ -245,8 +245,8 @@ def judge(
 ) -> tuple[int, bool]:
     """Frequencies that belong to fitted parameters, flags of how far they can be trusted, and whether they may judge.
 
-    ``gram`` is that of ``work.factor`` and ``work.scales``; ``found`` takes the frequencies and their errors. An estimate
-    may judge new samples if it is certain, or has been there for so long that a misfit is no beginner's.
+    ``gram`` is that of ``work.factor`` and ``work.scales``; ``found`` takes the frequencies and their errors. An
+    estimate may judge new samples if it is certain, or has been there for so long that a misfit is no beginner's.
     """
     memory, omega, errors = work.decoding, found[0], found[1]
     flags = decode(theta, clock.delay, clock.bottom, clock.top, memory, omega)
