@@ -10,6 +10,7 @@ import typing
 import pytest
 
 import ctid_cli
+from ctid_cli.frequency.tracking import BatchEstimator
 from ctid_cli.kinds import KINDS, classes
 from ctid_cli.models.transfer_function import ContinuousModel
 from ctid_cli.signals.excitation import Excitation
@@ -42,7 +43,7 @@ def public_callables():
         for kind, member in classes(section).items():
             if member.__name__ not in ctid_cli.__all__:
                 yield from members_of(kind, member)
-    for contract in (ContinuousModel, Excitation, Noise, Sampling):
+    for contract in (BatchEstimator, ContinuousModel, Excitation, Noise, Sampling):
         yield from members_of(contract.__name__, contract)
     for member in (MeasuredSource, Piece, SumOfSinusoids, Tone):  # sections without a kind
         yield member.__name__, member
