@@ -15,7 +15,7 @@ from ctid_cli.reporting.layout import Report, Table, count, csv_text, delay_labe
 from ctid_cli.reporting.percentages import Row, settings_of
 from ctid_cli.reporting.results import out_option, shown_path
 from ctid_cli.reporting.study import Study, load_study
-from ctid_cli.reporting.study_table import setting_text, setting_title
+from ctid_cli.reporting.table_blocks import setting_text, setting_title
 from ctid_cli.reporting.tables import build_tables
 from ctid_cli.text import listed
 

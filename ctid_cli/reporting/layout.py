@@ -132,11 +132,6 @@ def percent(value: float | None, n: int) -> str:
     return f"{value:.1f}" if n > 100 else f"{value:.0f}"
 
 
-def interval(low: float | None, high: float | None, n: int) -> str:
-    """A confidence interval in percent."""
-    return "-" if low is None or high is None else f"[{percent(low, n)}, {percent(high, n)}]"
-
-
 def seconds(value: float | None) -> str:
     """A duration in a unit that fits."""
     if value is None or not math.isfinite(value):

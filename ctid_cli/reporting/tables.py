@@ -7,15 +7,21 @@ from pathlib import Path
 
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.committed import committed_rows, committed_tables, made_by
-from ctid_cli.reporting.experiment_tables import experiment_report
 from ctid_cli.reporting.layout import Report
-from ctid_cli.reporting.percentages import study_rows
+from ctid_cli.reporting.percentages import Row, experiment_rows, settings_of, study_rows
 from ctid_cli.reporting.results import Results, differences, experiments_in, find_results, out_option, shown_path
 from ctid_cli.reporting.study import Study, data_folder, load_study
-from ctid_cli.reporting.study_table import study_blocks
+from ctid_cli.reporting.table_blocks import frequency_blocks, percentage_blocks, record_blocks, study_blocks
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.folder import InUseError
+from ctid_cli.storage.manifest import is_of_signal
 from ctid_cli.text import did_you_mean
+
+#: What a measured record's rows carry besides the keys of every table.
+RECORD_KEYS = (
+    *("id", "status", "delay", "numerator", "denominator", "standard_errors"),
+    *("fit_percent", "validation_fit_percent"),
+)
 
 
 def build_tables(names: Sequence[str], out: Path, style: str = "text", *, committed: bool = False) -> list[Report]:
@@ -86,6 +92,27 @@ def _study_report(study: Study, number: int, out: Path, style: str, committed: b
         notes.append(f"no experiment has the estimator {which} yet; its rows show the published values only")
     options = dict.fromkeys(name for results in found.values() for name in results.swept("estimators"))
     return Report(study_blocks(study, table, rows, style, list(options)), rows, notes)
+
+
+def experiment_report(results: Results, notes: Sequence[str] = ()) -> Report:
+    """What is said of one experiment."""
+    rows = experiment_rows(results)
+    if results.measured:
+        return Report(record_blocks(results), _record_rows(results, rows), notes)
+    blocks = frequency_blocks if is_of_signal(results.manifest) else percentage_blocks
+    return Report(blocks(results, rows), rows, notes)
+
+
+def _record_rows(results: Results, rows: Sequence[Row]) -> list[Row]:
+    """Rows of a measured record with its estimates."""
+    keys = settings_of(rows)
+    found = []
+    for row in rows:
+        same = {"estimator": row["method"], "initial_delay": row["initial_delay"]} | {key: row[key] for key in keys}
+        matching = (item for item in results.rows if all(item.get(key) == value for key, value in same.items()))
+        estimate = next(matching, {})
+        found.append(row | {key: estimate.get(key) for key in RECORD_KEYS})
+    return found
 
 
 def _notes(results: Results, out: Path) -> list[str]:

@@ -2,9 +2,10 @@
 
 import pytest
 
-from ctid_cli.reporting.experiment_tables import experiment_report, success_sentence
 from ctid_cli.reporting.percentages import experiment_rows, measures_of
 from ctid_cli.reporting.results import Results
+from ctid_cli.reporting.table_blocks import success_sentence
+from ctid_cli.reporting.tables import experiment_report
 from ctid_cli.running.plan import build_plan
 from ctid_cli.running.worker import failed
 from ctid_cli.specification.load import load_spec

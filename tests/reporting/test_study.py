@@ -8,7 +8,7 @@ from ctid_cli.reporting.failures import FAILING_COLUMNS, failing_estimates
 from ctid_cli.reporting.layout import Report, write_reports
 from ctid_cli.reporting.percentages import pooled_rows, study_rows
 from ctid_cli.reporting.study import load_study
-from ctid_cli.reporting.study_table import study_blocks
+from ctid_cli.reporting.table_blocks import study_blocks
 from ctid_cli.reporting.tables import build_tables
 from ctid_cli.storage.version import code_version
 

@@ -1,18 +1,35 @@
-"""A published table with our percentages in it, as blocks of a report."""
+"""Tables as blocks of a report: published ones with our percentages in them, and those of an experiment."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ctid_cli.reporting.layout import Table, delay_label, interval, number, percent, seconds
-from ctid_cli.reporting.percentages import Row, pooled_rows, settings_of
+from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.reporting.estimate import parameters
+from ctid_cli.reporting.layout import Table, delay_label, number, percent, seconds, with_error
+from ctid_cli.reporting.percentages import Row, measures_of, pooled_rows, settings_of
+from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.study import Study, StudyTable
 from ctid_cli.text import listed
+
+Blocks = list[list[str | Table]]
 
 NOT_RUN = "not run"
 RULE = "Estimates that failed count as not converged. 95 %: Wilson interval of the percentage."
 TIME = "Time: median of one estimate"
+
+#: Estimators side by side, and estimates of a measured record, before a table continues below.
+GROUPS_PER_BLOCK = 2
+ESTIMATES_PER_BLOCK = 3
+
+#: Titles of the columns of measured frequencies.
+MEASURE_TITLES = {
+    "median_settling_time": "settling",
+    "median_settling_after_step": "after step",
+    "false_alarms": "alarms",
+}
 
 _SHORT = {"snr_db": ("SNR", " dB")}
 
@@ -34,7 +51,9 @@ def percent_text(row: Row) -> str:
 
 def interval_text(row: Row) -> str:
     """The interval of a cell's percentage."""
-    return interval(row["low"], row["high"], row["n"]) if row["n"] else ""
+    if not row["n"]:
+        return ""
+    return "-" if row["low"] is None else f"[{percent(row['low'], row['n'])}, {percent(row['high'], row['n'])}]"
 
 
 def time_text(row: Row) -> str:
@@ -44,7 +63,7 @@ def time_text(row: Row) -> str:
 
 def study_blocks(
     study: Study, table: StudyTable, rows: Sequence[Row], style: str = "text", options: Sequence[str] = ()
-) -> list[list[str | Table]]:
+) -> Blocks:
     """A published table, all its cells together, and what its columns mean."""
     labels = settings_of(rows)
     given = {row["initial_delay"] for row in rows} - {None}
@@ -164,3 +183,115 @@ def _span(times: Sequence[float | None]) -> str:
     """Range of the cells' median times."""
     known = [time for time in times if time is not None]
     return " to ".join(dict.fromkeys(map(seconds, (min(known), max(known))))) if known else ""
+
+
+def success_sentence(settings: Mapping[str, Any]) -> str:
+    """What the percentages of an experiment count."""
+    rule = settings.get("success") or {}
+    soon = f" within {rule['by']:g} s" if rule.get("by") is not None else ""
+    sentences = {
+        "delay_relative_error": "delay estimate lies within {percent:g} % of the true delay",
+        "parameter_relative_error": "parameters all lie within {percent:g} % of the true ones",
+        "band": f"frequencies all come to lie within {{value:g}} rad/s of the true ones{soon}, to stay there",
+        "fit_percent": "model fits to at least {value:g} %",
+    }
+    parts = [
+        sentence.format(value=rule[key], percent=100 * rule[key])
+        for key, sentence in sentences.items()
+        if rule.get(key) is not None
+    ]
+    if not parts:
+        return "nothing, the specification has no success rule"
+    return "percent of the data sets whose " + " and whose ".join(parts)
+
+
+def percentage_blocks(results: Results, rows: Sequence[Row]) -> Blocks:
+    """Swept data and starts down, estimators across."""
+    options = results.swept("estimators")
+    down = [key for key in settings_of(rows) if key not in options and any(row[key] is not None for row in rows)]
+    cells: dict[tuple[Any, ...], dict[str, Row]] = {}
+    for row in rows:
+        own = (f"{key} {number(row[key])}" for key in options if row[key] is not None)
+        place = (*(row[key] for key in down), row["initial_delay"])
+        cells.setdefault(place, {})[", ".join([row["method"], *own])] = row
+    titles = list(dict.fromkeys(title for line in cells.values() for title in line))
+    tables: Blocks = []
+    for first in range(0, len(titles), GROUPS_PER_BLOCK):
+        block = titles[first : first + GROUPS_PER_BLOCK]
+        header = [*map(setting_title, down), "initial delay"]
+        header += [text for title in block for text in (f"{title}: %", "95 %", "n", "time")]
+        body = [
+            [*map(setting_text, down, place), delay_label(place[-1])]
+            + [text for title in block for text in _four(line.get(title))]
+            for place, line in cells.items()
+            if not line.keys().isdisjoint(block)
+        ]
+        tables.append([Table(header, body, "l" * (len(down) + 1) + "rrrr" * len(block))])
+    return [_heading(results), *tables, [f"{RULE} {TIME}."]]
+
+
+def _four(row: Row | None) -> list[str]:
+    return ["", "", "", ""] if row is None else [percent_text(row), interval_text(row), str(row["n"]), time_text(row)]
+
+
+def _heading(results: Results) -> list[str | Table]:
+    return [f"### {results.experiment}", f"Counted: {success_sentence(results.settings)}."]
+
+
+def frequency_blocks(results: Results, rows: Sequence[Row]) -> Blocks:
+    """Swept fields and estimators down, percentages and measures across."""
+    keys, measures = settings_of(rows), measures_of(rows)
+    titles = (MEASURE_TITLES.get(key, key.removeprefix("median_").replace("_", " ")) for key in measures)
+    header = [*map(setting_title, keys), "estimator", "%", "95 %", "n", *titles, "time"]
+    body = [
+        [
+            *(setting_text(key, row[key]) for key in keys),
+            *(row["method"], percent_text(row), interval_text(row), str(row["n"])),
+            *(number(row[key], 3) for key in measures),
+            time_text(row),
+        ]
+        for row in rows
+    ]
+    foot = f"{RULE} settling: median over the data sets of the time until the slowest tone is in the band to stay [s], "
+    foot += "from the start and after the last step of a frequency; - is never, or unknown. rms: median over the data "
+    foot += "sets of the root-mean-square error of each tone over the window [rad/s]. "
+    foot += "alarms: false ones, in all data sets together. " if "false_alarms" in measures else ""
+    table = Table(header, body, "l" * (len(keys) + 1) + "r" * (len(measures) + 4))
+    return [_heading(results), [table], [f"{foot}{TIME}."]]
+
+
+def record_blocks(results: Results) -> Blocks:
+    """Estimates of a measured record across, parameters with standard errors and measures of fit down."""
+    bounds = {item["name"]: item["content"].get("delay_bounds") for item in results.manifest["estimators"]}
+    fits = {"fit, estimation part": "fit_percent"}
+    if any(item.get("validation_fit_percent") is not None for item in results.rows):
+        fits["fit, validation part"] = "validation_fit_percent"
+    tables: Blocks = []
+    for first in range(0, len(results.rows), ESTIMATES_PER_BLOCK):
+        block = results.rows[first : first + ESTIMATES_PER_BLOCK]
+        found = [{item.name: item for item in parameters(row, bounds.get(row["estimator"]))} for row in block]
+        units = {name: item.unit for one in reversed(found) for name, item in one.items()}
+        names = dict.fromkeys(name for one in found for name in one)
+        body = [[key, "", *(str(row[key]) for row in block)] for key in ("id", "status")]
+        body += [[name, units[name], *(_with_error(one.get(name)) for one in found)] for name in names]
+        body += [[title, "%", *(number(row.get(key), 4) for row in block)] for title, key in fits.items()]
+        body.append(["time", "", *(seconds(row.get("seconds")) for row in block)])
+        header = ["", "unit", *(f"{row['estimator']}, start {_start(row['start'])}" for row in block)]
+        tables.append([Table(header, body, "ll" + "r" * len(block))])
+    foot = "± is one standard error. Fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x."
+    return [[f"### {results.experiment}"], *tables, [foot]]
+
+
+def _with_error(item: UncertainValue | None) -> str:
+    if item is None:
+        return "-"
+    if not math.isfinite(item.standard_error):
+        return f"{number(item.estimate)} ({item.status})"
+    return with_error(item.estimate, item.standard_error)
+
+
+def _start(label: str) -> str:
+    try:
+        return f"{float(label):g} s"
+    except ValueError:
+        return label
