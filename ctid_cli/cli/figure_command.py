@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ctid_cli.cli._common import Out, guarded
+from ctid_cli.cli._common import Out, guarded, write_files
 
 
 @guarded
@@ -32,8 +32,8 @@ def figure(
 
     Without a name: all figures of the useful-redundancy study.
     """
-    from ctid_cli.errors import StorageError, UsageError
-    from ctid_cli.reporting.figures.registry import find_figures, require_results
+    from ctid_cli.errors import UsageError
+    from ctid_cli.studies.drawing import find_figures, require_results
 
     figures = find_figures(names or [])
     if file is not None and len(figures) != 1:
@@ -41,10 +41,5 @@ def figure(
     require_results(figures, out)
     for item in figures:
         path = out / item.place if file is None else file
-        content = item.svg(out)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
-        except OSError as error:
-            raise StorageError(f"{path} cannot be written: {error.strerror or error}") from error
+        write_files({path: item.svg(out)})
         typer.echo(path)

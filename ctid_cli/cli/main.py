@@ -17,6 +17,7 @@ from ctid_cli.cli.run_command import run
 from ctid_cli.cli.schema_command import schema
 from ctid_cli.cli.show_command import show
 from ctid_cli.cli.status_command import status
+from ctid_cli.cli.study_command import study
 from ctid_cli.cli.table_command import table
 from ctid_cli.cli.track_command import track
 from ctid_cli.cli.validate_command import validate
@@ -56,6 +57,7 @@ def _root(
 app.command(cls=CheckCommand)(check)
 for _command in (fit, track, run, status, table, figure, show, export, validate, schema):
     app.command(cls=Command)(_command)
+app.add_typer(study, name="study")
 
 
 def main() -> None:

@@ -1,27 +1,36 @@
-"""What becomes of the four experiments if the formulas of the paper are taken as they are printed.
-
-A to D are the experiments of figures 1 to 4.
-
-python -m experiments.finite_time_frequency.as_printed
-"""
+"""What becomes of the four experiments, A to D, if the formulas of the paper are taken as they are printed."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from ctid_cli.frequency.drem_finite_time import DremFiniteTime
-from ctid_cli.frequency.drem_gradient import DremGradient
+from ctid_cli.arrays import Array
 from ctid_cli.frequency.regression import determinant_from_tones, theta_of
 from ctid_cli.reporting.layout import markdown_table, number
-from experiments.finite_time_frequency.acceptance import SIGMA, TRUTH, TUNING, clock, drem, settle, signal, stepped
+from ctid_cli.studies.catalogue import find_study
+
+from .measures import settle
 
 INTERVAL = 0.001
-#: Length of the records; D is judged before its step [s].
-DURATION = {"A": 60.0, "B": 60.0, "C": 60.0, "D": 30.0}
+#: Standard deviation of noise between -0.2 and 0.2.
+SIGMA = 0.4 / np.sqrt(12.0)
+#: Experiments of the paper, with the frequencies [rad/s] and phases of their two tones before any step.
+EXPERIMENTS = {
+    "A": ("two-tones", (2.0, 3.0), (0.0, 0.5 * np.pi)),
+    "B": ("harmonic", (2.0, 3.0), (0.0, 0.0)),
+    "C": ("random", (2.0, 3.0), (0.0, 0.0)),
+    "D": ("step", (1.8, 3.2), (0.0, 0.5 * np.pi)),
+}
 HEADER = ["what is printed", "measured", "as printed", "as corrected"]
+
+
+def table() -> str:
+    """All lines as Markdown."""
+    return markdown_table(HEADER, list(rows()), "llrr")
 
 
 def rows() -> Iterator[list[str]]:
@@ -33,49 +42,61 @@ def rows() -> Iterator[list[str]]:
     yield from delay()
 
 
-def components(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """The two sinusoids of a signal one by one, and their frequencies."""
-    t = clock(INTERVAL, 60.0)
-    omega = np.array([1.8, 3.2]) if name == "D" else TRUTH
-    phases = np.array([0.0, 0.5 * np.pi if name in "AD" else 0.0])
-    return np.sin(np.outer(t, omega) + phases), omega
+def options(name: str, estimator: str = "finite_time", **changes: Any) -> Any:
+    """An estimator with the tuning of one experiment, changed."""
+    plan = find_study("finite-time-frequency").plan(EXPERIMENTS[name][0])
+    own = next(cell.estimator.options for cell in plan.estimators if cell.name == estimator)
+    return replace(own, **changes)
+
+
+def tones(name: str, duration: float = 60.0) -> Array:
+    """The two sinusoids of a signal one by one, shape (N, 2)."""
+    _, omega, phases = EXPERIMENTS[name]
+    t = INTERVAL * np.arange(round(duration / INTERVAL))
+    return np.sin(np.outer(t, omega) + phases)
+
+
+def settled(estimator: Any, name: str, samples: Array) -> str:
+    """Time until both errors are below 0.05 rad/s to stay [s]."""
+    track = estimator.start(INTERVAL).run(samples)
+    time = settle(track.t, np.abs(track.omega - EXPERIMENTS[name][1]).max(axis=1), 0.05)
+    return f"{time:.3g}" if np.isfinite(time) else "never"
+
+
+def rms_determinant(name: str, h: float, d: float) -> float:
+    """Root mean square of the determinant of the mixed regression."""
+    delays = (round(h / INTERVAL), round(d / INTERVAL))
+    determinant = determinant_from_tones(tones(name), np.array(EXPERIMENTS[name][1]), *delays, INTERVAL)
+    return float(np.sqrt(np.nanmean(determinant**2)))
 
 
 def epsilon() -> Iterator[list[str]]:
     """The normalisation enters the determinant of n rows once, not in each row."""
-    for name, tuning in TUNING.items():
-        parts, omega = components(name)
-        determinant = determinant_from_tones(
-            parts, omega, round(tuning["h"] / INTERVAL), round(tuning["d"] / INTERVAL), INTERVAL
-        )
-        square = float(np.nanmean(determinant**2))
-        rates = [tuning["gamma"] * tuning["epsilon"] ** (2 * power) * square for power in (2, 1)]
+    for name in EXPERIMENTS:
+        tuning = options(name)
+        square = rms_determinant(name, tuning.h, tuning.d) ** 2
+        rates = [number(tuning.gamma * tuning.epsilon ** (2 * power) * square, 2) for power in (2, 1)]
         what = f"epsilon in every row, undisturbed signal of experiment {name}"
-        yield [what, "rate of the gradient [1/s]", *(number(rate, 2) for rate in rates)]
-        times = []
-        for power in ("literal", 1):
-            track = drem(DremGradient, name, power=power).start(INTERVAL).run(parts.sum(axis=1))
-            times.append(settle(track, omega, 0.05))
-        yield [what, "gradient within 0.05 [s]", *(never_or(time) for time in times)]
+        yield [what, "rate of the gradient [1/s]", *rates]
+        samples = tones(name).sum(axis=1)
+        times = [settled(options(name, "gradient", power=power), name, samples) for power in ("literal", 1)]
+        yield [what, "gradient within 0.05 [s]", *times]
 
 
 def start() -> Iterator[list[str]]:
     """Delays that are filled with zeros put a transient into the estimate, which never leaves it."""
     for name in ("A", "B", "D"):
-        samples = signal(name, INTERVAL, DURATION[name])
-        truth = stepped(INTERVAL, DURATION["D"])[0] if name == "D" else TRUTH
-        times = []
-        for gated in (False, True):
-            track = drem(DremFiniteTime, name, gated=gated).start(INTERVAL).run(samples)
-            times.append(settle(track, truth, 0.05))
-        what = f"delays begin with zeros, experiment {name}"
-        yield [what, "finite time within 0.05 [s]", *(never_or(time) for time in times)]
+        samples = tones(name, 30.0 if name == "D" else 60.0).sum(axis=1)
+        if name == "B":
+            samples += 0.25 * np.sin(15.0 * INTERVAL * np.arange(samples.size))
+        times = [settled(options(name, gated=gated), name, samples) for gated in (False, True)]
+        yield [f"delays begin with zeros, experiment {name}", "finite time within 0.05 [s]", *times]
 
 
 def sign() -> Iterator[list[str]]:
     """The regressand of n tones has the sign of that of one tone."""
-    h = TUNING["A"]["h"]
-    theta = theta_of(TRUTH, h)
+    h = options("A").h
+    theta = theta_of(np.array(EXPERIMENTS["A"][1]), h)
     found = []
     for sign_of in (-1.0, 1.0):
         roots = np.roots(np.concatenate(([1.0], sign_of * theta)))
@@ -86,36 +107,16 @@ def sign() -> Iterator[list[str]]:
 
 def excitation() -> Iterator[list[str]]:
     """The mixed regression can vanish although the tones are different."""
-    parts, omega = components("A")
-    sizes = []
-    for d in (2.0 * np.pi, TUNING["A"]["d"]):
-        determinant = determinant_from_tones(parts, omega, 100, round(d / INTERVAL), INTERVAL)
-        sizes.append(number(float(np.sqrt(np.nanmean(determinant**2))), 2))
+    sizes = [number(rms_determinant("A", 0.1, d), 2) for d in (2.0 * np.pi, options("A").d)]
     what = "the mixed regression is always excited (proposition 3), experiment A"
     yield [what, "rms determinant with d = 2 pi s and d = 0.13 s", *sizes]
 
 
 def delay() -> Iterator[list[str]]:
     """A delay that satisfies the printed condition is useless in noise; the paper's own delays do not satisfy it."""
-    samples = signal("A", INTERVAL, 20.0)
+    samples = tones("A", 20.0).sum(axis=1)
     samples = samples + SIGMA * np.random.default_rng(0).standard_normal(samples.size)
-    errors = []
-    for tuning in ("A", "C"):
-        track = drem(DremFiniteTime, tuning).start(INTERVAL).run(samples)
-        errors.append(number(float(np.abs(track.omega[-1] - TRUTH).max()), 2))
+    tracks = [options(tuning).start(INTERVAL).run(samples) for tuning in ("A", "C")]
+    errors = [number(float(np.abs(track.omega[-1] - EXPERIMENTS["A"][1]).max()), 2) for track in tracks]
     what = "h < pi/(2 w_max) = 0.52 s (remark 1), experiment A with noise"
     yield [what, "larger error at 20 s, h = 0.1 s and h = 0.6 s [rad/s]", *errors]
-
-
-def never_or(time: float) -> str:
-    """A time, or that it never came."""
-    return f"{time:.3g}" if np.isfinite(time) else "never"
-
-
-def table() -> str:
-    """All lines as Markdown."""
-    return markdown_table(HEADER, list(rows()), "llrr")
-
-
-if __name__ == "__main__":
-    sys.stdout.write(table() + "\n")

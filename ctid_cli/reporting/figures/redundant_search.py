@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
-from ctid_cli.errors import UsageError
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.delay_search import Minimum
 from ctid_cli.estimation.filtered_costs import FilteredCost
 from ctid_cli.estimators.useful_redundancy import NOTHING, PreparedUsefulRedundancy, RedundantFit, UsefulRedundancy
-from ctid_cli.reporting.figures.specification import published_plan
-from ctid_cli.reporting.study import load_study
-from ctid_cli.signals.record import Record
 from ctid_cli.simulation.dataset import DataSet
 
 #: How often the delays are gone through, up and down in turn: more does not lower the costs visibly.
@@ -60,24 +56,6 @@ class Landscape:
         """Cut-off frequencies of the filters [rad/s], shape (filters,)."""
         assert self.fit.filters is not None
         return self.fit.filters.cutoffs
-
-
-def published_search(
-    experiment: str, snr_db: float, noise: bool, otherwise: UsefulRedundancy
-) -> tuple[UsefulRedundancy, DataSet]:
-    """Estimator and first data set of an experiment of the useful-redundancy study."""
-    config = load_study().experiments[experiment].config
-    plan = published_plan(config)
-    cells = [cell for cell in plan.data_cells if cell.swept.get("snr_db") == snr_db]
-    if not cells:
-        raise UsageError(f"{config}: this figure shows a data set of SNR {snr_db:g} dB; add that to noise.snr_db")
-    data_set = cells[0].dataset(0)
-    if not noise:
-        record = data_set.record
-        assert record.noise_free is not None
-        data_set = replace(data_set, record=Record(record.t, record.noise_free, record.input))
-    named = [cell.estimator for cell in plan.estimators if cell.name == "proposed"]
-    return next((item for item in named if isinstance(item, UsefulRedundancy)), otherwise), data_set
 
 
 def landscape(

@@ -1,4 +1,4 @@
-"""Figures 1 to 7 of the useful-redundancy study.
+"""Figures 1 to 7 of the study.
 
 Figures 1 and 2 are theory; 3 to 7 are computed from the specifications of cases 1 and 2, whose first data set is made
 anew from its seed. Equation numbers are those of Ha, Welsh and Alamir, "Useful redundancy in parameter and time delay
@@ -7,21 +7,23 @@ estimation for continuous-time models" (arXiv:1703.09344).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
-from ctid_cli.filtering.filter_set import FilterSet, check_filters
+from ctid_cli.filtering.filter_set import FilterCheck, FilterSet, check_filters
 from ctid_cli.filtering.filter_theory import convergence_region, extrema, ideal_cost
-from ctid_cli.reporting.figures.redundant_search import Landscape, landscape, published_search
+from ctid_cli.reporting.figures.redundant_search import Landscape, landscape
 from ctid_cli.reporting.figures.search_plot import costs_svg, trajectory_svg
 from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, ramp, spread, svg
+from ctid_cli.signals.record import Record
+from ctid_cli.simulation.dataset import DataSet
+from ctid_cli.studies.catalogue import find_study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
 
 #: SNR of the data sets that are drawn [dB].
 SNR = 15.0
+#: Largest delay of the searches [s].
+LARGEST = 15.0
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,6 @@ class Case:
 
     number: int
     experiment: str
-    published: UsefulRedundancy
     #: Distance of the delays at which costs are drawn [s].
     interval: float
     #: Delays [s] that are drawn again in detail.
@@ -47,27 +50,12 @@ class Case:
     @property
     def delays(self) -> Array:
         """Delays at which costs are drawn [s]."""
-        low, high = self.published.delay_bounds
-        whole = np.arange(round((high - low) / self.interval) + 1) * self.interval + low
+        whole = np.arange(round(LARGEST / self.interval) + 1) * self.interval
         return np.unique(np.round(np.concatenate([whole, np.linspace(*self.detail, 41)]), 9))
 
 
-CASE_1 = Case(
-    number=1,
-    experiment="useful-redundancy/case1-regular",
-    published=UsefulRedundancy(2, 0, delay_bounds=(0, 15), bandwidth=2.02, filters=10, svf_cutoff=1.0),
-    interval=0.05,
-    detail=(7.4, 9.0),
-    sweeps=4,
-)
-CASE_2 = Case(
-    number=2,
-    experiment="useful-redundancy/case2-regular",
-    published=UsefulRedundancy(4, 1, delay_bounds=(0, 15), bandwidth=26.85, filters=15, svf_cutoff=25.0),
-    interval=0.04,
-    detail=(7.9, 8.1),
-    sweeps=2,
-)
+CASE_1 = Case(1, "case1-regular", interval=0.05, detail=(7.4, 9.0), sweeps=4)
+CASE_2 = Case(2, "case2-regular", interval=0.04, detail=(7.9, 8.1), sweeps=2)
 
 
 def figure_1() -> bytes:
@@ -111,70 +99,22 @@ def figure_1() -> bytes:
 def figure_2() -> bytes:
     """Six ideal costs, which of them serves which delay error, and the minimum path from one of these."""
     filters = FilterSet(bandwidth=2 * np.pi, count=6, beta=2.0)
-    largest, start, shown = 15.0, 14.0, 5.25
-    check = check_filters(filters.cutoffs, largest)
-    path = [(-1, start), *check.path(start)]
-    lines = ramp(filters.count)
+    check = check_filters(filters.cutoffs, LARGEST)
+    path = [(-1, 14.0), *check.path(14.0)]
 
     def draw(figure: Figure) -> None:
         above, below = figure.subplots(2, 1, height_ratios=[1.25, 1])
-        errors = np.linspace(0.0, shown, 1001)
-        for k, cutoff in enumerate(filters.cutoffs):
-            above.plot(errors, ideal_cost(errors, cutoff), linewidth=1.0, **lines[k])
-        ends = [2 * cutoff / np.pi for cutoff in filters.cutoffs]
-        for k, place in enumerate(spread(ends, 0.3)):
-            above.text(
-                shown + 0.05,
-                place,
-                f"filter {k + 1}: {filters.cutoffs[k] / np.pi:.2f}$\\pi$ rad/s",
-                va="center",
-                color=lines[k]["color"],
-                fontsize=8,
-            )
-        for (_, high), (k, low) in pairwise(path):
-            along = np.linspace(low, high, 60)
-            cost = ideal_cost(along, filters.cutoffs[k])
-            above.plot(along, cost, color=MARK, linewidth=2.2, alpha=0.8, solid_capstyle="round")
-        for (k, low), (following, _) in pairwise(path[1:]):
-            heights = [float(ideal_cost(low, filters.cutoffs[i])) for i in (k, following)]
-            above.plot([low, low], heights, color=MARK, linewidth=0.9, linestyle=":")
-            above.plot([low], heights[:1], "*", color=MARK, markersize=8, markeredgecolor="white", markeredgewidth=0.4)
-        above.set_xlim(0.0, shown)
-        above.set_ylim(bottom=0.0)
-        above.set_xlabel(r"delay error $|\delta\tau|$ [s]")
-        above.set_ylabel(r"cost $\bar{J}$ [(output unit)²]")
-
-        for color, label, helpful in (
-            (BAND, "leads closer to zero", lambda k, filters: k in filters),
-            (LIGHT, "leads closest", lambda k, filters: k == filters[0]),
-        ):
-            for k in range(filters.count):
-                spans = [(item.low, item.high) for item in check.intervals if helpful(k, item.filters)]
-                bars = [(low, high - low) for low, high in _joined(spans)]
-                below.broken_barh(bars, (k + 0.64, 0.72), color=color, linewidth=0, label=None if k else label)
-        for low, high in check.gaps:
-            below.axvspan(low, high, facecolor="none", edgecolor="black", hatch="//////", linewidth=0.6)
-            below.annotate(
-                f"gap, {low:.2f} to\n{high:.2f} s: no filter\nleads closer",
-                (high, 3.5),
-                (largest + 0.15, 3.5),
-                va="center",
-                fontsize=8,
-                annotation_clip=False,
-                arrowprops={"arrowstyle": "-", "linewidth": 0.6, "shrinkA": 1, "shrinkB": 0},
-            )
+        _draw_costs(above, filters, path)
+        _draw_intervals(below, check, filters.count)
         corners = [(error, k + 1) for (_, high), (k, low) in pairwise(path) for error in (high, low)]
-        below.plot(*np.transpose(corners), color=MARK, linewidth=1.1, label=f"minimum path from {start:g} s")
-        below.plot([start], [path[1][0] + 1], "s", color=MARK, markersize=4)
+        below.plot(*np.transpose(corners), color=MARK, linewidth=1.1, label=f"minimum path from {path[0][1]:g} s")
+        below.plot([path[0][1]], [path[1][0] + 1], "s", color=MARK, markersize=4)
         at = np.transpose([(low, k + 1) for k, low in path[1:-1]])
         below.plot(*at, "*", color=MARK, markersize=7, markeredgecolor="white", markeredgewidth=0.4, label="switch")
         below.legend(loc="lower left", bbox_to_anchor=(-0.01, 0.99), ncols=4, frameon=False, columnspacing=1.2)
-        below.set_xlim(0.0, largest)
-        below.set_ylim(0.45, 6.55)
-        below.set_yticks(range(1, 7))
+        below.set(xlim=(0.0, LARGEST), ylim=(0.45, 6.55), yticks=range(1, 7))
         below.grid(False, axis="y")
-        below.set_xlabel(r"delay error $|\delta\tau|$ [s]")
-        below.set_ylabel("filter")
+        below.set(xlabel=r"delay error $|\delta\tau|$ [s]", ylabel="filter")
         above.set_title("costs (50), and the end of the minimum path", loc="left")
         figure.suptitle(
             "Six ideal low-pass filters, $\\beta$ = 2, bandwidth $2\\pi$ rad/s: which filter serves which delay error\n"
@@ -182,6 +122,48 @@ def figure_2() -> bytes:
         )
 
     return svg(7.5, 5.8, draw)
+
+
+def _draw_costs(axes: Any, filters: FilterSet, path: list[tuple[int, float]]) -> None:
+    """Ideal costs with the minimum path on them."""
+    shown, lines = 5.25, ramp(filters.count)
+    errors = np.linspace(0.0, shown, 1001)
+    for k, cutoff in enumerate(filters.cutoffs):
+        axes.plot(errors, ideal_cost(errors, cutoff), linewidth=1.0, **lines[k])
+    for k, place in enumerate(spread([2 * cutoff / np.pi for cutoff in filters.cutoffs], 0.3)):
+        text = f"filter {k + 1}: {filters.cutoffs[k] / np.pi:.2f}$\\pi$ rad/s"
+        axes.text(shown + 0.05, place, text, va="center", color=lines[k]["color"], fontsize=8)
+    for (_, high), (k, low) in pairwise(path):
+        along = np.linspace(low, high, 60)
+        cost = ideal_cost(along, filters.cutoffs[k])
+        axes.plot(along, cost, color=MARK, linewidth=2.2, alpha=0.8, solid_capstyle="round")
+    for (k, low), (following, _) in pairwise(path[1:]):
+        heights = [float(ideal_cost(low, filters.cutoffs[i])) for i in (k, following)]
+        axes.plot([low, low], heights, color=MARK, linewidth=0.9, linestyle=":")
+        axes.plot([low], heights[:1], "*", color=MARK, markersize=8, markeredgecolor="white", markeredgewidth=0.4)
+    axes.set_xlim(0.0, shown)
+    axes.set_ylim(bottom=0.0)
+    axes.set(xlabel=r"delay error $|\delta\tau|$ [s]", ylabel=r"cost $\bar{J}$ [(output unit)²]")
+
+
+def _draw_intervals(axes: Any, check: FilterCheck, count: int) -> None:
+    """Which filter serves which delay error, and where none does."""
+    for color, label, most in ((BAND, "leads closer to zero", None), (LIGHT, "leads closest", 1)):
+        for k in range(count):
+            spans = [(item.low, item.high) for item in check.intervals if k in item.filters[:most]]
+            bars = [(low, high - low) for low, high in _joined(spans)]
+            axes.broken_barh(bars, (k + 0.64, 0.72), color=color, linewidth=0, label=None if k else label)
+    for low, high in check.gaps:
+        axes.axvspan(low, high, facecolor="none", edgecolor="black", hatch="//////", linewidth=0.6)
+        axes.annotate(
+            f"gap, {low:.2f} to\n{high:.2f} s: no filter\nleads closer",
+            (high, 3.5),
+            (LARGEST + 0.15, 3.5),
+            va="center",
+            fontsize=8,
+            annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "linewidth": 0.6, "shrinkA": 1, "shrinkB": 0},
+        )
 
 
 def _joined(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -234,16 +216,15 @@ def _data_set(case: Case) -> bytes:
 
 @cache
 def _computed(case: Case, noise: bool) -> Landscape:
-    estimator, data_set = published_search(case.experiment, SNR, noise, case.published)
+    estimator, data_set = published_search(case, noise)
     return landscape(estimator, data_set, case.delays, initial_delay=0.0, sweeps=case.sweeps)
 
 
-FIGURES: Mapping[str, Callable[[], bytes]] = {
-    "1": figure_1,
-    "2": figure_2,
-    "3": figure_3,
-    "4": figure_4,
-    "5": figure_5,
-    "6": figure_6,
-    "7": figure_7,
-}
+def published_search(case: Case, noise: bool) -> tuple[UsefulRedundancy, DataSet]:
+    """Estimator and first data set of a case."""
+    plan = find_study("useful-redundancy").plan(case.experiment)
+    data_set = next(cell.dataset(0) for cell in plan.data_cells if cell.swept["snr_db"] == SNR)
+    if not noise:
+        record = data_set.record
+        data_set = replace(data_set, record=Record(record.t, record.noise_free, record.input))
+    return next(cell.estimator for cell in plan.estimators if cell.name == "proposed"), data_set

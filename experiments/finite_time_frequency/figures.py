@@ -1,4 +1,4 @@
-"""Figures of the study of finite-time frequency estimation: 1 to 4 of the paper, with errors and with more estimators.
+"""Figures of the study: 1 to 4 of the paper, with errors and with more estimators.
 
 Signals and tuning are those of Vediakova, Vedyakov, Pyrkin, Bobtsov and Gromov, "Frequency estimation of
 multi-sinusoidal signals in finite-time" (2020). Two of its four estimators are not available in print: what stands in
@@ -7,24 +7,17 @@ their place is derived, and every figure says so.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.figures.error_plot import Curve, Group, Row, errors_svg
-from ctid_cli.reporting.figures.from_results import FromResults
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
-from ctid_cli.simulation.frequency_runs import SignalSource
 from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.store import read_tracks
 
-#: Experiments of the study and their specifications.
-CONFIGS: Mapping[str, str] = {
-    f"finite-time-frequency/{name.replace('_', '-')}": f"finite_time_frequency/{name}.yaml"
-    for name in ("two_tones", "harmonic", "random", "step", "recovery", "recovery_in_noise", "efficiency")
-}
 #: What estimators are called that the paper compares with, but that are not theirs.
 DERIVED = "derived, not the published algorithm"
 #: Columns of every figure: what the estimators have in common, and their labels by name in the specification.
@@ -79,7 +72,6 @@ def _row(results: Results, title: str = "", *, reference: bool = False, **swept:
     cell = next(cell for cell in plan.data_cells if cell.swept.items() >= swept.items())
     rows = {row["estimator"]: row for row in results.rows if row["replicate"] == 0 and row["cell"] == cell.hash}
     source = cell.source
-    assert isinstance(source, SignalSource)
     tracks = read_tracks(results.folder)
     groups = []
     for name, members in GROUPS.items():
@@ -113,15 +105,3 @@ def _whole_record_error(results: Results, tones: int) -> float:
     found = [row["measures"] for row in results.rows if row["estimator"] == "nonlinear_least_squares"]
     errors = np.array([[measures[f"rms_{k + 1}"] for k in range(tones)] for measures in found])
     return float(np.sqrt(np.mean(errors**2, axis=0)).max())
-
-
-def _of_results(draw: Callable[..., bytes], experiment: str) -> FromResults:
-    return FromResults({experiment: CONFIGS[experiment]}, draw)
-
-
-FIGURES: Mapping[str, FromResults] = {
-    "1": _of_results(figure_1, "finite-time-frequency/two-tones"),
-    "2": _of_results(figure_2, "finite-time-frequency/harmonic"),
-    "3": _of_results(figure_3, "finite-time-frequency/random"),
-    "4": _of_results(figure_4, "finite-time-frequency/step"),
-}

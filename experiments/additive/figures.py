@@ -1,4 +1,4 @@
-"""Figures of the study of additive models: 2, 3, 4 and 6 of the paper, and two of our own.
+"""Figures of the study: 2, 3, 4 and 6 of the paper, and two of our own.
 
 Numbers are those of González, Classens, Rojas, Welsh and Oomen, "Identification of Additive Continuous-time Systems in
 Open and Closed-loop" (arXiv:2401.01263). Figures 2 and 6 are computed from the specifications; the others show results.
@@ -6,34 +6,18 @@ Open and Closed-loop" (arXiv:2401.01263). Figures 2 and 6 are computed from the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-
 import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.figures.frequency_plot import Response, dense_frequencies, response_svg
-from ctid_cli.reporting.figures.from_results import FromResults
 from ctid_cli.reporting.figures.parameter_plot import Method, bias_svg, coverage_svg, mse_svg
-from ctid_cli.reporting.figures.specification import published_plan
 from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, ramp
 from ctid_cli.reporting.parameter_errors import ParameterErrors, parameter_errors, parameter_estimates
 from ctid_cli.reporting.results import Results
 from ctid_cli.signals.record import Record
-from ctid_cli.simulation.dataset import SimulatedSource
+from ctid_cli.studies.catalogue import find_study
 
-#: Experiments of the study and their specifications.
-CONFIGS: Mapping[str, str] = {
-    f"additive/{name.replace('_', '-')}": f"additive/{name}.yaml"
-    for name in (
-        "open_loop",
-        "closed_loop",
-        "closed_loop_coloured",
-        "coverage_open_loop",
-        "coverage_closed_loop",
-        "flexible_beam",
-    )
-}
 #: Estimators of the open-loop experiment.
 OPEN_LOOP = (Method("additive", "sum of four submodels"), Method("srivc", "SRIVC, 8 poles and 6 zeros, factored"))
 #: Estimators of the closed-loop experiment.
@@ -55,7 +39,7 @@ COVERAGE_CLOSED_LOOP = (Method("white", "white formula"),)
 
 def figure_2() -> bytes:
     """Frequency response of the eighth-order system."""
-    model = _system("additive/open-loop")
+    model = find_study("additive").plan("open-loop").data_cells[0].source.system
     frequencies = np.geomspace(0.1, 50.0, 1200)
     submodels = [
         Response(
@@ -85,12 +69,10 @@ def figure_4(results: Results) -> bytes:
 
 def figure_6() -> bytes:
     """Frequency response of a simulated beam: true, estimated, and where the estimation started."""
-    plan = published_plan(CONFIGS["additive/flexible-beam"])
+    plan = find_study("additive").plan("flexible-beam")
     cell = plan.data_cells[0]
-    true, data = _system("additive/flexible-beam"), cell.dataset(0)
+    true, data = cell.source.system, cell.dataset(0)
     start = plan.starts[0].draw(cell.content["seed"], 0, true)
-    assert start is not None
-    assert start.model is not None
     fit = plan.estimators[0].estimator.fit(data.record, start)
     lowest, highest = np.pi, 1000 * np.pi
     tones, measured = empirical_response(data.record, lowest, highest)
@@ -148,7 +130,6 @@ def empirical_response(record: Record, lowest: float, highest: float) -> tuple[A
     record out. The spectrum of the held input is that of its samples times ``(1 - exp(-jwh))/(jwh)``.
     """
     h = record.interval
-    assert h is not None
     window = np.hanning(record.t.size)
     whole = np.asarray(2 * np.pi * np.fft.rfftfreq(record.t.size, h), dtype=float)
     inside = (whole > lowest * (1 - 1e-9)) & (whole < highest * (1 + 1e-9))
@@ -156,13 +137,6 @@ def empirical_response(record: Record, lowest: float, highest: float) -> tuple[A
     outputs, inputs = (np.fft.rfft(window * signal)[inside] for signal in (record.y, record.input.at(record.t)))
     hold = (1 - np.exp(-1j * frequencies * h)) / (1j * frequencies * h)
     return frequencies, np.asarray(outputs / (inputs * hold))
-
-
-def _system(experiment: str) -> AdditiveModel:
-    source = published_plan(CONFIGS[experiment]).data_cells[0].source
-    assert isinstance(source, SimulatedSource)
-    assert isinstance(source.system, AdditiveModel)
-    return source.system
 
 
 def _errors(results: Results) -> list[ParameterErrors]:
@@ -175,17 +149,3 @@ def _parameters(rows: list[ParameterErrors]) -> list[str]:
 
 def _samples(rows: list[ParameterErrors]) -> str:
     return ", ".join(dict.fromkeys(str(row.samples) for row in rows))
-
-
-def _of_results(draw: Callable[..., bytes], *experiments: str) -> FromResults:
-    return FromResults({name: CONFIGS[name] for name in experiments}, draw)
-
-
-FIGURES: Mapping[str, Callable[[], bytes] | FromResults] = {
-    "2": figure_2,
-    "3": _of_results(figure_3, "additive/open-loop"),
-    "4": _of_results(figure_4, "additive/closed-loop"),
-    "6": figure_6,
-    "coloured": _of_results(figure_coloured, "additive/closed-loop-coloured"),
-    "coverage": _of_results(figure_coverage, "additive/coverage-open-loop", "additive/coverage-closed-loop"),
-}

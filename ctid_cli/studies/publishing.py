@@ -1,0 +1,138 @@
+"""What is published of a study: tables, figures, claims, and the environment that made them, from one commit."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import subprocess
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ctid_cli.errors import RefusedError, UsageError
+from ctid_cli.reporting.study import data_folder
+from ctid_cli.reporting.tables import csv_text
+from ctid_cli.storage.folder import PROVENANCE
+from ctid_cli.storage.version import current_origin
+from ctid_cli.studies.catalogue import StudyFolder, StudyResults, last_part
+from ctid_cli.studies.claim import COLUMNS, Claim, claims_table
+from ctid_cli.studies.drawing import StudyFigure
+
+#: What is kept of a session: nothing that names a machine, a user or a folder.
+KEPT = (
+    "started",
+    "stopped",
+    "computed",
+    "failed",
+    "jobs",
+    "processors",
+    "code_version",
+    "numeric_platform",
+    "packages",
+)
+
+
+def published_folder(study: StudyFolder) -> Path:
+    """Where a study is published in a checkout of the repository."""
+    return data_folder("experiments").parent / "results" / "published" / study.folder.name
+
+
+def evaluate(found: StudyResults) -> list[Claim]:
+    """All claims of a study; one that fails for every experiment that was not run."""
+    return list(_evaluated(found))
+
+
+def _evaluated(found: StudyResults) -> Iterator[Claim]:
+    for short in map(last_part, found.study.configs):
+        if short not in found:
+            yield Claim(short, "was run", "no", "yes", False)
+    for function, calls in found.study.claims.items():
+        state = found.study.function("claims", function)
+        for shorts in calls:
+            if all(short in found for short in shorts):
+                yield from state(*(found[short] for short in shorts))
+
+
+def commit_of(found: StudyResults) -> str:
+    """The commit of this repository that computed all results of a study; refuses any others."""
+    root = data_folder("experiments").parent
+    if not (root / ".git").exists():
+        raise UsageError(f"results are published from a checkout of the repository, and {root} is none")
+    changed = _git(root, "status", "--porcelain", "--", ".", ":(exclude)results/published")
+    if changed:
+        raise RefusedError(f"nothing is published from files that are not committed:\n{changed}")
+    for results in found.experiments.values():
+        if results.mixed:
+            raise RefusedError(f"{results.experiment} mixes results of different code versions or processors")
+        if any(origin.code_version != current_origin().code_version for origin in results.stored.origins):
+            raise RefusedError(
+                f"{results.experiment} was not computed by the code that is checked out, so that no commit can be "
+                "named for it; check out the commit that computed it, or run it again with --fresh"
+            )
+    if len({origin for results in found.experiments.values() for origin in results.stored.origins}) > 1:
+        raise RefusedError(f"the experiments of {found.study.name} were computed on different platforms")
+    return _git(root, "rev-parse", "HEAD")
+
+
+def _git(root: Path, *arguments: str) -> str:
+    try:
+        done = subprocess.run(["git", "-C", root, *arguments], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise UsageError(f"git {arguments[0]} fails in {root}: {getattr(error, 'stderr', '') or error}") from error
+    return done.stdout.strip()
+
+
+def rounded_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
+    """Rows as CSV with numbers to 6 digits: a published file must not change with the last bit of a sum."""
+    return csv_text(
+        [{key: float(f"{x:.6g}") if isinstance(x, float) else x for key, x in row.items()} for row in rows], columns
+    )
+
+
+def tables_of(found: StudyResults) -> dict[str, str]:
+    """Published tables of a study by file name."""
+    return {file: found.study.function("tables", name)(found) for file, name in found.study.files.items()}
+
+
+def publish(found: StudyResults, claims: Sequence[Claim], target: Path) -> None:
+    """Write everything that is published of a study, in place of what was published before."""
+    commit = commit_of(found)
+    texts = tables_of(found)
+    texts["claims.md"] = claims_table(claims, "md")
+    lines = io.StringIO()
+    csv.writer(lines, lineterminator="\n").writerows([COLUMNS, *(claim.cells for claim in claims)])
+    texts["claims.csv"] = lines.getvalue()
+    texts["environment.json"] = json.dumps({"commit": commit, "sessions": _sessions(found)}, indent=2) + "\n"
+    files = {Path(name): text.encode() for name, text in texts.items()}
+    for number in found.study.figures:
+        files[Path("figures") / f"figure_{number}.svg"] = StudyFigure(found.study, number).svg(found.out)
+    for old in target.rglob("*.*"):
+        old.unlink()
+    for name, content in files.items():
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        (target / name).write_bytes(content)
+
+
+def _sessions(found: StudyResults) -> dict[str, list[dict[str, object]]]:
+    sessions = {}
+    for short, results in found.experiments.items():
+        files = sorted((results.folder / PROVENANCE).glob("*.json"))
+        read = [json.loads(file.read_text(encoding="utf-8")) for file in files]
+        sessions[short] = [{key: session[key] for key in KEPT} for session in read]
+    return sessions
+
+
+def against_published(claims: Sequence[Claim], folder: Path) -> list[Claim]:
+    """Claims that hold now and did not when the study was published, or the other way round, as they were then."""
+    try:
+        with (folder / "claims.csv").open(encoding="utf-8", newline="") as file:
+            before = {(row["experiment"], row["claim"]): row for row in csv.DictReader(file)}
+    except OSError:
+        return []
+    changed = []
+    for claim in claims:
+        row = before.get((claim.experiment, claim.claim))
+        if row is not None and row["holds"] != claim.cells[-1]:
+            changed.append(Claim(**{**row, "holds": {"yes": True, "NO": False}.get(row["holds"])}))  # type: ignore[arg-type]
+    return changed

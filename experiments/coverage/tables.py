@@ -1,0 +1,121 @@
+"""What is published of the study: how often the intervals of each row cover, by parameter and formula."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from ctid_cli.arrays import Array
+from ctid_cli.inference.robust import sandwich_covariance
+from ctid_cli.reporting.layout import markdown_table
+from ctid_cli.reporting.parameter_errors import QUANTILE
+from ctid_cli.reporting.results import Results
+from ctid_cli.running.plan import build_plan
+from ctid_cli.specification.spec import spec_from_canonical
+from ctid_cli.storage.summary import wilson_interval
+from ctid_cli.studies.catalogue import StudyResults, last_part
+from ctid_cli.studies.publishing import rounded_csv
+
+#: Rows of the table by experiment: letter, and what the data are.
+ROWS = {
+    "case1-regular": ("a", "case 1, regular"),
+    "case1-irregular-exact": ("b", "case 1, irregular, exact input record"),
+    "first-order": ("c", "first order and delay"),
+    "first-order-coloured": ("d", "first order and delay, ARMA noise"),
+    "case1-irregular-sampled": ("e", "case 1, irregular, sampled input record"),
+}
+
+
+def named(numerator: Any, denominator: Any, delay: float) -> dict[str, float]:
+    """Coefficients of the monic denominator, of the numerator, and the delay [s]."""
+    names = [f"a{k}" for k in range(1, len(denominator))] + [f"b{k}" for k in range(len(numerator))]
+    return dict(zip(names, [*denominator[1:], *numerator], strict=True)) | {"delay": delay}
+
+
+@cache
+def coverage(results: Results) -> list[dict[str, Any]]:
+    """Coverage, ratio of standard errors and bias: a line for each formula and parameter."""
+    plan = build_plan(spec_from_canonical(dict(results.settings)))
+    system = plan.data_cells[0].source.system
+    truth = named(system.numerator, system.denominator, system.delay)
+    rows = [row for row in results.rows if row["delay"] is not None]
+    estimates = np.array([[*named(row["numerator"], row["denominator"], row["delay"]).values()] for row in rows])
+    white = np.array([[row["standard_errors"][name] for name in truth] for row in rows], dtype=float)
+    formulas = {"white": white}
+    if plan.data_cells[0].source.noise.coloured:
+        # Coloured noise is what the sandwich is meant for; the estimator stores the white formula, misused here.
+        formulas = {"sandwich": _sandwich(plan, [row["replicate"] for row in rows]), "white": white}
+    letter, _ = ROWS[last_part(results.experiment)]
+    lines = []
+    for formula, widths in formulas.items():
+        for (name, true), found, width in zip(truth.items(), estimates.T, widths.T, strict=True):
+            error, deviation, runs = found - true, float(np.std(found, ddof=1)), found.size
+            # A standard error that could not be computed covers nothing.
+            covered = int((np.abs(error) <= QUANTILE * width).sum())
+            low, high = wilson_interval(covered, runs)
+            lines.append(
+                {
+                    "row": letter,
+                    "formula": formula,
+                    "parameter": name,
+                    "true": float(true),
+                    "runs": runs,
+                    "not_converged": sum(row["status"] != "CONVERGED" for row in rows),
+                    "covered": covered,
+                    "percent": 100.0 * covered / runs,
+                    "low": 100.0 * low,
+                    "high": 100.0 * high,
+                    "standard_deviation": deviation,
+                    "mean_standard_error": float(np.nanmean(width)),
+                    "standard_error_ratio": float(np.nanmean(width)) / deviation,
+                    "bias": float(error.mean()),
+                    "bias_in_monte_carlo_errors": float(error.mean()) / (deviation / np.sqrt(runs)),
+                    "misused": formula != next(iter(formulas)),
+                }
+            )
+    return lines
+
+
+def _sandwich(plan: Any, replicates: list[int]) -> Array:
+    """Standard errors of the sandwich, which is not stored: from the same fits, made again."""
+    (cell,), (estimator,) = plan.data_cells, plan.estimators
+    errors = []
+    for replicate in replicates:
+        record = cell.dataset(replicate).record
+        fit = estimator.estimator.prepare(record).fit(None)
+        covariance = sandwich_covariance(fit.sensitivities, fit.residuals, regular=record.interval is not None)
+        errors.append(np.sqrt(np.diag(covariance)))
+    return np.array(errors)
+
+
+def _lines(found: StudyResults) -> list[dict[str, Any]]:
+    return [line for name in ROWS if name in found for line in coverage(found[name])]
+
+
+def numbers(found: StudyResults) -> str:
+    """All lines as numbers."""
+    return rounded_csv([{key: line[key] for key in line if key != "misused"} for line in _lines(found)])
+
+
+def markdown(found: StudyResults) -> str:
+    """All lines for people."""
+    titles = dict(ROWS.values())
+    rows = [
+        [
+            line["row"],
+            titles[line["row"]],
+            line["formula"] + (" (misused)" if line["misused"] else ""),
+            line["parameter"],
+            f"{line['true']:.5g}",
+            f"{line['percent']:.1f}",
+            f"{line['low']:.1f} to {line['high']:.1f}",
+            f"{line['standard_error_ratio']:.3f}",
+            f"{line['bias_in_monte_carlo_errors']:+.1f}",
+        ]
+        for line in _lines(found)
+    ]
+    header = ["row", "data", "formula", "parameter", "true", "coverage %", "95 % interval"]
+    header += ["standard error / deviation", "bias / Monte Carlo error"]
+    return markdown_table(header, rows, "llllrrlrr") + "\n"

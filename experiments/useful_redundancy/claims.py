@@ -1,0 +1,43 @@
+"""What must hold of the study's results."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from ctid_cli.reporting.comparison import compare
+from ctid_cli.reporting.results import Results
+from ctid_cli.reporting.rows import study_rows
+from ctid_cli.reporting.study import load_study
+from ctid_cli.studies.catalogue import last_part
+from ctid_cli.studies.claim import Claim, within
+
+#: Methods that must find the delay nearly always, wherever they start, and in how many of 100 data sets [%].
+RELIABLE = ("proposed", "proposed_spectral", "delay_profile", "profile_spectral")
+ALWAYS = 99.0
+
+
+def reaches_the_paper(results: Results) -> Iterator[Claim]:
+    """The published method converges as often as it was published to, in every cell."""
+    study = load_study()
+    rows = [
+        row.as_dict()
+        for table in study.tables.values()
+        for row in study_rows(study, table, {results.experiment: results})
+        if row.experiment == results.experiment
+    ]
+    against = [cell for cell in compare(rows, None, study).cells if cell.decisive]
+    if against:
+        lower = sum(cell.mismatch for cell in against)
+        shown = f"{lower} of {len(against)}; the lowest is {min(cell.percent for cell in against):.1f} %"
+        name = "cells of proposed below the paper, beyond chance"
+        yield within(last_part(results.experiment), name, lower, high=0, shown=shown)
+
+
+def always_converges(results: Results) -> Iterator[Claim]:
+    """The methods with redundant filters and those without an initial delay converge from everywhere."""
+    for name in RELIABLE:
+        judged = [row["converged"] for row in results.rows if row["estimator"] == name]
+        if judged:
+            percent = 100.0 * sum(judged) / len(judged)
+            shown = f"{percent:.2f} % of {len(judged)}"
+            yield within(last_part(results.experiment), f"{name} converges", percent, low=ALWAYS, shown=shown)
