@@ -13,7 +13,7 @@ from ctid_cli.reporting.layout import markdown_table
 from ctid_cli.reporting.parameter_errors import QUANTILE
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.spec import spec_from_canonical
+from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.summary import wilson_interval
 from ctid_cli.studies.catalogue import StudyResults, last_part
 from ctid_cli.studies.publishing import rounded_csv

@@ -4,6 +4,9 @@ from xml.etree import ElementTree
 
 import pytest
 
+from ctid_cli.studies import catalogue
+from ctid_cli.studies.catalogue import find_study
+
 
 def test_files_go_to_the_folder_of_the_study(ctid, tmp_path):
     done = ctid("figure", "useful-redundancy/1", "2", "--out", tmp_path / "new")
@@ -24,11 +27,9 @@ def test_a_single_figure_goes_where_it_is_told(ctid, tmp_path):
 
 
 def test_a_study_means_all_of_its_figures(ctid, tmp_path, monkeypatch):
-    from ctid_cli.reporting.figures import useful_redundancy
-
-    drawn = {number: (lambda number=number: f"<svg>{number}</svg>".encode()) for number in useful_redundancy.FIGURES}
-    for number, draw in drawn.items():
-        monkeypatch.setitem(useful_redundancy.FIGURES, number, draw)
+    module = find_study("useful-redundancy").module("figures")
+    for number in range(1, 8):
+        monkeypatch.setattr(module, f"figure_{number}", lambda number=number: f"<svg>{number}</svg>".encode())
     done = ctid("figure", "useful-redundancy", "--out", tmp_path)
     files = [tmp_path / "useful_redundancy_figures" / f"figure_{k}.svg" for k in range(1, 8)]
     assert done.stdout.split() == [str(file) for file in files]
@@ -51,10 +52,9 @@ def test_one_file_for_several_figures_is_refused(ctid, tmp_path):
 
 
 def test_an_installed_package_without_specifications_says_so(ctid, tmp_path, monkeypatch):
-    from ctid_cli.reporting.figures import specification, useful_redundancy
-
-    useful_redundancy._computed.cache_clear()
-    monkeypatch.setattr(specification, "data_folder", lambda name: tmp_path / "none")
+    find_study("useful-redundancy").module("figures")._computed.cache_clear()
+    place = catalogue.data_folder
+    monkeypatch.setattr(catalogue, "data_folder", lambda name: place(name) if name == "experiments" else tmp_path)
     done = ctid("figure", "3", "--out", tmp_path, code=2)
     assert "an installed package does not carry" in done.stderr
     assert len(done.stderr.splitlines()) == 1

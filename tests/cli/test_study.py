@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from ctid_cli.reporting.study import load_study
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
-from experiments.useful_redundancy import publish
+from ctid_cli.studies.catalogue import find_study, read_study
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "configs" / "useful_redundancy"
@@ -161,17 +161,14 @@ def test_any_experiment_can_be_checked_against_its_own_table(ctid, done, tmp_pat
     assert "6 of them with the same counts" in " ".join(text.split())
 
 
-def test_publishing_copies_tables_and_figures_and_lists_every_failure(ctid, profiled, tmp_path):
+def test_what_is_published_lists_every_failure(ctid, profiled):
+    study = find_study("useful-redundancy")
+    found = read_study(study, profiled)
+    texts = {file: study.function("tables", name)(found) for file, name in study.files.items()}
     for style in ("md", "csv"):
-        shown = ctid("table", "--format", style, "--out", profiled).stdout
-        (profiled / f"useful_redundancy.{style}").write_text(shown, encoding="utf-8")
-    target = tmp_path / "published"
-    arguments = ["--results", str(profiled), "--out", str(target)]
-    publish.main(arguments)
-    assert {file.name for file in target.iterdir()} == {"tables.md", "tables.csv", "failures.csv", "environment.json"}
-    assert [*json.loads((target / "environment.json").read_text(encoding="utf-8"))] == ["case1-regular"]
-    with (target / "failures.csv").open(encoding="utf-8", newline="") as file:
-        failures = list(csv.DictReader(file))
+        shown = ctid("table", "useful-redundancy", "--format", style, "--out", profiled).stdout
+        assert texts[f"tables.{style}"] == shown
+    failures = list(csv.DictReader(texts["failures.csv"].splitlines()))
     assert [(row["method"], row["snr_db"], row["initial_delay"], row["replicate"]) for row in failures] == [
         ("delay_profile", "15.0", "", "0"),
         ("delay_profile", "15.0", "", "1"),
@@ -181,10 +178,10 @@ def test_publishing_copies_tables_and_figures_and_lists_every_failure(ctid, prof
         assert (shown["delay"], shown["status"]) == (float(row["delay"]), row["status"])
         assert (shown["replicate"], shown["seed"]) == (int(row["replicate"]), int(row["seed"]))
 
-    figures = profiled / "useful_redundancy_figures"
-    figures.mkdir()
-    (figures / "one.svg").write_text("<svg/>", encoding="utf-8")
-    (target / "figures").mkdir()
-    (target / "figures" / "old.svg").write_text("<svg/>", encoding="utf-8")
-    publish.main(arguments)
-    assert [file.name for file in (target / "figures").iterdir()] == ["one.svg"]
+
+def test_a_method_that_always_fails_is_claimed_to(profiled):
+    study = find_study("useful-redundancy")
+    results = read_study(study, profiled)["case1-regular"]
+    (claim,) = study.module("claims").always_converges(results)
+    assert (claim.claim, claim.measured, claim.holds) == ("delay_profile converges", "0.00 % of 2", False)
+    assert list(study.module("claims").reaches_the_paper(results)) == []

@@ -1,22 +1,24 @@
 """The study of additive models: its specifications are the published settings, and its checks tell right from wrong."""
 
 import csv
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ctid_cli.reporting.figures.additive import CONFIGS
 from ctid_cli.reporting.parameter_errors import parameter_errors
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.sealed import seal_image
-from experiments.additive import acceptance, publish
+from ctid_cli.studies.catalogue import StudyResults, find_study, read_study
+from ctid_cli.studies.claim import claims_table
+from ctid_cli.studies.publishing import evaluate, tables_of
 from tests.reporting.ideal_results import ideal_results
 
-FILES = sorted(config.rpartition("/")[2] for config in CONFIGS.values())
+STUDY = find_study("additive")
+measures, claims = STUDY.module("measures"), STUDY.module("claims")
+FILES = sorted(config.rpartition("/")[2] for config in STUDY.configs.values())
 #: What is found under coloured noise in closed loop.
 BIASES = {"g1_a1": -0.6, "g1_a2": -1.1, "g1_b0": -0.7, "g2_a1": -5.7, "g2_a2": 1.4, "g2_b0": -6.1}
 
@@ -97,7 +99,7 @@ def test_the_beam_is_the_printed_model_and_says_that_it_is_simulated():
     assert "SIMULATED" in published("flexible_beam.yaml").text
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def ideal(tmp_path_factory):
     """A study that came out as theory expects, with fewer data sets and numbers of samples."""
     out = tmp_path_factory.mktemp("ideal")
@@ -124,45 +126,61 @@ def ideal(tmp_path_factory):
     return out
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def study(ideal):
-    return acceptance.read_study(ideal)
+    return read_study(STUDY, ideal)
 
 
 def failures(checks):
-    return [check.claim for check in checks if check.passed is False]
+    return [check.claim for check in checks if check.holds is False]
 
 
-def changed(study, name, change):
-    """The study with the estimates of one experiment changed."""
-    found = study[name]
-    estimates = [change(group) for group in found.estimates]
-    return {**study, name: replace(found, estimates=estimates, errors=parameter_errors(estimates))}
+@pytest.fixture
+def changed(study, monkeypatch):
+    """Claims on the study with the estimates of one experiment changed."""
+
+    def claims_of(name, change):
+        right = measures.estimates_of
+
+        def wrong(results):
+            found = right(results)
+            return [change(group) for group in found] if results is study[name] else found
+
+        with monkeypatch.context() as patch:
+            patch.setattr(measures, "estimates_of", wrong)
+            patch.setattr(claims, "errors_of", lambda results: parameter_errors(wrong(results)))
+            one = {key: value for key, value in study.experiments.items() if key == name or "coverage" in key + name}
+            return [claim for claim in evaluate(StudyResults(STUDY, study.out, one)) if claim.claim != "was run"]
+
+    return claims_of
 
 
 def test_a_study_as_theory_expects_is_accepted(study):
-    checks = acceptance.acceptance(study)
+    checks = evaluate(study)
     assert failures(checks) == []
-    assert sum(check.passed is True for check in checks) >= 28
-    written = acceptance.write(checks, "md")
-    assert written.count("\n") == len(checks) + 1
+    assert sum(check.holds is True for check in checks) >= 28
+    assert claims_table(checks, "md").count("\n") == len(checks) + 4
 
 
-def test_each_check_sees_what_it_is_for(study):
-    def scaled(group, estimator, factor, shift=0.0):
-        if group.estimator != estimator:
-            return group
-        deviation = group.values.std(axis=0)
-        return replace(group, values=group.truth + factor * (group.values - group.truth) + shift * deviation)
+def scaled(group, estimator, factor, shift=0.0):
+    if group.estimator != estimator:
+        return group
+    deviation = group.values.std(axis=0)
+    return replace(group, values=group.truth + factor * (group.values - group.truth) + shift * deviation)
 
-    def stopped(group, estimator, least, count):
-        there = group.estimator == estimator and group.samples >= least
-        return replace(group, not_converged=count) if there else group
 
-    def wide(group):
-        return replace(group, standard_errors=1.3 * group.standard_errors)
+def stopped(group, estimator, least, count):
+    there = group.estimator == estimator and group.samples >= least
+    return replace(group, not_converged=count) if there else group
 
-    cases = [
+
+def wide(group):
+    return replace(group, standard_errors=1.3 * group.standard_errors)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "claim"),
+    [
         ("open-loop", lambda g: scaled(g, "additive", 1.4), "N MSE / theory"),
         ("open-loop", lambda g: scaled(g, "srivc", 0.6), "MSE of srivc / MSE of additive, g2_b0"),
         ("closed-loop", lambda g: scaled(g, "clsrivc", 0.6), "MSE of clsrivc / MSE of additive, g1_a2"),
@@ -173,63 +191,38 @@ def test_each_check_sees_what_it_is_for(study):
         ("closed-loop-coloured", lambda g: scaled(g, "additive", 1.0, 0.4), "bias of additive, "),
         ("closed-loop-coloured", lambda g: scaled(g, "srivc", 1.0, 5.0), "bias of srivc, g2_a1"),
         ("coverage-open-loop", wide, "coverage outside"),
-    ]
-    for name, change, claim in cases:
-        wrong = failures(acceptance.acceptance(changed(study, name, change)))
-        assert any(claim in text for text in wrong), (name, claim, wrong)
+    ],
+)
+def test_each_claim_sees_what_it_is_for(changed, name, change, claim):
+    wrong = failures(changed(name, change))
+    assert any(claim in text for text in wrong), wrong
 
 
-def test_a_few_estimates_that_did_not_converge_may_be_forgiven(study):
-    def stopped(group):
+def test_a_few_estimates_that_did_not_converge_may_be_forgiven(changed):
+    def some(group):
         return replace(group, not_converged=3 if group.samples < 7000 or group.estimator != "additive" else 0)
 
-    assert failures(acceptance.acceptance(changed(study, "closed-loop", stopped))) == []
-    wrong = failures(acceptance.acceptance(changed(study, "open-loop", stopped)))
+    assert failures(changed("closed-loop", some)) == []
+    wrong = failures(changed("open-loop", some))
     assert wrong == ["additive converges, N from 5000 to 50000", "srivc converges, N from 20000 to 50000"]
 
 
 def test_what_was_not_run_does_not_hold(study):
-    checks = acceptance.acceptance({name: study[name] for name in ("open-loop",)})
-    assert len(failures(checks)) == 5
-    assert {check.claim for check in checks if check.passed is False} == {"was run"}
+    only = StudyResults(STUDY, study.out, {"open-loop": study["open-loop"]})
+    assert failures(evaluate(only)) == ["was run"] * 5
 
 
-def test_the_command_answers_with_its_exit_code(ideal, tmp_path, capsys):
-    acceptance.main(["--results", str(ideal)])
-    assert capsys.readouterr().out.rstrip().endswith("hold")
-    with pytest.raises(SystemExit) as stopped:
-        acceptance.main(["--results", str(tmp_path)])
-    assert stopped.value.code == 1
-    assert capsys.readouterr().out.rstrip().endswith("0 of 6 hold")
-
-
-def test_what_is_published(ideal, tmp_path):
-    target = tmp_path / "published"
-    (ideal / "additive_figures").mkdir(exist_ok=True)
-    (ideal / "additive_figures" / "figure_3.svg").write_text("<svg/>", encoding="utf-8")
-    arguments = ["--results", str(ideal), "--out", str(target)]
-    publish.main(arguments)
-    files = {"errors.csv", "ratios.csv", "coverage.csv", "unfinished.csv", "tables.md", "acceptance.md"}
-    assert {file.name for file in target.iterdir()} == files | {"environment.json", "figures"}
-    assert [file.name for file in (target / "figures").iterdir()] == ["figure_3.svg"]
-    assert json.loads((target / "environment.json").read_text(encoding="utf-8")) == {}
-    tables = {}
-    for name in ("errors", "ratios", "coverage", "unfinished"):
-        with (target / f"{name}.csv").open(encoding="utf-8", newline="") as file:
-            tables[name] = list(csv.DictReader(file))
+def test_what_is_published(study):
+    texts = tables_of(study)
+    assert list(texts) == ["errors.csv", "ratios.csv", "coverage.csv", "unfinished.csv", "tables.md"]
+    tables = {
+        name: list(csv.DictReader(texts[f"{name}.csv"].splitlines())) for name in ("errors", "ratios", "coverage")
+    }
     assert len(tables["errors"]) == 2 * 3 * 12 + 3 * 3 * 6 + 4 * 6 + 2 * 12 + 6 + 12
     assert len(tables["ratios"]) == 3 * 12 + 2 * 3 * 6 + 6
     assert [row["misused"] for row in tables["coverage"]] == ["no"] * 12 + ["yes"] * 12 + ["no"] * 6
-    assert tables["unfinished"] == []
+    assert texts["unfinished.csv"] == "experiment,estimator,samples,replicate,seed,status,id\n"
     for row in tables["ratios"]:
         assert float(row["ratio"]) == pytest.approx(float(row["theory"]), abs=6 * float(row["standard_error"]))
-    text = (target / "tables.md").read_text(encoding="utf-8")
     for heading in ("Open loop, section 6.1", "Closed loop, section 6.2", "SIMULATED stand-in", "Coverage of 95 %"):
-        assert heading in text
-
-
-def test_nothing_is_published_without_results(tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        publish.main(["--results", str(tmp_path), "--out", str(tmp_path / "published")])
-    assert "run first: make reproduce-additive" in capsys.readouterr().err
-    assert not (tmp_path / "published").exists()
+        assert heading in texts["tables.md"]

@@ -1,16 +1,29 @@
 """A small version of the coverage study: true standard errors cover, and the wrong formula is caught."""
 
+import pandas as pd
 import pytest
 from scipy import stats
 
-from experiments.coverage.coverage import BAND, ROWS, markdown, outside, study, summarise
+from ctid_cli.studies.catalogue import find_study, read_study
+from ctid_cli.studies.publishing import tables_of
+from tests.reporting.frequency_results import run_here
 
+STUDY = find_study("coverage")
+claims, tables = STUDY.module("claims"), STUDY.module("tables")
 RUNS = 60
 
 
-@pytest.fixture(scope="module")
-def summary():
-    return summarise(study(["c", "d"], RUNS))
+@pytest.fixture(scope="session")
+def found(tmp_path_factory):
+    out = tmp_path_factory.mktemp("coverage")
+    for name in ("first-order", "first-order-coloured"):
+        run_here(name, out, [f"monte_carlo.runs={RUNS}"], STUDY)
+    return read_study(STUDY, out)
+
+
+@pytest.fixture(scope="session")
+def summary(found):
+    return pd.DataFrame([line for results in found.experiments.values() for line in tables.coverage(results)])
 
 
 def chosen(summary, row, formula):
@@ -42,25 +55,30 @@ def test_the_white_formula_fails_under_coloured_noise(summary):
     assert (wrong["covered"] < right["covered"]).all()
 
 
-def test_only_the_formula_meant_for_a_row_is_judged(summary):
-    forced = summary.assign(percent=50.0)
-    assert set(zip(outside(forced)["row"], outside(forced)["formula"], strict=True)) == {
-        ("c", "white"),
-        ("d", "sandwich"),
-    }
-    assert outside(summary.assign(percent=sum(BAND) / 2)).empty
+def test_only_the_formula_meant_for_a_row_is_judged(found):
+    judged = [claim.claim for name in found.experiments for claim in claims.intervals_cover(found[name])]
+    assert judged == [
+        f"coverage of {name} [%], {formula} formula"
+        for formula in ("white", "sandwich")
+        for name in ("a1", "b0", "delay")
+    ]
+    assert [claim.holds for claim in claims.white_formula_is_misused(found["first-order-coloured"])][:2] == [True, True]
 
 
-def test_the_table_names_the_misuse(summary):
-    text = markdown(summary)
+def test_the_table_names_the_misuse(found, summary):
+    text = tables_of(found)["coverage.md"]
     assert text.count("white (misused)") == 3
     assert text.count("\n") == len(summary) + 2
+    assert tables_of(found)["coverage.csv"].startswith("row,formula,parameter,true,runs,not_converged,covered,percent,")
 
 
-def test_a_data_set_does_not_depend_on_the_number_of_runs():
-    few, more = study(["c"], 2), study(["c"], 3)
-    assert few.equals(more[more["replicate"] < 2].reset_index(drop=True))
+def test_rows_are_the_experiments_of_the_study_and_four_of_them_must_cover():
+    assert set(tables.ROWS) == {name.rpartition("/")[2] for name in STUDY.configs}
+    judged = [tables.ROWS[name][0] for (name,) in STUDY.claims["intervals_cover"]]
+    assert judged == ["a", "b", "c", "d"]
 
 
-def test_rows_that_must_cover():
-    assert [key for key, row in ROWS.items() if row.required] == ["a", "b", "c", "d"]
+def test_rows_b_and_e_see_the_same_data_sets():
+    exact, sampled = (STUDY.plan(f"case1-irregular-{kind}").data_cells[0].dataset(3) for kind in ("exact", "sampled"))
+    assert (exact.record.y == sampled.record.y).all()
+    assert exact.record.input.values.size != sampled.record.input.values.size

@@ -10,18 +10,17 @@ from ctid_cli.errors import UsageError
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.reporting.figures import additive, frequency_plot, parameter_plot
-from ctid_cli.reporting.figures.from_results import FromResults
+from ctid_cli.reporting.figures import frequency_plot, parameter_plot
 from ctid_cli.reporting.figures.parameter_plot import Method, bias_svg, coverage_svg, labelled, mse_svg, symbol
-from ctid_cli.reporting.figures.registry import STUDIES, find_figures, require_results
 from ctid_cli.reporting.parameter_errors import parameter_errors, parameter_estimates
-from ctid_cli.reporting.study import data_folder
-from ctid_cli.running.plan import build_plan
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
-from ctid_cli.specification.load import load_spec
+from ctid_cli.studies.catalogue import all_studies, find_study
+from ctid_cli.studies.drawing import find_figures, require_results
 from tests.reporting.ideal_results import TWO_MODES, ideal_results, plan_of
 
+STUDY = find_study("additive")
+additive = STUDY.module("figures")
 METHODS = (Method("additive", "the sum"), Method("srivc", "the fraction"))
 NAMES = ["g1_a1", "g1_a2", "g1_b0", "g2_a1", "g2_a2", "g2_b0"]
 
@@ -68,7 +67,7 @@ def test_figure_2_is_the_sum_of_its_submodels(drawn):
     above, below = drawn[0].axes
     assert legend_of(drawn[0]) == ["submodel 1", "submodel 2", "submodel 3", "submodel 4", "system"]
     frequencies, magnitude = content(above)[-1]
-    system = build_plan(load_spec(data_folder("configs") / "additive" / "open_loop.yaml")).data_cells[0].source.system
+    system = STUDY.plan("open-loop").data_cells[0].source.system
     response = unfactored(system).frequency_response(frequencies)
     assert magnitude == pytest.approx(20 * np.log10(np.abs(response)), abs=1e-6)
     (_, phase), *others = content(below)
@@ -108,7 +107,7 @@ def test_figure_6_says_that_it_is_simulated_and_ends_at_the_truth(drawn):
 
 
 def test_every_resonance_is_drawn(drawn):
-    plan = build_plan(load_spec(data_folder("configs") / "additive" / "flexible_beam.yaml"))
+    plan = STUDY.plan("flexible-beam")
     model = plan.data_cells[0].source.system
     frequencies = frequency_plot.dense_frequencies(model, 1.0, 3000.0)
     assert (np.diff(frequencies) > 0).all()
@@ -214,10 +213,9 @@ def test_labels_count_what_is_not_as_it_should_be(rows):
 
 @pytest.mark.parametrize("number", ["3", "4", "coloured", "coverage"])
 def test_figures_of_results_draw_every_estimator_of_their_experiments(number, drawn, tmp_path):
-    figure = additive.FIGURES[number]
     found, expected = [], set()
-    for config in figure.configs.values():
-        plan = build_plan(load_spec(data_folder("configs") / config), runs=4)
+    for short in STUDY.figures[number]:
+        plan = STUDY.plan(short, ["monte_carlo.runs=4"])
         found.append(ideal_results(plan, tmp_path))
         expected |= {part.name for part in plan.estimators}
     methods = {
@@ -227,18 +225,10 @@ def test_figures_of_results_draw_every_estimator_of_their_experiments(number, dr
         "coverage": additive.COVERAGE_OPEN_LOOP + additive.COVERAGE_CLOSED_LOOP,
     }[number]
     assert {method.name for method in methods} == expected
-    figure.draw(*found)
+    getattr(additive, f"figure_{number}")(*found)
     count = {"3": 4, "4": 6, "coloured": 1, "coverage": 2}[number]
     assert len(drawn[0].axes) == count
     assert all(axes.lines or axes.containers for axes in drawn[0].axes)
-
-
-def test_experiments_are_those_of_the_specifications():
-    for experiment, config in additive.CONFIGS.items():
-        assert load_spec(data_folder("configs") / config).experiment == experiment
-    for figure in additive.FIGURES.values():
-        if isinstance(figure, FromResults):
-            assert figure.configs.items() <= additive.CONFIGS.items()
 
 
 def test_results_that_are_missing_are_named_before_anything_is_drawn(tmp_path, monkeypatch):
@@ -261,7 +251,11 @@ def test_results_that_are_missing_are_named_before_anything_is_drawn(tmp_path, m
 
 
 def test_names_of_figures():
-    assert list(STUDIES) == ["useful-redundancy", "additive", "finite-time-frequency"]
+    assert [name for name, study in all_studies().items() if study.figures] == [
+        "additive",
+        "finite-time-frequency",
+        "useful-redundancy",
+    ]
     with pytest.raises(UsageError, match=r"additive has no figure 9; it has 2, 3, 4, 6, coloured, coverage$"):
         find_figures(["additive/9"])
     with pytest.raises(UsageError, match=r"'additive/colored' is neither.*did you mean 'additive/coloured'\?"):

@@ -10,13 +10,15 @@ import pytest
 from ctid_cli.errors import UsageError
 from ctid_cli.filtering.filter_set import FilterSet, check_filters
 from ctid_cli.filtering.filter_theory import extrema, ideal_cost
-from ctid_cli.reporting.figures import specification, useful_redundancy
-from ctid_cli.reporting.figures.redundant_search import landscape, published_search
-from ctid_cli.reporting.figures.registry import STUDIES, find_figures
+from ctid_cli.reporting.figures.redundant_search import landscape
 from ctid_cli.reporting.figures.search_plot import costs_svg, trajectory_svg
 from ctid_cli.reporting.figures.style import ramp, spread
-from ctid_cli.reporting.figures.useful_redundancy import CASE_1, CASE_2
+from ctid_cli.studies import catalogue
+from ctid_cli.studies.catalogue import find_study
+from ctid_cli.studies.drawing import find_figures
 
+useful_redundancy = find_study("useful-redundancy").module("figures")
+CASE_1, CASE_2 = useful_redundancy.CASE_1, useful_redundancy.CASE_2
 COARSE = np.unique(np.concatenate([np.arange(0.0, 15.1, 0.5), np.linspace(7.4, 8.8, 8)]))
 
 
@@ -41,21 +43,21 @@ class Recorder:
 
 
 def computed(case, noise, delays=COARSE, **options):
-    estimator, data_set = published_search(case.experiment, 15.0, noise, case.published)
+    estimator, data_set = useful_redundancy.published_search(case, noise)
     return landscape(replace(estimator, **options), data_set, delays, initial_delay=0.0)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def quiet():
     return computed(CASE_1, noise=False)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def noisy():
     return computed(CASE_1, noise=True)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def switching():
     """One step on each path: the search has to change the filter."""
     return computed(CASE_2, True, np.array([0.0, 4.0, 7.9, 7.98, 8.0, 8.02, 8.1, 12.0, 15.0]), max_iterations=1)
@@ -63,7 +65,7 @@ def switching():
 
 @pytest.mark.parametrize("number", ["1", "2"])
 def test_theory_is_drawn_the_same_every_time(number):
-    draw = useful_redundancy.FIGURES[number]
+    draw = getattr(useful_redundancy, f"figure_{number}")
     assert draw() == draw()
 
 
@@ -174,7 +176,7 @@ def test_costs_name_every_filter(noisy):
 @pytest.mark.parametrize("number", ["3", "4", "5", "6"])
 def test_figures_of_case_1_say_which_data_they_show(number, monkeypatch, quiet, noisy):
     monkeypatch.setattr(useful_redundancy, "_computed", lambda case, noise: noisy if noise else quiet)
-    written = texts(useful_redundancy.FIGURES[number]())
+    written = texts(getattr(useful_redundancy, f"figure_{number}")())
     assert "Case 1" in written
     assert ("without noise" in written) == (number in "34")
     assert ("SNR 15 dB" in written) == (number in "56")
@@ -194,28 +196,26 @@ def test_delays_that_are_drawn_cover_range_and_detail():
         assert inside.sum() >= 41
 
 
-@pytest.mark.parametrize("case", [CASE_1, CASE_2])
-def test_settings_are_those_of_the_specification_or_published(case):
-    estimator, data_set = published_search(case.experiment, 15.0, True, case.published)
-    published = case.published
-    for name in ("poles", "zeros", "delay_bounds", "bandwidth", "filters", "beta", "order", "svf_cutoff"):
-        assert getattr(estimator, name) == getattr(published, name)
+@pytest.mark.parametrize(
+    ("case", "poles", "zeros", "bandwidth", "filters", "svf_cutoff"),
+    [(CASE_1, 2, 0, 2.02, 10, 1.0), (CASE_2, 4, 1, 26.85, 15, 25.0)],
+)
+def test_settings_are_the_published_ones(case, poles, zeros, bandwidth, filters, svf_cutoff):
+    estimator, data_set = useful_redundancy.published_search(case, True)
+    assert (estimator.poles, estimator.zeros, estimator.bandwidth) == (poles, zeros, bandwidth)
+    assert (estimator.filters, estimator.beta, estimator.order) == (filters, 10, 10)
+    assert (estimator.svf_cutoff, tuple(estimator.delay_bounds)) == (svf_cutoff, (0, 15))
     assert data_set.true_model.delay == 8.0
     noise = data_set.record.y - data_set.record.noise_free
     assert 10 * np.log10(np.var(data_set.record.noise_free) / np.var(noise)) == pytest.approx(15.0, abs=0.5)
-    quiet = published_search(case.experiment, 15.0, False, published)[1]
+    quiet = useful_redundancy.published_search(case, False)[1]
     assert np.array_equal(quiet.record.y, data_set.record.noise_free)
 
 
 def test_without_specifications_the_message_says_so(monkeypatch, tmp_path):
-    monkeypatch.setattr(specification, "data_folder", lambda name: tmp_path)
+    monkeypatch.setattr(catalogue, "data_folder", lambda name: tmp_path)
     with pytest.raises(UsageError, match=r"case1_regular\.yaml, which an installed package does not carry; run"):
-        published_search(CASE_1.experiment, 15.0, True, CASE_1.published)
-
-
-def test_an_snr_that_is_not_in_the_specification_is_refused():
-    with pytest.raises(UsageError, match=r"case1_regular\.yaml: .* SNR 7 dB; add that to noise\.snr_db"):
-        published_search(CASE_1.experiment, 7.0, True, CASE_1.published)
+        useful_redundancy.published_search(CASE_1, True)
 
 
 def test_names_of_figures():
@@ -224,7 +224,9 @@ def test_names_of_figures():
         "useful_redundancy_figures/figure_1.svg",
     ]
     assert find_figures([]) == find_figures(["useful-redundancy"])
-    assert [item.number for item in find_figures([])] == list("1234567") == list(STUDIES["useful-redundancy"])
+    assert (
+        [item.number for item in find_figures([])] == list("1234567") == list(find_study("useful-redundancy").figures)
+    )
 
 
 @pytest.mark.parametrize(

@@ -7,18 +7,14 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.figures import error_plot, finite_time_frequency
+from ctid_cli.reporting.figures import error_plot
 from ctid_cli.reporting.figures.error_plot import Curve, Group, Row, errors_svg
-from ctid_cli.reporting.figures.finite_time_frequency import CONFIGS, DERIVED, FIGURES, GROUPS
-from ctid_cli.reporting.figures.from_results import FromResults
-from ctid_cli.reporting.figures.registry import find_figures, require_results
 from ctid_cli.reporting.results import read_results
-from ctid_cli.reporting.study import data_folder
-from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.store import read_tracks
-from tests.reporting.frequency_results import config, run_here
+from ctid_cli.studies.drawing import find_figures, require_results
+from tests.reporting.frequency_results import STUDY, run_here
 
+figures = STUDY.module("figures")
 NAMES = ("two-tones", "harmonic", "random", "step")
 #: A slow clock and short records; the step must come before their end.
 SHORT = ("sampling.interval=0.01", "sampling.duration=33", "tracks.window=[28, 33]", "monte_carlo.runs=2")
@@ -57,15 +53,15 @@ def legend_texts(legend):
     return [text.get_text() for text in legend.get_texts()]
 
 
-@pytest.mark.parametrize("number", FIGURES)
+@pytest.mark.parametrize("number", STUDY.figures)
 def test_every_figure_draws_every_tracker_and_says_what_is_derived(number, out, drawn):
     (item,) = find_figures([f"finite-time-frequency/{number}"])
     item.svg(out)
     (figure,) = drawn
     readings = 2 if number == "4" else 1
     panels = np.array(figure.axes).reshape(2 * readings, 3)
-    assert [axes.get_title(loc="left") for axes in panels[0]] == list(GROUPS)
-    for axes, labels in zip(panels[-1], GROUPS.values(), strict=True):
+    assert [axes.get_title(loc="left") for axes in panels[0]] == list(figures.GROUPS)
+    for axes, labels in zip(panels[-1], figures.GROUPS.values(), strict=True):
         assert legend_texts(axes.get_legend()) == list(labels.values())
         assert axes.get_xlabel() == "time [s]"
         assert axes.get_yscale() == "log"
@@ -80,12 +76,12 @@ def test_every_figure_draws_every_tracker_and_says_what_is_derived(number, out, 
 
 def test_lines_are_the_stored_tracks_and_thick_where_valid(out, drawn):
     results = read_results(out, "finite-time-frequency/step")
-    FIGURES["4"].draw(results)
+    figures.figure_4(results)
     tracks = read_tracks(results.folder)
     panels = np.array(drawn[0].axes).reshape(4, 3)
     cells = {cell["hash"]: cell["swept"]["phase_at_steps"] for cell in results.manifest["data_cells"]}
     for k, reading in enumerate(("jump", "continuous")):
-        for column, names in enumerate(GROUPS.values()):
+        for column, names in enumerate(figures.GROUPS.values()):
             above, below = panels[2 * k : 2 * k + 2, column]
             for place, name in enumerate(names):
                 (row,) = (
@@ -124,7 +120,7 @@ def test_the_grey_band_ends_where_finite_time_is_exact(out, drawn):
 
 def test_the_reference_is_the_worse_tone_over_all_data_sets(out, drawn):
     results = read_results(out, "finite-time-frequency/random")
-    FIGURES["3"].draw(results)
+    figures.figure_3(results)
     errors = [row["measures"] for row in results.rows if row["estimator"] == "nonlinear_least_squares"]
     assert len(errors) == 2
     expected = max(np.sqrt(np.mean([e[f"rms_{k}"] ** 2 for e in errors])) for k in (1, 2))
@@ -145,15 +141,15 @@ def test_an_svg_file_is_the_same_every_time():
 
 
 def test_missing_results_name_the_command(tmp_path, monkeypatch):
-    figures = find_figures(["finite-time-frequency"])
-    assert [figure.number for figure in figures] == ["1", "2", "3", "4"]
-    assert figures[0].place == Path("finite_time_frequency_figures/figure_1.svg")
+    drawn = find_figures(["finite-time-frequency"])
+    assert [figure.number for figure in drawn] == ["1", "2", "3", "4"]
+    assert drawn[0].place == Path("finite_time_frequency_figures/figure_1.svg")
     monkeypatch.chdir(tmp_path)
     command = " ".join(f"configs/finite_time_frequency/{name.replace('-', '_')}.yaml" for name in NAMES)
     with pytest.raises(UsageError, match=rf"run first: ctid run {command}$"):
-        require_results(figures, Path("results"))
+        require_results(drawn, Path("results"))
     with pytest.raises(UsageError, match=r"run first: ctid run configs/finite_time_frequency/harmonic\.yaml$"):
-        figures[1].svg(Path("results"))
+        drawn[1].svg(Path("results"))
 
 
 def test_results_without_tracks_are_refused(tmp_path):
@@ -164,18 +160,13 @@ def test_results_without_tracks_are_refused(tmp_path):
 
 
 def test_figures_are_those_of_the_specifications():
-    for experiment, file in CONFIGS.items():
-        assert load_spec(data_folder("configs") / file).experiment == experiment
-    for figure in FIGURES.values():
-        assert isinstance(figure, FromResults)
-        assert figure.configs.items() <= CONFIGS.items()
     for name in NAMES:
-        parts = {part.name: part.estimator.options for part in build_plan(load_spec(config(name))).estimators}
-        shown = {estimator for labels in GROUPS.values() for estimator in labels}
+        parts = {part.name: part.estimator.options for part in STUDY.plan(name).estimators}
+        shown = {estimator for labels in figures.GROUPS.values() for estimator in labels}
         assert shown == {estimator for estimator, options in parts.items() if options.online}
         derived = {
             part for part, options in parts.items() if options.kind in ("adaptive_observer", "filter_regression")
         }
-        assert derived == set(GROUPS[DERIVED])
-    assert DERIVED == "derived, not the published algorithm"
-    assert finite_time_frequency.DRAWN_INTERVAL == 0.1
+        assert derived == set(figures.GROUPS[figures.DERIVED])
+    assert figures.DERIVED == "derived, not the published algorithm"
+    assert figures.DRAWN_INTERVAL == 0.1

@@ -1,0 +1,184 @@
+"""``ctid study``: what each study has, its claims, the first estimates, and what is refused to be published."""
+
+import dataclasses
+import json
+
+import pytest
+
+from ctid_cli.errors import RefusedError, UsageError
+from ctid_cli.studies import catalogue, first_estimates, publishing
+from ctid_cli.studies.catalogue import all_studies, find_study, read_study
+from ctid_cli.studies.claim import Claim
+from tests.reporting.frequency_results import run_here
+
+STUDIES = all_studies()
+SHORT = ("sampling.interval=0.01", "sampling.duration=33", "tracks.window=[28, 33]")
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A study of one experiment, with a single short record."""
+    return dataclasses.replace(
+        find_study("finite-time-frequency"),
+        configs={"finite-time-frequency/two-tones": "finite_time_frequency/two_tones.yaml"},
+        figures={"1": ["two-tones"]},
+        files={"settling.csv": "settling_times"},
+        first={"two-tones": SHORT},
+    )
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("results")
+    run_here("two-tones", folder, SHORT)
+    return folder
+
+
+def test_list_names_every_study_and_specification(ctid):
+    text = ctid("study", "list").stdout
+    for study in STUDIES.values():
+        assert f"{study.name}: {study.title}" in text
+        for experiment, config in study.configs.items():
+            assert f"  {experiment}  configs/{config}" in text
+    assert list(STUDIES) == ["additive", "coverage", "finite-time-frequency", "useful-redundancy"]
+
+
+@pytest.mark.parametrize("study", STUDIES.values(), ids=list(STUDIES))
+def test_every_study_is_complete(study):
+    shorts = [catalogue.last_part(name) for name in study.configs]
+    for short in shorts:
+        assert study.plan(short).experiment == study.experiment(short)
+        assert study.plan(short).spec.warnings == ()
+    for number, parts in study.figures.items():
+        assert callable(study.function("figures", f"figure_{number}"))
+        assert set(parts) <= set(shorts)
+    for name in study.files.values():
+        assert callable(study.function("tables", name))
+    for name, calls in study.claims.items():
+        assert callable(study.function("claims", name))
+        assert {part for parts in calls for part in parts} <= set(shorts)
+    assert set(study.first) == set(shorts)
+    assert (study.folder / "README.md").is_file()
+    assert first_estimates.read_first(study)
+
+
+def test_studies_are_never_loaded_from_the_working_directory(monkeypatch, tmp_path):
+    folder = tmp_path / "experiments" / "additive"
+    folder.mkdir(parents=True)
+    (folder / "claims.py").write_text("raise SystemExit", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert find_study("additive").module("claims").__file__.startswith(str(find_study("additive").folder))
+
+
+def test_unknown_studies_are_refused(ctid):
+    assert "there is no study named 'addition'" in ctid("study", "run", "addition", code=2).stderr
+
+
+def test_what_was_not_run_does_not_hold(ctid, tmp_path):
+    done = ctid("study", "check", "coverage", "--out", tmp_path, code=7)
+    assert done.stdout.count("was run") == 5
+    assert "5 of the claims do not hold" in done.stderr
+
+
+def test_run_runs_every_specification(ctid, tmp_path, monkeypatch):
+    from ctid_cli.cli import run_command
+
+    calls = []
+    monkeypatch.setattr(run_command, "run", lambda **options: calls.append(options))
+    ctid("study", "run", "coverage", "--runs", 3, "--jobs", 1, "--out", tmp_path)
+    (call,) = calls
+    assert [file.name for file in call["configs"]] == [
+        config.partition("/")[2] for config in find_study("coverage").configs.values()
+    ]
+    assert (call["runs"], call["jobs"], call["out"]) == (3, 1, tmp_path)
+
+
+# First estimates -----------------------------------------------------------------------------------------
+
+
+def test_first_estimates_are_those_that_are_stored_and_a_difference_is_seen(small, tmp_path):
+    found = first_estimates.compute_first(small, tmp_path, jobs=1)
+    assert len(found) == 10
+    committed = json.loads(json.dumps(found))
+    assert first_estimates.differences(found, committed) == []
+    name = "two-tones finite_time None 0"
+    values = committed[name]["values"]
+    assert values["measures.omega_1"] == pytest.approx(2.0)
+    values["measures.omega_1"] *= 1 + 5e-7
+    assert first_estimates.differences(found, committed) == []
+    values["measures.omega_1"] *= 1 + 2e-6
+    (line,) = first_estimates.differences(found, committed)
+    assert line.startswith(f"{name}: measures.omega_1")
+    committed[name]["status"] = "INVALID"
+    assert first_estimates.differences(found, committed) == [f"{name}: status VALID (not INVALID)"]
+    del committed[name]
+    assert first_estimates.differences(found, committed) == [f"{name}: not among those that were committed"]
+    assert first_estimates.differences(committed, found) == [f"{name}: missing"]
+
+
+def test_a_chaotic_iteration_is_compared_over_one_step():
+    study = find_study("useful-redundancy")
+    for short, overrides in study.first.items():
+        plan = study.plan(short, overrides)
+        assert {cell.name for cell in plan.estimators if cell.content.get("variant") == "plain"} == {"existing"}
+        assert first_estimates._single_steps(plan) == {"existing"}
+    committed = first_estimates.read_first(study)
+    assert all(found["values"] for name, found in committed.items() if " existing " in name)
+
+
+# Publishing ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def clean(monkeypatch):
+    """A checkout without changes, whose code computed the results."""
+    answers = {"status": "", "rev-parse": "1234abcd"}
+    monkeypatch.setattr(publishing, "_git", lambda root, *arguments: answers[arguments[0]])
+    monkeypatch.setattr(publishing, "_is_current", lambda origin: True)
+    return answers
+
+
+def test_everything_is_published_with_its_commit(small, out, tmp_path, clean):
+    target = tmp_path / "published"
+    (target / "figures").mkdir(parents=True)
+    (target / "figures" / "figure_9.svg").write_text("old", encoding="utf-8")
+    claims = [Claim("two-tones", "one", "1", "at most 2", True), Claim("two-tones", "other", "3", "at most 2", False)]
+    publishing.publish(read_study(small, out), claims, target)
+    assert {file.relative_to(target).as_posix() for file in target.rglob("*.*")} == {
+        "settling.csv", "claims.md", "claims.csv", "environment.json", "figures/figure_1.svg",
+    }  # fmt: skip
+    environment = json.loads((target / "environment.json").read_text(encoding="utf-8"))
+    assert environment == {"commit": "1234abcd", "sessions": {"two-tones": []}}
+    assert "| two-tones | other | 3 | at most 2 | NO |" in (target / "claims.md").read_text(encoding="utf-8")
+    assert "1 of 2 hold" in (target / "claims.md").read_text(encoding="utf-8")
+    changed = publishing.against_published([dataclasses.replace(claims[1], holds=True), claims[0]], target)
+    assert changed == [claims[1]]
+    assert publishing.against_published(claims, tmp_path / "nowhere") == []
+
+
+def test_changed_files_are_not_published(small, out, tmp_path, clean):
+    clean["status"] = " M ctid_cli/signals/record.py"
+    with pytest.raises(RefusedError, match=r"not committed:\n M ctid_cli/signals/record\.py"):
+        publishing.publish(read_study(small, out), [], tmp_path)
+
+
+def test_results_of_other_code_are_not_published(small, out, tmp_path, clean, monkeypatch):
+    monkeypatch.setattr(publishing, "_is_current", lambda origin: False)
+    with pytest.raises(RefusedError, match="was not computed by the code that is checked out"):
+        publishing.publish(read_study(small, out), [], tmp_path)
+
+
+def test_mixed_results_are_not_published(small, out, tmp_path, clean):
+    found = read_study(small, out)
+    (results,) = found.experiments.values()
+    stored = dataclasses.replace(results.stored, origins=(*results.stored.origins,) * 2)
+    mixed = dataclasses.replace(found, experiments={"two-tones": dataclasses.replace(results, stored=stored)})
+    with pytest.raises(RefusedError, match="mixes results"):
+        publishing.publish(mixed, [], tmp_path)
+
+
+def test_an_installed_package_publishes_nothing(small, out, tmp_path, monkeypatch):
+    monkeypatch.setattr(publishing, "data_folder", lambda name: tmp_path / "package" / f"_{name}")
+    with pytest.raises(UsageError, match="from a checkout of the repository"):
+        publishing.publish(read_study(small, out), [], tmp_path)
