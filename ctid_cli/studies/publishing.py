@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from ctid_cli.errors import RefusedError, UsageError
+from ctid_cli.reporting.layout import csv_text
 from ctid_cli.reporting.study import data_folder
-from ctid_cli.reporting.tables import csv_text
 from ctid_cli.storage.folder import PROVENANCE
 from ctid_cli.storage.version import Origin, current_origin
 from ctid_cli.studies.catalogue import StudyFolder, StudyResults, last_part

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from ctid_cli.reporting.comparison import compare
+from ctid_cli.reporting.percentages import study_rows
 from ctid_cli.reporting.results import Results
-from ctid_cli.reporting.rows import study_rows
 from ctid_cli.reporting.study import load_study
 from ctid_cli.studies.catalogue import last_part
 from ctid_cli.studies.claim import Claim, within
@@ -20,10 +20,10 @@ def reaches_the_paper(results: Results) -> Iterator[Claim]:
     """The published method converges as often as it was published to, in every cell."""
     study = load_study()
     rows = [
-        row.as_dict()
+        row
         for table in study.tables.values()
         for row in study_rows(study, table, {results.experiment: results})
-        if row.experiment == results.experiment
+        if row["experiment"] == results.experiment
     ]
     against = [cell for cell in compare(rows, None, study).cells if cell.decisive]
     if against:

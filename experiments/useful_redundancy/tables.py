@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from ctid_cli.reporting.report import build_tables, write_tables
+from ctid_cli.reporting.layout import csv_text, write_reports
+from ctid_cli.reporting.percentages import ALWAYS
 from ctid_cli.reporting.results import lookup
-from ctid_cli.reporting.rows import ALWAYS
-from ctid_cli.reporting.tables import csv_text
+from ctid_cli.reporting.tables import build_tables
 from ctid_cli.studies.catalogue import StudyResults
 
 #: Methods whose failures are not listed one by one: from most initial delays this one is meant to fail.
@@ -21,12 +21,12 @@ COLUMNS = (
 
 def markdown(found: StudyResults) -> str:
     """The tables for people."""
-    return write_tables(build_tables([], found.out), "md") + "\n"
+    return write_reports(build_tables([], found.out, "md"), "md") + "\n"
 
 
 def cells(found: StudyResults) -> str:
     """The tables as numbers."""
-    return write_tables(build_tables([], found.out), "csv") + "\n"
+    return write_reports(build_tables([], found.out), "csv") + "\n"
 
 
 def failures(found: StudyResults) -> str:
