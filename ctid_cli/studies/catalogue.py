@@ -33,8 +33,11 @@ class StudyFolder:
     configs: Mapping[str, str]
     #: Experiments that each figure is drawn from, by the last parts of their names; none where it is computed.
     figures: Mapping[str, Sequence[str]]
-    #: Function in ``tables.py`` that writes each published file.
-    files: Mapping[str, str]
+    #: Function in ``tables.py`` that writes each published text.
+    texts: Mapping[str, str]
+    #: Published numbers by file: a function in ``tables.py`` that makes ``rows`` of the results of one experiment, its
+    #: ``columns`` if not all keys, and its ``experiments`` if not all.
+    numbers: Mapping[str, Mapping[str, Any]]
     #: Experiments that each function in ``claims.py`` is asked about, one call for each list.
     claims: Mapping[str, Sequence[Sequence[str]]]
     #: Settings with which the first data set of an experiment is computed again by a small reproduction.
@@ -125,7 +128,8 @@ def _study(content: Mapping[str, Any]) -> StudyFolder:
         title=content["title"],
         configs={name: item["config"] for name, item in content["experiments"].items()},
         figures={str(name): parts for name, parts in content["figures"].items()},
-        files=content["files"],
+        texts=content["texts"],
+        numbers=content["numbers"],
         claims=content["claims"],
         first=content["first"],
     )

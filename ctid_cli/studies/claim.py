@@ -15,11 +15,12 @@ COLUMNS = ("experiment", "claim", "measured", "required", "holds")
 class Claim:
     """One thing that must hold; ``holds`` is None for what is only reported."""
 
-    experiment: str
     claim: str
     measured: str
     required: str = ""
     holds: bool | None = None
+    #: Experiments whose results decide, filled in where claims are collected.
+    experiment: str = ""
 
     @property
     def cells(self) -> list[str]:
@@ -28,21 +29,19 @@ class Claim:
         return [self.experiment, self.claim, self.measured, self.required, verdict]
 
 
-def within(
-    experiment: str, claim: str, value: float | None, low: float = -math.inf, high: float = math.inf, shown: str = ""
-) -> Claim:
+def within(claim: str, value: float | None, low: float = -math.inf, high: float = math.inf, shown: str = "") -> Claim:
     """The claim that a number lies in an interval; None stands for what never came."""
     number = math.inf if value is None else float(value)
     if math.isinf(low):
         required = f"at most {high:g}"
     else:
         required = f"at least {low:g}" if math.isinf(high) else f"{low:.5g} to {high:.5g}"
-    return Claim(experiment, claim, shown or f"{number:.4g}", required, low <= number <= high)
+    return Claim(claim, shown or f"{number:.4g}", required, low <= number <= high)
 
 
-def near(experiment: str, claim: str, value: float | None, target: float, tolerance: float) -> Claim:
+def near(claim: str, value: float | None, target: float, tolerance: float) -> Claim:
     """The claim that a number lies around another one."""
-    return within(experiment, claim, value, target - tolerance, target + tolerance)
+    return within(claim, value, target - tolerance, target + tolerance)
 
 
 def claims_table(claims: Sequence[Claim], style: str = "text") -> str:

@@ -6,9 +6,9 @@ import csv
 import io
 import json
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from ctid_cli.errors import RefusedError, UsageError
 from ctid_cli.reporting.layout import csv_text
@@ -46,12 +46,13 @@ def evaluate(found: StudyResults) -> list[Claim]:
 def _evaluated(found: StudyResults) -> Iterator[Claim]:
     for short in map(last_part, found.study.configs):
         if short not in found:
-            yield Claim(short, "was run", "no", "yes", False)
+            yield Claim("was run", "no", "yes", False, short)
     for function, calls in found.study.claims.items():
         state = found.study.function("claims", function)
         for shorts in calls:
             if all(short in found for short in shorts):
-                yield from state(*(found[short] for short in shorts))
+                for claim in state(*(found[short] for short in shorts)):
+                    yield replace(claim, experiment=" and ".join(shorts))
 
 
 def commit_of(found: StudyResults) -> str:
@@ -87,22 +88,22 @@ def _git(root: Path, *arguments: str) -> str:
     return done.stdout.strip()
 
 
-def rounded_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
-    """Rows as CSV with numbers to 6 digits: a published file must not change with the last bit of a sum."""
-    return csv_text(
-        [{key: float(f"{x:.6g}") if isinstance(x, float) else x for key, x in row.items()} for row in rows], columns
-    )
-
-
-def tables_of(found: StudyResults) -> dict[str, str]:
-    """Published tables of a study by file name."""
-    return {file: found.study.function("tables", name)(found) for file, name in found.study.files.items()}
+def published_texts(found: StudyResults) -> dict[str, str]:
+    """Published tables and numbers of a study by file name."""
+    texts = {file: found.study.function("tables", name)(found) for file, name in found.study.texts.items()}
+    for file, item in found.study.numbers.items():
+        shorts = [short for short in item.get("experiments", found.experiments) if short in found]
+        rows = [row for short in shorts for row in found.study.function("tables", item["rows"])(found[short])]
+        # To 6 digits: a published file must not change with the last bit of a sum.
+        rounded = [{k: float(f"{x:.6g}") if isinstance(x, float) else x for k, x in row.items()} for row in rows]
+        texts[file] = csv_text(rounded, item.get("columns"))
+    return texts
 
 
 def publish(found: StudyResults, claims: Sequence[Claim], target: Path) -> None:
     """Write everything that is published of a study, in place of what was published before."""
     commit = commit_of(found)
-    texts = tables_of(found)
+    texts = published_texts(found)
     texts["claims.md"] = claims_table(claims, "md")
     lines = io.StringIO()
     csv.writer(lines, lineterminator="\n").writerows([COLUMNS, *(claim.cells for claim in claims)])

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
-from ctid_cli.reporting.parameter_errors import ParameterErrors, mse_ratio
+from ctid_cli.reporting.parameter_errors import mse_ratio
 from ctid_cli.reporting.results import Results
 from ctid_cli.studies.catalogue import last_part
 from ctid_cli.studies.claim import Claim, within
@@ -21,6 +21,11 @@ NEAR_THEORY = (0.75, 1.3)
 BIAS = 0.2
 #: Percentage of all points that must lie there: so many points have some that do not, by chance.
 SHARE = 97.0
+#: Points that are compared with theory: what they are, how their parameters end, and whether they decide.
+POINTS = {
+    "open-loop": (("points of the figure", "_b0", True), ("points of all parameters", "", False)),
+    "closed-loop": (("points of the figure", "", True),),
+}
 #: Mean-square error of another estimator over that of the sum of submodels: experiment, estimator, parameter, band.
 #: Parameters where theory says less than a tenth are left out: a few hundred runs cannot tell.
 RATIOS = {
@@ -48,31 +53,20 @@ COVERAGE, OUTSIDE = (93.0, 97.0), 1
 NOISE_FLOOR, FREQUENCY, BEAM_SHARE, BEAM_ITERATIONS = 1.2, 1e-5, 90.0, 12
 
 
-def errors_of_figure_are_those_of_theory(results: Results) -> Iterator[Claim]:
-    """N times the mean-square error against theory, of the parameters that figure 3 shows."""
-    shown = [row for row in errors_of(results) if row.parameter.endswith("_b0")]
-    yield from _near_theory(results, shown, "points of the figure", decides=True)
-
-
 def errors_are_those_of_theory(results: Results) -> Iterator[Claim]:
-    """The same of all parameters, which figure 4 shows."""
-    everything = last_part(results.experiment) == "closed-loop"
-    name = "points of the figure" if everything else "points of all parameters"
-    yield from _near_theory(results, errors_of(results), name, decides=everything)
-
-
-def _near_theory(results: Results, rows: Sequence[ParameterErrors], what: str, *, decides: bool) -> Iterator[Claim]:
+    """N times the mean-square error against theory: of the parameters that the figure shows, and of all."""
     low, high = NEAR_THEORY
-    ratios = np.array([row.ratio for row in rows if row.samples >= LONG and row.ratio is not None])
-    if ratios.size:
-        inside = 100 * float(np.mean((ratios >= low) & (ratios <= high)))
-        yield Claim(
-            last_part(results.experiment),
-            f"{what}, N >= {LONG}: N MSE / theory within {low:g} to {high:g}",
-            f"{inside:.1f} % of {ratios.size}; {ratios.min():.3f} to {ratios.max():.3f}, mean {ratios.mean():.3f}",
-            f"{SHARE:g} %" if decides else "",
-            bool(inside >= SHARE) if decides else None,
-        )
+    for what, names, decides in POINTS[last_part(results.experiment)]:
+        rows = [row for row in errors_of(results) if row.samples >= LONG and row.parameter.endswith(names)]
+        ratios = np.array([row.ratio for row in rows if row.ratio is not None])
+        if ratios.size:
+            inside = 100 * float(np.mean((ratios >= low) & (ratios <= high)))
+            yield Claim(
+                f"{what}, N >= {LONG}: N MSE / theory within {low:g} to {high:g}",
+                f"{inside:.1f} % of {ratios.size}; {ratios.min():.3f} to {ratios.max():.3f}, mean {ratios.mean():.3f}",
+                f"{SHARE:g} %" if decides else "",
+                bool(inside >= SHARE) if decides else None,
+            )
 
 
 def estimates_are_unbiased(results: Results) -> Iterator[Claim]:
@@ -83,7 +77,6 @@ def estimates_are_unbiased(results: Results) -> Iterator[Claim]:
         inside = 100 * float(np.mean([abs(row.bias_per_deviation) < BIAS for row in rows]))
         at = f"{abs(worst.bias_per_deviation):.3f} ({worst.estimator}, {worst.parameter}, N = {worst.samples})"
         yield Claim(
-            last_part(results.experiment),
             f"points of all parameters, N >= {LONG}: bias below {BIAS:g} standard deviations of one estimate",
             f"{inside:.1f} % of {len(rows)}; at most {at}",
             f"{SHARE:g} %",
@@ -102,7 +95,6 @@ def submodels_have_the_least_errors(results: Results) -> Iterator[Claim]:
             expected = f"; theory {theory[0][k] / theory[1][k]:.3f}" if all(x is not None for x in theory) else ""
             band = RATIOS.get((last_part(results.experiment), estimator, parameter))
             yield Claim(
-                last_part(results.experiment),
                 f"MSE of {estimator} / MSE of additive, {parameter}, N >= {LONG} together",
                 f"{ratio.ratio:.3f} ± {ratio.standard_error:.3f}{expected}",
                 f"{band[0]:g} to {band[1]:g}" if band else "",
@@ -121,7 +113,6 @@ def estimates_converge(results: Results) -> Iterator[Claim]:
         lost = sum(group.failed + group.not_converged for group in groups)
         valueless = sum(int(np.isnan(group.values).any(axis=1).sum()) for group in groups)
         yield Claim(
-            at,
             f"{estimator} converges, N from {groups[0].samples} to {groups[-1].samples}",
             f"at least {shares[worst]:.2f} % (N = {groups[worst].samples}); all but {lost} of "
             f"{sum(group.runs for group in groups)}; without a value {valueless}",
@@ -143,9 +134,7 @@ def feedback_biases_direct_instruments(results: Results) -> Iterator[Claim]:
             required, holds = f"beyond {BIASED:g} deviations", abs(row.bias_per_deviation) > BIASED
         elif row.estimator in ("additive", "clsrivc"):
             required, holds = f"within {UNBIASED:g} standard errors", abs(row.bias_per_error) <= UNBIASED
-        yield Claim(
-            last_part(results.experiment), f"bias of {row.estimator}, {row.parameter}", measured, required, holds
-        )
+        yield Claim(f"bias of {row.estimator}, {row.parameter}", measured, required, holds)
 
 
 def beam_is_found(results: Results) -> Iterator[Claim]:
@@ -155,18 +144,17 @@ def beam_is_found(results: Results) -> Iterator[Claim]:
     shown = f"{len(reached)} of {len(results.rows)} data sets"
     claim = f"squared output error below {NOISE_FLOOR:g} times that of the noise"
     share = 100 * len(reached) / len(results.rows)
-    yield Claim(last_part(results.experiment), claim, shown, f"{BEAM_SHARE:g} %", share >= BEAM_SHARE)
+    yield Claim(claim, shown, f"{BEAM_SHARE:g} %", share >= BEAM_SHARE)
     if reached:
         iterations = [row["iterations"] for row in reached]
         median = float(np.median(iterations))
         shown = f"median {median:g}, at most {max(iterations)}"
         required = f"median {BEAM_ITERATIONS} at most"
-        yield Claim(last_part(results.experiment), "iterations there", shown, required, median <= BEAM_ITERATIONS)
+        yield Claim("iterations there", shown, required, median <= BEAM_ITERATIONS)
         truth = {row.parameter: row.true for row in errors_of(results) if row.parameter.endswith("_a2")}
         errors = [np.sqrt(true / row["parameters"][name]) - 1 for row in reached for name, true in truth.items()]
         worst = float(np.max(np.abs(errors)))
         yield within(
-            last_part(results.experiment),
             "relative error of the natural frequencies there",
             worst,
             high=FREQUENCY,
@@ -187,7 +175,7 @@ def coverage_is_reported(results: Results) -> Iterator[Claim]:
     """Coverage of 95 % intervals by estimator; it is judged over both experiments together."""
     for estimator, percentages in _covered(results).items():
         claim = f"coverage of 95 % intervals, {estimator}{' (misused)' if is_misused(results, estimator) else ''}"
-        yield Claim(last_part(results.experiment), claim, f"{min(percentages):.1f} to {max(percentages):.1f} %")
+        yield Claim(claim, f"{min(percentages):.1f} to {max(percentages):.1f} %")
 
 
 def intervals_cover(*experiments: Results) -> Iterator[Claim]:
@@ -203,7 +191,6 @@ def intervals_cover(*experiments: Results) -> Iterator[Claim]:
     if found:
         outside = sum(not low <= percentage <= high for percentage in found)
         yield within(
-            " and ".join(last_part(results.experiment) for results in experiments),
             f"coverage outside {low:g} to {high:g} %, formula as it should be",
             outside,
             high=OUTSIDE,

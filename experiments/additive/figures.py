@@ -11,30 +11,26 @@ import numpy as np
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.figures.frequency_plot import Response, dense_frequencies, response_svg
-from ctid_cli.reporting.figures.parameter_plot import Method, bias_svg, coverage_svg, mse_svg
+from ctid_cli.reporting.figures.parameter_plot import bias_svg, coverage_svg, mse_svg
 from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, ramp
 from ctid_cli.reporting.parameter_errors import ParameterErrors, parameter_errors, parameter_estimates
 from ctid_cli.reporting.results import Results
 from ctid_cli.signals.record import Record
 from ctid_cli.studies.catalogue import find_study
 
-#: Estimators of the open-loop experiment.
-OPEN_LOOP = (Method("additive", "sum of four submodels"), Method("srivc", "SRIVC, 8 poles and 6 zeros, factored"))
-#: Estimators of the closed-loop experiment.
-CLOSED_LOOP = (
-    Method("additive", "sum of two submodels, closed loop"),
-    Method("clsrivc", "CLSRIVC, factored"),
-    Method("srivc", "SRIVC (direct), factored"),
-)
-#: Estimators under coloured noise in the loop.
-COLOURED = (
-    *CLOSED_LOOP,
-    Method("additive_direct", "sum of two submodels, instruments from the input"),
-)
-#: Formulas of standard errors in open loop, where the noise is coloured.
-COVERAGE_OPEN_LOOP = (Method("sandwich", "sandwich"), Method("white", "white formula, misused"))
-#: The formula of standard errors in closed loop, where the noise is white.
-COVERAGE_CLOSED_LOOP = (Method("white", "white formula"),)
+#: Estimators of each experiment, and what they are called: those in open loop,
+OPEN_LOOP = {"additive": "sum of four submodels", "srivc": "SRIVC, 8 poles and 6 zeros, factored"}
+#: in closed loop,
+CLOSED_LOOP = {
+    "additive": "sum of two submodels, closed loop",
+    "clsrivc": "CLSRIVC, factored",
+    "srivc": "SRIVC (direct), factored",
+}
+#: under coloured noise in the loop,
+COLOURED = CLOSED_LOOP | {"additive_direct": "sum of two submodels, instruments from the input"}
+#: and the formulas of standard errors in open loop, where the noise is coloured, and in closed loop, where it is white.
+COVERAGE_OPEN_LOOP = {"sandwich": "sandwich", "white": "white formula, misused"}
+COVERAGE_CLOSED_LOOP = {"white": "white formula"}
 
 
 def figure_2() -> bytes:

@@ -44,7 +44,7 @@ def is_misused(results: Results, estimator: str) -> bool:
     return bool(settings["noise"]["kind"] != "white" and settings["estimators"][estimator]["covariance"] == "white")
 
 
-def ratio_rows(results: Results) -> Iterator[dict[str, Any]]:
+def ratios(results: Results) -> Iterator[dict[str, Any]]:
     """Mean-square errors of other estimators over those of the sum of submodels, where both are consistent."""
     groups = by_estimator(results)
     reference = groups.pop("additive", [])

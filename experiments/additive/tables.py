@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,24 +11,11 @@ from ctid_cli.reporting.layout import markdown_table, number
 from ctid_cli.reporting.parameter_errors import ParameterErrors
 from ctid_cli.reporting.results import Results
 from ctid_cli.studies.catalogue import StudyResults, last_part
-from ctid_cli.studies.publishing import rounded_csv
 
-from .measures import by_estimator, errors_of, is_misused, ratio_rows
+from .measures import by_estimator, errors_of, is_misused, ratios
 
 #: Numbers of samples that the text shows, of all that were run.
 SIZES = 6
-#: Columns of errors.csv; standard errors are judged where the study asks for it, see coverage.csv.
-ERRORS = (
-    *("experiment", "estimator", "samples", "parameter", "true", "runs", "failed", "not_converged", "counted", "mse"),
-    *("n_mse", "theory", "ratio", "ratio_error", "bias", "deviation", "bias_per_deviation", "bias_per_error"),
-)
-#: Columns of coverage.csv.
-COVERAGE = (
-    *("experiment", "estimator", "misused", "samples", "parameter", "runs", "counted", "with_error", "covered"),
-    *("coverage", "low", "high", "error_ratio"),
-)
-#: Columns of unfinished.csv.
-UNFINISHED = ("experiment", "estimator", "samples", "replicate", "seed", "status", "id")
 #: Experiments on coverage.
 COVERING = ("coverage-open-loop", "coverage-closed-loop")
 TITLES = {
@@ -39,38 +26,23 @@ TITLES = {
 }
 
 
-def errors(found: StudyResults) -> str:
+def errors(results: Results) -> Iterator[dict[str, Any]]:
     """Errors of every parameter."""
-    rows = [row.as_dict() for results in found.experiments.values() for row in errors_of(results)]
-    return rounded_csv(rows, ERRORS)
+    return (row.as_dict() for row in errors_of(results))
 
 
-def ratios(found: StudyResults) -> str:
-    """Errors of other estimators over those of the sum of submodels."""
-    return rounded_csv([row for results in found.experiments.values() for row in ratio_rows(results)])
-
-
-def coverage(found: StudyResults) -> str:
+def coverage(results: Results) -> Iterator[dict[str, Any]]:
     """How often 95 % intervals contain the truth."""
-    rows = [
-        row.as_dict() | {"misused": "yes" if is_misused(found[name], row.estimator) else "no"}
-        for name in COVERING
-        if name in found
-        for row in errors_of(found[name])
-    ]
-    return rounded_csv(rows, COVERAGE)
+    for row in errors_of(results):
+        yield row.as_dict() | {"misused": "yes" if is_misused(results, row.estimator) else "no"}
 
 
-def unfinished(found: StudyResults) -> str:
+def unfinished(results: Results) -> Iterator[dict[str, Any]]:
     """Every estimate that failed or did not converge, with what makes it again."""
-    rows = []
-    for results in found.experiments.values():
-        samples = {cell["hash"]: cell["content"]["sampling"]["samples"] for cell in results.manifest["data_cells"]}
-        for row in results.rows:
-            if row["status"] != "CONVERGED":
-                content = row | {"samples": samples[row["cell"]], "seed": results.manifest["seed"]}
-                rows.append({name: content[name] for name in UNFINISHED})
-    return rounded_csv(rows, UNFINISHED)
+    samples = {cell["hash"]: cell["content"]["sampling"]["samples"] for cell in results.manifest["data_cells"]}
+    for row in results.rows:
+        if row["status"] != "CONVERGED":
+            yield row | {"samples": samples[row["cell"]], "seed": results.manifest["seed"]}
 
 
 def tables(found: StudyResults) -> str:
@@ -140,7 +112,7 @@ def parameters(results: Results) -> list[str]:
 def ratio_tables(results: Results) -> list[str]:
     """Paired ratios at a few numbers of samples, one table for each other estimator."""
     cells: dict[str, dict[int, list[Mapping[str, Any]]]] = {}
-    for row in ratio_rows(results):
+    for row in ratios(results):
         cells.setdefault(row["estimator"], {}).setdefault(row["samples"], []).append(row)
     written = []
     for estimator, lines in cells.items():

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from ctid_cli.reporting.results import Results
-from ctid_cli.studies.catalogue import last_part
 from ctid_cli.studies.claim import Claim, within
 
 from .tables import coverage
@@ -21,7 +20,7 @@ def intervals_cover(results: Results) -> Iterator[Claim]:
     for line in coverage(results):
         if not line["misused"]:
             claim = f"coverage of {line['parameter']} [%], {line['formula']} formula"
-            yield within(last_part(results.experiment), claim, line["percent"], *BAND)
+            yield within(claim, line["percent"], *BAND)
 
 
 def white_formula_is_misused(results: Results) -> Iterator[Claim]:
@@ -29,7 +28,7 @@ def white_formula_is_misused(results: Results) -> Iterator[Claim]:
     for line in coverage(results):
         if line["misused"]:
             claim = f"coverage of {line['parameter']} [%], white formula misused"
-            yield within(last_part(results.experiment), claim, line["percent"], high=MISUSED)
+            yield within(claim, line["percent"], high=MISUSED)
 
 
 def held_samples_shorten_the_delay(results: Results) -> Iterator[Claim]:
@@ -37,4 +36,4 @@ def held_samples_shorten_the_delay(results: Results) -> Iterator[Claim]:
     for line in coverage(results):
         if line["parameter"] == "delay":
             claim = "coverage of the delay [%], input known by its samples"
-            yield within(last_part(results.experiment), claim, line["percent"], high=BIASED)
+            yield within(claim, line["percent"], high=BIASED)

@@ -16,7 +16,6 @@ from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.summary import wilson_interval
 from ctid_cli.studies.catalogue import StudyResults, last_part
-from ctid_cli.studies.publishing import rounded_csv
 
 #: Rows of the table by experiment: letter, and what the data are.
 ROWS = {
@@ -90,15 +89,6 @@ def _sandwich(plan: Any, replicates: list[int]) -> Array:
     return np.array(errors)
 
 
-def _lines(found: StudyResults) -> list[dict[str, Any]]:
-    return [line for name in ROWS if name in found for line in coverage(found[name])]
-
-
-def numbers(found: StudyResults) -> str:
-    """All lines as numbers."""
-    return rounded_csv([{key: line[key] for key in line if key != "misused"} for line in _lines(found)])
-
-
 def markdown(found: StudyResults) -> str:
     """All lines for people."""
     titles = dict(ROWS.values())
@@ -114,7 +104,9 @@ def markdown(found: StudyResults) -> str:
             f"{line['standard_error_ratio']:.3f}",
             f"{line['bias_in_monte_carlo_errors']:+.1f}",
         ]
-        for line in _lines(found)
+        for name in ROWS
+        if name in found
+        for line in coverage(found[name])
     ]
     header = ["row", "data", "formula", "parameter", "true", "coverage %", "95 % interval"]
     header += ["standard error / deviation", "bias / Monte Carlo error"]

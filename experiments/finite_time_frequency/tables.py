@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from typing import Any
 
 from ctid_cli.reporting.layout import markdown_table, number
 from ctid_cli.reporting.results import Results
 from ctid_cli.studies.catalogue import StudyResults
-from ctid_cli.studies.publishing import rounded_csv
 
 from . import as_printed
 from .figures import DERIVED
-from .measures import BANDS, READINGS, Row, by_estimator, efficiency, is_derived, recovery, residuals, settling
+from .measures import BANDS, READINGS, by_estimator, efficiency, is_derived, recovery, residuals, settling
 
 #: Titles of the experiments of the paper.
 TITLES = {
@@ -21,30 +19,6 @@ TITLES = {
     "random": "Section VI-B, sin 2t + sin 3t, noise uniform in ±0.2 (figure 3)",
     "step": "Section VI-C, step of both frequencies at 30 s, no noise (figure 4)",
 }
-
-
-def settling_times(found: StudyResults) -> str:
-    """Settling times in the experiments of the paper."""
-    return _of_all(found, settling, *TITLES)
-
-
-def residual_errors(found: StudyResults) -> str:
-    """Errors that are left in the experiments of the paper."""
-    return _of_all(found, residuals, *TITLES)
-
-
-def recovery_times(found: StudyResults) -> str:
-    """How soon the frequencies are right again after a step."""
-    return _of_all(found, recovery, "recovery", "recovery-in-noise")
-
-
-def efficiencies(found: StudyResults) -> str:
-    """Errors over the Cramer-Rao bound."""
-    return _of_all(found, efficiency, "efficiency")
-
-
-def _of_all(found: StudyResults, measure: Callable[[Results], Iterator[Row]], *names: str) -> str:
-    return rounded_csv([row for name in names if name in found for row in measure(found[name])])
 
 
 def tables(found: StudyResults) -> str:

@@ -8,7 +8,6 @@ from ctid_cli.reporting.comparison import compare
 from ctid_cli.reporting.percentages import study_rows
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.study import load_study
-from ctid_cli.studies.catalogue import last_part
 from ctid_cli.studies.claim import Claim, within
 
 #: Methods that must find the delay nearly always, wherever they start, and in how many of 100 data sets [%].
@@ -30,7 +29,7 @@ def reaches_the_paper(results: Results) -> Iterator[Claim]:
         lower = sum(cell.mismatch for cell in against)
         shown = f"{lower} of {len(against)}; the lowest is {min(cell.percent for cell in against):.1f} %"
         name = "cells of proposed below the paper, beyond chance"
-        yield within(last_part(results.experiment), name, lower, high=0, shown=shown)
+        yield within(name, lower, high=0, shown=shown)
 
 
 def always_converges(results: Results) -> Iterator[Claim]:
@@ -40,4 +39,4 @@ def always_converges(results: Results) -> Iterator[Claim]:
         if judged:
             percent = 100.0 * sum(judged) / len(judged)
             shown = f"{percent:.2f} % of {len(judged)}"
-            yield within(last_part(results.experiment), f"{name} converges", percent, low=ALWAYS, shown=shown)
+            yield within(f"{name} converges", percent, low=ALWAYS, shown=shown)

@@ -83,8 +83,7 @@ def figure_1() -> bytes:
             arrowprops={"arrowstyle": "-", "linewidth": 0.6, "shrinkA": 2, "shrinkB": 0},
         )
         axes.text(-largest + 0.05, 2 * cutoff / np.pi - 0.12, r"$2\omega_c/\pi$", va="top", color=MIDDLE)
-        axes.set_xlabel(r"delay error $\delta\tau$ [s]")
-        axes.set_ylabel(r"cost $\bar{J}$ [(output unit)²]")
+        axes.set(xlabel=r"delay error $\delta\tau$ [s]", ylabel=r"cost $\bar{J}$ [(output unit)²]")
         axes.set_xlim(-largest, largest)
         axes.set_ylim(bottom=0.0)
         axes.legend(loc="lower left", frameon=True)
@@ -112,8 +111,8 @@ def figure_2() -> bytes:
         at = np.transpose([(low, k + 1) for k, low in path[1:-1]])
         below.plot(*at, "*", color=MARK, markersize=7, markeredgecolor="white", markeredgewidth=0.4, label="switch")
         below.legend(loc="lower left", bbox_to_anchor=(-0.01, 0.99), ncols=4, frameon=False, columnspacing=1.2)
-        below.set(xlim=(0.0, LARGEST), ylim=(0.45, 6.55), yticks=range(1, 7))
         below.grid(False, axis="y")
+        below.set(xlim=(0.0, LARGEST), ylim=(0.45, 6.55), yticks=range(1, 7))
         below.set(xlabel=r"delay error $|\delta\tau|$ [s]", ylabel="filter")
         above.set_title("costs (50), and the end of the minimum path", loc="left")
         figure.suptitle(

@@ -12,6 +12,7 @@ from ctid_cli.reporting.study import load_study
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.studies.catalogue import find_study, read_study
+from ctid_cli.studies.publishing import published_texts
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "configs" / "useful_redundancy"
@@ -164,7 +165,7 @@ def test_any_experiment_can_be_checked_against_its_own_table(ctid, done, tmp_pat
 def test_what_is_published_lists_every_failure(ctid, profiled):
     study = find_study("useful-redundancy")
     found = read_study(study, profiled)
-    texts = {file: study.function("tables", name)(found) for file, name in study.files.items()}
+    texts = published_texts(found)
     for style in ("md", "csv"):
         shown = ctid("table", "useful-redundancy", "--format", style, "--out", profiled).stdout
         assert texts[f"tables.{style}"] == shown

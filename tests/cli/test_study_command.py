@@ -22,7 +22,8 @@ def small(tmp_path_factory):
         find_study("finite-time-frequency"),
         configs={"finite-time-frequency/two-tones": "finite_time_frequency/two_tones.yaml"},
         figures={"1": ["two-tones"]},
-        files={"settling.csv": "settling_times"},
+        texts={},
+        numbers={"settling.csv": {"rows": "settling"}},
         first={"two-tones": SHORT},
     )
 
@@ -52,8 +53,10 @@ def test_every_study_is_complete(study):
     for number, parts in study.figures.items():
         assert callable(study.function("figures", f"figure_{number}"))
         assert set(parts) <= set(shorts)
-    for name in study.files.values():
+    for name in [*study.texts.values(), *(item["rows"] for item in study.numbers.values())]:
         assert callable(study.function("tables", name))
+    for item in study.numbers.values():
+        assert set(item.get("experiments", ())) <= set(shorts)
     for name, calls in study.claims.items():
         assert callable(study.function("claims", name))
         assert {part for parts in calls for part in parts} <= set(shorts)
@@ -143,7 +146,7 @@ def test_everything_is_published_with_its_commit(small, out, tmp_path, clean):
     target = tmp_path / "published"
     (target / "figures").mkdir(parents=True)
     (target / "figures" / "figure_9.svg").write_text("old", encoding="utf-8")
-    claims = [Claim("two-tones", "one", "1", "at most 2", True), Claim("two-tones", "other", "3", "at most 2", False)]
+    claims = [Claim("one", "1", "at most 2", True, "two-tones"), Claim("other", "3", "at most 2", False, "two-tones")]
     publishing.publish(read_study(small, out), claims, target)
     assert {file.relative_to(target).as_posix() for file in target.rglob("*.*")} == {
         "settling.csv", "claims.md", "claims.csv", "environment.json", "figures/figure_1.svg",

@@ -13,7 +13,7 @@ from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.sealed import seal_image
 from ctid_cli.studies.catalogue import StudyResults, find_study, read_study
 from ctid_cli.studies.claim import claims_table
-from ctid_cli.studies.publishing import evaluate, tables_of
+from ctid_cli.studies.publishing import evaluate, published_texts
 from tests.reporting.ideal_results import ideal_results
 
 STUDY = find_study("additive")
@@ -213,8 +213,8 @@ def test_what_was_not_run_does_not_hold(study):
 
 
 def test_what_is_published(study):
-    texts = tables_of(study)
-    assert list(texts) == ["errors.csv", "ratios.csv", "coverage.csv", "unfinished.csv", "tables.md"]
+    texts = published_texts(study)
+    assert list(texts) == ["tables.md", "errors.csv", "ratios.csv", "coverage.csv", "unfinished.csv"]
     tables = {
         name: list(csv.DictReader(texts[f"{name}.csv"].splitlines())) for name in ("errors", "ratios", "coverage")
     }

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from ctid_cli.studies.catalogue import find_study, read_study
-from ctid_cli.studies.publishing import tables_of
+from ctid_cli.studies.publishing import published_texts
 from tests.reporting.frequency_results import run_here
 
 STUDY = find_study("coverage")
@@ -66,10 +66,12 @@ def test_only_the_formula_meant_for_a_row_is_judged(found):
 
 
 def test_the_table_names_the_misuse(found, summary):
-    text = tables_of(found)["coverage.md"]
+    text = published_texts(found)["coverage.md"]
     assert text.count("white (misused)") == 3
     assert text.count("\n") == len(summary) + 2
-    assert tables_of(found)["coverage.csv"].startswith("row,formula,parameter,true,runs,not_converged,covered,percent,")
+    assert published_texts(found)["coverage.csv"].startswith(
+        "row,formula,parameter,true,runs,not_converged,covered,percent,"
+    )
 
 
 def test_rows_are_the_experiments_of_the_study_and_four_of_them_must_cover():

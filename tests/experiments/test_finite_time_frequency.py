@@ -9,7 +9,7 @@ from ctid_cli.reporting.study import data_folder
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.store import read_tracks
 from ctid_cli.studies.catalogue import read_study
-from ctid_cli.studies.publishing import evaluate, tables_of
+from ctid_cli.studies.publishing import evaluate, published_texts
 from tests.experiments import frequency_acceptance as acceptance
 from tests.reporting.frequency_results import STUDY, run_here
 
@@ -196,13 +196,13 @@ def test_claims_are_judged_on_stored_runs(study):
 def published(study):
     patch = pytest.MonkeyPatch()
     patch.setattr(as_printed, "INTERVAL", 0.01)
-    texts = tables_of(study)
+    texts = published_texts(study)
     patch.undo()
     return texts
 
 
 def test_everything_is_written(published):
-    assert list(published) == ["settling.csv", "residuals.csv", "recovery.csv", "efficiency.csv", "tables.md"]
+    assert list(published) == ["tables.md", "settling.csv", "residuals.csv", "recovery.csv", "efficiency.csv"]
     rows = list(csv.DictReader(published["recovery.csv"].splitlines()))
     assert {row["reading"] for row in rows} == {"jump", "continuous"}
     assert len(rows) == 2 * (8 + 11)

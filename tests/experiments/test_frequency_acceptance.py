@@ -31,8 +31,8 @@ def test_item_is_met(item):
 
 
 def test_a_missed_number_is_noticed():
-    assert near("item", "name", 1.04, 1.0, 0.05).holds
-    assert not near("item", "name", 1.06, 1.0, 0.05).holds
-    assert not within("item", "name", None, high=3.0).holds
-    assert not within("item", "name", float("nan"), 0.0, 1.0).holds
-    assert within("item", "name", 1.0, low=0.5).required == "at least 0.5"
+    assert near("name", 1.04, 1.0, 0.05).holds
+    assert not near("name", 1.06, 1.0, 0.05).holds
+    assert not within("name", None, high=3.0).holds
+    assert not within("name", float("nan"), 0.0, 1.0).holds
+    assert within("name", 1.0, low=0.5).required == "at least 0.5"

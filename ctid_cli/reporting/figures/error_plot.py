@@ -89,15 +89,13 @@ def errors_svg(rows: Sequence[Row], frequencies: tuple[float, float], errors: tu
                 _draw_frequencies(above, group.curves)
                 _draw_errors(below, group.curves, row)
                 above.set_ylim(*frequencies)
-                below.set_yscale("log")
-                below.set_ylim(*errors)
+                below.set(yscale="log", ylim=errors)
             panels[2 * k, 0].set_ylabel(f"{row.title}\nfrequency [rad/s]".strip())
             panels[2 * k + 1, 0].set_ylabel(f"{row.title}\nlarger error [rad/s]".strip())
         for axes, group in zip(panels[0], rows[0].groups, strict=True):
             axes.set_title(group.title, loc="left", fontsize=8)
         for axes, group in zip(panels[-1], rows[0].groups, strict=True):
-            axes.set_xlabel("time [s]")
-            axes.set_xlim(0.0, rows[0].duration)
+            axes.set(xlabel="time [s]", xlim=(0.0, rows[0].duration))
             axes.xaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 1.5, 2, 3, 5, 10]))
             axes.legend(
                 handles=_handles(group.curves), loc="upper left", bbox_to_anchor=(-0.03, -0.27), frameon=False,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,13 +24,8 @@ LOOKS: tuple[dict[str, Any], ...] = (
 #: Bias [standard errors of the mean] within which a parameter counts as unbiased: 1 in 1000, two-sided.
 UNBIASED = 3.3
 
-
-@dataclass(frozen=True)
-class Method:
-    """An estimator as figures show it."""
-
-    name: str
-    label: str
+#: Labels of estimators by their names.
+Methods = Mapping[str, str]
 
 
 def symbol(parameter: str) -> str:
@@ -40,7 +34,7 @@ def symbol(parameter: str) -> str:
 
 
 def mse_svg(
-    rows: Sequence[ParameterErrors], methods: Sequence[Method], parameters: Sequence[str], columns: int, title: str
+    rows: Sequence[ParameterErrors], methods: Methods, parameters: Sequence[str], columns: int, title: str
 ) -> bytes:
     """Mean-square errors over the number of samples, one panel for each parameter."""
     lines = -(-len(parameters) // columns)
@@ -51,7 +45,7 @@ def mse_svg(
         panels = figure.subplots(lines, columns, sharex=True, squeeze=False)
         for axes, parameter in zip(panels.flat, parameters, strict=False):
             for method, look in zip(methods, LOOKS, strict=False):
-                found = [row for row in rows if (row.estimator, row.parameter) == (method.name, parameter)]
+                found = [row for row in rows if (row.estimator, row.parameter) == (method, parameter)]
                 found.sort(key=lambda row: row.samples)
                 theory = [(row.samples, row.theory / row.samples) for row in found if row.theory is not None]
                 if theory:
@@ -61,10 +55,9 @@ def mse_svg(
                     axes.plot(
                         *np.transpose(points), **look | {"linestyle": "none"}, markersize=3.2, markeredgewidth=0.8
                     )
-            axes.set_xscale("log")
-            axes.set_yscale("log")
-            axes.xaxis.set_minor_formatter(NullFormatter())
-            axes.yaxis.set_minor_formatter(NullFormatter())
+            axes.set(xscale="log", yscale="log")
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.set_minor_formatter(NullFormatter())
             axes.set_title(symbol(parameter), loc="left")
         for axes in panels[:, 0]:
             axes.set_ylabel("mean-square error")
@@ -78,9 +71,7 @@ def mse_svg(
     return svg(7.5, 1.4 + 2.1 * lines, draw)
 
 
-def bias_svg(
-    rows: Sequence[ParameterErrors], methods: Sequence[Method], parameters: Sequence[str], title: str
-) -> bytes:
+def bias_svg(rows: Sequence[ParameterErrors], methods: Methods, parameters: Sequence[str], title: str) -> bytes:
     """Biases in standard deviations of one estimate, one line for each parameter."""
     counted = min((row.counted for row in rows), default=0)
     band = UNBIASED / np.sqrt(counted) if counted else 0.0
@@ -93,7 +84,7 @@ def bias_svg(
             for place, parameter in enumerate(parameters):
                 height = -place + 0.17 * (0.5 * (len(methods) - 1) - k)
                 for row in rows:
-                    if (row.estimator, row.parameter) != (method.name, parameter) or row.bias_per_deviation is None:
+                    if (row.estimator, row.parameter) != (method, parameter) or row.bias_per_deviation is None:
                         continue
                     axes.plot([0.0, row.bias_per_deviation], [height] * 2, color=look["color"], linewidth=0.8)
                     axes.plot([row.bias_per_deviation], [height], **look | {"linestyle": "none"}, markersize=5)
@@ -106,7 +97,7 @@ def bias_svg(
     return svg(7.5, 1.5 + 0.5 * len(parameters), draw)
 
 
-def coverage_svg(panels: Sequence[tuple[str, Sequence[ParameterErrors], Sequence[Method]]], title: str) -> bytes:
+def coverage_svg(panels: Sequence[tuple[str, Sequence[ParameterErrors], Methods]], title: str) -> bytes:
     """Percentages of 95 % intervals that contain the true parameter."""
     widths = [len({row.parameter for row in rows}) for _, rows, _ in panels]
 
@@ -119,9 +110,7 @@ def coverage_svg(panels: Sequence[tuple[str, Sequence[ParameterErrors], Sequence
             axes.axhspan(95 - half, min(95 + half, 100), color=BAND, linewidth=0)
             axes.axhline(95, color=MIDDLE, linewidth=0.8)
             for k, (method, look) in enumerate(zip(methods, LOOKS, strict=False)):
-                found = {
-                    row.parameter: row for row in rows if row.estimator == method.name and row.coverage is not None
-                }
+                found = {row.parameter: row for row in rows if row.estimator == method and row.coverage is not None}
                 at = np.array([parameters.index(parameter) for parameter in found]) + 0.16 * (
                     k - 0.5 * (len(methods) - 1)
                 )
@@ -135,7 +124,7 @@ def coverage_svg(panels: Sequence[tuple[str, Sequence[ParameterErrors], Sequence
                     **look | {"linestyle": "none"},
                     markersize=4,
                     elinewidth=0.8,
-                    label=labelled(method, rows),
+                    label=labelled(method, methods[method], rows),
                 )
             axes.set_xticks(range(len(parameters)), [symbol(parameter) for parameter in parameters], fontsize=8)
             axes.set_title(f"{name}, {_data_sets(rows)}", loc="left", fontsize=8)
@@ -147,15 +136,15 @@ def coverage_svg(panels: Sequence[tuple[str, Sequence[ParameterErrors], Sequence
     return svg(7.5, 3.8, draw)
 
 
-def labelled(method: Method, rows: Sequence[ParameterErrors]) -> str:
+def labelled(method: str, label: str, rows: Sequence[ParameterErrors]) -> str:
     """What an estimator is called, and how many of its estimates are not as they should be."""
     # Every parameter of a group carries the same counts.
-    own = {(row.samples, row.start): row for row in rows if row.estimator == method.name}.values()
+    own = {(row.samples, row.start): row for row in rows if row.estimator == method}.values()
     runs, counted = sum(row.runs for row in own), sum(row.counted for row in own)
     unfinished = sum(row.failed + row.not_converged for row in own)
     notes = [f"{unfinished} of {runs} not converged"] if unfinished else []
     notes += [f"{runs - counted} without a value"] if counted < runs else []
-    return f"{method.label} ({', '.join(notes)})" if notes else method.label
+    return f"{label} ({', '.join(notes)})" if notes else label
 
 
 def _data_sets(rows: Sequence[ParameterErrors]) -> str:
@@ -164,14 +153,12 @@ def _data_sets(rows: Sequence[ParameterErrors]) -> str:
     return f"{text} data sets{' a point' if len({row.samples for row in rows}) > 1 else ''}"
 
 
-def _legend(
-    figure: Figure, methods: Sequence[Method], rows: Sequence[ParameterErrors], note: str, *, line: bool = True
-) -> None:
+def _legend(figure: Figure, methods: Methods, rows: Sequence[ParameterErrors], note: str, *, line: bool = True) -> None:
     from matplotlib.lines import Line2D
 
     off = {} if line else {"linestyle": "none"}
     handles = [
-        Line2D([], [], **look | off, markersize=4, linewidth=0.9, label=labelled(method, rows))
+        Line2D([], [], **look | off, markersize=4, linewidth=0.9, label=labelled(method, methods[method], rows))
         for method, look in zip(methods, LOOKS, strict=False)
     ]
     wide = max(len(str(handle.get_label())) for handle in handles) > 40 or len(handles) > 3

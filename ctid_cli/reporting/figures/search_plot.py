@@ -39,9 +39,7 @@ def costs_svg(result: Landscape, title: str) -> bytes:
                 arrowprops={"arrowstyle": "-", "linewidth": 0.5, "color": color, "shrinkA": 0, "shrinkB": 0},
             )
         axes.text(result.true_delay - 0.1, 0.97 * top, "true delay", ha="right", va="top", fontsize=8, color=MIDDLE)
-        axes.set_xlim(delays[0], delays[-1])
-        axes.set_ylim(0.0, top)
-        axes.set_xlabel(r"delay $\hat\tau$ [s]")
+        axes.set(xlim=(delays[0], delays[-1]), ylim=(0.0, top), xlabel=r"delay $\hat\tau$ [s]")
         axes.set_ylabel(r"cost $100\,\|y_k - \hat x_k\| \,/\, \|y_k - \mathrm{mean}\,y_k\|$ [%]")
         figure.suptitle(title)
 
