@@ -397,7 +397,7 @@ class PreparedProfile:
         profile = Profile(found.delays, found.costs * first.mean_factor, self.bandwidth, cutoff)
         starts = [(minimum.delay, minimum.theta) for minimum in found.minima]
         interval = self.data[0].interval
-        if interval is None:
+        if interval == 0.0:
             return starts, profile
         # On a regular clock the cost has a kink at every interval, and local minima between them that a model too small
         # for its system makes deep: every sample is asked about an eighth of a period around what the filters found.
