@@ -33,7 +33,8 @@ def table(
 
     With their 95 % intervals and numbers of data sets, and the published values where there are any.
 
-    Without a name: all tables of the useful-redundancy study. Cells that were not run say so.
+    Without a name: all tables of the useful-redundancy study. Cells that were not run say so; where the folder results
+    holds nothing of a table, as in a fresh clone, the committed results are printed.
     """
     from ctid_cli.errors import MismatchError, UsageError
     from ctid_cli.reporting.comparison import check_tables, mismatch_sentence, write_comparison
@@ -45,7 +46,11 @@ def table(
     if not out.is_dir():
         typer.echo(f"ctid: there is no folder {out}, so nothing was run yet (--out names the results folder)", err=True)
     if not check:
-        typer.echo(write_reports(build_tables(names or [], out, style, committed=out == Path("results")), style))
+        tables = build_tables(names or [], out, style, committed=out == Path("results"))
+        typer.echo(write_reports(tables, style))
+        # Text and Markdown hold their notes themselves.
+        for note in (note for report in tables for note in report.notes if style in ("csv", "json")):
+            typer.echo(f"ctid: {note}", err=True)
         return
     comparison = check_tables(names or [], out, reference)
     typer.echo(write_comparison(comparison, style))

@@ -23,14 +23,8 @@ def committed_tables(study: str = DEFAULT_STUDY) -> Path | None:
     return folder / "tables.csv" if (folder / "tables.csv").is_file() else None
 
 
-def committed_rows(study: str) -> list[Row]:
-    """The cells of a study's committed tables, as `study_rows` has them."""
-    file = committed_tables(study)
-    return [row | {"table": int(row["table"])} for row in read_tables(file)] if file else []
-
-
 def made_by(tables: Path) -> str:
-    """Which code computed committed tables, as a clause that begins with a blank; empty where it is the present one."""
+    """Which code computed committed tables, as a participle clause; empty where it is the present one."""
     try:
         environment = json.loads((tables.parent / "environment.json").read_text(encoding="utf-8"))
     except OSError:
@@ -40,7 +34,7 @@ def made_by(tables: Path) -> str:
     if versions <= {code_version()}:
         return ""
     commit = f" (commit {environment['commit'][:12]})" if "commit" in environment else ""
-    return f" by an earlier version of the code or of its numerical libraries{commit}"
+    return f"computed by an earlier version of the code or of its numerical libraries{commit}"
 
 
 def read_tables(file: Path) -> list[Row]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.committed import committed_rows, committed_tables, made_by
+from ctid_cli.reporting.committed import committed_tables, made_by, read_tables
 from ctid_cli.reporting.layout import Report
 from ctid_cli.reporting.percentages import Row, experiment_rows, settings_of, study_rows
 from ctid_cli.reporting.results import Results, differences, experiments_in, find_results, out_option, shown_path
@@ -80,11 +80,11 @@ def _study_report(study: Study, number: int, out: Path, style: str, committed: b
                 notes.append(f"{name} was run with other settings than the published ones: {'; '.join(changed)}")
         notes += _notes(results, out)
     rows = study_rows(study, table, found)
-    if committed and not found and (stored := [row for row in committed_rows(study.name) if row["table"] == number]):
-        file = committed_tables(study.name)
-        assert file is not None
-        rows = stored
-        notes.insert(0, f"these are the committed results, of {shown_path(file)}, computed{made_by(file)}")
+    file = committed_tables(study.name) if committed and not found else None
+    if file is not None:
+        rows = [row | {"table": number} for row in read_tables(file) if row["table"] == str(number)]
+        remark = made_by(file)
+        notes.insert(0, f"these are the committed results of {shown_path(file)}" + (f", {remark}" if remark else ""))
     published = {method for row in table.rows for method in row.published}
     missing = [method for method in study.methods if known and method in published - known]
     if missing:

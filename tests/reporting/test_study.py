@@ -77,7 +77,7 @@ def test_in_a_fresh_clone_the_committed_tables_stand_in(tmp_path):
     (table,) = build_tables(["3"], tmp_path, committed=True)
     assert {row["table"] for row in table.records} == {3}
     assert all(row["n"] and row["percent"] is not None for row in table.records)
-    assert "committed results, of " in table.notes[0]
+    assert "committed results of " in table.notes[0]
     assert "not run" not in Report(table.blocks).draw()
     assert json.loads(write_reports([table], "json"))[0]["table"] == 3
 
@@ -90,7 +90,7 @@ def test_results_of_earlier_code_are_called_so(tmp_path):
     assert made_by(tables) == ""
     old = {"case1": [current], "case2": [{"code_version": "0" * 16}]}
     environment.write_text(json.dumps(old), encoding="utf-8")
-    assert made_by(tables) == " by an earlier version of the code or of its numerical libraries"
+    assert made_by(tables) == "computed by an earlier version of the code or of its numerical libraries"
     environment.write_text(json.dumps({"commit": "abcdef" * 7, "sessions": old}), encoding="utf-8")
     assert made_by(tables).endswith(" libraries (commit abcdefabcdef)")
 
