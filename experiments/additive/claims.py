@@ -155,10 +155,7 @@ def beam_is_found(results: Results) -> Iterator[Claim]:
         errors = [np.sqrt(true / row["parameters"][name]) - 1 for row in reached for name, true in truth.items()]
         worst = float(np.max(np.abs(errors)))
         yield within(
-            "relative error of the natural frequencies there",
-            worst,
-            high=FREQUENCY,
-            shown=f"at most {worst:.1e}",
+            "relative error of the natural frequencies there", worst, high=FREQUENCY, shown=f"at most {worst:.1e}"
         )
 
 

@@ -16,12 +16,7 @@ from .measures import READINGS, Row, efficiency, followed, larger_error, recover
 #: Longest times to come back to 1e-6 rad/s after a step without noise [s].
 RECOVERY = {"window": 7.605, "restarting": 2.85, "restarting_prefiltered": 3.9}
 #: Largest root-mean-square error over the Cramer-Rao bound.
-EFFICIENT = {
-    "restarting_prefiltered": 2.6,
-    "restarting_total": 4.0,
-    "esprit": 1.35,
-    "nonlinear_least_squares": 1.35,
-}
+EFFICIENT = {"restarting_prefiltered": 2.6, "restarting_total": 4.0, "esprit": 1.35, "nonlinear_least_squares": 1.35}
 #: From when to when [s] the finite-time estimate is exact, and how much it may be off.
 EXACT = {"two-tones": (0.66, np.inf, 1e-8), "step": (3.6, 30.0, 1e-10)}
 #: When the gradient has settled within some bands [s]: by experiment, reading of the step and piece of the record.

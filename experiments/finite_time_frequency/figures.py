@@ -28,11 +28,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
         "restarting": "restarting least squares",
         "restarting_prefiltered": "the same with a prefilter",
     },
-    DERIVED: {
-        "observer": "adaptive observer",
-        "filter": "filter regression",
-        "filter_gradient": "the same, gradient",
-    },
+    DERIVED: {"observer": "adaptive observer", "filter": "filter regression", "filter_gradient": "the same, gradient"},
 }
 #: Rows of the drawn tracks are so far apart [s], finer than a line is wide.
 DRAWN_INTERVAL = 0.1

@@ -20,7 +20,7 @@ from ctid_cli.filtering.filter_set import FilterCheck, FilterSet, check_filters
 from ctid_cli.filtering.filter_theory import convergence_region, extrema, ideal_cost
 from ctid_cli.reporting.figures.redundant_search import Landscape, landscape
 from ctid_cli.reporting.figures.search_plot import costs_svg, trajectory_svg
-from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, ramp, spread, svg
+from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, pointed, ramp, spread, svg
 from ctid_cli.signals.record import Record
 from ctid_cli.simulation.dataset import DataSet
 from ctid_cli.studies.catalogue import find_study
@@ -75,13 +75,8 @@ def figure_1() -> bytes:
             at = np.concatenate([-places[first::2][::-1], places[first::2]])
             axes.plot(at, ideal_cost(at, cutoff), marker, color=MARK, markersize=4.5, label=label)
         axes.plot([0.0], [0.0], "o", color=DARK, markersize=6, clip_on=False, label="global minimum")
-        axes.annotate(
-            f"convergence region\n$|\\delta\\tau| < {region:.4f}$ s\n(by the approximation (37): {printed:.4f} s)",
-            (region, 1.0),
-            (region + 0.3, 1.0),
-            va="center",
-            arrowprops={"arrowstyle": "-", "linewidth": 0.6, "shrinkA": 2, "shrinkB": 0},
-        )
+        text = f"convergence region\n$|\\delta\\tau| < {region:.4f}$ s\n(by the approximation (37): {printed:.4f} s)"
+        pointed(axes, text, (region, 1.0), (region + 0.3, 1.0), {"linewidth": 0.6, "shrinkA": 2})
         axes.text(-largest + 0.05, 2 * cutoff / np.pi - 0.12, r"$2\omega_c/\pi$", va="top", color=MIDDLE)
         axes.set(xlabel=r"delay error $\delta\tau$ [s]", ylabel=r"cost $\bar{J}$ [(output unit)²]")
         axes.set_xlim(-largest, largest)
@@ -154,15 +149,8 @@ def _draw_intervals(axes: Any, check: FilterCheck, count: int) -> None:
             axes.broken_barh(bars, (k + 0.64, 0.72), color=color, linewidth=0, label=None if k else label)
     for low, high in check.gaps:
         axes.axvspan(low, high, facecolor="none", edgecolor="black", hatch="//////", linewidth=0.6)
-        axes.annotate(
-            f"gap, {low:.2f} to\n{high:.2f} s: no filter\nleads closer",
-            (high, 3.5),
-            (LARGEST + 0.15, 3.5),
-            va="center",
-            fontsize=8,
-            annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "linewidth": 0.6, "shrinkA": 1, "shrinkB": 0},
-        )
+        text = f"gap, {low:.2f} to\n{high:.2f} s: no filter\nleads closer"
+        pointed(axes, text, (high, 3.5), (LARGEST + 0.15, 3.5), {"linewidth": 0.6, "shrinkA": 1}, fontsize=8)
 
 
 def _joined(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:

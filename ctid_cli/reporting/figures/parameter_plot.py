@@ -110,22 +110,14 @@ def coverage_svg(panels: Sequence[tuple[str, Sequence[ParameterErrors], Methods]
             axes.axhspan(95 - half, min(95 + half, 100), color=BAND, linewidth=0)
             axes.axhline(95, color=MIDDLE, linewidth=0.8)
             for k, (method, look) in enumerate(zip(methods, LOOKS, strict=False)):
-                found = {row.parameter: row for row in rows if row.estimator == method and row.coverage is not None}
-                at = np.array([parameters.index(parameter) for parameter in found]) + 0.16 * (
+                found = [row for row in rows if row.estimator == method and row.coverage is not None]
+                at = np.array([parameters.index(row.parameter) for row in found]) + 0.16 * (
                     k - 0.5 * (len(methods) - 1)
                 )
-                middle = np.array([row.coverage for row in found.values()], dtype=float)
-                ends = np.array([(row.low, row.high) for row in found.values()], dtype=float).reshape(-1, 2).T
-                axes.errorbar(
-                    at,
-                    middle,
-                    # Rounding puts an end on the wrong side by a hair.
-                    np.maximum(np.abs(ends - middle), 0.0),
-                    **look | {"linestyle": "none"},
-                    markersize=4,
-                    elinewidth=0.8,
-                    label=labelled(method, methods[method], rows),
-                )
+                places = np.array([(row.coverage, row.low, row.high) for row in found], dtype=float).reshape(-1, 3).T
+                style = look | {"linestyle": "none", "markersize": 4, "elinewidth": 0.8}
+                label = labelled(method, methods[method], rows)
+                axes.errorbar(at, places[0], np.abs(places[1:] - places[0]), **style, label=label)
             axes.set_xticks(range(len(parameters)), [symbol(parameter) for parameter in parameters], fontsize=8)
             axes.set_title(f"{name}, {_data_sets(rows)}", loc="left", fontsize=8)
             axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), frameon=False)
@@ -163,10 +155,5 @@ def _legend(figure: Figure, methods: Methods, rows: Sequence[ParameterErrors], n
     ]
     wide = max(len(str(handle.get_label())) for handle in handles) > 40 or len(handles) > 3
     figure.legend(
-        handles=handles,
-        loc="outside lower center",
-        ncols=2 if wide else 3,
-        frameon=False,
-        title=note,
-        title_fontsize=8,
+        handles=handles, loc="outside lower center", ncols=2 if wide else 3, frameon=False, title=note, title_fontsize=8
     )

@@ -9,7 +9,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.reporting.figures.redundant_search import Landscape
-from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, ramp, spread, svg
+from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, pointed, ramp, spread, svg
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,16 +28,9 @@ def costs_svg(result: Landscape, title: str) -> bytes:
             axes.plot(delays, members[:, k], linewidth=1.1, **line)
         for k, place in enumerate(spread(members[-1], 0.052 * top)):
             color = lines[k]["color"]
-            axes.annotate(
-                f"{k + 1}: {result.cutoffs[k]:.3g} rad/s",
-                (delays[-1], members[-1, k]),
-                (delays[-1] + 0.35, place),
-                va="center",
-                fontsize=8,
-                color=color,
-                annotation_clip=False,
-                arrowprops={"arrowstyle": "-", "linewidth": 0.5, "color": color, "shrinkA": 0, "shrinkB": 0},
-            )
+            ends = (delays[-1], members[-1, k]), (delays[-1] + 0.35, place)
+            name = f"{k + 1}: {result.cutoffs[k]:.3g} rad/s"
+            pointed(axes, name, *ends, {"linewidth": 0.5, "color": color}, fontsize=8, color=color)
         axes.text(result.true_delay - 0.1, 0.97 * top, "true delay", ha="right", va="top", fontsize=8, color=MIDDLE)
         axes.set(xlim=(delays[0], delays[-1]), ylim=(0.0, top), xlabel=r"delay $\hat\tau$ [s]")
         axes.set_ylabel(r"cost $100\,\|y_k - \hat x_k\| \,/\, \|y_k - \mathrm{mean}\,y_k\|$ [%]")
@@ -85,15 +78,8 @@ def _draw_true_delay(axes: Any, result: Landscape) -> None:
 def _draw_reference(axes: Any, result: Landscape, low: float, high: float) -> None:
     delays, least = result.delays, result.reference
     axes.plot(delays, least, color=DARK, linewidth=1.4, label="$J_0$, least over the coefficients")
-    axes.plot(
-        delays,
-        result.evaluated,
-        color=LIGHT,
-        linewidth=0.8,
-        drawstyle="steps-mid",
-        zorder=1.5,
-        label="$J_0$ as the search evaluates it",
-    )
+    steps = {"drawstyle": "steps-mid", "zorder": 1.5, "label": "$J_0$ as the search evaluates it"}
+    axes.plot(delays, result.evaluated, color=LIGHT, linewidth=0.8, **steps)
     for k, leg in enumerate(result.legs):
         label = None if k else "Gauss-Newton steps"
         axes.plot(leg.delays, leg.costs, "o:", color=MARK, markersize=3.5, linewidth=0.8, label=label)
@@ -121,8 +107,7 @@ def _draw_filters(axes: Any, result: Landscape) -> None:
         axes.plot(leg.delays[[0, 0]], [before[-1], row[0]], color=MARK, linewidth=0.8, linestyle=":")
     _draw_marks(axes, result, rows, named=False)
     axes.grid(False, axis="y")
-    axes.set_ylim(0.4, count + 0.6)
-    axes.set_yticks(range(1, count + 1, 1 if count <= 10 else 2))
+    axes.set(ylim=(0.4, count + 0.6), yticks=range(1, count + 1, 1 if count <= 10 else 2))
     axes.tick_params(axis="y", labelsize=7)
 
 
@@ -131,14 +116,11 @@ def _draw_marks(axes: Any, result: Landscape, heights: Sequence[Array], named: b
     first, last = result.legs[0], result.legs[-1]
     leaving = zip(result.legs[1:], heights, strict=False)
     stars = [(leg.delays[0], before[-1]) for leg, before in leaving if leg.switched]
+    end = {"marker": "D", "markersize": 5, "markerfacecolor": "white", "zorder": 5}
     for name, places, style in (
         ("start", [(first.delays[0], heights[0][0])], {"marker": "s", "markersize": 5}),
         ("switch", stars, {"marker": "*", "markersize": 10, "zorder": 4}),
-        (
-            "end of the search",
-            [(last.delays[-1], heights[-1][-1])],
-            {"marker": "D", "markersize": 5, "markerfacecolor": "white", "zorder": 5},
-        ),
+        ("end of the search", [(last.delays[-1], heights[-1][-1])], end),
     ):
         if places:
             axes.plot(*np.transpose(places), linestyle="", color=MARK, label=name if named else None, **style)
