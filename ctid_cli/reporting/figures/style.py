@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,10 +47,10 @@ def svg(width: float, height: float, draw: Callable[[Figure], None]) -> bytes:
     return file.getvalue()
 
 
-def pointed(axes: Any, text: str, point: ArrayLike, place: ArrayLike, arrow: Mapping[str, Any], **style: Any) -> None:
+def pointed(axes: Any, text: str, point: ArrayLike, place: ArrayLike, arrow: dict[str, Any], **style: Any) -> None:
     """A text beside the axes with a thin line to the point that it speaks of."""
-    arrow = {"arrowstyle": "-", "shrinkA": 0, "shrinkB": 0} | arrow
-    axes.annotate(text, point, place, va="center", annotation_clip=False, arrowprops=arrow, **style)
+    line: dict[str, Any] = {"arrowstyle": "-", "shrinkA": 0, "shrinkB": 0}
+    axes.annotate(text, point, place, va="center", annotation_clip=False, arrowprops=line | arrow, **style)
 
 
 def ramp(count: int) -> list[dict[str, Any]]:
