@@ -64,15 +64,23 @@ class Place:
     line: int
     column: int
 
+    def problem(self, path: KeyPath, message: str) -> Problem:
+        """A problem here."""
+        return Problem(self.file, self.line, self.column, path_text(path), message)
+
 
 @dataclass
 class YamlSource:
     """The values of a YAML text and where each of them stands."""
 
     file: str
+    #: Where the text begins in its file.
+    line: int = 1
+    column: int = 1
     tree: Any = None
     keys: dict[KeyPath, Place] = field(default_factory=dict)
     values: dict[KeyPath, Place] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)
 
     def place(self, path: KeyPath, *, key: bool = False) -> Place:
         """Where a problem with a key path is to be reported."""
@@ -94,8 +102,72 @@ class YamlSource:
 
     def problem(self, path: KeyPath, message: str, *, key: bool = False) -> Problem:
         """A problem at a key path."""
-        place = self.place(path, key=key)
-        return Problem(place.file, place.line, place.column, path_text(path), message)
+        return self.place(path, key=key).problem(path, message)
+
+    def build(self, node: Any, path: KeyPath = (), parents: tuple[Any, ...] = ()) -> Any:
+        """The value of a node; what is wrong with it goes to the problems."""
+        place = self.values[path] = self.at(node.start_mark)
+        if len(self.values) > MAX_VALUES:
+            message = f"more than {MAX_VALUES} values, aliases counted as often as they are used"
+            raise SpecError([*self.problems, place.problem(path, message)])
+        if any(node is parent for parent in parents):
+            raise SpecError([*self.problems, place.problem(path, "an alias refers to its own parent")])
+        if isinstance(node, yaml.ScalarNode):
+            return self._scalar(node, path)
+        collection = "seq" if isinstance(node, yaml.SequenceNode) else "map"
+        if node.tag != _TAG + collection:
+            self._refuse_tag(node, path, "a plain list or mapping")
+        if collection == "seq":
+            return [self.build(item, (*path, k), (*parents, node)) for k, item in enumerate(node.value)]
+        return self._mapping(node, path, (*parents, node))
+
+    def at(self, mark: Any) -> Place:
+        """The place of a mark of PyYAML."""
+        if mark is None:
+            return Place(self.file, self.line, self.column)
+        return Place(self.file, mark.line + self.line, mark.column + (self.column if mark.line == 0 else 1))
+
+    def _mapping(self, node: Any, path: KeyPath, parents: tuple[Any, ...]) -> dict[str, Any]:
+        mapping: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            place = self.at(key_node.start_mark)
+            if not isinstance(key_node, yaml.ScalarNode):
+                self.problems.append(place.problem(path, "a key must be a plain word"))
+                continue
+            key = key_node.value
+            here = (*path, key)
+            if key == "<<":
+                message = "merge keys (<<) are not supported; write the keys out, or use an alias for a whole value"
+                self.problems.append(place.problem(here, message))
+            elif key in mapping:
+                first = self.keys[here].line
+                message = f"the key {key!r} is given twice, on line {first} and on line {place.line}; keep one"
+                self.problems.append(place.problem(here, message))
+            else:
+                self.keys[here] = place
+                mapping[key] = self.build(value_node, here, parents)
+        return mapping
+
+    def _scalar(self, node: Any, path: KeyPath) -> Any:
+        text: str = node.value
+        tag: str = node.tag.removeprefix(_TAG)
+        if tag == "str":
+            return text
+        # An explicit tag (!!float abc) may contradict its text, so the pattern is asked again.
+        if tag not in _SCALARS or not _SCALARS[tag].match(text):
+            return self._refuse_tag(node, path, "the plain value")
+        if tag == "null":
+            return None
+        if tag == "bool":
+            return text == "true"
+        if tag == "int":
+            # Python refuses very long digit strings; beyond any use as a whole number they are still a number.
+            return int(text) if len(text) < 400 else float(text)
+        return float(re.sub(r"\.(?=[a-zA-Z])", "", text))  # Python writes .inf and .nan without their point
+
+    def _refuse_tag(self, node: Any, path: KeyPath, instead: str) -> None:
+        message = f"the tag {node.tag.replace(_TAG, '!!')} cannot be used here; write {instead}"
+        self.problems.append(self.at(node.start_mark).problem(path, message))
 
 
 def path_text(path: KeyPath) -> str:
@@ -123,33 +195,33 @@ def read_yaml(path: Path) -> YamlSource:
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         column = error.start - (data.rfind(b"\n", 0, error.start) + 1) + 1
-        problem = Problem(str(path), line, column, "", "the file is not UTF-8 text; save it as UTF-8")
-        raise SpecError([problem]) from None
+        message = "the file is not UTF-8 text; save it as UTF-8"
+        raise SpecError([Place(str(path), line, column).problem((), message)]) from None
     return parse_yaml(text, str(path))
 
 
 def parse_yaml(text: str, file: str, *, line: int = 1, column: int = 1) -> YamlSource:
     """Values and places of a YAML text."""
-    builder = _Builder(file, line - 1, column - 1)
+    source = YamlSource(file, line, column)
     try:
         root = yaml.compose(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         if error.context_mark is not None and "end" in (error.problem or "") and "stream" in (error.problem or ""):
             mark = error.context_mark  # what was never closed is of more use than the end of the file
-        raise SpecError([builder.problem(mark, (), _syntax_message(error))]) from None
+        raise SpecError([source.at(mark).problem((), _syntax_message(error))]) from None
     except yaml.reader.ReaderError as error:
         before = text[: error.position]
         place = Place(file, line + before.count("\n"), error.position - (before.rfind("\n") + 1) + 1)
-        message = f"the character {_character(error.character)} is not allowed in YAML"
-        raise SpecError([Problem(file, place.line, place.column, "", message)]) from None
+        code = ord(error.character) if isinstance(error.character, str) else error.character
+        raise SpecError([place.problem((), f"the character U+{code:04X} is not allowed in YAML")]) from None
     except RecursionError:
-        raise SpecError([Problem(file, line, column, "", "lists or mappings are nested too deeply")]) from None
+        raise SpecError([source.at(None).problem((), "lists or mappings are nested too deeply")]) from None
     if root is not None:
-        builder.source.tree = builder.build(root, (), ())
-    if builder.problems:
-        raise SpecError(builder.problems)
-    return builder.source
+        source.tree = source.build(root)
+    if source.problems:
+        raise SpecError(source.problems)
+    return source
 
 
 def apply_overrides(source: YamlSource, overrides: Iterable[str]) -> None:
@@ -187,8 +259,8 @@ def _apply_override(source: YamlSource, override: str, number: int) -> None:
         node = node[part]
         if not isinstance(node, dict):
             raise refuse(f"{path_text(path[:depth])} is not a mapping, so nothing can be set inside it")
-        source.keys.setdefault(path[:depth], Place(OVERRIDE_FILE, number, 1))
-        source.values.setdefault(path[:depth], Place(OVERRIDE_FILE, number, 1))
+        for places in (source.keys, source.values):
+            places.setdefault(path[:depth], Place(OVERRIDE_FILE, number, 1))
     node[path[-1]] = value.tree
     for places in (source.keys, source.values):
         for old in [p for p in places if p[: len(path)] == path]:
@@ -197,93 +269,6 @@ def _apply_override(source: YamlSource, override: str, number: int) -> None:
     source.values[path] = Place(OVERRIDE_FILE, number, column)
     source.keys.update({path + p: place for p, place in value.keys.items()})
     source.values.update({path + p: place for p, place in value.values.items()})
-
-
-class _Builder:
-    """Builds values from nodes and remembers where they stand."""
-
-    def __init__(self, file: str, line_offset: int, column_offset: int) -> None:
-        self.source = YamlSource(file)
-        self.problems: list[Problem] = []
-        self._line_offset = line_offset
-        self._column_offset = column_offset
-        self._count = 0
-
-    def place(self, mark: Any) -> Place:
-        if mark is None:
-            return Place(self.source.file, 1 + self._line_offset, 1 + self._column_offset)
-        column = mark.column + 1 + (self._column_offset if mark.line == 0 else 0)
-        return Place(self.source.file, mark.line + 1 + self._line_offset, column)
-
-    def problem(self, mark: Any, path: KeyPath, message: str) -> Problem:
-        place = self.place(mark)
-        return Problem(place.file, place.line, place.column, path_text(path), message)
-
-    def build(self, node: Any, path: KeyPath, parents: tuple[Any, ...]) -> Any:
-        self._count += 1
-        if self._count > MAX_VALUES:
-            message = f"more than {MAX_VALUES} values, aliases counted as often as they are used"
-            raise SpecError([*self.problems, self.problem(node.start_mark, path, message)])
-        if any(node is parent for parent in parents):
-            raise SpecError([*self.problems, self.problem(node.start_mark, path, "an alias refers to its own parent")])
-        self.source.values[path] = self.place(node.start_mark)
-        if isinstance(node, yaml.ScalarNode):
-            return self._scalar(node, path)
-        if isinstance(node, yaml.SequenceNode):
-            self._refuse_tag(node, path, "seq")
-            return [self.build(item, (*path, k), (*parents, node)) for k, item in enumerate(node.value)]
-        self._refuse_tag(node, path, "map")
-        return self._mapping(node, path, (*parents, node))
-
-    def _mapping(self, node: Any, path: KeyPath, parents: tuple[Any, ...]) -> dict[str, Any]:
-        mapping: dict[str, Any] = {}
-        for key_node, value_node in node.value:
-            if not isinstance(key_node, yaml.ScalarNode):
-                self.problems.append(self.problem(key_node.start_mark, path, "a key must be a plain word"))
-                continue
-            key = key_node.value
-            here = (*path, key)
-            place = self.place(key_node.start_mark)
-            if key == "<<":
-                message = "merge keys (<<) are not supported; write the keys out, or use an alias for a whole value"
-                self.problems.append(self.problem(key_node.start_mark, here, message))
-                continue
-            if key in mapping:
-                first = self.source.keys[here]
-                message = f"the key {key!r} is given twice, on line {first.line} and on line {place.line}; keep one"
-                self.problems.append(self.problem(key_node.start_mark, here, message))
-                continue
-            self.source.keys[here] = place
-            mapping[key] = self.build(value_node, here, parents)
-        return mapping
-
-    def _scalar(self, node: Any, path: KeyPath) -> Any:
-        text: str = node.value
-        tag: str = node.tag.removeprefix(_TAG)
-        if tag == "str":
-            return text
-        # An explicit tag (!!float abc) may contradict its text, so the pattern is asked again.
-        if tag not in _SCALARS or not _SCALARS[tag].match(text):
-            message = f"the tag {node.tag.replace(_TAG, '!!')} cannot be used here; write the plain value"
-            self.problems.append(self.problem(node.start_mark, path, message))
-            return None
-        if tag == "null":
-            return None
-        if tag == "bool":
-            return text == "true"
-        if tag == "int":
-            # Python refuses very long digit strings; beyond any use as a whole number they are still a number.
-            return int(text) if len(text) < 400 else float(text)
-        return float(re.sub(r"\.(?=[a-zA-Z])", "", text))  # Python writes .inf and .nan without their point
-
-    def _refuse_tag(self, node: Any, path: KeyPath, name: str) -> None:
-        if node.tag != _TAG + name:
-            message = f"the tag {node.tag.replace(_TAG, '!!')} cannot be used here; write a plain list or mapping"
-            self.problems.append(self.problem(node.start_mark, path, message))
-
-
-def _character(code: int | str) -> str:
-    return f"U+{ord(code) if isinstance(code, str) else code:04X}"
 
 
 def _syntax_message(error: yaml.MarkedYAMLError) -> str:
@@ -297,7 +282,6 @@ def _syntax_message(error: yaml.MarkedYAMLError) -> str:
     hints: Mapping[str, str] = {
         "mapping values are not allowed": "; text with a colon needs quotes, keys of a mapping the same indentation",
         "could not find expected ':'": "; a key needs a colon and a space after it",
-        "did not find expected ',' or '}'": "; separate the entries by commas and close the brace",
         "expected ',' or '}'": "; separate the entries by commas and close the brace",
         "expected ',' or ']'": "; separate the items by commas and close the bracket",
         "expected <block end>": "; check the indentation of this line",
