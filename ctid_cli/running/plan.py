@@ -239,14 +239,12 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
 
 def _simulated(chosen: Mapping[str, Variant], loop: LoopOptions | None, folder: Path, spec: Spec) -> SimulatedSource:
     """Source of the data sets of one combination of the sections' variants."""
-    pinned = chosen["excitation"].values if loop is None else chosen["loop"].values["reference"]
     return SimulatedSource(
         system=chosen["system"].options,
         excitation=located(chosen["excitation"].options, folder) if loop is None else None,
         sampling=chosen["sampling"].options,
         noise=chosen["noise"].options if "noise" in chosen else None,
         seed=_seed(spec),
-        input_sha256=pinned.get("sha256"),
         loop=None if loop is None else dataclasses.replace(loop, reference=located(loop.reference, folder)),
     )
 

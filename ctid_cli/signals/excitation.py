@@ -293,6 +293,8 @@ class InputFile(Excitation):
         Column of the values [input unit].
     hold : {"zoh", "foh"}, default "zoh"
         How the input behaves between its breaks.
+    sha256 : str, optional
+        SHA-256 of the file, to make sure of its content; a specification fills it in from the file.
 
     Notes
     -----
@@ -308,6 +310,7 @@ class InputFile(Excitation):
     time: str = "t"
     input: str = "u"
     hold: Hold = "zoh"
+    sha256: str | None = None
 
     def __post_init__(self) -> None:
         require_choice("hold", self.hold, get_args(Hold))

@@ -53,14 +53,13 @@ class SimulatedSource:
     sampling: Sampling
     noise: Noise | None
     seed: int
-    input_sha256: str | None = None
     loop: LoopOptions | None = None
 
     def dataset(self, replicate: int) -> DataSet:
         """One realisation."""
         generator = self.excitation if self.loop is None else self.loop.reference
-        if isinstance(generator, InputFile) and self.input_sha256 is not None:
-            require_content(generator.file, self.input_sha256)
+        if isinstance(generator, InputFile) and generator.sha256 is not None:
+            require_content(generator.file, generator.sha256)
         assert generator is not None
         times = self.sampling.times(stream(self.seed, "sampling", replicate))
         applied = generator.generate(times, stream(self.seed, "input", replicate))
@@ -220,8 +219,3 @@ def require_content(path: str, sha256: str) -> None:
             f"{path}: the content (SHA-256 {found[:12]}…) is not that which the experiment was planned with "
             f"({sha256[:12]}…); restore the file, or run the changed one as an experiment of its own"
         )
-
-
-def check_input_file(options: Any) -> None:
-    """Refuse the file of an excitation if it cannot be read."""
-    read_held_signal(options.file, time=options.time, input=options.input, hold=options.hold)

@@ -70,7 +70,7 @@ def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool
         if spec.loop is None and not broken & {"loop", "data", "excitation"}:
             yield from over({(): cases}, partial(_of_instruments, at))
         if spec.starts is not None:
-            yield from over({(): cases}, partial(_of_delays, name, spec.starts.delays))
+            yield from over({(): cases}, partial(_of_delays, name, spec.starts.initial_delay or []))
     if spec.starts is not None:
         yield from _start_complaints(spec, spec.starts, broken)
     yield from _success_complaints(spec)
@@ -93,9 +93,9 @@ def joint_warnings(spec: Spec) -> list[Complaint]:
     if spec.starts is not None:
         taken = {variants(section)[0].options.start_from for section in spec.estimators.values()}
         unused = "no estimator here uses a start of this kind; each is run once"
-        if spec.starts.delays and "delay" not in taken:
+        if spec.starts.initial_delay and "delay" not in taken:
             warnings.append((("starts", "initial_delay"), unused))
-        if spec.starts.parameter_sets and "parameters" not in taken:
+        if spec.starts.parameters and "parameters" not in taken:
             warnings.append((("starts", "parameters"), unused))
     return warnings
 
@@ -186,11 +186,11 @@ def _of_delays(name: str, delays: Sequence[float | UniformStart], options: Any) 
 
 
 def _start_complaints(spec: Spec, starts: StartsSection, broken: frozenset[str]) -> Iterator[Complaint]:
-    random = [k for k, point in enumerate(starts.delays) if isinstance(point, UniformStart)]
+    random = [k for k, point in enumerate(starts.initial_delay or []) if isinstance(point, UniformStart)]
     if random and spec.monte_carlo is None and "monte_carlo" not in broken:
         yield ("starts", "initial_delay", random[0]), "a random start needs a seed; add monte_carlo: {runs: 1, seed: 1}"
-    drawn = [k for k, parameters in enumerate(starts.parameter_sets) if isinstance(parameters, RelativeStart)]
-    for k, parameters in enumerate(starts.parameter_sets):
+    drawn = [k for k, parameters in enumerate(starts.parameters or []) if isinstance(parameters, RelativeStart)]
+    for k, parameters in enumerate(starts.parameters or []):
         path = ("starts", "parameters", k)
         if not isinstance(parameters, RelativeStart):
             yield from _structure_complaints(spec, path, parameters.options())

@@ -9,7 +9,8 @@ from typing import Any
 from pydantic import ValidationError, create_model
 
 from ctid_cli.errors import DataError, Problem, SpecError
-from ctid_cli.simulation.dataset import check_input_file, file_sha256, joined, located
+from ctid_cli.signals.csv_file import read_held_signal
+from ctid_cli.simulation.dataset import file_sha256, joined, located
 from ctid_cli.specification.joint_checks import joint_complaints, joint_warnings
 from ctid_cli.specification.messages import Complaint, Located, explained, shown
 from ctid_cli.specification.option_sections import EstimatorSection
@@ -117,7 +118,8 @@ def _with_files(spec: Spec) -> tuple[Spec, list[Complaint]]:
         if spec.measured is not None:
             spec.measured.dataset(0)
         else:
-            check_input_file(located(variants(section)[0].options, spec.folder))
+            source = located(variants(section)[0].options, spec.folder)
+            read_held_signal(source.file, time=source.time, input=source.input, hold=source.hold)
     except DataError as error:
         return spec, [((*place, "file"), str(error))]
     return spec, []

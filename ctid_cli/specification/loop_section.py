@@ -10,19 +10,10 @@ from pydantic import Field
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.signals.record import Enters
 from ctid_cli.simulation.dataset import LoopOptions
-from ctid_cli.specification.fields import Coefficients, Number, Swept
+from ctid_cli.specification.fields import Number, Swept
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.option_sections import ExcitationSection
-from ctid_cli.specification.sections import Section, WithKey, variants
-
-
-class ControllerSection(Section):
-    """A discrete-time controller ``C(q) = numerator / denominator``."""
-
-    target: ClassVar[type | None] = DiscreteController
-
-    numerator: Coefficients = Field(description="coefficients in descending powers of the shift operator q")
-    denominator: Coefficients = Field(description="coefficients in descending powers of the shift operator q")
+from ctid_cli.specification.sections import Section, WithKey, section_for, variants
 
 
 class PidSection(Section):
@@ -60,9 +51,9 @@ class LoopSection(Section):
 
     target: ClassVar[type | None] = LoopOptions
 
-    controller: Annotated[
-        ControllerSection | PidControllerSection, WithKey("pid", PidControllerSection, ControllerSection)
-    ] = Field(description="Discrete-time controller, acting at every sample")
+    controller: Annotated[Section, WithKey("pid", PidControllerSection, section_for(DiscreteController))] = Field(
+        description="Discrete-time controller, acting at every sample"
+    )
     reference: ExcitationSection | None = Field(
         default=None, description="The reference; for a measured record it is a column, data.reference"
     )

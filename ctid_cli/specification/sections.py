@@ -14,7 +14,6 @@ import math
 import types
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -31,10 +30,11 @@ from pydantic import (
 )
 from pydantic.functional_validators import ModelWrapValidatorHandler
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import CtidError
 from ctid_cli.kinds import classes
 from ctid_cli.signals.sampling import geometric_sizes
-from ctid_cli.specification.fields import LATER, ByShape, Number, OneOf, Swept, Text, Whole
+from ctid_cli.specification.fields import LATER, ByShape, Coefficients, Number, OneOf, Swept, Text, Whole
 from ctid_cli.specification.messages import Complaint, explained, several_wrong
 from ctid_cli.specification.option_docs import OptionDoc, option_docs
 from ctid_cli.specification.yaml_source import KeyPath
@@ -162,14 +162,7 @@ class Geometric(Section):
         return geometric_sizes(first, last, count)
 
 
-def section_for(
-    target: type,
-    kind: str = "",
-    extra: Mapping[str, Any] = MappingProxyType({}),
-    *,
-    sweeping: bool = True,
-    without: str = "",
-) -> type[Section]:
+def section_for(target: type, kind: str = "", *, sweeping: bool = True, without: str = "") -> type[Section]:
     """Section of an option dataclass."""
     hints, docs = get_type_hints(target), option_docs(target)
     fields: dict[str, Any] = {}
@@ -187,17 +180,16 @@ def section_for(
         description = docs.get(option.name, OptionDoc()).text or None
         fields[option.name] = (form, Field(**_default(option), description=description))
     summary = (target.__doc__ or target.__name__).strip().splitlines()[0]
-    section = create_model(target.__name__, __base__=Section, __doc__=summary, **(fields | dict(extra)))
+    section = create_model(target.__name__, __base__=Section, __doc__=summary, **fields)
     section.target = target
     return section
 
 
 class Kinds(OneOf):
-    """Annotation of a section that is one of several, told apart by its ``kind``; `extra` fields by kind."""
+    """Annotation of a section that is one of several, told apart by its ``kind``."""
 
-    def __init__(self, *names: str, **extra: Mapping[str, Any]) -> None:
-        targets = {kind: target for name in names for kind, target in classes(name).items()}
-        sections = {kind: section_for(target, kind, extra.get(kind, {})) for kind, target in targets.items()}
+    def __init__(self, *names: str) -> None:
+        sections = {kind: section_for(target, kind) for name in names for kind, target in classes(name).items()}
 
         def choose(value: Any) -> str | None:
             kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
@@ -227,6 +219,8 @@ class WithKey(OneOf):
 def _form(hint: Any, name: str) -> tuple[Any, bool]:
     """Annotation of an option of a given type, and whether it can be swept."""
     simple = {float: Number, int: Whole, bool: bool, str: Text}
+    if hint == Array:
+        return Coefficients, False
     origin, arguments = get_origin(hint), get_args(hint)
     if hint in simple:
         # Names of files and columns are no quantities, and sweeping them would hide what a result belongs to.

@@ -19,7 +19,7 @@ from ctid_cli.simulation.dataset import MeasuredSource, located
 from ctid_cli.specification.fields import LATER, MAX_WHOLE, Positive, Text, matching
 from ctid_cli.specification.loop_section import LoopSection
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.option_sections import SHA256, EstimatorSection, ExcitationSection, NoiseSection, Sha256
+from ctid_cli.specification.option_sections import EstimatorSection, ExcitationSection, NoiseSection
 from ctid_cli.specification.sections import Options, Section, variants
 from ctid_cli.specification.signal_sections import AnySamplingSection, DisturbanceOrNone, SignalSection, TracksSection
 from ctid_cli.specification.start_sections import StartsSection
@@ -36,9 +36,7 @@ _OF_SYSTEMS = ("system", "excitation", "loop", "noise", "data", "starts")
 
 
 #: A measured record in place of a simulated one.
-MeasuredSection = Annotated[
-    Any, Options(MeasuredSource, extra={"sha256": (Sha256, SHA256)}, without="loop", sweeping=False)
-]
+MeasuredSection = Annotated[Any, Options(MeasuredSource, without="loop", sweeping=False)]
 
 
 class MonteCarloSection(Section):
@@ -137,7 +135,10 @@ class Spec(Section):
             yield from _of_a_record(raw, present) if "data" in present else _of_a_simulation(raw, present)
         random = _random_section(raw, present)
         if random and "monte_carlo" not in present:
-            yield ("monte_carlo",), f"is missing, and {random} is random; add it, for example {{runs: 100, seed: 1}}"
+            yield (
+                ("monte_carlo",),
+                f"is missing, and the {random} is random; add it, for example {{runs: 100, seed: 1}}",
+            )
 
     def complaints(self) -> Iterator[Complaint]:
         """Say which estimators are the same."""

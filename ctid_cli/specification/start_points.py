@@ -85,13 +85,13 @@ def start_points(section: StartsSection | None) -> tuple[AnyStart, ...]:
     if section is None:
         return ()
     points: list[AnyStart] = []
-    for delay in section.delays:
+    for delay in section.initial_delay or []:
         if isinstance(delay, UniformStart):
             low, high = delay.uniform
             points.append(StartPoint(f"uniform({_short(low)}, {_short(high)})", "random", (low, high)))
         else:
             points.append(StartPoint(_short(delay), delay))
-    for parameters in section.parameter_sets:
+    for parameters in section.parameters or []:
         values = parameters.model_dump(mode="json")
         if isinstance(parameters, RelativeStart):
             spread = parameters.relative_uniform

@@ -80,13 +80,3 @@ class StartsSection(Section):
         """Say that there is no start."""
         if self.initial_delay is None and self.parameters is None:
             yield (), "give initial_delay, parameters or both, or leave the section out"
-
-    @property
-    def delays(self) -> list[float | UniformStart]:
-        """Initial delays, in the order of the specification."""
-        return self.initial_delay or []
-
-    @property
-    def parameter_sets(self) -> list[RelativeStart | GivenStart]:
-        """Initial parameters, in the order of the specification."""
-        return self.parameters or []

@@ -111,7 +111,7 @@ def test_longer_records_begin_with_the_shorter_ones_and_data_sets_repeat():
 def test_a_reference_is_sampled(tmp_path):
     file = tmp_path / "reference.csv"
     file.write_text("t,u\n0,0\n10,10\n")
-    ramp = source(reference=InputFile(str(file), hold="foh"), input_sha256=file_sha256(str(file)))
+    ramp = source(reference=InputFile(str(file), hold="foh", sha256=file_sha256(str(file))))
     np.testing.assert_allclose(ramp.dataset(0).record.loop.reference[:200], 0.05 * np.arange(200), atol=1e-12)
     file.write_text("t,u\n0,0\n10,11\n")
     with pytest.raises(DataError, match="not that which the experiment was planned with"):
@@ -166,7 +166,7 @@ monte_carlo: {runs: 1, seed: 1}
         (place / "reference.csv").write_text("t,u\n0,1\n2,-1\n")
         (place / "spec.yaml").write_text(text)
         (cell,) = build_plan(load_spec(place / "spec.yaml")).data_cells
-        assert cell.source.input_sha256 == file_sha256(str(place / "reference.csv"))
+        assert cell.source.loop.reference.sha256 == file_sha256(str(place / "reference.csv"))
         assert "file" not in cell.content["loop"]["reference"]
         assert cell.dataset(0).record.loop.reference[[0, 39, 40]].tolist() == [1.0, 1.0, -1.0]
         cells.append(cell)

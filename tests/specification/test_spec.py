@@ -241,6 +241,23 @@ def test_excitation_and_sampling_are_tried_together(tmp_path):
     assert "(with excitation.time = 1000.0)" in problem.message
 
 
+def test_nothing_random_needs_no_monte_carlo(tmp_path):
+    changes = [
+        ("  kind: prbs\n  stages: 10\n  clock_period: 0.05\n", "  kind: step\n"),
+        ("monte_carlo: {runs: 10, seed: 1}\n", ""),
+        (", {uniform: [0, 9]}]", "]"),
+    ]
+    (problem,) = problems(tmp_path, changed(SIMULATED, *changes))
+    assert problem.key == "monte_carlo"
+    assert "the noise is random" in problem.message
+    plan = build_plan(load(tmp_path, changed(SIMULATED, *changes), "noise=null"))
+    assert plan.runs == 1
+    assert plan.data_cells[0].dataset(0).record.n_samples == 4000
+    (problem,) = problems(tmp_path, changed(SIMULATED, *changes[:2]), "noise=null")
+    assert problem.key == "starts.initial_delay[2]"
+    assert "needs a seed" in problem.message
+
+
 def test_slow_sampling_is_a_warning(tmp_path):
     # Poles at 2 rad/s: the limit is pi / 2 = 1.5708 s.
     assert load(tmp_path, changed(SIMULATED, ("interval: 0.05", "interval: 1.57"))).warnings == ()
@@ -446,9 +463,7 @@ def test_the_schema_knows_every_option_and_its_unit():
         for kind, target in classes(name).items():
             section = schema["$defs"][target.__name__]
             assert section["properties"]["kind"]["const"] == kind
-            assert set(section["properties"]) - {"kind", "sha256"} == {
-                option.name for option in fields(target) if option.init
-            }
+            assert set(section["properties"]) - {"kind"} == {option.name for option in fields(target) if option.init}
     interval = schema["$defs"]["RegularSampling"]["properties"]["interval"]
     assert interval["description"] == "Sampling interval [s]."
     assert interval["oneOf"] == [{"type": "number"}, {"type": "array", "items": {"type": "number"}}]
