@@ -11,7 +11,7 @@ import typer
 from ctid_cli.errors import Problem, SpecError, UsageError
 
 if TYPE_CHECKING:
-    from ctid_cli.running.plan import Plan
+    from ctid_cli.running.cells import Plan
 
 
 def load_plans(configs: Sequence[Path], overrides: Sequence[str], runs: int | None = None) -> list[tuple[Path, Plan]]:

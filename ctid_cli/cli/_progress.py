@@ -131,7 +131,7 @@ class Reporter(_Progress):
             self._start(event.data_sets, MofNCompleteColumn(), rate, rate="-", failed=0)
 
     def _advance(self, event: Any) -> None:
-        from ctid_cli.storage.manifest import FAILURES
+        from ctid_cli.storage.columns import FAILURES
 
         self.failed += sum(row["status"] in FAILURES for row in event.rows)
         now = self._clock()

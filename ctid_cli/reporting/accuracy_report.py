@@ -11,7 +11,7 @@ from ctid_cli.inference.quantile import normal_quantile
 from ctid_cli.reporting.expected_accuracy import expected_accuracy
 from ctid_cli.reporting.layout import Report, Table, count, number
 from ctid_cli.reporting.table_blocks import setting_text, setting_title
-from ctid_cli.running.plan import DataCell, EstimatorCell, Plan
+from ctid_cli.running.cells import DataCell, EstimatorCell, Plan
 from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.text import listed
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.percentages import Row
 from ctid_cli.reporting.study import DEFAULT_STUDY, data_folder
-from ctid_cli.storage.version import code_version
+from ctid_cli.storage.identity import present_versions
 
 #: Columns that tables must have to be compared with.
 NEEDED = ("table", "experiment", "initial_delay", "method", "n", "converged")
@@ -30,11 +30,17 @@ def made_by(tables: Path) -> str:
     except OSError:
         return ""
     sessions = environment.get("sessions", environment)
-    versions = {session["code_version"] for name in sessions for session in sessions[name]}
-    if versions <= {code_version()}:
+    versions = {version for name in sessions for session in sessions[name] for version in _versions(session)}
+    if versions <= present_versions():
         return ""
     commit = f" (commit {environment['commit'][:12]})" if "commit" in environment else ""
     return f"computed by an earlier version of the code or of its numerical libraries{commit}"
+
+
+def _versions(session: Mapping[str, Any]) -> Iterable[str]:
+    """The code versions of a run; those of older ones were the same for all estimators."""
+    found = session["code_version"]
+    return [found] if isinstance(found, str) else found.values()
 
 
 def read_tables(file: Path) -> list[Row]:

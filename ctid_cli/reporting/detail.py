@@ -126,7 +126,7 @@ def repeat(found: FoundEstimate) -> Repeated:
                 drawn = start.draw(found.seed, task.replicate, data.true_model)
                 fit = estimator.estimator.prepare(data.record).fit(drawn)
                 if isinstance(fit, FrequencyFit) and isinstance(data, SignalDataSet):
-                    sides = (row.get("measures") or {}, fit.result(data)["measures"])
+                    sides = (row.get("measures") or {}, data.result_of(fit, None, None)["measures"])
                     then, now = ({k: v for k, v in side.items() if k.startswith("omega")} for side in sides)
                     return Repeated([], _difference(then, now))
                 model = {name: plain(getattr(fit.model, name)) for name in ("numerator", "denominator", "delay")}

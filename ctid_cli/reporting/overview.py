@@ -11,7 +11,7 @@ from typing import Any
 from ctid_cli.reporting.estimate import as_object
 from ctid_cli.reporting.layout import Table, number
 from ctid_cli.reporting.results import out_option
-from ctid_cli.storage.manifest import FAILURES
+from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.store import ExperimentStatus
 
 #: Failed estimates that the text lists.

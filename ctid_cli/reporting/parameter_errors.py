@@ -22,7 +22,8 @@ from ctid_cli.reporting.expected_accuracy import long_record_variances
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import spec_from_canonical
-from ctid_cli.storage.manifest import FAILURES, true_parameters
+from ctid_cli.storage.columns import FAILURES
+from ctid_cli.storage.manifest import true_parameters
 from ctid_cli.storage.summary import wilson_interval
 
 #: Standard errors on either side of an estimate that make a 95 % interval.

@@ -20,8 +20,8 @@ from typing import Any
 
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.reporting.study import Study, StudyTable
-from ctid_cli.running.plan import RESERVED_COLUMNS
 from ctid_cli.simulation.frequency_measures import base_name, measure_names
+from ctid_cli.storage.columns import reserved_names
 from ctid_cli.storage.manifest import is_of_signal
 
 Row = dict[str, Any]
@@ -51,7 +51,7 @@ def measures_of(rows: Iterable[Mapping[str, Any]]) -> list[str]:
 def settings_of(rows: Iterable[Mapping[str, Any]]) -> list[str]:
     """Keys of the swept fields; none of them has a reserved name, but initial parameters are told apart by theirs."""
     rows = list(rows)
-    others = RESERVED_COLUMNS.difference(["start"]).union(measures_of(rows))
+    others = reserved_names().difference(["start"]).union(measures_of(rows))
     return list(dict.fromkeys(key for row in rows for key in row if key not in others))
 
 

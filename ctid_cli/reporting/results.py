@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from ctid_cli.errors import UsageError
+from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.folder import experiment_folders
-from ctid_cli.storage.manifest import FAILURES, Manifest
+from ctid_cli.storage.manifest import Manifest
 from ctid_cli.storage.store import Stored, read_stored
 from ctid_cli.storage.summary import summarise
 from ctid_cli.text import did_you_mean
@@ -54,7 +55,7 @@ class Results:
     @property
     def mixed(self) -> bool:
         """Whether other code or another processor computed some of the estimates."""
-        return len(self.stored.origins) > 1
+        return self.stored.mixed
 
     @property
     def measured(self) -> bool:

@@ -12,25 +12,26 @@ import threading
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.errors import DataError, RefusedError, StorageError
 from ctid_cli.running import events
+from ctid_cli.running.job import Job
 from ctid_cli.running.stopping import StopRequest
-from ctid_cli.running.worker import Job
 from ctid_cli.storage import folder as place
 from ctid_cli.storage import journal
-from ctid_cli.storage.manifest import FAILURES, Key, Manifest, Outcome, Slot, assemble, slots
+from ctid_cli.storage.columns import FAILURES
+from ctid_cli.storage.identity import Origin, are_mixed, origin_of
+from ctid_cli.storage.manifest import Key, Slot, assemble, slots
 from ctid_cli.storage.provenance import now, session_info
 from ctid_cli.storage.store import seal
-from ctid_cli.storage.version import Origin, current_origin
 
 if TYPE_CHECKING:
-    from ctid_cli.running.plan import Plan
+    from ctid_cli.running.cells import Plan
 
 #: Finished data sets are committed after this time [s], or when there are this many of them.
 COMMIT_SECONDS = 0.2
@@ -80,9 +81,9 @@ def run_experiment(
 ) -> RunSummary:
     """Compute the missing estimates of a plan and seal all of them."""
     begun = time.monotonic()
-    origin = current_origin()
+    origins = current_origins(plan)
     with StopRequest(stop) as stopping, ExitStack() as stack:
-        peek = _look(plan, folder, origin, fresh=fresh, allow_mixed=allow_mixed)
+        peek = _look(plan, folder, origins, fresh=fresh, allow_mixed=allow_mixed)
         todo = _jobs(plan, peek)
         if todo:
             on_event(events.KernelsCompiling())
@@ -92,18 +93,17 @@ def run_experiment(
         _make(folder)
         stack.enter_context(place.lock(folder))
         # Another run may have come between.
-        place.check_free(folder, plan.experiment, origin, allow_mixed=allow_mixed)
+        place.check_free(folder, plan.manifest(), origins, allow_mixed=allow_mixed)
         try:
             log = journal.open_journal(folder / journal.FILE_NAME)
         except StorageError as error:
             raise StorageError(f"{error}. {place.what_is_safe(folder)}") from error
         stack.callback(log.close)
-        run = _Run(plan, folder, log, origin, on_event, jobs or usable_processors())
+        run = _Run(plan, folder, log, origins, on_event, jobs or usable_processors())
         stack.callback(run.cleanup)
         run.start()
         run.compute(stopping)
-        run.finish(stopping.reason)
-        return run.summary(stopping.reason if run.missing else None, moved, time.monotonic() - begun)
+        return run.finish(stopping.reason, moved, begun)
 
 
 def usable_processors() -> int:
@@ -117,45 +117,36 @@ class _Run:
     """One run, from the first entry in the journal to the sealed file."""
 
     def __init__(
-        self, plan: Plan, folder: Path, log: journal.Journal, origin: Origin, on_event: events.OnEvent, jobs: int
+        self,
+        plan: Plan,
+        folder: Path,
+        log: journal.Journal,
+        origins: Mapping[str, Origin],
+        on_event: events.OnEvent,
+        workers: int,
     ) -> None:
-        self.plan, self.folder, self.log, self.origin = plan, folder, log, origin
-        self.on_event, self.workers = on_event, jobs
-        self.manifest: Manifest = plan.manifest()
+        self.plan, self.folder, self.log, self.origins = plan, folder, log, origins
+        self.on_event, self.workers = on_event, workers
+        self.manifest = plan.manifest()
         self.slots: dict[Key, list[Slot]] = defaultdict(list)
         for slot in slots(self.manifest):
             self.slots[slot.key].append(slot)
-        stored = log.keys()
-        self.reused = len(self.slots.keys() & stored)
-        self.left_aside = len(stored - self.slots.keys())
-        self.jobs = _jobs(plan, stored)
-        self.computed = self.done = self.failed = 0
-        self.mixed = False
+        self.ready, self.jobs = _ready(plan, folder, log.keys())
+        self.computed = self.done = 0
         self.started = now()
-        self.info: dict[str, Any] = {}
-        self.session = 0
-
-    @property
-    def missing(self) -> int:
-        return len(self.slots) - self.reused - self.computed
 
     def start(self) -> None:
         spec = self.plan.spec
-        try:
+        canonical = json.dumps(spec.canonical(), sort_keys=True, indent=2, allow_nan=False, ensure_ascii=False)
+        with _writing(self.folder):
             _write_if_new(self.folder / place.SPEC, spec.text.encode())
-            canonical = json.dumps(spec.canonical(), sort_keys=True, indent=2, allow_nan=False, ensure_ascii=False)
             _write_if_new(self.folder / place.CANONICAL, f"{canonical}\n".encode())
             (self.folder / place.PROVENANCE).mkdir(exist_ok=True)
-        except OSError as error:
-            raise _cannot_write(self.folder, error) from error
-        self.info = session_info(spec.text, spec.folder, self.origin, self.workers)
-        self.session = self.log.begin(self.manifest, self.origin, self.started, self.info)
+        versions = {cell.name: self.origins[cell.hash] for cell in self.plan.estimators}
+        self.info = session_info(spec.text, spec.folder, versions, self.workers)
+        self.session = self.log.begin(self.manifest, self.origins, self.started, self.info)
         self._announce()
-        self.on_event(
-            events.PlanReady(
-                self.plan.experiment, self.folder, len(self.jobs), self.missing, self.reused, self.left_aside
-            )
-        )
+        self.on_event(self.ready)
 
     def compute(self, stopping: StopRequest) -> None:
         from ctid_cli.running.pool import Died, Finished, kill_workers, run_jobs
@@ -192,69 +183,73 @@ class _Run:
             unfinished[data_set] -= len(item.outcomes)
             self.done += unfinished[data_set] == 0
             self.computed += len(item.outcomes)
-            rows = tuple(row for outcome in item.outcomes for row in self._rows(outcome))
+            rows = tuple(
+                assemble(slot, self.manifest, outcome.result, outcome.seconds)
+                for outcome in item.outcomes
+                for slot in self.slots[outcome.key]
+            )
             self.on_event(events.DataSetDone(self.done, len(self.jobs), rows))
         self._announce()
-
-    def _rows(self, outcome: Outcome) -> list[Mapping[str, Any]]:
-        return [assemble(slot, self.manifest, outcome.result, outcome.seconds) for slot in self.slots[outcome.key]]
 
     def _announce(self) -> None:
         place.announce(self.folder, self.plan.experiment, self.started, self.done, len(self.jobs))
 
-    def finish(self, reason: str | None) -> None:
+    def finish(self, reason: str | None, moved: Path | None, begun: float) -> RunSummary:
         self.on_event(events.Sealed(self.folder / place.SEALED, *seal(self.folder, self.log)))
         statuses = self.log.statuses()
-        self.failed = sum(statuses.get(key) in FAILURES for key in self.slots)
-        self.mixed = len(self.log.origins()) > 1
-        stopped = now()
-        ended = "finished" if not self.missing else reason or "unfinished"
+        failed = sum(statuses.get(key) in FAILURES for key in self.slots)
+        missing = self.ready.estimates - self.computed
+        stopped, ended = now(), "finished" if not missing else reason or "unfinished"
         self.log.end(self.session, stopped, ended)
-        counts = {"planned": len(self.slots), "reused": self.reused, "computed": self.computed, "failed": self.failed}
+        counts = {"planned": len(self.slots), "reused": self.ready.reused, "computed": self.computed, "failed": failed}
         about = {"session": self.session, "started": self.started, "stopped": stopped, "reason": ended, **counts}
         text = json.dumps(about | self.info, indent=2, ensure_ascii=False)
         name = f"{self.session:04d}-{self.started.replace(':', '').replace('-', '')}.json"
-        try:
+        with _writing(self.folder):
             place.write_safely(self.folder / place.PROVENANCE / name, f"{text}\n".encode())
-        except OSError as error:
-            raise _cannot_write(self.folder, error) from error
+        return RunSummary(
+            experiment=self.plan.experiment,
+            folder=self.folder,
+            **counts,
+            left_aside=self.ready.left_aside,
+            mixed=are_mixed(self.log.origins()),
+            moved_aside=moved,
+            seconds=time.monotonic() - begun,
+            stopped_by=reason if missing else None,
+        )
 
     def cleanup(self) -> None:
         with suppress(OSError):
             (self.folder / place.RUNNING).unlink(missing_ok=True)
 
-    def summary(self, stopped_by: str | None, moved: Path | None, seconds: float) -> RunSummary:
-        return RunSummary(
-            self.plan.experiment,
-            self.folder,
-            len(self.slots),
-            self.reused,
-            self.computed,
-            self.failed,
-            self.left_aside,
-            self.mixed,
-            moved,
-            seconds,
-            stopped_by,
-        )
-
 
 def preview(plan: Plan, folder: Path, *, fresh: bool = False, allow_mixed: bool = False) -> events.PlanReady:
     """What a run would do, without doing or writing anything."""
-    stored = _look(plan, folder, current_origin(), fresh=fresh, allow_mixed=allow_mixed)
+    stored = _look(plan, folder, current_origins(plan), fresh=fresh, allow_mixed=allow_mixed)
+    return _ready(plan, folder, stored)[0]
+
+
+def current_origins(plan: Plan) -> dict[str, Origin]:
+    """Where the estimates of each estimator will come from, by hash."""
+    # All data cells are made by the same classes; only the values of their fields differ.
+    source = plan.data_cells[0].source
+    return {cell.hash: origin_of(source, cell.estimator) for cell in plan.estimators}
+
+
+def _ready(plan: Plan, folder: Path, stored: set[Key]) -> tuple[events.PlanReady, list[Job]]:
+    """What there is to do, in numbers and as jobs."""
     planned = {slot.key for slot in slots(plan.manifest())}
-    reused = len(planned & stored)
-    return events.PlanReady(
-        plan.experiment, folder, len(_jobs(plan, stored)), len(planned) - reused, reused, len(stored - planned)
-    )
+    reused, jobs = len(planned & stored), _jobs(plan, stored)
+    counts = (len(jobs), len(planned) - reused, reused, len(stored - planned))
+    return events.PlanReady(plan.experiment, folder, *counts), jobs
 
 
-def _look(plan: Plan, folder: Path, origin: Origin, *, fresh: bool, allow_mixed: bool) -> set[Key]:
+def _look(plan: Plan, folder: Path, origins: Mapping[str, Origin], *, fresh: bool, allow_mixed: bool) -> set[Key]:
     """Which estimates are stored in a folder that this plan may be run into."""
     if fresh or not folder.exists():
         return set()
     with place.lock(folder, shared=True):
-        place.check_free(folder, plan.experiment, origin, allow_mixed=allow_mixed)
+        place.check_free(folder, plan.manifest(), origins, allow_mixed=allow_mixed)
         with place.reading_journal(folder) as log:
             return set() if log is None else log.keys()
 
@@ -311,10 +306,8 @@ def _compile_kernels(plan: Plan) -> float:
 
 
 def _make(folder: Path) -> None:
-    try:
+    with _writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _cannot_write(folder, error) from error
     if not folder.is_dir():
         raise RefusedError(f"{folder} is a file, not a folder")
 
@@ -324,5 +317,10 @@ def _write_if_new(path: Path, data: bytes) -> None:
         place.write_safely(path, data)
 
 
-def _cannot_write(folder: Path, error: OSError) -> StorageError:
-    return StorageError(f"{folder} cannot be written ({error.strerror or error}); stored estimates are untouched")
+@contextmanager
+def _writing(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or error
+        raise StorageError(f"{folder} cannot be written ({reason}); stored estimates are untouched") from error

@@ -6,146 +6,24 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import UsageError
 from ctid_cli.kinds import KINDS
-from ctid_cli.models.additive import AdditiveModel, Term
+from ctid_cli.running.cells import DataCell, EstimatorCell, Plan, starts_of
 from ctid_cli.simulation.dataset import LoopOptions, SimulatedSource, Source, located
 from ctid_cli.simulation.frequency_measures import Measuring
 from ctid_cli.simulation.frequency_runs import FrequencyEstimation, SignalSource
 from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, variants
 from ctid_cli.specification.spec import Spec
-from ctid_cli.specification.start_points import NO_START, AnyStart, ParameterStart, StartPoint, start_points
+from ctid_cli.specification.start_points import NO_START, start_points
 from ctid_cli.specification.yaml_source import KeyPath
-from ctid_cli.storage.manifest import Key, Manifest
+from ctid_cli.storage.columns import reserved_names
 
 #: Data sets that one experiment may ask for; beyond this its plan alone would fill the memory.
 MAX_DATA_SETS = 1_000_000
-
-#: Columns that every row of results or tables has; a swept field of the same name is written with its section.
-# fmt: off
-RESERVED_COLUMNS = frozenset((
-    "id", "experiment", "estimator", "kind", "cell", "replicate", "start", "initial_delay", "start_delay",
-    "status", "message", "delay", "numerator", "denominator", "parameters", "standard_errors", "cost", "fit_percent",
-    "validation_fit_percent", "iterations", "condition_number", "seconds", "converged", "true_delay", "table",
-    "sampling", "method", "n", "failed", "percent", "low", "high", "published_percent", "median_seconds",
-))
-# fmt: on
-
-
-@dataclass(frozen=True, eq=False)
-class DataCell:
-    """One combination of system, excitation or loop, sampling, noise and seed, or one measured record."""
-
-    content: dict[str, Any]
-    hash: str
-    swept: dict[str, Any]
-    source: Source | SignalSource
-
-    def dataset(self, replicate: int) -> Any:
-        """One data set."""
-        return self.source.dataset(replicate)
-
-
-@dataclass(frozen=True, eq=False)
-class EstimatorCell:
-    """One estimator with one combination of its swept options."""
-
-    name: str
-    kind: str
-    estimator: Any
-    content: dict[str, Any]
-    hash: str
-    swept: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Task:
-    """One data set."""
-
-    cell: int
-    replicate: int
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """All data sets and estimates of an experiment."""
-
-    spec: Spec
-    data_cells: tuple[DataCell, ...]
-    estimators: tuple[EstimatorCell, ...]
-    starts: tuple[AnyStart, ...]
-    runs: int
-    spec_hash: str
-
-    @property
-    def experiment(self) -> str:
-        """Name of the experiment."""
-        return self.spec.experiment
-
-    def tasks(self) -> list[Task]:
-        """The data sets."""
-        return [Task(cell, replicate) for replicate in range(self.runs) for cell in range(len(self.data_cells))]
-
-    def keys(self, task: Task) -> list[tuple[Key, EstimatorCell, AnyStart]]:
-        """The estimates wanted of a data set."""
-        data_hash = self.data_cells[task.cell].hash
-        return [
-            (Key(data_hash, task.replicate, cell.hash, start.label), cell, start)
-            for cell in self.estimators
-            for start in _starts_of(cell.estimator.start_from, self.starts)
-        ]
-
-    @property
-    def terms(self) -> tuple[Term, ...] | None:
-        """Structure of the submodels that estimates of one fraction are also given as; None for none.
-
-        That of the simulated system, by rising natural frequency, or else of the first estimator of submodels.
-        """
-        cell = self.data_cells[0].source
-        if isinstance(cell, SimulatedSource) and isinstance(cell.system, AdditiveModel):
-            return cell.system.sorted().terms
-        found = (getattr(cell.estimator, "terms", None) for cell in self.estimators)
-        return next((tuple(terms) for terms in found if terms is not None), None)
-
-    def manifest(self) -> Manifest:
-        """The plan as plain data."""
-        replicates = [0] * len(self.data_cells)
-        starts: dict[str, list[str]] = {}
-        for task in self.tasks():
-            replicates[task.cell] += 1
-            if not starts:
-                for _, cell, start in self.keys(task):
-                    starts.setdefault(f"{cell.name}/{cell.hash}", []).append(start.label)
-        canonical = self.spec.canonical()
-        return {
-            "experiment": self.experiment,
-            "runs": self.runs,
-            "seed": (canonical.get("monte_carlo") or {}).get("seed"),
-            "spec_hash": self.spec_hash,
-            "spec": canonical,
-            "success": canonical.get("success"),
-            "data_cells": [
-                {"hash": cell.hash, "replicates": count, "swept": dict(cell.swept), "content": cell.content}
-                for cell, count in zip(self.data_cells, replicates, strict=True)
-            ],
-            "estimators": [
-                {
-                    "name": cell.name,
-                    "kind": cell.kind,
-                    "hash": cell.hash,
-                    "swept": dict(cell.swept),
-                    "content": cell.content,
-                    "starts": starts.get(f"{cell.name}/{cell.hash}", []),
-                }
-                for cell in self.estimators
-            ],
-            "starts": {start.label: start.initial_delay for start in self.starts},
-        }
 
 
 def build_plan(spec: Spec, runs: int | None = None) -> Plan:
@@ -177,7 +55,7 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
         _estimator_cell(name, variant, names) for name, cases in estimators.items() for variant in cases
     )
     starts = start_points(spec.starts)
-    if any(NO_START in _starts_of(cell.estimator.start_from, starts) for cell in estimator_cells):
+    if any(NO_START in starts_of(cell.estimator.start_from, starts) for cell in estimator_cells):
         starts = (*starts, NO_START)
     return Plan(
         spec=spec,
@@ -187,12 +65,6 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
         runs=count,
         spec_hash=content_hash(_without_circumstances(spec.canonical())),
     )
-
-
-def _starts_of(kind: str | None, starts: tuple[AnyStart, ...]) -> tuple[AnyStart, ...]:
-    """The starts that an estimator which takes one of a kind begins from."""
-    wanted = {None: (), "delay": (StartPoint,), "parameters": (ParameterStart,)}[kind]
-    return tuple(start for start in starts if isinstance(start, wanted) and start != NO_START) or (NO_START,)
 
 
 def _data_variants(spec: Spec) -> dict[str, list[Variant]]:
@@ -281,9 +153,9 @@ def _estimator_cell(name: str, variant: Variant, names: Mapping[KeyPath, str]) -
 def _column_names(paths: Iterable[KeyPath]) -> dict[KeyPath, str]:
     """Name of the column of every swept field: its last word, or more of its path where that is taken."""
     distinct = list(dict.fromkeys(paths))
-    last = [path[-1] for path in distinct]
+    last, reserved = [path[-1] for path in distinct], reserved_names()
     return {
-        path: ".".join(map(str, path)) if path[-1] in RESERVED_COLUMNS or last.count(path[-1]) > 1 else str(path[-1])
+        path: ".".join(map(str, path)) if path[-1] in reserved or last.count(path[-1]) > 1 else str(path[-1])
         for path in distinct
     }
 

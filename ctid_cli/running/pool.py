@@ -23,7 +23,9 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ctid_cli.running.worker import Job, failed, initialise, run_job
+from ctid_cli.running.job import Job, run_job
+from ctid_cli.running.worker import initialise
+from ctid_cli.storage.columns import failed
 from ctid_cli.storage.manifest import Outcome
 
 #: How often the caller gets a chance to do something else while nothing is finished [s].

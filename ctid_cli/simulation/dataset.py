@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
@@ -24,6 +25,7 @@ from ctid_cli.signals.noise import Noise
 from ctid_cli.signals.record import Enters, Loop, Record, regular_interval
 from ctid_cli.signals.sampling import Sampling
 from ctid_cli.signals.streams import stream
+from ctid_cli.simulation.additive_parameters import additive_parameters
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,35 @@ class DataSet:
     record: Record
     true_model: TransferFunction | AdditiveModel | None = None
     validation: Record | None = None
+
+    def result_of(self, fit: Any, start: Any, terms: Sequence[Term] | None) -> dict[str, Any]:
+        """What is stored of a fit to the record."""
+        parameters, errors = additive_parameters(fit, terms)
+        return {
+            "status": fit.status.name,
+            "message": str(fit.status.value),
+            "start_delay": None if start is None else start.delay,
+            "delay": fit.model.delay,
+            "numerator": fit.model.numerator,
+            "denominator": fit.model.denominator,
+            "parameters": parameters,
+            "standard_errors": fit.standard_errors | errors,
+            "cost": fit.cost,
+            "fit_percent": fit.fit_percent,
+            "validation_fit_percent": self._validation_fit_percent(fit.model),
+            "iterations": int(fit.iterations),
+            "condition_number": fit.condition_number,
+        }
+
+    def _validation_fit_percent(self, model: Any) -> float | None:
+        from ctid_cli.filtering.simulate import simulate
+        from ctid_cli.inference.diagnostics import fit_percent
+
+        record = self.validation
+        if record is None:
+            return None
+        simulated = simulate(model, record.input, record.t)
+        return float(fit_percent(record.y[record.valid], simulated[record.valid]))
 
 
 @dataclass(frozen=True, eq=False)

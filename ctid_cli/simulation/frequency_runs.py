@@ -41,6 +41,23 @@ class SignalDataSet:
     replicate: int
     true_model: ClassVar[None] = None
 
+    def result_of(self, fit: FrequencyFit, start: Any, terms: Any) -> dict[str, Any]:
+        """What is stored of a fit to the record."""
+        source, interval = self.source, self.record.interval
+        measuring = source.measuring
+        times = interval * np.arange(self.record.samples.size, dtype=float)
+        true = true_frequencies(source.signal, source.disturbance, fit.options.tones, times)
+        last = fit.last
+        result: dict[str, Any] = {"status": "VALID", "message": "The last estimate is valid."}
+        if not last.valid:
+            result = {"status": "INVALID", "message": " ".join(last.reasons)}
+        if not isinstance(fit.found, FrequencyTrack):
+            return result | {"measures": measure_estimate(last, true, measuring.window, times)}
+        result["measures"] = measure_track(fit.found, true, source.signal, measuring, fit.options)
+        if measuring.interval is not None and self.replicate < measuring.runs:
+            result["track"] = pack_track(thinned(fit.found, measuring.interval, interval))
+        return result
+
 
 @dataclass(frozen=True, eq=False)
 class SignalSource:
@@ -104,20 +121,3 @@ class FrequencyFit:
     def last(self) -> FrequencyEstimate:
         """The estimate at the end of the record."""
         return self.found.final if isinstance(self.found, FrequencyTrack) else self.found
-
-    def result(self, data: SignalDataSet) -> dict[str, Any]:
-        """The estimate as it is stored."""
-        source, interval = data.source, data.record.interval
-        measuring = source.measuring
-        times = interval * np.arange(data.record.samples.size, dtype=float)
-        true = true_frequencies(source.signal, source.disturbance, self.options.tones, times)
-        last = self.last
-        result: dict[str, Any] = {"status": "VALID", "message": "The last estimate is valid."}
-        if not last.valid:
-            result = {"status": "INVALID", "message": " ".join(last.reasons)}
-        if not isinstance(self.found, FrequencyTrack):
-            return result | {"measures": measure_estimate(last, true, measuring.window, times)}
-        result["measures"] = measure_track(self.found, true, source.signal, measuring, self.options)
-        if measuring.interval is not None and data.replicate < measuring.runs:
-            result["track"] = pack_track(thinned(self.found, measuring.interval, interval))
-        return result

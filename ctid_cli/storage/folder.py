@@ -12,7 +12,7 @@ import os
 import platform
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +20,8 @@ from typing import Any
 
 from ctid_cli.errors import RefusedError, StorageError, UsageError
 from ctid_cli.storage import journal
-from ctid_cli.storage.version import Origin
+from ctid_cli.storage.identity import Origin
+from ctid_cli.storage.manifest import Manifest
 
 SPEC = "spec.yaml"
 CANONICAL = "spec.canonical.json"
@@ -119,8 +120,9 @@ def write_safely(path: Path, data: bytes) -> None:
         os.close(descriptor)
 
 
-def check_free(folder: Path, experiment: str, origin: Origin, *, allow_mixed: bool) -> None:
+def check_free(folder: Path, manifest: Manifest, origins: Mapping[str, Origin], *, allow_mixed: bool) -> None:
     """Refuse a folder whose results this run must not add to."""
+    experiment = manifest["experiment"]
     with reading_journal(folder) as log:
         if log is None:
             if (folder / SEALED).exists():
@@ -135,9 +137,11 @@ def check_free(folder: Path, experiment: str, origin: Origin, *, allow_mixed: bo
                 f"{folder} holds the experiment {log.experiment()!r}, not {experiment!r}; choose another results folder"
                 " (--out), or --fresh to move the old results aside"
             )
-        others = [other for other in log.origins().values() if other != origin]
-        if others and not allow_mixed:
-            raise RefusedError(_other_origin(folder, others[-1], origin))
+        # What the plan does not ask for is left aside, wherever it came from.
+        cells = {cell["hash"] for cell in manifest["data_cells"]}
+        for data, estimator, made in sorted(log.made()):
+            if data in cells and made != origins.get(estimator, made) and not allow_mixed:
+                raise RefusedError(_other_origin(folder, made, origins[estimator]))
 
 
 def _other_origin(folder: Path, other: Origin, origin: Origin) -> str:

@@ -12,31 +12,37 @@ import json
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import RefusedError, StorageError
+from ctid_cli.storage.identity import Origin, gathered
 from ctid_cli.storage.manifest import Key, Manifest, Outcome
-from ctid_cli.storage.version import Origin
 
 FILE_NAME = "journal.sqlite"
 #: Raised by one whenever an older ctid could misread the file.
-FORMAT = 1
+FORMAT = 2
 #: Marks an SQLite file as a journal of ctid ("ctid" in ASCII).
 APPLICATION = 0x63746964
 
 _SCHEMA = (
     "CREATE TABLE meta (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID",
     "CREATE TABLE origins (number INTEGER PRIMARY KEY, code_version TEXT, platform TEXT, packages TEXT)",
-    """CREATE TABLE sessions (
-        number INTEGER PRIMARY KEY, origin INTEGER, started TEXT, stopped TEXT, reason TEXT, info TEXT)""",
+    "CREATE TABLE sessions (number INTEGER PRIMARY KEY, started TEXT, stopped TEXT, reason TEXT, info TEXT)",
     """CREATE TABLE estimates (
         data_hash TEXT, replicate INTEGER, estimator_hash TEXT, start TEXT,
-        result TEXT NOT NULL, checksum TEXT NOT NULL, seconds REAL, session INTEGER NOT NULL,
+        result TEXT NOT NULL, checksum TEXT NOT NULL, seconds REAL, session INTEGER NOT NULL, origin INTEGER,
         PRIMARY KEY (data_hash, replicate, estimator_hash, start)) WITHOUT ROWID""",
+)
+#: From format 1, in which a run had one origin, whatever its estimators.
+_UPGRADE = (
+    "ALTER TABLE estimates ADD COLUMN origin INTEGER",
+    "UPDATE estimates SET origin = (SELECT origin FROM sessions WHERE number = session)",
+    "ALTER TABLE sessions DROP COLUMN origin",
 )
 _SEALED = "sealed"
 
@@ -49,7 +55,7 @@ class Entry:
     #: Time it took [s].
     seconds: float | None
     session: int
-    origin: int
+    origin: Origin
 
 
 class Journal:
@@ -58,6 +64,8 @@ class Journal:
     def __init__(self, connection: sqlite3.Connection, path: Path) -> None:
         self._connection = connection
         self.path = path
+        #: Numbers of the present run's origins by estimator.
+        self._origins: dict[str, int] = {}
 
     def experiment(self) -> str:
         """Name of the experiment."""
@@ -73,14 +81,22 @@ class Journal:
         """Checksum of the sealed file, or None if estimates came after it."""
         return self._meta(_SEALED)
 
-    def origins(self) -> dict[int, Origin]:
-        """Code and platform of the runs that have written here, by number."""
+    def origins(self) -> tuple[Origin, ...]:
+        """Where the stored estimates come from."""
+        return gathered((estimator, origin) for _, estimator, origin in self.made())
+
+    def made(self) -> set[tuple[str, str, Origin]]:
+        """Data cells and estimators of the stored estimates, and where these come from."""
         with self._guard("read"):
-            rows = self._connection.execute("SELECT * FROM origins ORDER BY number").fetchall()
-            return {
-                number: Origin(code, platform, tuple((name, version) for name, version in json.loads(packages)))
-                for number, code, platform, packages in rows
-            }
+            known = self._known_origins()
+            rows = self._connection.execute(
+                "SELECT DISTINCT data_hash, estimator_hash, origin FROM estimates JOIN sessions ON session = number"
+            )
+            return {(data, estimator, known[origin]) for data, estimator, origin in rows}
+
+    def _known_origins(self) -> dict[int, Origin]:
+        rows = self._connection.execute("SELECT number, code_version, platform, packages FROM origins")
+        return {number: Origin.of(code, platform, json.loads(packages)) for number, code, platform, packages in rows}
 
     def sessions(self) -> list[dict[str, Any]]:
         """Every run that has written here, the oldest first."""
@@ -111,6 +127,7 @@ class Journal:
         """Every stored estimate, each compared with its checksum."""
         found = {}
         with self._guard("read"):
+            origins = self._known_origins()
             rows = self._connection.execute(
                 "SELECT data_hash, replicate, estimator_hash, start, result, checksum, seconds, session, origin"
                 " FROM estimates JOIN sessions ON session = number"
@@ -119,7 +136,7 @@ class Journal:
                 key = Key(*parts)
                 if _checksum(key, result) != checksum:
                     raise StorageError(f"{self.path} is damaged: estimate {key.id} has changed since it was written")
-                found[key] = Entry(json.loads(result), seconds, session, origin)
+                found[key] = Entry(json.loads(result), seconds, session, origins[origin])
         return found
 
     def check(self) -> None:
@@ -129,23 +146,25 @@ class Journal:
         if found != ("ok",):
             raise StorageError(f"{self.path} is damaged: {found[0] if found else 'no answer'}")
 
-    def begin(self, manifest: Manifest, origin: Origin, started: str, info: dict[str, Any]) -> int:
-        """Note that a run begins."""
+    def begin(self, manifest: Manifest, origins: Mapping[str, Origin], started: str, info: dict[str, Any]) -> int:
+        """Note that a run begins, and where the estimates of each estimator will come from."""
         with self._transaction() as connection:
             # Not sorted: the order of swept fields and starts is that of the specification.
             text = json.dumps(manifest, allow_nan=False)
             if self._meta("manifest") != text:
                 self._set_meta("manifest", text)
                 connection.execute("DELETE FROM meta WHERE name = ?", (_SEALED,))
-            known = {value: number for number, value in self.origins().items()}
-            number = known.get(origin)
-            if number is None:
-                row = (origin.code_version, origin.platform, _json(origin.packages))
-                number = connection.execute(
-                    "INSERT INTO origins (code_version, platform, packages) VALUES (?, ?, ?)", row
-                ).lastrowid
+            known = {origin: number for number, origin in self._known_origins().items()}
+            for estimator, origin in origins.items():
+                if origin not in known:
+                    row = (origin.code_version, origin.platform, canonical_json(origin.packages))
+                    cursor = connection.execute(
+                        "INSERT INTO origins (code_version, platform, packages) VALUES (?, ?, ?)", row
+                    )
+                    known[origin] = int(cursor.lastrowid or 0)
+                self._origins[estimator] = known[origin]
             cursor = connection.execute(
-                "INSERT INTO sessions (origin, started, info) VALUES (?, ?, ?)", (number, started, _json(info))
+                "INSERT INTO sessions (started, info) VALUES (?, ?)", (started, canonical_json(info))
             )
             return int(cursor.lastrowid or 0)
 
@@ -153,10 +172,11 @@ class Journal:
         """Store estimates; when this returns, they are safe."""
         rows = []
         for key, result, seconds in outcomes:
-            text = _json(result)
-            rows.append((*key, text, _checksum(key, text), seconds, session))
+            text = canonical_json(result)
+            origin = self._origins[key.estimator_hash]
+            rows.append((*key, text, _checksum(key, text), seconds, session, origin))
         with self._transaction() as connection:
-            connection.executemany("INSERT INTO estimates VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
+            connection.executemany("INSERT INTO estimates VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
             connection.execute("DELETE FROM meta WHERE name = ?", (_SEALED,))
 
     def mark_sealed(self, checksum: str) -> None:
@@ -219,14 +239,14 @@ def open_journal(path: Path) -> Journal:
         connection.execute("PRAGMA locking_mode=EXCLUSIVE")
         connection.execute("PRAGMA journal_mode=WAL")
         connection.execute("PRAGMA synchronous=FULL")
-        if not connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone():
+        new = not connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone()
+        if new or _format(connection, path) < FORMAT:
             connection.execute("BEGIN IMMEDIATE")
-            for statement in _SCHEMA:
+            for statement in _SCHEMA if new else _UPGRADE:
                 connection.execute(statement)
             connection.execute(f"PRAGMA application_id={APPLICATION}")
             connection.execute(f"PRAGMA user_version={FORMAT}")
             connection.execute("COMMIT")
-        _refuse_foreign(connection, path)
     except sqlite3.Error as error:
         connection.close()
         raise StorageError(f"{path} is damaged or cannot be written ({error})") from error
@@ -263,7 +283,7 @@ def read_journal(path: Path) -> Iterator[Journal | None]:
             try:
                 empty = not connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone()
                 if not empty:
-                    _refuse_foreign(connection, path)
+                    _format(connection, path)
                     empty = not connection.execute("SELECT 1 FROM meta WHERE name = 'manifest'").fetchone()
             except sqlite3.Error as error:
                 raise StorageError(f"{path} is damaged or not a journal ({error})") from error
@@ -272,7 +292,8 @@ def read_journal(path: Path) -> Iterator[Journal | None]:
             connection.close()
 
 
-def _refuse_foreign(connection: sqlite3.Connection, path: Path) -> None:
+def _format(connection: sqlite3.Connection, path: Path) -> int:
+    """Format of a journal; other files, and newer formats, are refused."""
     (application,) = connection.execute("PRAGMA application_id").fetchone()
     (written_by,) = connection.execute("PRAGMA user_version").fetchone()
     if application != APPLICATION:
@@ -282,11 +303,8 @@ def _refuse_foreign(connection: sqlite3.Connection, path: Path) -> None:
             f"{path} has format {written_by}; this ctid reads formats up to {FORMAT}. Use the newer ctid that wrote it,"
             " another results folder (--out), or --fresh to move the old results aside"
         )
+    return int(written_by)
 
 
 def _checksum(key: Key, result: str) -> str:
     return hashlib.sha256("\n".join([*map(str, key), result]).encode()).hexdigest()[:32]
-
-
-def _json(value: Any) -> str:
-    return json.dumps(value, sort_keys=True, allow_nan=False, separators=(",", ":"), ensure_ascii=False)

@@ -1,24 +1,8 @@
 """A plan as plain data: what the stored estimates are compared with, sorted by and described from.
 
 The journal and the sealed file keep the manifest, so that results can be listed, counted and exported without the
-specification that made them, also by later versions that read specifications differently.
-
-Keys of an estimate row
------------------------
-- ``id``: short name; ``experiment``, ``estimator``, ``kind``; ``cell``: hash of the data cell; ``replicate``;
-  ``start``: its label.
-- ``initial_delay``: where the search was asked to start [s], ``"random"``, or None for estimators without a start;
-  ``start_delay``: where it did start [s].
-- ``status``: name of a `Status`, or ``FAILED`` (the estimator raised an exception), ``CRASHED`` (its process died),
-  ``TIMEOUT``; ``message``: what that means, or the exception with a short traceback.
-- ``delay`` [s], ``numerator`` and ``denominator`` (monic, descending powers), ``standard_errors`` by parameter name.
-- ``parameters`` of the submodels by name, only in experiments whose system or estimators are additive: ``g1_a1``
-  multiplies the first power of p in the denominator of the submodel with the least natural frequency.
-- ``cost`` [output unit^2], ``fit_percent``, ``validation_fit_percent``, ``iterations``, ``condition_number``.
-- ``measures`` of estimated frequencies by name, only in experiments on a signal; see
-  `ctid_cli.simulation.frequency_measures`. Their ``status`` is ``VALID`` or ``INVALID``, or one of the failures.
-- ``seconds``: time for preparing the record and fitting, as if the estimate had been alone [s].
-- one key per swept field. None stands for a value that does not exist or is not finite.
+specification that made them, also by later versions that read specifications differently. `storage.columns` says what
+a row of the table of estimates holds.
 """
 
 from __future__ import annotations
@@ -27,26 +11,9 @@ import hashlib
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-Manifest = dict[str, Any]
+from ctid_cli.storage import columns
 
-#: What an estimator returns, in the order of the columns.
-RESULT_FIELDS = (
-    "status",
-    "message",
-    "start_delay",
-    "delay",
-    "numerator",
-    "denominator",
-    "parameters",
-    "standard_errors",
-    "cost",
-    "fit_percent",
-    "validation_fit_percent",
-    "iterations",
-    "condition_number",
-)
-#: Statuses of estimates that have no result because something went wrong.
-FAILURES = ("FAILED", "CRASHED", "TIMEOUT")
+Manifest = dict[str, Any]
 
 
 class Key(NamedTuple):
@@ -63,6 +30,17 @@ class Key(NamedTuple):
         return hashlib.sha256("/".join(map(str, self)).encode()).hexdigest()[:12]
 
 
+class Outcome(NamedTuple):
+    """One estimate, or how it failed."""
+
+    #: Which estimate.
+    key: Key
+    #: Values of the columns that come from a result.
+    result: dict[str, Any]
+    #: Time for preparing the record and fitting [s]; None where nothing was measured.
+    seconds: float | None
+
+
 class Slot(NamedTuple):
     """One place in the table of estimates: which estimate belongs there and how it is labelled."""
 
@@ -70,16 +48,10 @@ class Slot(NamedTuple):
     cell: Mapping[str, Any]
     estimator: Mapping[str, Any]
 
-
-class Outcome(NamedTuple):
-    """One estimate, or how it failed."""
-
-    #: Which estimate.
-    key: Key
-    #: Values of `RESULT_FIELDS`.
-    result: dict[str, Any]
-    #: Time for preparing the record and fitting [s]; None where nothing was measured.
-    seconds: float | None
+    @property
+    def swept(self) -> dict[str, Any]:
+        """Values of the swept fields."""
+        return {**self.cell["swept"], **self.estimator["swept"]}
 
 
 def slots(manifest: Manifest) -> Iterator[Slot]:
@@ -93,7 +65,8 @@ def slots(manifest: Manifest) -> Iterator[Slot]:
 
 def assemble(slot: Slot, manifest: Manifest, result: Mapping[str, Any], seconds: float | None) -> dict[str, Any]:
     """An estimate row."""
-    return {
+    values = {
+        **result,
         "id": slot.key.id,
         "experiment": manifest["experiment"],
         "estimator": slot.estimator["name"],
@@ -102,24 +75,27 @@ def assemble(slot: Slot, manifest: Manifest, result: Mapping[str, Any], seconds:
         "replicate": slot.key.replicate,
         "start": slot.key.start,
         "initial_delay": manifest["starts"].get(slot.key.start),
-        **{name: result.get(name) for name in RESULT_FIELDS if name != "parameters" or is_additive(manifest)},
-        **({"measures": result.get("measures")} if is_of_signal(manifest) else {}),
         "seconds": seconds,
-        **slot.cell["swept"],
-        **slot.estimator["swept"],
     }
+    return {column.name: values.get(column.name) for column in row_columns(manifest)} | slot.swept
+
+
+def row_columns(manifest: Manifest) -> list[columns.Column]:
+    """The columns of a row as it is computed, before it is compared with the truth."""
+    here = {"all", "systems", "additive" if is_additive(manifest) else "", "signals" if is_of_signal(manifest) else ""}
+    return [column for column in columns.COLUMNS if column.of in here and column.source != "truth"]
 
 
 def is_additive(manifest: Manifest) -> bool:
     """Whether estimates have parameters of submodels."""
     # One system for all data cells.
-    system = next((cell["content"].get("system") for cell in manifest["data_cells"]), None)
-    return "additive" in (system or {}) or any("terms" in part["content"] for part in manifest["estimators"])
+    system = manifest["data_cells"][0]["content"].get("system") or {}
+    return "additive" in system or any("terms" in part["content"] for part in manifest["estimators"])
 
 
 def is_of_signal(manifest: Manifest) -> bool:
     """Whether the estimates are frequencies of a signal."""
-    return any("signal" in cell["content"] for cell in manifest["data_cells"])
+    return "signal" in manifest["data_cells"][0]["content"]
 
 
 def swept_names(manifest: Manifest) -> list[str]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import platform
 import sys
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ctid_cli.storage.version import Origin, package_versions
+from ctid_cli.storage.identity import Origin, numeric_platform, package_versions
 
 
 def now() -> str:
@@ -17,7 +18,7 @@ def now() -> str:
     return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def session_info(spec_text: str, spec_folder: Path, origin: Origin, jobs: int) -> dict[str, Any]:
+def session_info(spec_text: str, spec_folder: Path, origins: Mapping[str, Origin], jobs: int) -> dict[str, Any]:
     """Describe the run that is about to start."""
     return {
         "argv": sys.argv,
@@ -26,8 +27,8 @@ def session_info(spec_text: str, spec_folder: Path, origin: Origin, jobs: int) -
         "system": platform.platform(),
         "processors": os.cpu_count(),
         "jobs": jobs,
-        "code_version": origin.code_version,
-        "numeric_platform": origin.platform,
+        "code_version": {name: origin.code_version for name, origin in origins.items()},
+        "numeric_platform": numeric_platform(),
         "packages": {"python": platform.python_version(), **package_versions()},
         "git_commit": git_commit(Path(__file__).resolve().parents[2]),
         "spec_folder": str(spec_folder.resolve()),

@@ -10,46 +10,26 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import h5py
 import numpy as np
 
+from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import RefusedError, StorageError
-from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, measure_names, unpack_track
-from ctid_cli.storage.manifest import (
-    FAILURES,
-    Key,
-    Manifest,
-    assemble,
-    is_additive,
-    is_of_signal,
-    slots,
-    swept_names,
-)
-from ctid_cli.storage.summary import parameter_names
-from ctid_cli.storage.version import Origin
-
-if TYPE_CHECKING:
-    import h5py
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, unpack_track
+from ctid_cli.storage import columns
+from ctid_cli.storage.identity import Origin
+from ctid_cli.storage.manifest import Key, Manifest, assemble, row_columns, slots, swept_names
 
 #: Raised by one whenever an older ctid could misread the file.
 FORMAT = 1
 KIND = "ctid runs"
-
-_TEXTS = ("id", "estimator", "kind", "estimator_hash", "cell", "start", "status", "message")
-_NUMBERS = ("start_delay", "delay", "cost", "fit_percent", "validation_fit_percent", "condition_number")
-_UNITS = {
-    "start_delay": "s",
-    "delay": "s",
-    "cost": "output unit^2",
-    "fit_percent": "%",
-    "validation_fit_percent": "%",
-    "condition_number": "-",
-}
-#: Stands for a missing number of iterations.
-_NO_ITERATIONS = -1
+#: Stands for a missing whole number.
+_MISSING = -1
 
 
 @dataclass(frozen=True)
@@ -65,22 +45,25 @@ class SealedRuns:
 def seal_image(
     manifest: Manifest, origins: Sequence[Origin], results: Mapping[Key, dict[str, Any]]
 ) -> tuple[bytes, str, int]:
-    """The sealed file as bytes."""
-    import h5py
-
-    rows = [
-        assemble(slot, manifest, results[slot.key], None) | {"estimator_hash": slot.key.estimator_hash}
-        for slot in slots(manifest)
-        if slot.key in results
-    ]
-    tracks = {
-        slot.key.id: results[slot.key]["track"]
-        for slot in slots(manifest)
-        if results.get(slot.key, {}).get("track") is not None
-    }
+    """The sealed file as bytes, its checksum, and the number of estimates in it."""
+    stored = [slot for slot in slots(manifest) if slot.key in results]
+    rows = [assemble(slot, manifest, results[slot.key], None) for slot in stored]
     with h5py.File("runs.h5", "w", driver="core", backing_store=False) as file:
-        _write(file, manifest, sorted(origins, key=_origin_text), rows)
-        _write_tracks(file, tracks)
+        _write_plan(file, manifest, sorted(origins))
+        group = file.create_group("estimates")
+        _write(group, "estimator_hash", _encode([slot.key.estimator_hash for slot in stored]))
+        for column in row_columns(manifest):
+            # The name of the experiment is an attribute; times are not results.
+            if column.name != "experiment" and column.source != "clock":
+                _write_column(group, column, [row[column.name] for row in rows])
+        swept = group.create_group("swept")
+        for name in swept_names(manifest):
+            values = [row.get(name) for row in rows]
+            numbers = all(v is None or (isinstance(v, int | float) and not isinstance(v, bool)) for v in values)
+            _write(swept, name, _floats(values) if numbers else _encode([canonical_json(value) for value in values]))
+        for key in dict.fromkeys(slot.key for slot in stored):
+            if results[key].get("track") is not None:
+                _write_track(file.require_group("tracks").create_group(key.id), results[key]["track"])
         checksum = _content_checksum(file)
         file.attrs["checksum"] = checksum
         file.flush()
@@ -90,8 +73,8 @@ def seal_image(
 def read_sealed(path: Path) -> SealedRuns:
     """Read a sealed file and compare it with its checksum."""
     with _checked(path) as (file, checksum):
-        manifest = json.loads(_text(file["manifest"]))
-        origins = tuple(_origin(entry) for entry in json.loads(str(file.attrs["origins"])))
+        manifest = json.loads(bytes(file["manifest"][()]).decode("utf-8"))
+        origins = tuple(Origin.of(**entry) for entry in json.loads(str(file.attrs["origins"])))
         return SealedRuns(manifest, origins, _results(file["estimates"]), checksum)
 
 
@@ -110,10 +93,8 @@ def verify_sealed(path: Path) -> str:
 
 @contextmanager
 def _checked(path: Path) -> Iterator[tuple[h5py.File, str]]:
-    import h5py
-
     try:
-        with _open(path, h5py) as file:
+        with _open(path) as file:
             if file.attrs.get("format") != KIND:
                 raise StorageError(f"{path} is an HDF5 file, but not one that 'ctid run' has written")
             version = int(file.attrs["format_version"])
@@ -131,7 +112,7 @@ def _checked(path: Path) -> Iterator[tuple[h5py.File, str]]:
         raise StorageError(f"{path} cannot be read ({error})") from error
 
 
-def _open(path: Path, h5py: Any) -> h5py.File:
+def _open(path: Path) -> h5py.File:
     try:
         return h5py.File(path, "r")
     except BlockingIOError:
@@ -139,140 +120,111 @@ def _open(path: Path, h5py: Any) -> h5py.File:
         return h5py.File(path, "r", locking=False)
 
 
-def _write(file: h5py.File, manifest: Manifest, origins: Sequence[Origin], rows: Sequence[Mapping[str, Any]]) -> None:
-    spec = json.dumps(manifest["spec"], sort_keys=True, allow_nan=False, separators=(",", ":"))
-    attributes = {
-        "format": KIND,
-        "format_version": FORMAT,
-        "experiment": manifest["experiment"],
-        "spec_hash": manifest["spec_hash"],
-        "seed": "none" if manifest["seed"] is None else manifest["seed"],
-        "runs": manifest["runs"],
-        "estimates_planned": sum(1 for _ in slots(manifest)),
-        "origins": json.dumps([_origin_dict(origin) for origin in origins], sort_keys=True),
-        "code_version": " ".join(dict.fromkeys(origin.code_version for origin in origins)),
-        "platform": " | ".join(dict.fromkeys(origin.platform for origin in origins)),
-    }
-    file.attrs.update(attributes)
-    file.create_dataset("spec", data=_bytes(spec), track_times=False)
+def _write_plan(file: h5py.File, manifest: Manifest, origins: Sequence[Origin]) -> None:
+    file.attrs.update(
+        {
+            "format": KIND,
+            "format_version": FORMAT,
+            "experiment": manifest["experiment"],
+            "spec_hash": manifest["spec_hash"],
+            "seed": "none" if manifest["seed"] is None else manifest["seed"],
+            "runs": manifest["runs"],
+            "estimates_planned": sum(1 for _ in slots(manifest)),
+            "origins": json.dumps([asdict(origin) for origin in origins], sort_keys=True),
+            "code_version": " ".join(dict.fromkeys(origin.code_version for origin in origins)),
+            "platform": " | ".join(dict.fromkeys(origin.platform for origin in origins)),
+        }
+    )
     # The order of swept fields in the manifest is that of the specification, and columns follow it.
-    file.create_dataset("manifest", data=_bytes(json.dumps(manifest, allow_nan=False)), track_times=False)
-    group = file.create_group("estimates")
-    for name in _TEXTS:
-        _column(group, name, _encode([str(row[name] or "") for row in rows]))
-    _column(group, "replicate", np.array([row["replicate"] for row in rows], dtype=np.int64))
-    iterations = [_NO_ITERATIONS if row["iterations"] is None else row["iterations"] for row in rows]
-    _column(group, "iterations", np.array(iterations, dtype=np.int64)).attrs["missing"] = _NO_ITERATIONS
-    for name in _NUMBERS:
-        _column(group, name, _floats([row[name] for row in rows])).attrs["unit"] = _UNITS[name]
-    initial = [row["initial_delay"] for row in rows]
-    # "random" is no number: where the search started is in start_delay, and the label in start.
-    fixed = _column(group, "initial_delay", _floats([v if isinstance(v, int | float) else None for v in initial]))
-    fixed.attrs["unit"] = "s"
-    for name in ("numerator", "denominator"):
-        _ragged(group, name, [row[name] for row in rows])
-    _named(group, "standard_errors", "standard_error_names", [row["standard_errors"] for row in rows])
-    if is_additive(manifest):
-        found = [row["parameters"] for row in rows]
-        _named(group, "parameters", "parameter_names", found, parameter_names(found))
-    if is_of_signal(manifest):
-        measures = [row["measures"] for row in rows]
-        _named(group, "measures", "measure_names", measures, measure_names(measures))
-    swept = group.create_group("swept")
-    for name in swept_names(manifest):
-        values = [row.get(name) for row in rows]
-        if all(v is None or (isinstance(v, int | float) and not isinstance(v, bool)) for v in values):
-            _column(swept, name, _floats(values))
-        else:
-            _column(swept, name, _encode([json.dumps(value, sort_keys=True) for value in values]))
+    for name, text in (("spec", canonical_json(manifest["spec"])), ("manifest", json.dumps(manifest, allow_nan=False))):
+        # A byte array, because HDF5 strings end at their first zero byte, and attributes have a length limit.
+        file.create_dataset(name, data=np.frombuffer(text.encode("utf-8"), dtype=np.uint8), track_times=False)
 
 
-def _write_tracks(file: h5py.File, tracks: Mapping[str, Mapping[str, Any]]) -> None:
-    from ctid_cli.frequency.flags import Flag
-
-    bits = ", ".join(f"{int(flag)} {str(flag.name).lower()}" for flag in Flag)
+def _write_track(group: h5py.Group, packed: Mapping[str, Any]) -> None:
     units = {"t": "s", "omega": MEASURE_UNITS["omega"], "flags": "-", "uncertainty": "rad/s"}
-    for identifier, packed in tracks.items():
-        group = file.require_group("tracks").create_group(identifier)
-        for name, values in unpack_track(packed).items():
-            _column(group, name, values).attrs["unit"] = units[name]
-        group["flags"].attrs["bits"] = f"{bits}; an estimate without any is valid"
+    for name, values in unpack_track(packed).items():
+        _write(group, name, values).attrs["unit"] = units[name]
+    bits = ", ".join(f"{int(flag)} {str(flag.name).lower()}" for flag in Flag)
+    group["flags"].attrs["bits"] = f"{bits}; an estimate without any is valid"
 
 
-def _column(group: h5py.Group, name: str, values: np.ndarray[Any, Any]) -> h5py.Dataset:
-    if not values.size:
-        return group.create_dataset(name, data=values, track_times=False)
-    return group.create_dataset(name, data=values, track_times=False, compression="gzip", shuffle=True)
+def _write(group: h5py.Group, name: str, values: np.ndarray[Any, Any]) -> h5py.Dataset:
+    packing: dict[str, Any] = {"compression": "gzip", "shuffle": True} if values.size else {}
+    return group.create_dataset(name, data=values, track_times=False, **packing)
 
 
-def _ragged(group: h5py.Group, name: str, rows: Sequence[Sequence[float | None] | None]) -> None:
-    lengths = np.array([_NO_ITERATIONS if row is None else len(row) for row in rows], dtype=np.int64)
-    padded = np.full((len(rows), max([1, *lengths.tolist()])), np.nan)
-    for k, row in enumerate(rows):
-        if row:
-            padded[k, : len(row)] = _floats(row)
-    _column(group, name, padded).attrs["padding"] = "NaN, behind the last coefficient; descending powers"
-    _column(group, f"{name}_length", lengths)
-
-
-def _named(
-    group: h5py.Group,
-    column: str,
-    names_of: str,
-    rows: Sequence[Mapping[str, float | None] | None],
-    order: Sequence[str] = (),
-) -> None:
-    names = list(dict.fromkeys([*order, *(name for row in rows if row for name in row)]))
-    values = np.full((len(rows), len(names)), np.nan)
-    present = np.zeros((len(rows), len(names)), dtype=np.uint8)
-    for k, row in enumerate(rows):
-        for name, value in (row or {}).items():
-            place = names.index(name)
-            present[k, place] = 1
-            values[k, place] = np.nan if value is None else value
-    _column(group, column, values)
-    _column(group, f"{column}_present", present)
-    _column(group, names_of, _encode(names))
+def _write_column(group: h5py.Group, column: columns.Column, rows: Sequence[Any]) -> None:
+    name = column.name
+    match column.type:
+        case "str":
+            _write(group, name, _encode([str(row or "") for row in rows]))
+        case "int64" | "Int64":
+            written = _write(group, name, np.array([_MISSING if row is None else row for row in rows], dtype=np.int64))
+            if column.type == "Int64":
+                written.attrs["missing"] = _MISSING
+        case "coefficients":
+            lengths = np.array([_MISSING if row is None else len(row) for row in rows], dtype=np.int64)
+            padded = np.full((len(rows), max([1, *lengths.tolist()])), np.nan)
+            for k, row in enumerate(rows):
+                padded[k, : len(row or ())] = _floats(row or ())
+            _write(group, name, padded).attrs["padding"] = "NaN, behind the last coefficient; descending powers"
+            _write(group, f"{name}_length", lengths)
+        case "by name":
+            names = column.names(rows)
+            present = np.array([[part in (row or ()) for part in names] for row in rows], dtype=np.uint8)
+            values = [_floats([(row or {}).get(part) for part in names]) for row in rows]
+            shape = (len(rows), len(names))
+            _write(group, name, np.array(values, dtype=np.float64).reshape(shape))
+            _write(group, f"{name}_present", present.reshape(shape))
+            _write(group, f"{name.removesuffix('s')}_names", _encode(names))
+        case _:
+            # "random" is no number: where the search started is in start_delay, and the label in start.
+            numbers = [row if isinstance(row, int | float) else None for row in rows]
+            written = _write(group, name, _floats(numbers))
+            if column.unit:
+                written.attrs["unit"] = column.unit
 
 
 def _results(group: h5py.Group) -> dict[Key, dict[str, Any]]:
-    texts = {name: _decode(group[name][()]) for name in ("cell", "estimator_hash", "start", "status", "message")}
-    numbers = {name: group[name][()].tolist() for name in (*_NUMBERS, "replicate", "iterations")}
-    coefficients = {name: group[name][()].tolist() for name in ("numerator", "denominator")}
-    lengths = {name: group[f"{name}_length"][()].tolist() for name in ("numerator", "denominator")}
-    errors = _read_named(group, "standard_errors", "standard_error_names")
-    parameters = _read_named(group, "parameters", "parameter_names") if "parameters" in group else []
-    measures = _read_named(group, "measures", "measure_names") if "measures" in group else []
-    results = {}
-    for k in range(len(texts["cell"])):
-        key = Key(texts["cell"][k], numbers["replicate"][k], texts["estimator_hash"][k], texts["start"][k])
-        failed = texts["status"][k] in FAILURES
-        result: dict[str, Any] = {name: _none(numbers[name][k]) for name in _NUMBERS}
-        result |= {"status": texts["status"][k], "message": texts["message"][k]}
-        result["iterations"] = None if numbers["iterations"][k] == _NO_ITERATIONS else numbers["iterations"][k]
-        for name, rows in coefficients.items():
-            length = lengths[name][k]
-            result[name] = None if length == _NO_ITERATIONS else [_none(value) for value in rows[k][:length]]
-        result["standard_errors"] = None if failed else errors[k]
-        result["parameters"] = (parameters[k] or None) if parameters else None
-        if measures:
-            result["measures"] = measures[k] or None
-        results[key] = result
-    return results
+    keys = (_decode(group["cell"]), group["replicate"][()].tolist(), _decode(group["estimator_hash"]))
+    found: list[dict[str, Any]] = [columns.no_result() for _ in keys[0]]
+    for column in columns.COLUMNS:
+        # A column that is younger than the file is missing.
+        if column.source == "result" and column.name in group:
+            for result, value in zip(found, _read_column(group, column), strict=True):
+                result[column.name] = value
+    for result in found:
+        # An estimate with a model has a table of errors, if an empty one.
+        if result["denominator"] is not None:
+            result["standard_errors"] = result["standard_errors"] or {}
+    return dict(zip(map(Key, *keys, _decode(group["start"])), found, strict=True))
 
 
-def _read_named(group: h5py.Group, column: str, names_of: str) -> list[dict[str, float | None]]:
-    names = _decode(group[names_of][()])
-    values, present = group[column][()].tolist(), group[f"{column}_present"][()].tolist()
-    return [
-        {name: _none(value) for name, value, there in zip(names, row, mask, strict=True) if there}
-        for row, mask in zip(values, present, strict=True)
-    ]
+def _read_column(group: h5py.Group, column: columns.Column) -> list[Any]:
+    name = column.name
+    if column.type == "str":
+        return _decode(group[name])
+    values = group[name][()].tolist()
+    match column.type:
+        case "int64" | "Int64":
+            return [None if value == _MISSING else value for value in values]
+        case "coefficients":
+            lengths = group[f"{name}_length"][()].tolist()
+            return [
+                None if length == _MISSING else [_none(value) for value in row[:length]]
+                for row, length in zip(values, lengths, strict=True)
+            ]
+        case "by name":
+            names = _decode(group[f"{name.removesuffix('s')}_names"])
+            return [
+                {part: _none(value) for part, value, there in zip(names, row, mask, strict=True) if there} or None
+                for row, mask in zip(values, group[f"{name}_present"][()].tolist(), strict=True)
+            ]
+    return [_none(value) for value in values]
 
 
 def _content_checksum(file: h5py.File) -> str:
-    import h5py
-
     digest = hashlib.sha256()
 
     def include(text: str, data: bytes = b"") -> None:
@@ -293,44 +245,18 @@ def _content_checksum(file: h5py.File) -> str:
     return digest.hexdigest()
 
 
-def _bytes(text: str) -> np.ndarray[Any, Any]:
-    # A byte array, because HDF5 strings end at their first zero byte, and attributes have a length limit.
-    return np.frombuffer(text.encode("utf-8"), dtype=np.uint8)
-
-
-def _text(dataset: Any) -> str:
-    return bytes(dataset[()].tobytes()).decode("utf-8")
-
-
 def _encode(texts: Sequence[str]) -> np.ndarray[Any, Any]:
-    import h5py
-
     encoded = [text.encode("utf-8") for text in texts]
-    kind = h5py.string_dtype("utf-8", max([1, *map(len, encoded)]))
-    return np.array(encoded, dtype=kind)
+    return np.array(encoded, dtype=h5py.string_dtype("utf-8", max([1, *map(len, encoded)])))
 
 
-def _decode(values: np.ndarray[Any, Any]) -> list[str]:
-    return [value.decode("utf-8") for value in values.tolist()]
+def _decode(dataset: h5py.Dataset) -> list[str]:
+    return [value.decode("utf-8") for value in dataset[()].tolist()]
 
 
 def _floats(values: Sequence[Any]) -> np.ndarray[Any, Any]:
-    return np.array([np.nan if value is None else float(value) for value in values], dtype=np.float64)
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
 
 
 def _none(value: float) -> float | None:
     return None if value != value else value
-
-
-def _origin_dict(origin: Origin) -> dict[str, Any]:
-    packages = [list(pair) for pair in origin.packages]
-    return {"code_version": origin.code_version, "platform": origin.platform, "packages": packages}
-
-
-def _origin(entry: Mapping[str, Any]) -> Origin:
-    packages = tuple((name, version) for name, version in entry["packages"])
-    return Origin(entry["code_version"], entry["platform"], packages)
-
-
-def _origin_text(origin: Origin) -> str:
-    return json.dumps(_origin_dict(origin), sort_keys=True)

@@ -4,67 +4,35 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.errors import StorageError, UsageError
-from ctid_cli.storage import journal
-from ctid_cli.storage.folder import (
-    SEALED,
-    TIMINGS,
-    InUseError,
-    experiment_folders,
-    lock,
-    no_results,
-    reading_journal,
-    require_experiment,
-    who_runs,
-    write_safely,
-)
+from ctid_cli.storage import columns, journal
+from ctid_cli.storage import folder as place
+from ctid_cli.storage.folder import SEALED, TIMINGS, InUseError
+from ctid_cli.storage.identity import Origin, are_mixed, gathered
 from ctid_cli.storage.manifest import (
-    FAILURES,
     Key,
     Manifest,
     Slot,
     assemble,
-    is_additive,
     is_of_signal,
+    row_columns,
     slots,
     swept_names,
     true_delay,
     true_parameters,
 )
 from ctid_cli.storage.summary import is_converged
-from ctid_cli.storage.version import Origin
 
 if TYPE_CHECKING:
     import pandas as pd
-
-_TEXT_COLUMNS = ("id", "experiment", "estimator", "kind", "cell", "start", "status", "message")
-_FLOAT_COLUMNS = (
-    "start_delay",
-    "delay",
-    "cost",
-    "fit_percent",
-    "validation_fit_percent",
-    "condition_number",
-    "seconds",
-    "true_delay",
-)
-_COLUMNS = (
-    *("id", "experiment", "estimator", "kind", "cell", "replicate", "start", "initial_delay", "start_delay", "status"),
-    *("message", "delay", "numerator", "denominator", "parameters", "standard_errors", "cost", "fit_percent"),
-    *("validation_fit_percent", "iterations", "condition_number", "seconds"),
-)
-
-
-#: Columns of an experiment on a signal.
-_SIGNAL_COLUMNS = (
-    *("id", "experiment", "estimator", "kind", "cell", "replicate", "status", "message", "measures", "seconds"),
-)
 
 
 @dataclass(frozen=True)
@@ -76,6 +44,11 @@ class Stored:
     results: Mapping[Key, dict[str, Any]]
     #: Time that each took [s], by key.
     seconds: Mapping[Key, float | None]
+
+    @property
+    def mixed(self) -> bool:
+        """Whether several versions of the code, or platforms, computed what is compared here."""
+        return are_mixed(self.origins)
 
     def slots(self) -> list[Slot]:
         """Places of the stored estimates, in the order of the sealed file."""
@@ -111,28 +84,34 @@ class FoundEstimate:
 
 
 @dataclass(frozen=True)
-class GroupStatus:
+class Progress:
+    """How many estimates are asked for, are stored, and are stored as failures."""
+
+    planned: int
+    done: int
+    failed: int
+
+    @property
+    def todo(self) -> int:
+        """Estimates that are still to be computed."""
+        return self.planned - self.done
+
+
+@dataclass(frozen=True)
+class GroupStatus(Progress):
     """Progress of one estimator on one data cell."""
 
     estimator: str
     cell: str
     swept: dict[str, Any]
-    planned: int
-    done: int
-    todo: int
-    failed: int
 
 
 @dataclass(frozen=True)
-class ExperimentStatus:
+class ExperimentStatus(Progress):
     """Progress of an experiment."""
 
     experiment: str
     folder: Path
-    planned: int
-    done: int
-    todo: int
-    failed: int
     left_aside: int | None
     mixed: bool
     running: dict[str, Any] | None
@@ -146,19 +125,17 @@ def seal(folder: Path, log: journal.Journal) -> tuple[int, str]:
     """
     from ctid_cli.storage.sealed import seal_image, verify_sealed
 
-    manifest, entries, origins = log.manifest(), log.entries(), log.origins()
-    planned = list(dict.fromkeys(slot.key for slot in slots(manifest) if slot.key in entries))
-    used = {entries[key].origin for key in planned}
-    results = {key: entries[key].result for key in planned}
-    image, checksum, count = seal_image(manifest, [origins[number] for number in sorted(used)], results)
+    manifest, entries = log.manifest(), log.entries()
+    stored = _planned(manifest, entries)
+    image, checksum, count = seal_image(manifest, stored.origins, stored.results)
     times = io.StringIO()
     table = csv.writer(times, lineterminator="\n")
     table.writerow(("id", "seconds", "session"))
-    table.writerows((key.id, entries[key].seconds, entries[key].session) for key in planned)
+    table.writerows((key.id, entries[key].seconds, entries[key].session) for key in stored.results)
     target = folder / SEALED
     try:
-        write_safely(folder / TIMINGS, times.getvalue().encode())
-        write_safely(target, image)
+        place.write_safely(folder / TIMINGS, times.getvalue().encode())
+        place.write_safely(target, image)
     except OSError as error:
         reason = error.strerror or error
         raise StorageError(
@@ -173,26 +150,40 @@ def seal(folder: Path, log: journal.Journal) -> tuple[int, str]:
 
 def read_stored(folder: Path) -> Stored:
     """The estimates of the latest plan of an experiment."""
-    require_experiment(folder)
-    try:
-        with lock(folder, shared=True, patience=0.2), reading_journal(folder) as log:
-            if log is not None and (log.sealed() is None or not (folder / SEALED).exists()):
-                entries, origins = log.entries(), log.origins()
-                manifest = log.manifest()
-                used = {entries[slot.key].origin for slot in slots(manifest) if slot.key in entries}
-                return Stored(
-                    manifest,
-                    tuple(origins[number] for number in sorted(used)),
-                    {key: entry.result for key, entry in entries.items()},
-                    {key: entry.seconds for key, entry in entries.items()},
-                )
-    except InUseError:
-        if not (folder / SEALED).exists():
-            raise
-    if not (folder / SEALED).exists():
-        # The run was killed before it had planned anything.
-        raise no_results(folder)
+    with _reading(folder) as log:
+        if log is not None and (log.sealed() is None or not (folder / SEALED).exists()):
+            return _planned(log.manifest(), log.entries())
     return _read_sealed(folder)
+
+
+@contextmanager
+def _reading(folder: Path) -> Iterator[journal.Journal | None]:
+    """The journal of an experiment; None where there is only the sealed file to read, for instance during a run."""
+    place.require_experiment(folder)
+    sealed = (folder / SEALED).exists()
+    with ExitStack() as stack:
+        log = None
+        try:
+            stack.enter_context(place.lock(folder, shared=True, patience=0.2))
+            log = stack.enter_context(place.reading_journal(folder))
+        except InUseError:
+            if not sealed:
+                raise
+        if log is None and not sealed:
+            # The run was killed before it had planned anything.
+            raise place.no_results(folder)
+        yield log
+
+
+def _planned(manifest: Manifest, entries: Mapping[Key, journal.Entry]) -> Stored:
+    """What a plan asks for, out of all that a journal holds."""
+    planned = {slot.key: entries[slot.key] for slot in slots(manifest) if slot.key in entries}
+    return Stored(
+        manifest,
+        gathered((key.estimator_hash, entry.origin) for key, entry in planned.items()),
+        {key: entry.result for key, entry in planned.items()},
+        {key: entry.seconds for key, entry in planned.items()},
+    )
 
 
 def read_tracks(folder: Path) -> dict[str, dict[str, Any]]:
@@ -236,40 +227,26 @@ def load_estimates(folder: Path) -> pd.DataFrame:
 
     stored = read_stored(folder)
     rows = stored.rows()
-    frame = pd.DataFrame(index=pd.RangeIndex(len(rows)))
-    own = [name for name in _COLUMNS if name != "parameters" or is_additive(stored.manifest)]
-    last = ["converged", "true_delay"]
-    if is_of_signal(stored.manifest):
-        own, last = list(_SIGNAL_COLUMNS), ["converged"]
-    for name in (*own, *swept_names(stored.manifest), *last):
-        frame[name] = _column(name, [row.get(name) for row in rows])
-    frame.attrs["mixed"] = len(stored.origins) > 1
+    # Where there is no system, the columns of one would be empty.
+    left_out = "systems" if is_of_signal(stored.manifest) else ""
+    own = [column.name for column in row_columns(stored.manifest) if column.of != left_out]
+    compared = [column.name for column in columns.COLUMNS if column.source == "truth" and column.of != left_out]
+    types = {column.name: column.dtype for column in columns.COLUMNS}
+    frame = pd.DataFrame(
+        {
+            name: pd.Series([row.get(name) for row in rows], dtype=types.get(name))
+            for name in (*own, *swept_names(stored.manifest), *compared)
+        }
+    )
+    frame.attrs["mixed"] = stored.mixed
     return frame
-
-
-def _column(name: str, values: list[Any]) -> pd.Series[Any]:
-    import pandas as pd
-
-    if name == "converged":
-        return pd.Series(values, dtype="boolean")
-    if name == "replicate":
-        return pd.Series(values, dtype="int64")
-    if name == "iterations":
-        return pd.Series(values, dtype="Int64")
-    if name in _FLOAT_COLUMNS:
-        return pd.Series(values, dtype="float64")
-    if name in _TEXT_COLUMNS:
-        return pd.Series(values, dtype="str")
-    if name in _COLUMNS or name == "measures":
-        return pd.Series(values, dtype="object")
-    return pd.Series(values)
 
 
 def find_estimate(results: Path, prefix: str) -> FoundEstimate:
     """Find one estimate among all experiments."""
     matches: dict[str, FoundEstimate] = {}
     in_use = ""
-    for folder in experiment_folders(results):
+    for folder in place.experiment_folders(results):
         try:
             stored = read_stored(folder)
         except InUseError as error:
@@ -297,33 +274,31 @@ def find_estimate(results: Path, prefix: str) -> FoundEstimate:
 
 def spec_folder(folder: Path) -> Path | None:
     """Folder of the specification that an experiment was last run with."""
-    with lock(folder, shared=True), reading_journal(folder) as log:
+    with place.lock(folder, shared=True), place.reading_journal(folder) as log:
         sessions = [] if log is None else log.sessions()
     return Path(sessions[-1]["spec_folder"]) if sessions else None
 
 
 def experiment_status(folder: Path) -> ExperimentStatus:
     """Count what is done and what is missing."""
-    require_experiment(folder)
-    left_aside: int | None = None
-    running: dict[str, Any] | None = None
     try:
-        with lock(folder, shared=True, patience=0.2), reading_journal(folder) as log:
+        with _reading(folder) as log:
             if log is not None:
                 statuses, manifest = log.statuses(), log.manifest()
-                planned = {slot.key for slot in slots(manifest)}
-                left_aside = len(statuses.keys() - planned)
-                return _status(folder, manifest, statuses, left_aside, len(log.origins()) > 1, None)
+                left_aside = len(statuses.keys() - {slot.key for slot in slots(manifest)})
+                return _status(folder, manifest, statuses, left_aside, are_mixed(log.origins()), None)
     except InUseError:
-        running = who_runs(folder) or {"pid": None, "host": None}
-        if not (folder / SEALED).exists():
-            name = str(running.get("experiment") or folder.name)
-            return ExperimentStatus(name, folder, 0, 0, 0, 0, None, False, running, ())
-    if not (folder / SEALED).exists():
-        raise no_results(folder)
+        # The first run has nothing to read yet.
+        running = place.who_runs(folder) or _SOMEONE
+        name = str(running.get("experiment") or folder.name)
+        return ExperimentStatus(0, 0, 0, name, folder, None, False, running, ())
     stored = _read_sealed(folder)
     statuses = {key: str(result["status"]) for key, result in stored.results.items()}
-    return _status(folder, stored.manifest, statuses, left_aside, len(stored.origins) > 1, running)
+    in_use = place.who_runs(folder) or _SOMEONE if (folder / journal.FILE_NAME).exists() else None
+    return _status(folder, stored.manifest, statuses, None, stored.mixed, in_use)
+
+
+_SOMEONE = {"pid": None, "host": None}
 
 
 def _status(
@@ -334,22 +309,15 @@ def _status(
     mixed: bool,
     running: dict[str, Any] | None,
 ) -> ExperimentStatus:
-    counts: dict[tuple[str, str, str], list[int]] = {}
-    swept: dict[tuple[str, str, str], dict[str, Any]] = {}
-    for slot in slots(manifest):
-        group = (slot.estimator["name"], slot.key.estimator_hash, slot.key.data_hash)
-        swept.setdefault(group, {**slot.cell["swept"], **slot.estimator["swept"]})
-        count = counts.setdefault(group, [0, 0, 0])
-        status = statuses.get(slot.key)
-        count[0] += 1
-        count[1] += status is not None
-        count[2] += status in FAILURES
-    groups = tuple(
-        GroupStatus(name, cell, swept[name, estimator, cell], planned, done, planned - done, failed)
-        for (name, estimator, cell), (planned, done, failed) in counts.items()
-    )
-    planned, done = sum(group.planned for group in groups), sum(group.done for group in groups)
-    failed = sum(group.failed for group in groups)
+    groups = []
+    for (name, _, cell), members in groupby(
+        slots(manifest), lambda slot: (slot.estimator["name"], slot.key.estimator_hash, slot.key.data_hash)
+    ):
+        wanted = list(members)
+        found = [statuses[slot.key] for slot in wanted if slot.key in statuses]
+        failed = sum(status in columns.FAILURES for status in found)
+        groups.append(GroupStatus(len(wanted), len(found), failed, name, cell, wanted[0].swept))
+    planned, done, failed = (sum(getattr(group, name) for group in groups) for name in ("planned", "done", "failed"))
     return ExperimentStatus(
-        manifest["experiment"], folder, planned, done, planned - done, failed, left_aside, mixed, running, groups
+        planned, done, failed, manifest["experiment"], folder, left_aside, mixed, running, tuple(groups)
     )

@@ -16,12 +16,11 @@ counts in every percentage. Without ``success``, or without true values to compa
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ctid_cli.inference.quantile import normal_quantile
-from ctid_cli.simulation.frequency_measures import is_settled, measure_names
-from ctid_cli.storage.manifest import FAILURES
+from ctid_cli.simulation.frequency_measures import is_settled
+from ctid_cli.storage import columns
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -47,7 +46,7 @@ def is_converged(
         conditions.append(row["fit_percent"] is not None and row["fit_percent"] >= rule["fit_percent"])
     if not conditions:
         return None
-    return row["status"] not in FAILURES and all(conditions)
+    return row["status"] not in columns.FAILURES and all(conditions)
 
 
 def _near(value: float | None, true: float, tolerance: float) -> bool:
@@ -65,6 +64,9 @@ def wilson_interval(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
         raise ValueError(f"successes must lie between 0 and the number of trials; got {k} of {n}")
     if n == 0:
         return math.nan, math.nan
+    # SciPy is slow to load, and most who read results need no interval.
+    from ctid_cli.inference.quantile import normal_quantile
+
     z = normal_quantile(level)
     p = k / n
     centre = p + z**2 / (2 * n)
@@ -80,81 +82,38 @@ def summarise(estimates: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """Count estimates in groups."""
     import pandas as pd
 
-    groups: dict[tuple[Any, ...], list[int]] = {}
-    columns = [estimates[name].astype(object).where(estimates[name].notna(), None).tolist() for name in by]
-    for position in range(len(estimates)):
-        groups.setdefault(tuple(column[position] for column in columns), []).append(position)
+    keys = estimates[list(by)].astype(object).where(estimates[list(by)].notna(), None)
+    # Without anything to group by, all rows are one group.
+    numbers = keys.groupby(list(by) or (lambda _: 0), sort=False, dropna=False).ngroup().to_numpy()
     rows = []
-    for values, positions in groups.items():
-        group = estimates.iloc[positions]
-        n = len(group)
-        row: dict[str, Any] = dict(zip(by, values, strict=True)) | {"n": n}
-        row["failed"] = int(group["status"].isin(FAILURES).sum())
-        judged = bool(group["converged"].notna().all())
-        converged = int(group["converged"].sum()) if judged else None
-        low, high = wilson_interval(converged, n) if converged is not None else (math.nan, math.nan)
-        row |= {"converged": converged, "percent": math.nan if converged is None else 100 * converged / n}
-        row |= {"low": 100 * low, "high": 100 * high, "median_seconds": float(group["seconds"].median())}
+    for number, group in estimates.groupby(numbers):
+        n, row = len(group), keys.iloc[int((numbers == number).argmax())].to_dict()
+        row |= {"n": n, "failed": int(group["status"].isin(columns.FAILURES).sum())}
+        row["median_seconds"] = float(group["seconds"].median())
+        if group["converged"].notna().all():
+            k = int(group["converged"].sum())
+            low, high = wilson_interval(k, n)
+            row |= {"converged": k, "percent": 100 * k / n, "low": 100 * low, "high": 100 * high}
         rows.append(row)
-    names = [*by, "n", "failed", "converged", "percent", "low", "high", "median_seconds"]
-    return pd.DataFrame({name: pd.Series([row[name] for row in rows], dtype=_dtype(name, by)) for name in names})
-
-
-def _dtype(name: str, by: Sequence[str]) -> Any:
-    if name in by:
-        return "object"
-    return {"n": "int64", "failed": "int64", "converged": "Int64"}.get(name, "float64")
+    types = dict.fromkeys(by, "object") | columns.COUNTS
+    return pd.DataFrame({name: pd.Series([row.get(name) for row in rows], dtype=kind) for name, kind in types.items()})
 
 
 def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:
-    """Estimates as a flat table for other programs."""
+    """Estimates as a flat table for other programs, with one number per cell."""
     import pandas as pd
 
-    if "measures" in estimates:
-        return _flat_measures(estimates)
-    numerators, denominators = estimates["numerator"].tolist(), estimates["denominator"].tolist()
-    errors = estimates["standard_errors"].tolist()
-    flat: dict[str, list[Any]] = {}
-    for k in range(max((len(row) for row in numerators if row), default=0)):
-        flat[f"b{k}"] = [row[k] if row and k < len(row) else None for row in numerators]
-    for k in range(1, max((len(row) for row in denominators if row), default=0)):
-        flat[f"a{k}"] = [row[k] if row and k < len(row) else None for row in denominators]
-    parameters = estimates["parameters"].tolist() if "parameters" in estimates else []
-    for name in parameter_names(parameters):
-        flat[name] = [row.get(name) if row else None for row in parameters]
-    present = {name for row in errors if row for name in row}
-    order = [name for name in (*flat, "delay") if name in present]
-    for name in (*order, *sorted(present.difference(order))):
-        flat[f"se_{name}"] = [row.get(name) if row else None for row in errors]
-    columns: dict[str, Any] = {}
+    parts = {column.name: column for column in columns.COLUMNS if column.type in ("coefficients", "by name")}
+    flat: dict[str, Any] = {}
     for name in estimates.columns:
-        if name == "numerator":
-            columns |= {key: pd.Series(values, dtype="float64", index=estimates.index) for key, values in flat.items()}
-        elif name not in ("denominator", "parameters", "standard_errors"):
-            columns[name] = estimates[name]
-    return pd.DataFrame(columns)
-
-
-def _flat_measures(estimates: pd.DataFrame) -> pd.DataFrame:
-    import pandas as pd
-
-    rows = estimates["measures"].tolist()
-    columns: dict[str, Any] = {}
-    for name in estimates.columns:
-        if name != "measures":
-            columns[name] = estimates[name]
+        if name not in parts:
+            flat[name] = estimates[name]
             continue
-        for measure in measure_names(rows):
-            values = [(row or {}).get(measure) for row in rows]
-            columns[measure] = pd.Series(values, dtype="float64", index=estimates.index)
-    return pd.DataFrame(columns)
-
-
-def parameter_names(rows: Iterable[Mapping[str, float | None] | None]) -> list[str]:
-    """Names of the parameters of submodels that any estimate has."""
-
-    def place(name: str) -> tuple[int, str, int]:
-        submodel, coefficient = name.split("_")
-        return int(submodel[1:]), coefficient[0], int(coefficient[1:])
-
-    return sorted({name for row in rows if row for name in row}, key=place)
+        # As mappings, coefficients are numbered from 0; the first one of a denominator is 1 and left out.
+        rows: list[Any] = [dict(enumerate(row)) if isinstance(row, list) else row or {} for row in estimates[name]]
+        found: list[Any] = parts[name].names(rows) if parts[name].type == "by name" else []
+        found = found or sorted({k for row in rows for k in row if k or name != "denominator"})
+        for part in found:
+            values = [row.get(part) for row in rows]
+            flat[f"{parts[name].prefix}{part}"] = pd.Series(values, dtype="float64", index=estimates.index)
+    return pd.DataFrame(flat)

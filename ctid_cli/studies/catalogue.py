@@ -16,7 +16,8 @@ import yaml
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.results import Results, find_results
 from ctid_cli.reporting.study import data_folder
-from ctid_cli.running.plan import Plan, build_plan
+from ctid_cli.running.cells import Plan
+from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 
 #: Name under which modules of studies are imported, whatever the working directory holds.

@@ -14,7 +14,7 @@ from ctid_cli.errors import RefusedError, UsageError
 from ctid_cli.reporting.layout import csv_text
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.storage.folder import PROVENANCE
-from ctid_cli.storage.version import Origin, current_origin
+from ctid_cli.storage.identity import present_versions
 from ctid_cli.studies.catalogue import StudyFolder, StudyResults, last_part
 from ctid_cli.studies.claim import COLUMNS, Claim, claims_table
 from ctid_cli.studies.drawing import StudyFigure
@@ -63,21 +63,19 @@ def commit_of(found: StudyResults) -> str:
     changed = _git(root, "status", "--porcelain", "--", ".", ":(exclude)results/published")
     if changed:
         raise RefusedError(f"nothing is published from files that are not committed:\n{changed}")
+    present = present_versions()
     for results in found.experiments.values():
         if results.mixed:
             raise RefusedError(f"{results.experiment} mixes results of different code versions or processors")
-        if not all(map(_is_current, results.stored.origins)):
+        if not {origin.code_version for origin in results.stored.origins} <= present:
             raise RefusedError(
                 f"{results.experiment} was not computed by the code that is checked out, so that no commit can be "
                 "named for it; check out the commit that computed it, or run it again with --fresh"
             )
-    if len({origin for results in found.experiments.values() for origin in results.stored.origins}) > 1:
+    origins = [origin for results in found.experiments.values() for origin in results.stored.origins]
+    if len({(origin.platform, origin.packages) for origin in origins}) > 1:
         raise RefusedError(f"the experiments of {found.study.name} were computed on different platforms")
     return _git(root, "rev-parse", "HEAD")
-
-
-def _is_current(origin: Origin) -> bool:
-    return origin.code_version == current_origin().code_version
 
 
 def _git(root: Path, *arguments: str) -> str:

@@ -3,9 +3,9 @@
 import pytest
 
 from ctid_cli.reporting.results import Results
+from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import Key
 from ctid_cli.storage.store import Stored
-from ctid_cli.storage.version import Origin
 
 
 def make_estimate(delay, status="CONVERGED", numerator=(8.0,), denominator=(1.0, 2.8, 4.0), **more):

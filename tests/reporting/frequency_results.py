@@ -1,8 +1,8 @@
 """Results of studies computed in this process."""
 
-from ctid_cli.running.worker import Job, run_job
+from ctid_cli.running.job import Job, run_job
+from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.sealed import seal_image
-from ctid_cli.storage.version import Origin
 from ctid_cli.studies.catalogue import find_study
 
 STUDY = find_study("finite-time-frequency")

@@ -6,9 +6,9 @@ from ctid_cli.reporting.expected_accuracy import long_record_variances
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
+from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import Key, true_parameters
 from ctid_cli.storage.store import Stored
-from ctid_cli.storage.version import Origin
 
 #: Two modes, two numbers of samples, and an estimator of each form.
 TWO_MODES = """\

@@ -7,11 +7,11 @@ from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.table_blocks import success_sentence
 from ctid_cli.reporting.tables import experiment_report
 from ctid_cli.running.plan import build_plan
-from ctid_cli.running.worker import failed
 from ctid_cli.specification.load import load_spec
+from ctid_cli.storage.columns import failed
+from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import slots
 from ctid_cli.storage.store import Stored
-from ctid_cli.storage.version import Origin
 
 SPEC = """\
 experiment: made

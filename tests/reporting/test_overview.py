@@ -10,12 +10,11 @@ def progress(**changes):
         "folder": Path("results/e"),
         "planned": 30,
         "done": 12,
-        "todo": 18,
         "failed": 11,
         "left_aside": 5,
         "mixed": True,
         "running": None,
-        "groups": (GroupStatus("existing", "c", {"snr_db": 5.0}, 30, 12, 18, 11),),
+        "groups": (GroupStatus(30, 12, 11, "existing", "c", {"snr_db": 5.0}),),
     }
     return ExperimentStatus(**(values | changes))
 

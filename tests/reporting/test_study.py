@@ -10,7 +10,7 @@ from ctid_cli.reporting.percentages import pooled_rows, study_rows
 from ctid_cli.reporting.study import load_study
 from ctid_cli.reporting.table_blocks import study_blocks
 from ctid_cli.reporting.tables import build_tables
-from ctid_cli.storage.version import code_version
+from ctid_cli.storage.identity import present_versions
 
 RANDOM = "uniform(0, 9)"
 
@@ -83,7 +83,7 @@ def test_in_a_fresh_clone_the_committed_tables_stand_in(tmp_path):
 
 
 def test_results_of_earlier_code_are_called_so(tmp_path):
-    tables, current = tmp_path / "tables.csv", {"code_version": code_version()}
+    tables, current = tmp_path / "tables.csv", {"code_version": dict.fromkeys("ab", min(present_versions()))}
     environment = tmp_path / "environment.json"
     assert made_by(tables) == ""
     environment.write_text(json.dumps({"case1": [current]}), encoding="utf-8")

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.errors import DataError
-from ctid_cli.running.plan import Plan
+from ctid_cli.running.cells import Plan
+from ctid_cli.simulation.dataset import DataSet
 from ctid_cli.storage.manifest import Key
 
 
@@ -60,11 +61,18 @@ class FakeData:
     validation: None = None
     true_model: None = None
 
+    result_of = DataSet.result_of
+    _validation_fit_percent = DataSet._validation_fit_percent
+
 
 @dataclass(frozen=True)
 class FakeCell:
     content: dict[str, Any]
     swept: dict[str, Any]
+
+    @property
+    def source(self) -> FakeCell:
+        return self
 
     @cached_property
     def hash(self) -> str:

@@ -20,11 +20,13 @@ import pytest
 
 from ctid_cli.errors import DataError, RefusedError, StorageError
 from ctid_cli.running import engine, events
-from ctid_cli.running.engine import RunSummary, preview, run_experiment
+from ctid_cli.running.engine import RunSummary, current_origins, preview, run_experiment
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import folder, journal
-from ctid_cli.storage.manifest import RESULT_FIELDS, Key, slots
+from ctid_cli.storage.columns import no_result
+from ctid_cli.storage.identity import Origin
+from ctid_cli.storage.manifest import Key, slots
 from ctid_cli.storage.store import experiment_status, load_estimates
 from tests.running import run_toys
 from tests.running.fakes import FakePlan, Toy
@@ -133,7 +135,7 @@ def test_events_tell_the_story_in_order(tmp_path: Path) -> None:
     assert [event.done for event in done] == [1, 2, 3, 4, 5, 6]
     assert {event.total for event in done} == {6}
     row = done[0].rows[0]
-    results = set(RESULT_FIELDS) - {"parameters"}
+    results = set(no_result()) - {"parameters"}
     assert {"id", "experiment", "estimator", "cell", "replicate", "start", "seconds", "level"} | results <= set(row)
     assert "parameters" not in row, "only experiments with submodels have them"
 
@@ -342,8 +344,10 @@ def test_running_jobs_are_abandoned_when_they_take_long(tmp_path: Path) -> None:
 
 
 def change_origin(monkeypatch: pytest.MonkeyPatch, **changes: str) -> None:
-    other = dataclasses.replace(engine.current_origin(), **changes)  # type: ignore[arg-type]
-    monkeypatch.setattr(engine, "current_origin", lambda: other)
+    def other(plan: Any) -> dict[str, Origin]:
+        return {name: dataclasses.replace(origin, **changes) for name, origin in current_origins(plan).items()}  # type: ignore[arg-type]
+
+    monkeypatch.setattr(engine, "current_origins", other)
 
 
 def newer_format(place: Path) -> None:

@@ -15,8 +15,8 @@ from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.running.engine import run_experiment
+from ctid_cli.running.job import Job, run_job
 from ctid_cli.running.plan import build_plan
-from ctid_cli.running.worker import Job, run_job
 from ctid_cli.signals.sinusoids import Piece, SumOfSinusoids, Tone
 from ctid_cli.simulation.frequency_measures import (
     Measuring,

@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 
 from ctid_cli.errors import RefusedError, StorageError
+from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.journal import Journal, open_journal, read_journal
 from ctid_cli.storage.manifest import Key, Outcome
-from ctid_cli.storage.version import Origin
 
 ORIGIN = Origin("c0de", "a platform", (("python", "3.11.7"), ("numpy", "2.4")))
+ORIGINS = {"estimator": ORIGIN}
 MANIFEST = {"experiment": "toys", "data_cells": [], "estimators": [], "starts": {}}
 
 
@@ -21,7 +22,7 @@ def outcome(replicate: int, delay: float = 8.0) -> Outcome:
 
 def filled(path: Path, count: int = 3) -> Journal:
     log = open_journal(path)
-    session = log.begin(MANIFEST, ORIGIN, "2026-11-21T04:00:00Z", {"host": "here"})
+    session = log.begin(MANIFEST, ORIGINS, "2026-11-21T04:00:00Z", {"host": "here"})
     log.add([outcome(k, 8.0 + k / 3) for k in range(count)], session)
     return log
 
@@ -39,7 +40,8 @@ def test_what_was_added_is_read_back_exactly(tmp_path: Path) -> None:
         assert read is not None
         assert read.experiment() == "toys"
         assert read.manifest() == MANIFEST
-        assert read.origins() == {1: ORIGIN}
+        assert read.origins() == (ORIGIN,)
+        assert read.origins()[0].estimators == ("estimator",)
         entries = read.entries()
         assert {key.replicate: entry.result["delay"] for key, entry in entries.items()} == {
             0: 8.0,
@@ -97,12 +99,12 @@ def test_the_seal_is_broken_by_new_estimates_and_by_a_new_plan(tmp_path: Path) -
     log = filled(tmp_path / "journal.sqlite")
     log.mark_sealed("abc")
     assert log.sealed() == "abc"
-    log.begin(MANIFEST, ORIGIN, "later", {})
+    log.begin(MANIFEST, ORIGINS, "later", {})
     assert log.sealed() == "abc"
     log.add([outcome(7)], 2)
     assert log.sealed() is None
     log.mark_sealed("def")
-    log.begin({**MANIFEST, "starts": {"3": 3.0}}, ORIGIN, "later", {})
+    log.begin({**MANIFEST, "starts": {"3": 3.0}}, ORIGINS, "later", {})
     assert log.sealed() is None
     log.close()
 
@@ -163,9 +165,9 @@ def test_another_programs_database_is_refused(tmp_path: Path) -> None:
 def test_a_newer_format_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "journal.sqlite"
     log = filled(path)
-    log._connection.execute("PRAGMA user_version=2")
+    log._connection.execute("PRAGMA user_version=3")
     log.close()
-    with pytest.raises(RefusedError, match="format 2; this ctid reads formats up to 1"), read_journal(path):
+    with pytest.raises(RefusedError, match="format 3; this ctid reads formats up to 2"), read_journal(path):
         pass
 
 

@@ -10,18 +10,19 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import RefusedError, StorageError, UsageError
-from ctid_cli.running.engine import run_experiment
-from ctid_cli.running.worker import failed
+from ctid_cli.running.engine import current_origins, run_experiment
+from ctid_cli.storage.columns import failed, no_result
 from ctid_cli.storage.folder import experiment_folders
+from ctid_cli.storage.identity import origin_of
 from ctid_cli.storage.journal import open_journal, read_journal
 from ctid_cli.storage.manifest import slots, true_parameters
 from ctid_cli.storage.sealed import read_sealed, seal_image
 from ctid_cli.storage.store import experiment_status, find_estimate, load_estimates, read_stored
 from ctid_cli.storage.summary import export_rows
-from ctid_cli.storage.version import current_origin
 from tests.running.fakes import FakePlan, Toy
 
 PLAN = FakePlan(Toy("raise", at=1), Toy(order=3))
+ORIGIN = origin_of(PLAN.data_cells[0], PLAN.estimators[0].estimator)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,7 @@ def test_the_sealed_file_explains_itself_to_other_programs(place: Path) -> None:
     with h5py.File(place / "runs.h5") as file:
         assert file.attrs["experiment"] == "toys"
         assert (file.attrs["seed"], file.attrs["runs"], file.attrs["format_version"]) == (7, 6, 1)
-        assert file.attrs["code_version"] == current_origin().code_version
+        assert file.attrs["code_version"] == ORIGIN.code_version
         assert json.loads(bytes(file["spec"][()]).decode()) == PLAN.spec.canonical()
         group = file["estimates"]
         status = group["status"].asstr()[()]
@@ -133,14 +134,13 @@ def test_sealing_extreme_contents_gives_them_back(tmp_path: Path) -> None:
     plan = FakePlan(Toy(), runs=1, levels=(1,))
     manifest = plan.manifest()  # type: ignore[arg-type]
     keys = [slot.key for slot in slots(manifest)]
-    odd: dict[str, Any] = {
+    odd: dict[str, Any] = no_result() | {
         "status": "CONVERGED",
         "message": "τ̂ = 8\n\tπ",
         "start_delay": 0.0,
         "delay": 5e-324,
         "numerator": [None, -0.0, 1.7976931348623157e308],
         "denominator": [1.0],
-        "parameters": None,
         "standard_errors": {},
         "cost": None,
         "fit_percent": -1e300,
@@ -149,13 +149,13 @@ def test_sealing_extreme_contents_gives_them_back(tmp_path: Path) -> None:
         "condition_number": None,
     }
     for results in ({keys[0]: odd, keys[1]: failed("died", "CRASHED")}, {keys[1]: odd}, {}):
-        image, checksum, count = seal_image(manifest, [current_origin()], results)
+        image, checksum, count = seal_image(manifest, [ORIGIN], results)
         (tmp_path / "runs.h5").write_bytes(image)
         read = read_sealed(tmp_path / "runs.h5")
         assert read.results == results
         assert (read.checksum, count) == (checksum, len(results))
         assert read.manifest == manifest
-        assert read.origins == (current_origin(),)
+        assert read.origins == (ORIGIN,)
 
 
 def additive(manifest: dict[str, Any]) -> dict[str, Any]:
@@ -180,13 +180,13 @@ def test_parameters_of_submodels_are_sealed(tmp_path: Path) -> None:
         keys[2]: result | {"parameters": None, "standard_errors": {"a1": 0.2}},
         keys[3]: failed("died", "CRASHED"),
     }
-    (tmp_path / "runs.h5").write_bytes(seal_image(manifest, [current_origin()], results)[0])
+    (tmp_path / "runs.h5").write_bytes(seal_image(manifest, [ORIGIN], results)[0])
     assert read_sealed(tmp_path / "runs.h5").results == results
     frame = load_estimates(tmp_path)
     assert frame["parameters"].tolist() == [results[key]["parameters"] for key in keys]
     assert "g1_b1" in export_rows(frame)
     # Where nothing is additive, there is no trace of it, neither in the file nor in the rows.
-    image, _, _ = seal_image(plain, [current_origin()], {key: result | {"standard_errors": {}} for key in keys})
+    image, _, _ = seal_image(plain, [ORIGIN], {key: result | {"standard_errors": {}} for key in keys})
     (tmp_path / "runs.h5").write_bytes(image)
     with h5py.File(tmp_path / "runs.h5") as file:
         assert not [name for name in file["estimates"] if "parameter" in name]
@@ -207,7 +207,7 @@ def test_true_parameters_are_those_of_the_sorted_submodels(tmp_path: Path) -> No
         slot.key: failed("", "CONVERGED") | {"parameters": found, "standard_errors": {}}
         for slot, found in zip(slots(manifest), (near, far), strict=True)
     }
-    (tmp_path / "runs.h5").write_bytes(seal_image(manifest, [current_origin()], results)[0])
+    (tmp_path / "runs.h5").write_bytes(seal_image(manifest, [ORIGIN], results)[0])
     assert load_estimates(tmp_path)["converged"].tolist() == [True, False]
 
 
@@ -229,7 +229,8 @@ def test_find_an_estimate_by_the_beginning_of_its_id(place: Path) -> None:
 
 def test_estimates_of_a_killed_run_are_readable(place: Path) -> None:
     log = open_journal(place / "journal.sqlite")
-    log.begin(FakePlan(Toy("raise", at=1), Toy(order=3), runs=8).manifest(), current_origin(), "now", {})  # type: ignore[arg-type]
+    killed: Any = FakePlan(Toy("raise", at=1), Toy(order=3), runs=8)
+    log.begin(killed.manifest(), current_origins(killed), "now", {})
     log.close()
     assert len(read_stored(place).rows()) == 36
     status = experiment_status(place)

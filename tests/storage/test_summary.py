@@ -7,7 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ctid_cli.storage.summary import export_rows, is_converged, parameter_names, summarise, wilson_interval
+from ctid_cli.storage.columns import parameter_names
+from ctid_cli.storage.summary import export_rows, is_converged, summarise, wilson_interval
 
 # R. G. Newcombe, Statistics in Medicine 17 (1998) 857-872, Table I, method 3.
 NEWCOMBE = [
@@ -150,7 +151,7 @@ def test_export_has_a_column_for_every_coefficient() -> None:
 def test_export_has_a_column_for_every_parameter_of_submodels() -> None:
     estimates = frame()
     found = [{"g1_a1": 1.0, "g1_b0": 2.0}, {"g1_a1": 3.0, "g1_a10": 4.0, "g1_a2": None, "g1_b0": 5.0}, None, None, {}]
-    estimates["parameters"] = pd.Series(found, dtype="object")
+    estimates.insert(estimates.columns.get_loc("standard_errors"), "parameters", pd.Series(found, dtype="object"))
     estimates["standard_errors"] = pd.Series(
         [{"g1_b0": 0.5}, {"a1": 0.25, "g1_a10": 0.1}, None, {}, {}], dtype="object"
     )

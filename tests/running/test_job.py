@@ -10,8 +10,9 @@ import pytest
 from ctid_cli.canonical import plain
 from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.running.worker import Job, failure, run_job
-from ctid_cli.storage.manifest import RESULT_FIELDS, Key
+from ctid_cli.running.job import Job, failure, run_job
+from ctid_cli.storage.columns import no_result
+from ctid_cli.storage.manifest import Key
 from tests.running.fakes import (
     STARTS,
     FakeCell,
@@ -66,7 +67,7 @@ def test_results_do_not_depend_on_what_else_is_wanted() -> None:
 
 def test_results_are_plain_and_complete() -> None:
     for outcome in run_job(job(Toy(at=2))):
-        assert tuple(outcome.result) == RESULT_FIELDS
+        assert list(outcome.result) == list(no_result())
         assert json.loads(json.dumps(outcome.result, allow_nan=False)) == outcome.result
         assert outcome.result["standard_errors"] == {"b0": 0.1, "delay": None}
         assert outcome.seconds is not None
@@ -82,7 +83,7 @@ def test_one_failing_estimator_leaves_the_others_alone() -> None:
 def test_a_data_set_that_cannot_be_made_fails_every_estimate() -> None:
     outcomes = run_job(job(Toy(), cell=Broken({}, {})))
     assert [outcome.result["status"] for outcome in outcomes] == ["FAILED", "FAILED"]
-    assert outcomes[0].result["message"].startswith("MemoryError: no room\n  worker.py:")
+    assert outcomes[0].result["message"].startswith("MemoryError: no room\n  job.py:")
 
 
 def test_messages_are_the_same_in_every_process() -> None:

@@ -1,0 +1,137 @@
+"""A plan: the data sets of an experiment, and the estimates that are wanted of each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from ctid_cli.storage.manifest import Key, Manifest
+
+if TYPE_CHECKING:
+    from ctid_cli.models.additive import Term
+    from ctid_cli.simulation.dataset import Source
+    from ctid_cli.simulation.frequency_runs import SignalSource
+    from ctid_cli.specification.spec import Spec
+    from ctid_cli.specification.start_points import AnyStart
+
+
+@dataclass(frozen=True, eq=False)
+class DataCell:
+    """One combination of system, excitation or loop, sampling, noise and seed, or one measured record."""
+
+    content: dict[str, Any]
+    hash: str
+    swept: dict[str, Any]
+    source: Source | SignalSource
+
+    def dataset(self, replicate: int) -> Any:
+        """One data set."""
+        return self.source.dataset(replicate)
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatorCell:
+    """One estimator with one combination of its swept options."""
+
+    name: str
+    kind: str
+    estimator: Any
+    content: dict[str, Any]
+    hash: str
+    swept: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One data set."""
+
+    cell: int
+    replicate: int
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """All data sets and estimates of an experiment."""
+
+    spec: Spec
+    data_cells: tuple[DataCell, ...]
+    estimators: tuple[EstimatorCell, ...]
+    starts: tuple[AnyStart, ...]
+    runs: int
+    spec_hash: str
+
+    @property
+    def experiment(self) -> str:
+        """Name of the experiment."""
+        return self.spec.experiment
+
+    def tasks(self) -> list[Task]:
+        """The data sets."""
+        return [Task(cell, replicate) for replicate in range(self.runs) for cell in range(len(self.data_cells))]
+
+    def keys(self, task: Task) -> list[tuple[Key, EstimatorCell, AnyStart]]:
+        """The estimates wanted of a data set."""
+        data_hash = self.data_cells[task.cell].hash
+        return [
+            (Key(data_hash, task.replicate, cell.hash, start.label), cell, start)
+            for cell in self.estimators
+            for start in starts_of(cell.estimator.start_from, self.starts)
+        ]
+
+    @property
+    def terms(self) -> tuple[Term, ...] | None:
+        """Structure of the submodels that estimates of one fraction are also given as; None for none.
+
+        That of the simulated system, by rising natural frequency, or else of the first estimator of submodels.
+        """
+        from ctid_cli.models.additive import AdditiveModel
+        from ctid_cli.simulation.dataset import SimulatedSource
+
+        cell = self.data_cells[0].source
+        if isinstance(cell, SimulatedSource) and isinstance(cell.system, AdditiveModel):
+            return cell.system.sorted().terms
+        found = (getattr(cell.estimator, "terms", None) for cell in self.estimators)
+        return next((tuple(terms) for terms in found if terms is not None), None)
+
+    def manifest(self) -> Manifest:
+        """The plan as plain data."""
+        replicates = [0] * len(self.data_cells)
+        starts: dict[str, list[str]] = {}
+        for task in self.tasks():
+            replicates[task.cell] += 1
+            if not starts:
+                for _, cell, start in self.keys(task):
+                    starts.setdefault(f"{cell.name}/{cell.hash}", []).append(start.label)
+        canonical = self.spec.canonical()
+        return {
+            "experiment": self.experiment,
+            "runs": self.runs,
+            "seed": (canonical.get("monte_carlo") or {}).get("seed"),
+            "spec_hash": self.spec_hash,
+            "spec": canonical,
+            "success": canonical.get("success"),
+            "data_cells": [
+                {"hash": cell.hash, "replicates": count, "swept": dict(cell.swept), "content": cell.content}
+                for cell, count in zip(self.data_cells, replicates, strict=True)
+            ],
+            "estimators": [
+                {
+                    "name": cell.name,
+                    "kind": cell.kind,
+                    "hash": cell.hash,
+                    "swept": dict(cell.swept),
+                    "content": cell.content,
+                    "starts": starts.get(f"{cell.name}/{cell.hash}", []),
+                }
+                for cell in self.estimators
+            ],
+            "starts": {start.label: start.initial_delay for start in self.starts},
+        }
+
+
+def starts_of(kind: str | None, starts: tuple[AnyStart, ...]) -> tuple[AnyStart, ...]:
+    """The starts that an estimator which takes one of a kind begins from."""
+    from ctid_cli.specification.start_points import NO_START, ParameterStart, StartPoint
+
+    wanted = {None: (), "delay": (StartPoint,), "parameters": (ParameterStart,)}[kind]
+    return tuple(start for start in starts if isinstance(start, wanted) and start != NO_START) or (NO_START,)

@@ -1,0 +1,116 @@
+"""The columns of stored estimates: the one list that journal, sealed file, tables, export, JSON and documentation read.
+
+A column that is added here, and given a value where estimates are made, appears in all of them; in results that were
+stored before, it is missing.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from ctid_cli.simulation.frequency_measures import measure_names
+
+#: Statuses of estimates that have no result because something went wrong.
+FAILURES = ("FAILED", "CRASHED", "TIMEOUT")
+
+ByName = Mapping[str, float | None]
+
+
+def parameter_names(rows: Iterable[ByName | None]) -> list[str]:
+    """Names of parameters that any estimate has: b0 ..., a1 ..., then those of submodels, the delay and others."""
+
+    def place(name: str) -> tuple[int, int, str, int]:
+        found = re.fullmatch(r"(?:g(\d+)_)?([ab])(\d+)", name)
+        if not found:
+            return (2 if name == "delay" else 3, 0, name, 0)
+        submodel, letter, power = found.groups()
+        return (1, int(submodel), letter, int(power)) if submodel else (0, "ba".index(letter), letter, int(power))
+
+    return sorted({name for row in rows if row for name in row}, key=place)
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column."""
+
+    name: str
+    #: A type of pandas, or one of those that are objects to it: ``coefficients`` by descending powers, numbers
+    #: ``by name``, and an ``initial delay``, which may be the word random.
+    type: Literal["str", "int64", "Int64", "float64", "boolean", "coefficients", "by name", "initial delay"]
+    meaning: str
+    unit: str | None = None
+    #: Which experiments have it; in rows, those of systems are empty for signals.
+    of: Literal["all", "systems", "additive", "signals"] = "all"
+    #: Where its value comes from.
+    source: Literal["plan", "result", "clock", "truth"] = "result"
+    #: What the names of its parts begin with in a table with one number per cell.
+    prefix: str = ""
+    names: Callable[[Iterable[ByName | None]], list[str]] = parameter_names
+
+    @property
+    def dtype(self) -> str:
+        """Its type in pandas."""
+        return "object" if self.type in ("coefficients", "by name", "initial delay") else self.type
+
+
+#: All columns, in the order of tables; swept fields stand before those that are compared with the truth.
+COLUMNS = (
+    Column("id", "str", "the same data, estimator and start always have the same 12 hexadecimal digits", source="plan"),
+    Column("experiment", "str", "name of the experiment", source="plan"),
+    Column("estimator", "str", "name from the specification", source="plan"),
+    Column("kind", "str", "kind of the estimator", source="plan"),
+    Column("cell", "str", "hash of system, excitation, sampling, noise and seed", source="plan"),
+    Column("replicate", "int64", "which data set of the cell, from 0", source="plan"),
+    Column("start", "str", "start as planned; `none` for estimators without one", of="systems", source="plan"),
+    Column(
+        *("initial_delay", "initial delay", "where the search was asked to start: a number, `random`, or null", "s"),
+        of="systems",
+        source="plan",
+    ),
+    Column("start_delay", "float64", "where the search did start", "s", of="systems"),
+    Column("status", "str", "how the estimate ended, see below"),
+    Column("message", "str", "the sentence that belongs to the status, or the exception and where it was raised"),
+    Column("delay", "float64", "delay", "s", of="systems"),
+    Column("numerator", "coefficients", "descending powers", of="systems", prefix="b"),
+    Column("denominator", "coefficients", "descending powers, monic", of="systems", prefix="a"),
+    Column(
+        *("parameters", "by name", "of submodels: `g1_a1` multiplies s in the denominator of the slowest one"),
+        of="additive",
+    ),
+    Column("standard_errors", "by name", "of `b0` ..., `a1` ..., `delay` and `parameters`", of="systems", prefix="se_"),
+    Column("cost", "float64", "mean squared output error", "output unit^2", of="systems"),
+    Column("fit_percent", "float64", "fit on the record that was estimated from", "%", of="systems"),
+    Column("validation_fit_percent", "float64", "fit on the rest of a measured record", "%", of="systems"),
+    Column("iterations", "Int64", "in all stages", of="systems"),
+    Column("condition_number", "float64", "of the scaled normal equations", "-", of="systems"),
+    Column("measures", "by name", "what was measured of the frequencies, see below", of="signals", names=measure_names),
+    Column("seconds", "float64", "time of this estimate, as if it had been alone", "s", source="clock"),
+    Column("converged", "boolean", "whether it meets the success rule; null without one", source="truth"),
+    Column("true_delay", "float64", "delay of the simulated system", "s", of="systems", source="truth"),
+)
+
+#: What tables count in groups of estimates, with the types of pandas.
+COUNTS = {
+    "n": "int64",
+    "failed": "int64",
+    "converged": "Int64",
+    **dict.fromkeys(("percent", "low", "high", "median_seconds"), "float64"),
+}
+
+
+def reserved_names() -> frozenset[str]:
+    """Names of the columns of estimates and tables; a swept field of such a name is written with its section."""
+    return frozenset((*(c.name for c in COLUMNS), *COUNTS, "table", "sampling", "method", "published_percent"))
+
+
+def failed(message: str, status: str) -> dict[str, Any]:
+    """The result of an estimate that does not exist."""
+    return no_result() | {"status": status, "message": message}
+
+
+def no_result() -> dict[str, Any]:
+    """A result in which everything is missing."""
+    return {column.name: None for column in COLUMNS if column.source == "result"}
