@@ -17,7 +17,7 @@ from ctid_cli.estimation.refined_iv import NEGLIGIBLE_FALL, ROUNDING, SLOW_STEPS
 from ctid_cli.filtering.bank import standard_moments
 from ctid_cli.filtering.filter_data import FilterData, plain_array
 from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT
-from ctid_cli.filtering.realisation import polynomial_roots, scaled_denominator, time_scale
+from ctid_cli.filtering.realisation import scaled_roots
 from ctid_cli.inference.sensitivity import Structure
 
 
@@ -74,8 +74,7 @@ def stabilise(theta: Array, n: int) -> None:
         a[i + 1] = theta[i]
     if is_hurwitz(a):
         return
-    w0 = time_scale(a)
-    roots = polynomial_roots(scaled_denominator(a, w0))
+    w0, roots = scaled_roots(a)
     largest = 0.0
     for i in range(n):
         largest = max(largest, abs(roots[i]))

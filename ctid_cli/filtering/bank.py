@@ -29,7 +29,7 @@ from ctid_cli.filtering.exponential import held_step, place
 from ctid_cli.filtering.filter_data import FilterData, in_unit, plain_array, split_delay
 from ctid_cli.filtering.modal_pass import modal_pass
 from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT, modal_condition, pole_slopes
-from ctid_cli.filtering.realisation import chain, polynomial_roots, scaled_denominator, time_scale
+from ctid_cli.filtering.realisation import chain, scaled_roots
 from ctid_cli.filtering.row_sink import RowSink, row_sink
 
 Form = Literal["auto", "modal", "chain"]
@@ -40,8 +40,8 @@ def _double_chain(a: Array, b: Array) -> tuple[float, Array, Array, Array, Array
     """Realise 1/A driven by the input and a second 1/A driven by the output of B/A."""
     n = a.size - 1
     m = b.size - 1
-    w0 = time_scale(a)
-    single, entry, powers = chain(polynomial_roots(scaled_denominator(a, w0)))
+    w0, roots = scaled_roots(a)
+    single, entry, powers = chain(roots)
     # p^k/A in seconds, from the chain in the time unit 1/w0.
     for k in range(n):
         for i in range(n):
@@ -157,8 +157,8 @@ def _evaluate(coefficients: Array, point: complex) -> tuple[complex, complex]:
 def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Array]:
     """Partial fractions of the standard rows: their condition, poles, residues of x, and the map from internal rows."""
     n = a.size - 1
-    w0 = time_scale(a)
-    roots = polynomial_roots(scaled_denominator(a, w0)) * w0
+    w0, scaled = scaled_roots(a)
+    roots = scaled * w0
     modes = 0
     for i in range(n):
         if roots[i].imag >= 0.0:

@@ -13,10 +13,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.filter_data import plain_array
-from ctid_cli.filtering.sampled import SampledModel, sampled_model, state_space_response
+from ctid_cli.filtering.sampled import SampledModel, sampled_model
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
@@ -93,23 +93,8 @@ def simulate_loop(
     discrete = _realised(controller)
     _require_solvable(plant, discrete)
     A, B, C, D = discrete.state_space()
-    u, x = np.empty(r.size), np.empty(r.size)
-    _closed_loop(
-        plant.transition,
-        plant.from_input,
-        plant.output,
-        plant.direct,
-        plant.shift,
-        A,
-        B[:, 0].copy(),
-        C[0],
-        float(D[0, 0]),
-        r,
-        v,
-        float(enters == "controller"),
-        u,
-        x,
-    )
+    law = SampledModel(A, B[:, 0].copy(), C[0].copy(), float(D[0, 0]), 0)
+    u, x = _closed_loop(plant, law, r, v, float(enters == "controller"))
     if not (np.isfinite(u).all() and np.isfinite(x).all()):
         raise DataError(
             "the signals of the closed loop are not finite: check reference and noise, and whether the loop is stable; "
@@ -119,56 +104,44 @@ def simulate_loop(
 
 
 @njit(cache=True, nogil=True)
-def _closed_loop(
-    transition: Array,
-    from_input: Array,
-    output: Array,
-    direct: float,
-    shift: int,
-    A: Array,
-    B: Array,
-    C: Array,
-    D: float,
-    r: Array,
-    v: Array,
-    before: float,
-    u: Array,
-    x: Array,
-) -> None:
+def _advance(model: SampledModel, value: float, state: Array, following: Array) -> None:
+    """``z_(k+1) = F z_k + g value``."""
+    for i in range(state.size):
+        total = model.from_input[i] * value
+        for j in range(state.size):
+            total += model.transition[i, j] * state[j]
+        following[i] = total
+
+
+@njit(cache=True, nogil=True)
+def _closed_loop(plant: SampledModel, law: SampledModel, r: Array, v: Array, before: float) -> tuple[Array, Array]:
     """Compiled body of :func:`simulate_loop`; ``before`` is the share of r that the controller sees, 1 or 0."""
-    n, m = from_input.size, B.size
-    z, z_next = np.zeros(n), np.zeros(n)
-    s, s_next = np.zeros(m), np.zeros(m)
-    for k in range(u.size):
+    u, x = np.empty(r.size), np.empty(r.size)
+    z, z_next = np.zeros(plant.from_input.size), np.zeros(plant.from_input.size)
+    s, s_next = np.zeros(law.from_input.size), np.zeros(law.from_input.size)
+    for k in range(r.size):
+        # x without the input that arrives now, and what the controller's state and the reference put out.
         free = 0.0
-        for i in range(n):
-            free += output[i] * z[i]
+        for i in range(z.size):
+            free += plant.output[i] * z[i]
         error = before * r[k] - v[k]
-        law = (1.0 - before) * r[k]
-        for i in range(m):
-            law += C[i] * s[i]
-        if shift == 0:
+        held = (1.0 - before) * r[k]
+        for i in range(s.size):
+            held += law.output[i] * s[i]
+        if plant.shift == 0:
             # The input acts on the output that it is made from: solve for it.
-            arriving = (law + D * (error - free)) / (1.0 + D * direct)
-            x[k] = free + direct * arriving
+            arriving = (held + law.direct * (error - free)) / (1.0 + law.direct * plant.direct)
+            x[k] = free + plant.direct * arriving
             u[k] = arriving
         else:
-            arriving = u[k - shift] if k >= shift else 0.0
-            x[k] = free + direct * arriving
-            u[k] = law + D * (error - x[k])
-        error -= x[k]
-        for i in range(n):
-            total = from_input[i] * arriving
-            for j in range(n):
-                total += transition[i, j] * z[j]
-            z_next[i] = total
-        for i in range(m):
-            total = B[i] * error
-            for j in range(m):
-                total += A[i, j] * s[j]
-            s_next[i] = total
+            arriving = u[k - plant.shift] if k >= plant.shift else 0.0
+            x[k] = free + plant.direct * arriving
+            u[k] = held + law.direct * (error - x[k])
+        _advance(plant, arriving, z, z_next)
+        _advance(law, error - x[k], s, s_next)
         z, z_next = z_next, z
         s, s_next = s_next, s
+    return u, x
 
 
 def loop_state_space(
@@ -200,21 +173,6 @@ def loop_radius(model: AdditiveModel | TransferFunction, controller: Controller,
     """Largest magnitude of the poles of the sampled loop: it is stable below 1."""
     dynamics = loop_state_space(model, controller, interval)[0]
     return float(np.abs(np.linalg.eigvals(dynamics)).max(initial=0.0))
-
-
-def input_sensitivity(
-    model: AdditiveModel | TransferFunction,
-    controller: Controller,
-    interval: float,
-    frequencies: ArrayLike,
-    enters: Enters = "controller",
-) -> ComplexArray:
-    r"""Frequency response from the reference to the input of the noise-free loop.
-
-    Evaluated on the state space of the loop, so it stays finite where model or controller integrate.
-    """
-    loop = loop_state_space(model, controller, interval, enters)
-    return state_space_response(*loop, frequencies, interval)[:, 0, 0]
 
 
 def _realised(controller: Controller) -> DiscreteController:

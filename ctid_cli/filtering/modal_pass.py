@@ -108,7 +108,7 @@ def first_rows(poles: ComplexArray) -> IntArray:
 
 
 @njit(cache=True, nogil=True)
-def _put(block: Array, row: int, column: int, value: complex, paired: bool) -> int:
+def put(block: Array, row: int, column: int, value: complex, paired: bool) -> int:
     """Write the state of a mode, that of a pair with its imaginary part below the real one; returns the next row."""
     block[row, column] = value.real
     if not paired:
@@ -184,15 +184,15 @@ def modal_pass(poles: ComplexArray, residues: ComplexArray, delay: float, data: 
                         z_now, w_now = _advance(weights, z_now, w_now, u[j], change)
                     x += residues[i].real * z_now.real - residues[i].imag * z_now.imag
                     paired = poles[i].imag != 0.0
-                    _put(block, n + row, filled, w_now, paired)
-                    row = _put(block, row, filled, z_now, paired)
+                    put(block, n + row, filled, w_now, paired)
+                    row = put(block, row, filled, z_now, paired)
             else:
                 for i in range(2 * n):
                     block[i, filled] = 0.0
             block[2 * n, filled] = value
             row = 2 * n + 1
             for i in range(modes):
-                row = _put(block, row, filled, e[i], poles[i].imag != 0.0)
+                row = put(block, row, filled, e[i], poles[i].imag != 0.0)
             block[row, filled] = y[k] - x
             filled += 1
             if filled == BLOCK:

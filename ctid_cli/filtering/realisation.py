@@ -28,12 +28,13 @@ def time_scale(denominator: Array) -> float:
 
 
 @njit(cache=True, nogil=True)
-def scaled_denominator(coefficients: Array, w0: float) -> Array:
-    """Coefficients of a monic denominator in the time unit 1/w0."""
-    scaled = np.empty(coefficients.size)
-    for k in range(coefficients.size):
-        scaled[k] = coefficients[k] / w0**k
-    return scaled
+def scaled_roots(denominator: Array) -> tuple[float, ComplexArray]:
+    """Characteristic frequency w0 of a monic polynomial, and its roots in the time unit 1/w0, see the next function."""
+    w0 = time_scale(denominator)
+    scaled = np.empty(denominator.size)
+    for k in range(denominator.size):
+        scaled[k] = denominator[k] / w0**k
+    return w0, polynomial_roots(scaled)
 
 
 @njit(cache=True, nogil=True)

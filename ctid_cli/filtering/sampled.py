@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.exponential import held_step
 from ctid_cli.filtering.filter_data import plain_array, split_delay
-from ctid_cli.filtering.realisation import chain, polynomial_roots, scaled_denominator, time_scale
+from ctid_cli.filtering.realisation import chain, scaled_roots
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
@@ -19,8 +19,7 @@ from ctid_cli.signals.checks import require_positive
 from ctid_cli.signals.held import HeldSignal
 
 
-@dataclass(frozen=True, eq=False)
-class SampledModel:
+class SampledModel(NamedTuple):
     r"""``z_(k+1) = F z_k + g u_(k-shift)``, ``x_k = c z_k + d u_(k-shift)`` for an input held between the samples."""
 
     #: F, block diagonal for a sum of submodels, shape (n, n).
@@ -76,8 +75,8 @@ def _part(part: TransferFunction, interval: float, fraction: float) -> tuple[Arr
     if not n:
         return np.zeros((0, 0)), np.zeros(0), np.zeros(0), direct
     a = plain_array(part.denominator)
-    w0 = time_scale(a)
-    dynamics, gain, powers = chain(polynomial_roots(scaled_denominator(a, w0)))
+    w0, roots = scaled_roots(a)
+    dynamics, gain, powers = chain(roots)
     strictly_proper = (numerator - direct * a)[1:] / w0 ** np.arange(1, n + 1)
     output = strictly_proper[::-1] @ powers
     transition, from_input, _ = held_step(dynamics, gain, interval * w0)
@@ -85,21 +84,6 @@ def _part(part: TransferFunction, interval: float, fraction: float) -> tuple[Arr
         part_way, from_held, _ = held_step(dynamics, gain, fraction * interval * w0)
         output, direct = output @ part_way, float(output @ from_held) + direct
     return transition, from_input, output, direct
-
-
-def sampled_state_space(model: AdditiveModel | TransferFunction, interval: float) -> tuple[Array, Array, Array, Array]:
-    r"""State-space form ``A, B, C, D`` of :func:`sampled_model`."""
-    return sampled_model(model, interval).state_space()
-
-
-def state_space_response(
-    A: ArrayLike, B: ArrayLike, C: ArrayLike, D: ArrayLike, frequencies: ArrayLike, interval: float
-) -> ComplexArray:
-    r"""``C (q I - A)^(-1) B + D`` at ``q = exp(j w h)``."""
-    dynamics, inputs, outputs, feedthrough = (np.asarray(matrix, dtype=float) for matrix in (A, B, C, D))
-    q = np.exp(1j * np.asarray(frequencies, dtype=float) * interval)
-    resolvent = q[:, None, None] * np.eye(len(dynamics)) - dynamics
-    return np.asarray(outputs @ np.linalg.solve(resolvent, inputs.astype(complex)) + feedthrough)
 
 
 def simulate_additive(model: AdditiveModel, signal: HeldSignal, times: ArrayLike) -> Array:

@@ -11,7 +11,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.filtering.chain_pass import irregular_chain_pass, regular_chain_pass
 from ctid_cli.filtering.exponential import held_step
 from ctid_cli.filtering.filter_data import FilterData, in_unit, plain_array, split_delay
-from ctid_cli.filtering.realisation import chain, polynomial_roots, scaled_denominator, time_scale
+from ctid_cli.filtering.realisation import chain, scaled_roots
 from ctid_cli.filtering.row_sink import RowSink
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
@@ -89,8 +89,8 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
 def _response(a: Array, b: Array, delay: float, data: FilterData) -> Array:
     """Compiled body of :func:`simulate`: no output is filtered and no row kept; ``b`` has n entries."""
     n = a.size - 1
-    w0 = time_scale(a)
-    dynamics, gain, powers = chain(polynomial_roots(scaled_denominator(a, w0)))
+    w0, roots = scaled_roots(a)
+    dynamics, gain, powers = chain(roots)
     output_map = np.zeros(n)
     for i in range(n):
         for j in range(n):

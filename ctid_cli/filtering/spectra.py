@@ -13,6 +13,8 @@ By Parseval the mean square of v over the window is ``|V(0)|^2 + 2 sum_k |V(w_k)
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -55,10 +57,10 @@ class RecordSpectra:
         output = HeldSignal(record.t, record.bridged_y, "foh")
         #: Mean factor by which straight lines between the samples damp each frequency [-], shape (K,).
         self.damping: Array = _damping(record, window, self.frequencies)
-        joined = _HeldSpectrum(output, start, end - start, 0.0, count)
+        joined = _held_spectrum(output, start, end - start, 0.0, count)
         #: Spectrum of the output [output unit], shape (K,).
-        self.outputs: ComplexArray = joined.at(0.0, count, 1.0 / self.damping[-count:])[self._first :]
-        self._input = _HeldSpectrum(record.input, start, end - start, greatest_delay, count)
+        self.outputs: ComplexArray = _window_spectrum(joined, 0.0, 1.0 / self.damping[-count:])[self._first :]
+        self._input = _held_spectrum(record.input, start, end - start, greatest_delay, count)
         self._remembered: dict[float, ComplexArray] = {}
 
     @property
@@ -73,7 +75,7 @@ class RecordSpectra:
         needed = self.frequencies.size if count is None else count
         known = self._remembered.get(delay)
         if known is None or known.size < needed:
-            known = self._input.at(delay, needed - 1 + self._first)[self._first :]
+            known = _window_spectrum(self._input, delay, np.ones(needed - 1 + self._first))[self._first :]
             if len(self._remembered) >= REMEMBERED:
                 del self._remembered[next(iter(self._remembered))]
             self._remembered[delay] = known
@@ -126,58 +128,47 @@ def _damping(record: Record, window: tuple[float, float], frequencies: Array) ->
     return damping
 
 
-class _HeldSpectrum:
-    """Spectrum of a held signal over a window, for any delay of the signal.
+class _HeldSpectrum(NamedTuple):
+    """A held signal laid out for its spectrum over a window, at any delay.
 
     Integration by parts leaves sums over the breaks: of the jumps of the value for a constant hold, of the jumps of
     the slope for a linear one. Their partial sums are kept at every few breaks at both ends of the window.
     """
 
-    def __init__(self, signal: HeldSignal, start: float, duration: float, greatest_delay: float, count: int) -> None:
-        times = signal.t - start
-        values = plain_array(signal.values)
-        self.foh = signal.hold == "foh"
-        slopes = np.zeros(times.size)
-        if self.foh:
-            slopes[:-1] = np.diff(values) / np.diff(times)
-        jumps = np.diff(slopes if self.foh else values, prepend=0.0)
-        integral = np.concatenate(
-            ([0.0], np.cumsum(np.diff(times) * (values[:-1] + 0.5 * slopes[:-1] * np.diff(times))))
-        )
-        # Nothing happens at a break without a jump, and nothing after the window matters.
-        kept = (jumps != 0.0) & (times < duration)
-        kept[0] = True
-        self.times, self.values, self.slopes, self.jumps, self.integral = (
-            np.ascontiguousarray(array[kept]) for array in (times, values, slopes, jumps, integral)
-        )
-        self.duration = duration
-        early = int(np.searchsorted(self.times, 0.0, side="right"))
-        late = int(np.searchsorted(self.times, duration - greatest_delay))
-        breaks = self.times.size
-        stretch = max(SHORTEST_STRETCH, (early + breaks - late) // STRETCHES)
-        #: Numbers of breaks up to which partial sums are kept.
-        self.marks = np.union1d(np.arange(0, early + 1, stretch), np.arange(late, breaks + 1, stretch)).astype(np.int64)
-        self.sums = _partial_sums(self.times, self.jumps, self.marks, 2 * np.pi / duration, count)
+    #: Breaks that jump, from the start of the window [s]; values, slopes, jumps and integrals there, shape (M,).
+    times: Array
+    values: Array
+    slopes: Array
+    jumps: Array
+    integral: Array
+    foh: bool
+    #: Numbers of breaks up to which partial sums are kept, and these, shape (marks, 2, count).
+    marks: IntArray
+    sums: Array
+    duration: float
 
-    def at(self, delay: float, count: int, gain: Array | None = None) -> ComplexArray:
-        """Spectrum at zero frequency and the ``count`` frequencies above it, of the signal later by ``delay``.
 
-        At the latter, what happens inside the window, as opposed to its ends, is multiplied by ``gain``.
-        """
-        spectrum: ComplexArray = _window_spectrum(
-            self.times,
-            self.values,
-            self.slopes,
-            self.jumps,
-            self.integral,
-            self.foh,
-            self.marks,
-            self.sums,
-            self.duration,
-            delay,
-            np.ones(count) if gain is None else gain,
-        )
-        return spectrum
+def _held_spectrum(
+    signal: HeldSignal, start: float, duration: float, greatest_delay: float, count: int
+) -> _HeldSpectrum:
+    """Lay out a signal for ``count`` frequencies."""
+    times, values, foh = signal.t - start, plain_array(signal.values), signal.hold == "foh"
+    steps = np.diff(times)
+    slopes = np.zeros(times.size)
+    if foh:
+        slopes[:-1] = np.diff(values) / steps
+    jumps = np.diff(slopes if foh else values, prepend=0.0)
+    integral = np.concatenate(([0.0], np.cumsum(steps * (values[:-1] + 0.5 * slopes[:-1] * steps))))
+    # Nothing happens at a break without a jump, and nothing after the window matters.
+    kept = (jumps != 0.0) & (times < duration)
+    kept[0] = True
+    times, values, slopes, jumps, integral = (array[kept] for array in (times, values, slopes, jumps, integral))
+    early = int(np.searchsorted(times, 0.0, side="right"))
+    late = int(np.searchsorted(times, duration - greatest_delay))
+    stretch = max(SHORTEST_STRETCH, (early + times.size - late) // STRETCHES)
+    marks = np.union1d(np.arange(0, early + 1, stretch), np.arange(late, times.size + 1, stretch)).astype(np.int64)
+    sums = _partial_sums(times, jumps, marks, 2 * np.pi / duration, count)
+    return _HeldSpectrum(times, values, slopes, jumps, integral, foh, marks, sums, duration)
 
 
 @njit(cache=True, nogil=True)
@@ -236,20 +227,10 @@ def _last_at(grid: Array | IntArray, value: float) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _window_spectrum(
-    times: Array,
-    values: Array,
-    slopes: Array,
-    jumps: Array,
-    integral: Array,
-    foh: bool,
-    marks: IntArray,
-    sums: Array,
-    duration: float,
-    delay: float,
-    gain: Array,
-) -> ComplexArray:
-    """Compiled body of :meth:`_HeldSpectrum.at`.
+def _window_spectrum(held: _HeldSpectrum, delay: float, gain: Array) -> ComplexArray:
+    """Spectrum at zero frequency and at as many above it as there are gains, of the signal later by ``delay``.
+
+    The gain multiplies what happens inside the window, as opposed to its ends.
 
     With a and b the ends of the window on the undelayed signal's clock, value v and slope r there, and D the sum of
     ``jump exp(-jw t)`` over the breaks between them,
@@ -259,6 +240,7 @@ def _window_spectrum(
     i = 1 for a constant hold (whose slopes are zero) and 2 for a linear one. ``e_a`` is 1 unless a precedes the first
     break, where the signal begins with a jump.
     """
+    times, values, slopes, jumps, integral, foh, marks, sums, duration = held
     count = gain.size
     spectrum = np.zeros(count + 1, np.complex128)
     begin, end = max(-delay, times[0]), duration - delay

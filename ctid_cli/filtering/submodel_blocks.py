@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
+from ctid_cli.filtering.modal_pass import put
 from ctid_cli.filtering.submodel_map import PooledModes
 
 
@@ -86,37 +87,23 @@ def _mode_block(
     f_re, f_im = weights[4].real, weights[4].imag
     g_re, g_im = weights[5].real, weights[5].imag
     for k in range(span.skip):
-        block[single_row, k] = 0.0
-        if paired:
-            block[single_row + 1, k] = 0.0
+        put(block, single_row, k, 0.0j, paired)
         if double:
-            block[double_row, k] = 0.0
-            if paired:
-                block[double_row + 1, k] = 0.0
+            put(block, double_row, k, 0.0j, paired)
     for k in range(span.skip, span.length):
         j = span.first + k
         value = u[j]
         change = u[j + 1] - value if foh and j < last else 0.0
         # Read out a fraction of an interval after the break, then advance from the break itself.
+        z_now, w_now = complex(z_re, z_im), complex(w_re, w_im)
         if fraction > 0.0:
-            z, w, rise = complex(z_re, z_im), complex(w_re, w_im), fraction * change
-            z_now = part[0] * z + (part[2] * value + part[3] * rise)
-            block[single_row, k] = z_now.real
-            if paired:
-                block[single_row + 1, k] = z_now.imag
+            rise = fraction * change
             if double:
-                w_now = (part[0] * w + part[1] * z) + (part[4] * value + part[5] * rise)
-                block[double_row, k] = w_now.real
-                if paired:
-                    block[double_row + 1, k] = w_now.imag
-        else:
-            block[single_row, k] = z_re
-            if paired:
-                block[single_row + 1, k] = z_im
-            if double:
-                block[double_row, k] = w_re
-                if paired:
-                    block[double_row + 1, k] = w_im
+                w_now = (part[0] * w_now + part[1] * z_now) + (part[4] * value + part[5] * rise)
+            z_now = part[0] * z_now + (part[2] * value + part[3] * rise)
+        put(block, single_row, k, z_now, paired)
+        if double:
+            put(block, double_row, k, w_now, paired)
         # The square first: it is driven by the mode before its step.
         if double:
             new_re = (d_re * w_re - d_im * w_im) + (m_re * z_re - m_im * z_im) + (f_re * value + g_re * change)
@@ -159,9 +146,7 @@ def output_block(
             e_re = new_re
         begun = True
         before = values[k]
-        block[row, k] = e_re
-        if paired:
-            block[row + 1, k] = e_im
+        put(block, row, k, complex(e_re, e_im), paired)
     state[2] = complex(e_re, e_im)
 
 

@@ -10,7 +10,7 @@ from numba import njit
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.filtering.filter_data import plain_array
 from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT, modal_condition, pole_slopes
-from ctid_cli.filtering.realisation import polynomial_roots, scaled_denominator, time_scale
+from ctid_cli.filtering.realisation import scaled_roots
 
 
 @njit(cache=True, nogil=True)
@@ -230,8 +230,8 @@ def pooled_modes(theta: Array, degrees: IntArray, closed: bool) -> PooledModes:
         monic = np.ones(own + 1)
         for k in range(own):
             monic[k + 1] = (a[own - 2 - k] if k < own - 1 else 1.0) / highest
-        w0 = time_scale(monic)
-        roots = polynomial_roots(scaled_denominator(monic, w0)) * w0
+        w0, scaled = scaled_roots(monic)
+        roots = scaled * w0
         simple, slopes, curvatures = pole_slopes(roots)
         if not simple:
             condition = np.inf

@@ -93,23 +93,24 @@ class SubmodelFilter:
         """Second moments at one parameter vector."""
         # What overflows is found by the sums not being finite.
         with np.errstate(all="ignore"):
-            if self.free:
-                rows = self.rows(theta)
-                moments = None if rows is None else _moments_of_rows(*rows)
-            else:
-                moments = self._moments(theta)
+            moments = self._moments(theta)
         if moments is None:
             return None
         finite = np.isfinite(moments.hessian).all() and np.isfinite(moments.instrument_regressor).all()
         return moments if finite and np.isfinite(moments.squared_error) else None
 
     def _moments(self, theta: Array) -> SubmodelMoments | None:
-        """Second moments without a free response."""
+        """Second moments that need not be finite: of the pass, or of the rows where these are made in parts."""
         p = self.size
-        fast = self._run(self.data, theta, False)
+        fast = None if self.free else self._run(self.data, theta, False)
         if fast is None:
-            rows = self._general_rows(self.data, theta)
-            return None if rows is None else _moments_of_rows(*rows)
+            rows = self.rows(theta)
+            if rows is None:
+                return None
+            psi, phi, error, output = rows
+            return SubmodelMoments(
+                psi.T @ phi, psi.T @ error, psi.T @ psi, float(error @ error), float(output @ output)
+            )
         row, maps, gram = fast
         products = maps[:p] @ gram
         return SubmodelMoments(
@@ -237,10 +238,6 @@ class SubmodelFilter:
             filtered = _with_highest(bank[:, 2 * n + 1 : 3 * n + 1], data.y[data.use], own)
         columns[:, :n] = -filtered[:, 1 : n + 1] / highest
         return columns
-
-
-def _moments_of_rows(psi: Array, phi: Array, error: Array, output: Array) -> SubmodelMoments:
-    return SubmodelMoments(psi.T @ phi, psi.T @ error, psi.T @ psi, float(error @ error), float(output @ output))
 
 
 def _split_direct(part: Submodel) -> tuple[float, Array, Array]:

@@ -15,7 +15,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.filtering.exponential import held_step
 from ctid_cli.filtering.filter_data import plain_array, split_delay
-from ctid_cli.filtering.realisation import chain, polynomial_roots, scaled_denominator, time_scale
+from ctid_cli.filtering.realisation import chain, scaled_roots
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_positive
@@ -108,8 +108,7 @@ def _cascade(b: Array, a: Array, integrators: int) -> tuple[Array, Array, Array,
     """
     n = a.size - 1
     order = n + integrators
-    w0 = time_scale(plain_array(a))
-    poles = polynomial_roots(scaled_denominator(plain_array(a), w0)) if n else np.zeros(0, np.complex128)
+    w0, poles = scaled_roots(plain_array(a))
     first, first_entry, first_powers = chain(np.concatenate([poles, np.zeros(integrators)]))
     second, second_entry, second_powers = chain(poles)
     size = order + n

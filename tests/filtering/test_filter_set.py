@@ -1,22 +1,14 @@
 """Low-pass filter sets: costs of a delay error by independent routes, and the check against descents on a grid."""
 
-import mpmath
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import integrate, linalg, signal
+from scipy import integrate
 
 from ctid_cli.filtering.filter_set import LEAST_BETA, FilterSet, check_filters, sufficient_number_of_filters
-from ctid_cli.filtering.filter_theory import convergence_region, extrema, filtered_cost, ideal_cost
+from ctid_cli.filtering.filter_theory import convergence_region, extrema, ideal_cost
 from ctid_cli.filtering.lowpass import Lowpass
-from ctid_cli.models.transfer_function import TransferFunction
-
-CASE_1 = TransferFunction([2], [0.25, 0.7, 1], delay=8.0)
-CASE_2 = TransferFunction([-6400, 1600], [1, 5, 408, 416, 1600], delay=8.0)
-UNITY = TransferFunction([1], [1])
-ERRORS = [-2.0, 1e-7, 1e-3, 0.05, 0.7, 3.0, 15.0]
-
 
 # The ideal filter -----------------------------------------------------------------------------------------------------
 
@@ -72,118 +64,6 @@ def test_convergence_region():
     inside = np.linspace(0, convergence_region(2.0, exact=True), 2001)
     assert (np.diff(ideal_cost(inside, 2.0)) > 0).all()
     assert ideal_cost(inside[-1] * 1.001, 2.0) < ideal_cost(inside[-1], 2.0)
-
-
-# Any filter -----------------------------------------------------------------------------------------------------------
-
-
-def by_autocorrelation(errors, system, lowpass):
-    """2 [gamma(0) - gamma(d)], gamma(d) = C expm(A d) P C' with P from the Lyapunov equation."""
-    one = signal.tf2ss(system.numerator, system.denominator)
-    two = signal.tf2ss(lowpass.numerator, lowpass.denominator)
-    n, m = one[0].shape[0], two[0].shape[0]
-    a = np.block([[one[0], np.zeros((n, m))], [two[1] @ one[2], two[0]]])
-    b = np.vstack([one[1], two[1] @ one[3]])
-    c = np.hstack([two[3] @ one[2], two[2]])
-    p = linalg.solve_continuous_lyapunov(a, -b @ b.T)
-    gamma = [(c @ linalg.expm(a * abs(d)) @ p @ c.T).item() for d in (0.0, *errors)]
-    return 2 * (gamma[0] - np.array(gamma[1:]))
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize(
-    ("system", "lowpass"),
-    [
-        (CASE_1, Lowpass(0.202, 4)),
-        (CASE_1, Lowpass(2.02, 3)),
-        (CASE_2, Lowpass(2.685, 2)),
-        (CASE_2, Lowpass(26.85, 1)),
-        (TransferFunction([1, 0.3], [1, 0.02, 9]), TransferFunction([1, 4], [1, 2, 4])),
-    ],
-)
-def test_cost_by_the_autocorrelation(system, lowpass):
-    model = lowpass.model if isinstance(lowpass, Lowpass) else lowpass
-    errors = np.array([-2.0, 0.3, 0.7, 3.0, 15.0])
-    expected = by_autocorrelation(errors, system, model)
-    np.testing.assert_allclose(filtered_cost(errors, system, lowpass), expected, rtol=2e-10)
-    assert filtered_cost(0.0, system, lowpass) == 0.0
-
-
-@pytest.mark.parametrize(
-    ("system", "lowpass"),
-    [(CASE_1, Lowpass(0.202, 10)), (CASE_2, Lowpass(2.685, 10)), (CASE_2, Lowpass(26.85, 2))],
-)
-def test_cost_by_residues_in_many_digits(system, lowpass):
-    # gamma(d) is the sum of the residues of F(s) F(-s) exp(s d) at the poles of F.
-    with mpmath.workdps(60):
-        n, wc = lowpass.order, mpmath.mpf(lowpass.cutoff)
-        butterworth = [wc * mpmath.expjpi(mpmath.mpf(2 * k + 1 + n) / (2 * n)) for k in range(n)]
-
-        def value(coefficients, s):
-            total = mpmath.mpf(0)
-            for c in coefficients:
-                total = total * s + mpmath.mpf(c)
-            return total
-
-        own = [mpmath.findroot(lambda s: value(system.denominator, s), complex(p)) for p in system.poles]
-        poles = butterworth + own
-
-        total = [mpmath.mpf(0)] * len(ERRORS)
-        for p in poles:
-            residue = value(system.numerator, p) * value(system.numerator, -p) * wc ** (2 * n)
-            for q in poles:
-                residue /= (p - q if q is not p else 1) * (-p - q)
-            total = [t - 2 * residue * mpmath.expm1(p * abs(d)) for t, d in zip(total, ERRORS, strict=True)]
-        expected = [float(t.real) for t in total]
-    np.testing.assert_allclose(filtered_cost(ERRORS, system, lowpass), expected, rtol=1e-10)
-
-
-def test_a_butterworth_filter_of_high_order_is_nearly_ideal():
-    errors = np.linspace(0.05, 6.0, 60)
-    ideal = ideal_cost(errors, 2.0)
-    off = [np.abs(filtered_cost(errors, UNITY, Lowpass(2.0, n)) / ideal - 1).max() for n in (5, 10, 20)]
-    # The spectra differ in a band of relative width 1/n.
-    assert off[2] < 0.5 * off[1] < 0.5 * 0.6 * off[0]
-    assert off[2] < 0.06
-
-
-def test_spectrum_of_the_input():
-    shaped = filtered_cost(ERRORS, CASE_1, Lowpass(2.0, 3), input_spectrum=lambda w: 1 / (1 + w**2))
-    cascade = TransferFunction(CASE_1.numerator, np.polymul(CASE_1.denominator, [1, 1]))
-    np.testing.assert_allclose(shaped, filtered_cost(ERRORS, cascade, Lowpass(2.0, 3)), rtol=1e-9)
-    np.testing.assert_allclose(
-        filtered_cost(ERRORS, CASE_1, Lowpass(2.0, 10), input_spectrum=lambda w: 3.0),
-        3 * filtered_cost(ERRORS, CASE_1, Lowpass(2.0, 10)),
-        rtol=1e-12,
-    )
-
-
-@pytest.mark.parametrize("order", [1, 2, 10])
-def test_noise_lifts_the_cost(order):
-    # Noise bandwidth of a Butterworth filter: wc (pi/2n)/sin(pi/2n) on each side.
-    lifted = filtered_cost([0.0, 2.0], CASE_1, Lowpass(0.4, order), noise_intensity=0.7)
-    bandwidth = 0.4 * (np.pi / (2 * order)) / np.sin(np.pi / (2 * order))
-    np.testing.assert_allclose(
-        lifted - filtered_cost([0.0, 2.0], CASE_1, Lowpass(0.4, order)), 0.7 * bandwidth / np.pi, rtol=1e-10
-    )
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((1.0, TransferFunction([1], [1, -1]), Lowpass(1.0)), "the system must be stable"),
-        ((1.0, CASE_1, TransferFunction([1], [1, 0])), "the low-pass filter must be stable"),
-        ((1.0, UNITY, UNITY), "together must have more poles than zeros"),
-        ((1.0, CASE_1, UNITY, None, 0.1), "with noise, the low-pass filter must have more poles"),
-        ((1.0, CASE_1, Lowpass(1.0), None, -0.1), "noise_intensity must be zero or a positive number"),
-        ((1.0, CASE_1, Lowpass(1.0), lambda w: np.cos(w)), "finite and not negative"),
-        ((np.nan, CASE_1, Lowpass(1.0)), "not a finite number"),
-        ((1e9, CASE_1, Lowpass(1.0)), "oscillates too often"),
-    ],
-)
-def test_costs_that_do_not_exist(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        filtered_cost(*arguments)
 
 
 # The set --------------------------------------------------------------------------------------------------------------

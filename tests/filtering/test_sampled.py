@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.sampled import sampled_model, sampled_state_space, simulate_additive, state_space_response
+from ctid_cli.filtering.sampled import sampled_model, simulate_additive
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import unfactored
@@ -55,6 +55,13 @@ def response(matrices, u):
     return np.array(output)
 
 
+def response_at(matrices, w):
+    """``C (q I - A)^(-1) B + D`` from the first input to the first output, q = exp(jwh)."""
+    A, B, C, D = matrices
+    resolvent = np.exp(1j * np.asarray(w) * INTERVAL)[:, None, None] * np.eye(len(A)) - A
+    return (C @ np.linalg.solve(resolvent, B.astype(complex)) + D)[:, 0, 0]
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_zero_order_hold_equivalent_is_that_of_python_control(name):
     model = MODELS[name]
@@ -65,10 +72,10 @@ def test_zero_order_hold_equivalent_is_that_of_python_control(name):
     u = np.eye(1, 80)[0]
     expected = control.forced_response(tool, INTERVAL * np.arange(80), u).outputs
     np.testing.assert_allclose(
-        response(sampled_state_space(model, INTERVAL), u), expected, atol=1e-11 * np.abs(expected).max()
+        response(sampled_model(model, INTERVAL).state_space(), u), expected, atol=1e-11 * np.abs(expected).max()
     )
     w = np.array([0.5, 6.0, 40.0])
-    gain = state_space_response(*sampled_state_space(model, INTERVAL), w, INTERVAL)[:, 0, 0]
+    gain = response_at(sampled_model(model, INTERVAL).state_space(), w)
     np.testing.assert_allclose(gain, [tool(np.exp(1j * x * INTERVAL)) for x in w], rtol=1e-10)
 
 
@@ -81,7 +88,7 @@ def test_response_is_the_exact_one_whatever_the_delay(name, delay):
     simulator = simulate_additive if isinstance(model, AdditiveModel) else simulate
     # One instant off the grid makes the simulator step from break to break.
     expected = simulator(model, HeldSignal(t, u), np.append(t, t[-1] + 0.01))[:-1]
-    matrices = sampled_state_space(model, INTERVAL)
+    matrices = sampled_model(model, INTERVAL).state_space()
     np.testing.assert_allclose(response(matrices, u), expected, atol=1e-12 * np.abs(expected).max())
     assert len(matrices[0]) == sum(g.order for g in parts(model)) + int(np.ceil(delay / INTERVAL - 1e-9))
 
@@ -101,8 +108,8 @@ def test_unit_of_time_does_not_matter(unit, delay, name):
     scaled = []
     for g in parts(MODELS[name]):
         b, a = (c * unit ** np.arange(c.size - 1.0, -1.0, -1.0) for c in (g.numerator, g.denominator))
-        scaled.append(response(sampled_state_space(TransferFunction(b, a, unit * delay), unit), u))
-    expected = response(sampled_state_space(with_delay(MODELS[name], delay), 1.0), u)
+        scaled.append(response(sampled_model(TransferFunction(b, a, unit * delay), unit).state_space(), u))
+    expected = response(sampled_model(with_delay(MODELS[name], delay), 1.0).state_space(), u)
     assert np.abs(sum(scaled) - expected).max() <= 1e-10 * max(np.abs(expected).max(), 1e-300)
 
 
@@ -122,9 +129,9 @@ def test_sum_of_submodels_and_single_fraction_simulate_alike(name, hold, regular
 
 def test_what_has_no_sampled_equivalent_is_refused():
     with pytest.raises(DataError, match="more zeros than poles"):
-        sampled_state_space(TransferFunction([1.0, 0.0, 0.0], [1.0, 1.0]), 0.1)
+        sampled_model(TransferFunction([1.0, 0.0, 0.0], [1.0, 1.0]), 0.1).state_space()
     for interval in (0.0, np.nan):
         with pytest.raises(ValueError, match="sampling interval must be a positive number"):
-            sampled_state_space(FOUR_MODES, interval)
+            sampled_model(FOUR_MODES, interval).state_space()
     with pytest.raises(DataError, match="increase strictly"):
         simulate_additive(FOUR_MODES, HeldSignal([0.0], [1.0]), [1.0, 1.0])
