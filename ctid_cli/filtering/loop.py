@@ -103,42 +103,44 @@ def simulate_loop(
     return LoopSignals(u, x)
 
 
-@njit(cache=True, nogil=True)
-def _advance(model: SampledModel, value: float, state: Array, following: Array) -> None:
+@njit(cache=True, nogil=True, inline="always")
+def _advance(transition: Array, from_input: Array, value: float, state: Array, following: Array) -> None:
     """``z_(k+1) = F z_k + g value``."""
     for i in range(state.size):
-        total = model.from_input[i] * value
+        total = from_input[i] * value
         for j in range(state.size):
-            total += model.transition[i, j] * state[j]
+            total += transition[i, j] * state[j]
         following[i] = total
 
 
 @njit(cache=True, nogil=True)
 def _closed_loop(plant: SampledModel, law: SampledModel, r: Array, v: Array, before: float) -> tuple[Array, Array]:
     """Compiled body of :func:`simulate_loop`; ``before`` is the share of r that the controller sees, 1 or 0."""
+    F, g, c, direct, shift = plant
+    A, B, C, D, _ = law
     u, x = np.empty(r.size), np.empty(r.size)
-    z, z_next = np.zeros(plant.from_input.size), np.zeros(plant.from_input.size)
-    s, s_next = np.zeros(law.from_input.size), np.zeros(law.from_input.size)
+    z, z_next = np.zeros(g.size), np.zeros(g.size)
+    s, s_next = np.zeros(B.size), np.zeros(B.size)
     for k in range(r.size):
         # x without the input that arrives now, and what the controller's state and the reference put out.
         free = 0.0
         for i in range(z.size):
-            free += plant.output[i] * z[i]
+            free += c[i] * z[i]
         error = before * r[k] - v[k]
         held = (1.0 - before) * r[k]
         for i in range(s.size):
-            held += law.output[i] * s[i]
-        if plant.shift == 0:
+            held += C[i] * s[i]
+        if shift == 0:
             # The input acts on the output that it is made from: solve for it.
-            arriving = (held + law.direct * (error - free)) / (1.0 + law.direct * plant.direct)
-            x[k] = free + plant.direct * arriving
+            arriving = (held + D * (error - free)) / (1.0 + D * direct)
+            x[k] = free + direct * arriving
             u[k] = arriving
         else:
-            arriving = u[k - plant.shift] if k >= plant.shift else 0.0
-            x[k] = free + plant.direct * arriving
-            u[k] = held + law.direct * (error - x[k])
-        _advance(plant, arriving, z, z_next)
-        _advance(law, error - x[k], s, s_next)
+            arriving = u[k - shift] if k >= shift else 0.0
+            x[k] = free + direct * arriving
+            u[k] = held + D * (error - x[k])
+        _advance(F, g, arriving, z, z_next)
+        _advance(A, B, error - x[k], s, s_next)
         z, z_next = z_next, z
         s, s_next = s_next, s
     return u, x
