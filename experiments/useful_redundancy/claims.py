@@ -24,10 +24,10 @@ def reaches_the_paper(results: Results) -> Iterator[Claim]:
         for row in study_rows(study, table, {results.experiment: results})
         if row["experiment"] == results.experiment
     ]
-    against = [cell for cell in compare(rows, None, study).cells if cell.decisive]
+    against = compare(rows, None, study).decisive
     if against:
-        lower = sum(cell.mismatch for cell in against)
-        shown = f"{lower} of {len(against)}; the lowest is {min(cell.percent for cell in against):.1f} %"
+        lower = sum(cell["mismatch"] for cell in against)
+        shown = f"{lower} of {len(against)}; the lowest is {min(cell['percent'] for cell in against):.1f} %"
         name = "cells of proposed below the paper, beyond chance"
         yield within(name, lower, high=0, shown=shown)
 
