@@ -69,24 +69,23 @@ def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Located:
     path = tuple(part for part in error["loc"] if not str(part).startswith(TAG) and part != "[key]")
     kind, value, context = error["type"], error["input"], error.get("ctx", {})
     at_key = context.get("at_key", False) or kind in ("missing", "extra_forbidden") or "[key]" in error["loc"]
-    if kind == "no_kind":
-        if isinstance(value, Mapping):
-            path, kind, value = (*path, "kind"), "no_kind" if "kind" in value else "kind_missing", value.get("kind")
-        else:
-            kind, context = "no_form", {"allowed": f"a mapping with a 'kind' (one of {context['allowed']})"}
+    if kind == "no_kind" and not isinstance(value, Mapping):
+        kind, context = "no_form", {"allowed": f"a mapping with a 'kind' (one of {context['allowed']})"}
+    elif kind == "no_kind":
+        path, kind, value = (*path, "kind"), "no_kind" if "kind" in value else "kind_missing", value.get("kind")
+    elif kind == "float_type" and type(value) is int:
+        kind, value = "finite_number", float("inf")  # an integer beyond all floating-point numbers
     if kind not in SENTENCES:
         return path, error["msg"], at_key
-    if kind == "float_type" and isinstance(value, int) and not isinstance(value, bool):
-        kind, value = "finite_number", float("inf")  # an integer beyond all floating-point numbers
-    description = descriptions.get(str(path[0]), "") if path else ""
+    field = str(path[0]) if path else ""
+    description = descriptions.get(field, "")
     unit = re.search(r" \[[^\]-][^\]]*\]", description)
-    keys = ", ".join(descriptions)
     words = {
         "shown": shown(value),
         "unit": unit[0] if unit else "",
         "meaning": f": {description}" if description else "",
-        "keys": keys,
-        "near": did_you_mean(str(path[-1]), descriptions) or ";" if path else "",
+        "keys": ", ".join(descriptions),
+        "near": did_you_mean(field, descriptions) or ";",
         **context,
     }
     if kind == "literal_error":

@@ -42,8 +42,8 @@ from ctid_cli.specification.yaml_source import KeyPath
 #: Combinations that one section may sweep, and data cells that one experiment may hold.
 MAX_COMBINATIONS = 10_000
 
-#: A complaint, and the swept values that it is about.
 AnySection = TypeVar("AnySection", bound="Section")
+#: A complaint, and the swept values that it is about.
 Failure = tuple[KeyPath, str, Mapping[KeyPath, Any]]
 
 
@@ -218,13 +218,11 @@ class WithKey(OneOf):
 
 def _form(hint: Any, name: str) -> tuple[Any, bool]:
     """Annotation of an option of a given type, and whether it can be swept."""
-    simple = {float: Number, int: Whole, bool: bool, str: Text}
-    if hint == Array:
-        return Coefficients, False
+    simple = {float: Number, int: Whole, bool: bool, str: Text, Array: Coefficients}
     origin, arguments = get_origin(hint), get_args(hint)
     if hint in simple:
         # Names of files and columns are no quantities, and sweeping them would hide what a result belongs to.
-        return simple[hint], hint is not str
+        return simple[hint], hint not in (str, Array)
     if origin is Literal:
         return hint, True
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
@@ -234,16 +232,22 @@ def _form(hint: Any, name: str) -> tuple[Any, bool]:
         return form | None, scalar
     if origin in (Union, types.UnionType) and len(arguments) == 2:
         (usual, _), (other, word) = (_form(argument, name) for argument in arguments)
-        hint, shape = ("a word is allowed too", "text") if word else ("a list is allowed too", "list")
-        return Annotated[Any, ByShape(usual, hint, **{shape: other})], word
-    if origin is tuple and arguments[1:] == (Ellipsis,) and dataclasses.is_dataclass(arguments[0]):
-        # A list of such lists would say too little about which of them belong together, so that nothing in it is swept.
-        item = section_for(arguments[0], sweeping=False)  # type: ignore[arg-type]
-        return Annotated[list[item], Field(min_length=1)], False  # type: ignore[valid-type]
-    if origin is tuple and all(argument in (float, Ellipsis) for argument in arguments):
-        length = None if Ellipsis in arguments else len(arguments)
-        return Annotated[list[Number], Field(min_length=length or 1, max_length=length)], False
+        if word:
+            return Annotated[Any, ByShape(usual, "a word is allowed too", text=other)], True
+        return Annotated[Any, ByShape(usual, "a list is allowed too", list=other)], False
+    if origin is tuple:
+        return _list_form(arguments), False
     raise TypeError(f"{name}: a field of type {hint} has no form in a specification")
+
+
+def _list_form(items: tuple[Any, ...]) -> Any:
+    """Annotation of an option that is a tuple of numbers or of option dataclasses."""
+    if dataclasses.is_dataclass(items[0]):
+        # A list of such lists would say too little about which of them belong together, so that nothing in it is swept.
+        item = section_for(items[0], sweeping=False)  # type: ignore[arg-type]
+        return Annotated[list[item], Field(min_length=1)]  # type: ignore[valid-type]
+    length = None if Ellipsis in items else len(items)
+    return Annotated[list[Number], Field(min_length=length or 1, max_length=length)]
 
 
 def _default(option: dataclasses.Field[Any]) -> dict[str, Any]:
