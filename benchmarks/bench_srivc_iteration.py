@@ -4,8 +4,8 @@ import time
 
 import numpy as np
 
-from ctid_cli.estimation.problems import CoefficientProblem
-from ctid_cli.estimation.refined_iv import iterate
+from ctid_cli.estimation.iteration import RULES, Steps, iterate
+from ctid_cli.estimation.sampled import at_known_delay
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.sensitivity import Structure
@@ -38,7 +38,7 @@ def iteration_times(problem, theta, variant):
     times = []
     for _ in range(REPEATS + 1):
         begin = time.perf_counter()
-        result = iterate(problem, theta, max_iterations=ITERATIONS, tolerance=1e-300, variant=variant)
+        result = iterate(problem, theta, Steps(ITERATIONS, 1e-300, RULES[variant]))
         times.append((time.perf_counter() - begin) / ITERATIONS)
         assert result.iterations == ITERATIONS
     return np.array(times[1:])
@@ -50,8 +50,8 @@ def main():
         for regular in (True, False):
             data = filter_data(noisy_record(system, n_samples, interval, regular))
             structure = Structure(system.order, system.numerator.size - 1)
-            problem = CoefficientProblem(data, structure, system.delay)
-            theta = np.concatenate((system.denominator[1:], system.numerator))
+            problem = at_known_delay(data, structure)
+            theta = np.concatenate((system.denominator[1:], system.numerator, [system.delay]))
             times = 1e6 * iteration_times(problem, theta, "plain")
             clock = "regular" if regular else "irregular"
             goal = f"{target:11d}" if regular else f"{'-':>11}"

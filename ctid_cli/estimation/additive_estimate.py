@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, overload
+from typing import Any, Literal, NamedTuple, overload
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.additive_problem import AdditiveProblem
-from ctid_cli.estimation.common import history_entry
-from ctid_cli.estimation.refined_iv import Equations, Iterated, StepRule, iterate
+from ctid_cli.estimation.common import diverged, history_entry, quality
+from ctid_cli.estimation.iteration import GUARDED, Equations, Iterated, Steps, iterate
 from ctid_cli.filtering.loop import loop_radius
-from ctid_cli.inference.covariance import condition_number, white_noise_covariance
+from ctid_cli.inference.covariance import white_noise_covariance
 from ctid_cli.inference.fit import IterationRecord
 from ctid_cli.inference.robust import sandwich_covariance
 from ctid_cli.inference.status import Status
@@ -31,16 +30,17 @@ class History(Sequence[IterationRecord]):
 
     def __init__(self, problem: AdditiveProblem) -> None:
         self._problem = problem
-        self._entries: list[tuple[str, int, Array, float]] = []
+        self._entries: list[tuple[str, int, Array]] = []
 
-    def add(self, stage: str, iteration: int, theta: Array, cost: float) -> None:
-        """Append an iteration."""
-        self._entries.append((stage, iteration, theta.copy(), cost))
+    def add(self, stage: str, result: Iterated | None) -> None:
+        """Append the start and the accepted steps of an iteration."""
+        if result is not None:
+            self._entries += [(stage, k, row) for k, row in enumerate(result.path)]
 
     @property
-    def numbers(self) -> list[int]:
-        """Numbers of the iterations within their stages, 0 for a start."""
-        return [entry[1] for entry in self._entries]
+    def steps(self) -> int:
+        """Number of accepted steps, starts not counted."""
+        return sum(number > 0 for _, number, _ in self._entries)
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -54,94 +54,61 @@ class History(Sequence[IterationRecord]):
     def __getitem__(self, index: int | slice) -> IterationRecord | tuple[IterationRecord, ...]:
         if isinstance(index, slice):
             return tuple(self[k] for k in range(*index.indices(len(self))))
-        stage, iteration, theta, cost = self._entries[index]
-        return history_entry(stage, iteration, self._problem, theta, cost)
+        stage, iteration, row = self._entries[index]
+        return history_entry(stage, iteration, self._problem, row[:-1], float(row[-1]))
 
 
-@dataclass(frozen=True, eq=False)
-class SubmodelEstimate:
+class SubmodelEstimate(NamedTuple):
     """Estimated parameters of a sum of submodels."""
 
     #: Parameters of the model, in the order of the problem's terms, shape (p,).
     theta: Array
-    #: Their covariance; NaN where it is not defined, shape (p, p).
-    covariance: Array
-    status: Status
-    iterations: int
-    #: ``sum eps^2`` [output unit^2]; NaN where the estimate has no finite response.
-    squared_error: float
-    #: ``1 - ||y - x||^2 / ||y - mean y||^2`` [-].
-    r2: float
-    #: Of the scaled ``sum psi psi'`` [-].
-    condition_number: float
     #: Spectral radius of the sampled loop [-]; NaN in open loop.
     loop_radius: float
-    history: History
+    #: Covariance, status and all else that a `Fit` says of them, by its names.
+    values: dict[str, Any]
 
 
 def estimate_submodels(
-    problem: AdditiveProblem,
-    theta: Array,
-    *,
-    max_iterations: int,
-    tolerance: float,
-    variant: StepRule,
-    covariance: Covariance,
+    problem: AdditiveProblem, theta: Array, steps: Steps, covariance: Covariance
 ) -> SubmodelEstimate:
     """Iterate from a start and judge the result.
 
     Where the iteration does not converge it is run once more with the other interpolation of the output; and in open
     loop, if that does not help, goes on with guarded steps.
     """
-    p, data = problem.size, problem.data
+    p, y = problem.size, problem.data.y_used
     whole = np.concatenate((theta, np.zeros(problem.filter.free)))
     radius = _loop_radius(problem, whole)
-    if radius > 1.0 and data.y.size * np.log(radius) > np.log(LARGEST_GROWTH):
+    if radius > 1.0 and problem.data.y.size * np.log(radius) > np.log(LARGEST_GROWTH):
         raise DataError(
             f"the start makes an unstable loop with the controller (largest pole magnitude {radius:.4g}, it must be "
             "below 1), so the instruments cannot be simulated; start closer, or with instruments 'open_loop'"
         )
     history = History(problem)
 
-    def run(stage: str, problem: AdditiveProblem, start: Array, variant: StepRule) -> Iterated | None:
-        begun = len(history)
+    def run(stage: str, problem: AdditiveProblem, start: Array, steps: Steps) -> Iterated | None:
+        result = iterate(problem, start, steps)
+        history.add(stage, result)
+        return result
 
-        def record_step(theta: Array, equations: Equations) -> None:
-            history.add(stage, len(history) - begun, theta, equations.squared_error / data.count)
-
-        return iterate(
-            problem, start, max_iterations=max_iterations, tolerance=tolerance, variant=variant, on_step=record_step
-        )
-
-    result = run("refine", problem, whole, variant)
+    result = run("refine", problem, whole, steps)
     if result is None or result.status is not Status.CONVERGED:
-        result = _better(result, run("refine_again", problem.with_other_hold(), whole, variant))
+        result = _better(result, run("refine_again", problem.with_other_hold(), whole, steps))
     if result is not None and result.status is Status.MAX_ITERATIONS and not problem.filter.loop.closed:
         # Slow on its way to a minimum: near it the cost may guard the steps, and Gauss-Newton is faster.
-        result = _better(result, run("refine_guarded", problem, result.theta, "guarded"))
-    iterations = sum(number > 0 for number in history.numbers)
-    nan = float("nan")
-    undefined = np.full((p, p), nan)
+        result = _better(result, run("refine_guarded", problem, result.theta, steps._replace(rule=GUARDED)))
+    values: dict[str, Any] = {"iterations": history.steps, "history": history}
     if result is None:
-        return SubmodelEstimate(theta, undefined, Status.DIVERGED, iterations, nan, nan, nan, radius, history)
+        return SubmodelEstimate(theta, radius, {**values, **diverged(p, y.size)})
     equations, status = result.equations, result.status
-    y = data.y_used
-    matrix = undefined
+    matrix = np.full((p, p), np.nan)
     if status is not Status.DIVERGED:
         matrix = _covariance(problem, result.theta, equations, covariance)[:p, :p]
         if status is Status.CONVERGED and np.isnan(matrix).any():
             status = Status.SINGULAR
-    return SubmodelEstimate(
-        theta=result.theta[:p],
-        covariance=matrix,
-        status=status,
-        iterations=iterations,
-        squared_error=equations.squared_error,
-        r2=1.0 - equations.squared_error / float(np.sum((y - y.mean()) ** 2)),
-        condition_number=condition_number(equations.hessian),
-        loop_radius=_loop_radius(problem, result.theta),
-        history=history,
-    )
+    values |= {"covariance": matrix, "status": status, **quality(equations, float(np.sum((y - y.mean()) ** 2)), y.size)}
+    return SubmodelEstimate(result.theta[:p], _loop_radius(problem, result.theta), values)
 
 
 def _better(one: Iterated | None, other: Iterated | None) -> Iterated | None:

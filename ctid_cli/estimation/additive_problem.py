@@ -11,8 +11,9 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.problems import is_hurwitz, reflect_unstable
-from ctid_cli.estimation.refined_iv import Equations
+from ctid_cli.estimation.common import named
+from ctid_cli.estimation.iteration import Equations, inadmissible
+from ctid_cli.estimation.stability import is_hurwitz, reflect_unstable
 from ctid_cli.filtering.filter_data import FilterData, plain_array
 from ctid_cli.filtering.submodel_blocks import LoopData
 from ctid_cli.filtering.submodels import OPEN_LOOP, InitialState, SubmodelFilter
@@ -39,16 +40,15 @@ def loop_data(record: Record, instruments: Instruments) -> LoopData:
     """The feedback that instruments are simulated with."""
     if instruments == "open_loop":
         return OPEN_LOOP
-    where = f"{record.name}: " if record.name else ""
     if record.loop is None:
         raise DataError(
-            f"{where}closed-loop instruments need the reference and the controller, and this record has neither; give "
-            "them with the record, or use instruments 'open_loop'"
+            f"{named(record)}closed-loop instruments need the reference and the controller, and this record has "
+            "neither; give them with the record, or use instruments 'open_loop'"
         )
     if not record.input_on_grid or record.input.hold != "zoh":
         raise DataError(
-            f"{where}closed-loop instruments need an input that is held from sample to sample of a regular clock: the "
-            "controller is discrete"
+            f"{named(record)}closed-loop instruments need an input that is held from sample to sample of a regular "
+            "clock: the controller is discrete"
         )
     controller = DiscreteController(record.loop.controller.numerator, record.loop.controller.denominator)
     order = controller.denominator.size
@@ -83,6 +83,16 @@ class AdditiveProblem:
         """The same problem with the other interpolation of the output in the regressors."""
         data = self.data._replace(y_foh=not self.data.y_foh)
         return AdditiveProblem(data, self.terms, self.delay, self.filter.loop, self.initial_state)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples in the sums."""
+        return self.data.count
+
+    @property
+    def free(self) -> int:
+        """Number of parameters to iterate on, those of a free response included."""
+        return self.size + self.filter.free
 
     @property
     def size(self) -> int:
@@ -139,13 +149,12 @@ class AdditiveProblem:
         duration = float(t[-1] - t[0])
         return math.pi * math.sqrt(2.0 * (t.size - 1)) / duration
 
-    def equations(self, theta: Array) -> Equations | None:
+    def equations(self, theta: Array) -> Equations:
         """Second moments of the iteration."""
-        if not np.isfinite(theta).all():
-            return None
-        moments = self.filter.moments(theta)
+        moments = self.filter.moments(theta) if np.isfinite(theta).all() else None
         if moments is None:
-            return None
+            nothing: Equations = inadmissible(theta.size)
+            return nothing
         return Equations(
             moments.instrument_regressor,
             moments.instrument_error,

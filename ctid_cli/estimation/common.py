@@ -1,28 +1,33 @@
-"""What every estimator of a single transfer function checks and reports in the same way."""
+"""What every estimator of a system checks, lays out and reports in the same way."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, Protocol
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.estimation.problems import CoefficientProblem
+from ctid_cli.estimation.iteration import Equations, Iterated
+from ctid_cli.estimation.sampled import SampledProblem
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
 from ctid_cli.inference.diagnostics import percent_from_r_squared
 from ctid_cli.inference.fit import Fit, IterationRecord
-from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.checks import require_integer
+from ctid_cli.signals.checks import require_choice, require_integer, require_not_negative, require_positive
 from ctid_cli.signals.record import Record
 
 #: What an estimator takes from a start: an initial delay, or initial parameters.
 StartFrom = Literal["delay", "parameters"]
+#: What an estimator makes of a record before it knows a start, and what it returns.
+LaidOut = TypeVar("LaidOut")
+AnyFit = TypeVar("AnyFit", bound=Fit)
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,142 @@ class Start:
     model: AdditiveModel | None = None
 
 
+class Estimator(Generic[LaidOut, AnyFit]):
+    """An estimator of a system: frozen options, checked when they are given, and how it uses them."""
+
+    kind: ClassVar[str]
+    start_from: ClassVar[StartFrom | None] = None
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    def _lay_out(self, record: Any) -> LaidOut:
+        """What can be computed, and refused, before a start is known."""
+        raise NotImplementedError
+
+    def _estimate(self, laid_out: LaidOut, start: Start | None) -> AnyFit:
+        raise NotImplementedError
+
+    def prepare(self, record: Any) -> Prepared[LaidOut, AnyFit]:
+        """Check a record, or several where they may be, and lay it out once for any number of starts.
+
+        A DataError says why nothing can be estimated.
+        """
+        return Prepared(self, self._lay_out(record))
+
+    def fit(self, record: Any, start: Start | None = None) -> AnyFit:
+        """Estimate from a record, or several where they may be, and from a start where the estimator takes one.
+
+        A DataError says why nothing can be estimated.
+        """
+        return self.prepare(record).fit(start)
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared(Generic[LaidOut, AnyFit]):
+    """A record laid out for an estimator, ready to fit from any start."""
+
+    estimator: Estimator[LaidOut, AnyFit]
+    laid_out: LaidOut
+
+    def fit(self, start: Start | None = None) -> AnyFit:
+        """Estimate from one start."""
+        return self.estimator._estimate(self.laid_out, start)
+
+
+# --- options ---------------------------------------------------------------------------------------
+
+
+def _require_fraction(name: str, value: float) -> None:
+    if not 0 < value < 1:
+        raise OptionError(name, f"{name} must lie between 0 and 1, not {value}")
+
+
+#: Checks of the options that several estimators share, by name; None stands for an option that was not given.
+CHECKS: Mapping[str, Callable[[str, Any], None]] = {
+    "poles": lambda name, value: require_integer(name, value, 1, 12),
+    "zeros": lambda name, value: require_integer(name, value, 0),
+    "delay": lambda name, value: require_not_negative(name, value, "s"),
+    "svf_cutoff": lambda name, value: require_positive(name, value, "rad/s"),
+    "bandwidth": lambda name, value: require_positive(name, value, "rad/s"),
+    "max_iterations": lambda name, value: require_integer(name, value, 1),
+    "max_rounds": lambda name, value: require_integer(name, value, 1),
+    "filters": lambda name, value: require_integer(name, value, 2),
+    "order": lambda name, value: require_integer(name, value, 1, 20),
+    "tolerance": _require_fraction,
+}
+
+
+@lru_cache
+def _choices(options: type) -> dict[str, tuple[str, ...]]:
+    """The words that each option of a Literal type may be."""
+    return {name: get_args(hint) for name, hint in get_type_hints(options).items() if get_origin(hint) is Literal}
+
+
+def check_options(options: Any) -> None:
+    """Check every option by itself."""
+    choices = _choices(options.__class__)
+    for item in fields(options):
+        name, value = item.name, getattr(options, item.name)
+        if name in choices:
+            require_choice(name, value, choices[name])
+        elif name in CHECKS and not (value is None and item.default is None):
+            CHECKS[name](name, value)
+
+
+def check_proper(poles: int, zeros: int) -> None:
+    """Check the degrees of a strictly proper model."""
+    if zeros >= poles:
+        raise OptionError(
+            "zeros", f"zeros must be fewer than poles (a strictly proper model): got {zeros} zeros and {poles} poles"
+        )
+
+
+def checked_bounds(bounds: tuple[float, float], known_allowed: bool = False) -> tuple[float, float]:
+    """Bounds of the delay as numbers; two equal ones are a known delay."""
+    try:
+        low, high = (float(bound) for bound in bounds)
+    except (TypeError, ValueError):
+        low, high = np.nan, np.nan
+    if not 0 <= low <= high < np.inf or (low == high and not known_allowed):
+        raise OptionError(
+            "delay_bounds", f"delay_bounds must be two delays in seconds, the smaller (0 or more) first: got {bounds!r}"
+        )
+    return low, high
+
+
+# --- records ---------------------------------------------------------------------------------------
+
+
+def named(record: Record) -> str:
+    """How a message about a record begins."""
+    return f"{record.name}: " if record.name else ""
+
+
+def check_record(record: Record, data: FilterData, parameters: int) -> None:
+    """Refuse records from which nothing can be estimated."""
+    if data.count <= parameters:
+        raise DataError(
+            f"{named(record)}{data.count} usable samples for {parameters} parameters; "
+            "take a longer record, a smaller model, or a smaller largest delay"
+        )
+    if np.ptp(record.input.values) == 0.0:
+        raise DataError(
+            f"{named(record)}the input is constant ({record.input.values[0]:g}); it excites nothing to identify"
+        )
+    if np.ptp(data.y_used) == 0.0:
+        raise DataError(f"{named(record)}the output is constant ({data.y_used[0]:g}) over the samples that can be used")
+
+
+def check_greatest_delay(record: Record, greatest: float) -> None:
+    """Refuse a delay that may last as long as the record."""
+    duration = record.t[-1] - record.input.t[0]
+    if greatest >= duration:
+        raise DataError(
+            f"{named(record)}the greatest delay, {greatest:g} s, is not shorter than the record, {duration:g} s"
+        )
+
+
 def initial_delay(start: Start | None, bounds: tuple[float, float]) -> float:
     """Delay from which a search starts."""
     low, high = bounds
@@ -50,93 +191,94 @@ def initial_delay(start: Start | None, bounds: tuple[float, float]) -> float:
     return delay
 
 
-def check_structure(poles: int, zeros: int) -> None:
-    """Check the degrees of a strictly proper model."""
-    require_integer("poles", poles, 1, 12)
-    require_integer("zeros", zeros, 0)
-    if zeros >= poles:
-        raise OptionError(
-            "zeros", f"zeros must be fewer than poles (a strictly proper model): got {zeros} zeros and {poles} poles"
-        )
-
-
-def check_iteration(max_iterations: int, tolerance: float) -> None:
-    """Check the stopping rule of an iteration."""
-    require_integer("max_iterations", max_iterations, 1)
-    if not 0 < tolerance < 1:
-        raise OptionError("tolerance", f"tolerance must lie between 0 and 1, not {tolerance}")
-
-
-def check_record(record: Record, data: FilterData, parameters: int) -> None:
-    """Refuse records from which nothing can be estimated."""
-    where = f"{record.name}: " if record.name else ""
-    if data.count <= parameters:
-        raise DataError(
-            f"{where}{data.count} usable samples for {parameters} parameters; "
-            "take a longer record, a smaller model, or a smaller largest delay"
-        )
-    if np.ptp(record.input.values) == 0.0:
-        raise DataError(f"{where}the input is constant ({record.input.values[0]:g}); it excites nothing to identify")
-    if np.ptp(data.y_used) == 0.0:
-        raise DataError(f"{where}the output is constant ({data.y_used[0]:g}) over the samples that can be used")
+# --- results ---------------------------------------------------------------------------------------
 
 
 class Splits(Protocol):
     """An estimation problem, as far as its history needs to know it."""
 
+    @property
+    def samples(self) -> int:
+        """Number of samples in the sums."""
+
     def split(self, theta: Array) -> tuple[Array, Array, float]:
         """Denominator, numerator and delay of a parameter vector."""
 
 
-def history_entry(stage: str, iteration: int, problem: Splits, theta: Array, cost: float) -> IterationRecord:
+def history_entry(stage: str, iteration: int, problem: Splits, theta: Array, squared_error: float) -> IterationRecord:
     """Describe one accepted iteration."""
     a, b, delay = problem.split(theta)
+    cost = squared_error / problem.samples
     return IterationRecord(stage, iteration, delay, cost, tuple(a.tolist()), tuple(b.tolist()))
 
 
+def history_of(stage: str, problem: Splits, result: Iterated | None) -> list[IterationRecord]:
+    """Describe the start and the accepted steps of an iteration."""
+    path = np.empty((0, 1)) if result is None else result.path
+    return [history_entry(stage, k, problem, row[:-1], float(row[-1])) for k, row in enumerate(path)]
+
+
+def covariance_of(equations: Equations, free: IndexArray, count: int, status: Status) -> tuple[Array, Status]:
+    """Covariance of the free parameters for white noise, NaN for the others, and the status that it leaves."""
+    covariance = np.full(equations.hessian.shape, np.nan)
+    if not free.size:
+        return covariance, status
+    block = np.ix_(free, free)
+    covariance[block] = white_noise_covariance(equations.hessian[block], equations.squared_error, count)
+    singular = status is Status.CONVERGED and bool(np.isnan(covariance[block]).any())
+    return covariance, Status.SINGULAR if singular else status
+
+
+def quality(equations: Equations, spread: float, count: int) -> dict[str, Any]:
+    """Cost, agreement and conditioning by the names of `Fit`; ``spread`` is ``sum (y - mean y)^2``."""
+    r2 = 1.0 - equations.squared_error / spread
+    return {
+        "cost": equations.squared_error / count,
+        "fit_percent": percent_from_r_squared(r2),
+        "r2": r2,
+        "count": count,
+        "condition_number": condition_number(equations.hessian),
+    }
+
+
+def diverged(size: int, count: int) -> dict[str, Any]:
+    """What stands in a `Fit` without a finite response."""
+    nan = float("nan")
+    return {
+        "covariance": np.full((size, size), nan),
+        "status": Status.DIVERGED,
+        "cost": nan,
+        "fit_percent": nan,
+        "r2": nan,
+        "count": count,
+        "condition_number": nan,
+    }
+
+
 def finish(
-    problem: CoefficientProblem,
-    theta: Array,
-    status: Status,
-    iterations: int,
-    history: list[IterationRecord],
-    accurate: bool = True,
+    problem: SampledProblem, theta: Array, status: Status, iterations: int, history: list[IterationRecord]
 ) -> Fit:
     """Assemble the result of an estimation."""
-    structure: Structure = problem.structure
     a, b, delay = problem.split(theta)
-    model = TransferFunction(b, a, delay)
-    count = problem.data.count
-    moments = problem.moments(theta)
-    undefined = np.full((structure.size, structure.size), np.nan)
-    if moments is None:
-        nan = float("nan")
-        return Fit(
-            model, structure.names, undefined, Status.DIVERGED, nan, nan, nan, count, iterations, nan, tuple(history)
-        )
-    hessian = structure.hessian(moments)
-    free = structure.size - int(status is Status.DELAY_AT_BOUND)
-    covariance = undefined
-    if accurate:
+    size, y = problem.free, problem.data.y_used
+    found = problem.equations(theta)
+    if np.isfinite(found.squared_error):
+        # A delay that is held is no parameter of the result.
+        found = found._replace(hessian=found.hessian[:size, :size])
         # A delay at its bound is no minimum: it has no standard error, and the others hold for that delay.
-        covariance[:free, :free] = white_noise_covariance(
-            hessian[:free, :free], structure.squared_error(moments), count
-        )
-        if status is Status.CONVERGED and np.isnan(covariance[:free, :free]).any():
-            status = Status.SINGULAR
-    squared_error = structure.squared_error(moments)
-    y = problem.data.y_used
-    r2 = 1.0 - squared_error / float(np.sum((y - y.mean()) ** 2))
+        accurate = 0 if status is Status.LEAST_SQUARES else size - int(status is Status.DELAY_AT_BOUND)
+        covariance, status = covariance_of(found, np.arange(accurate), y.size, status)
+        values = {
+            "covariance": covariance,
+            "status": status,
+            **quality(found, float(np.sum((y - y.mean()) ** 2)), y.size),
+        }
+    else:
+        values = diverged(size, y.size)
     return Fit(
-        model=model,
-        parameter_names=structure.names,
-        covariance=covariance,
-        status=status,
-        cost=squared_error / count,
-        fit_percent=percent_from_r_squared(r2),
-        r2=r2,
-        count=count,
+        model=TransferFunction(b, a, delay),
+        parameter_names=problem.structure.names,
         iterations=iterations,
-        condition_number=condition_number(hessian),
         history=tuple(history),
+        **values,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -21,6 +22,16 @@ HOPELESS = 4.0
 #: Gauss-Newton steps on the delay that end the search.
 DESCENT_ITERATIONS = 10
 DESCENT_TOLERANCE = 1e-4
+
+
+class GridCost(Protocol):
+    """A cost that offers starts of its own at every delay."""
+
+    def starts(self, delay: float) -> list[Array]:
+        """Parameters with the delay last from which to minimise; more may be found than one."""
+
+    def minimise_from(self, delay: float, starts: Sequence[Array]) -> Minimum | None:
+        """Least cost at a delay over several starts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +65,7 @@ def search_grid(levels: Sequence[Level], bounds: tuple[float, float], fewest: in
     first = found = scan(levels[0].cost, delays)
     spacing = float(delays[1] - delays[0])
     for level in levels[1:]:
-        centres = [delays[k] for k in _hopeful(_costs(found), KEPT)]
+        centres = [delays[k] for k in _hopeful(costs_of(found), KEPT)]
         count = int(np.ceil(REACH * spacing / level.spacing))
         offsets = level.spacing * np.arange(-count, count + 1)
         # Grids that overlap share their points.
@@ -63,12 +74,12 @@ def search_grid(levels: Sequence[Level], bounds: tuple[float, float], fewest: in
         delays = np.unique(np.clip(delays, low, high))
         found = scan(level.cost, delays)
         spacing = level.spacing
-    minima = [_descended(levels[-1].cost, found[k], bounds) for k in _hopeful(_costs(found), MINIMA)]
+    minima = [_descended(levels[-1].cost, found[k], bounds) for k in _hopeful(costs_of(found), MINIMA)]
     minima.sort(key=lambda minimum: minimum.squared_error)
-    return GridSearch(grid, _costs(first), tuple(minima))
+    return GridSearch(grid, costs_of(first), tuple(minima))
 
 
-def scan(cost: FilteredCost, delays: Array) -> list[Minimum | None]:
+def scan(cost: GridCost, delays: Array) -> list[Minimum | None]:
     """Least costs at given delays."""
     found: list[Minimum | None] = [None] * delays.size
     # Along the grid and back, so that good coefficients reach both neighbours.
@@ -77,10 +88,10 @@ def scan(cost: FilteredCost, delays: Array) -> list[Minimum | None]:
         for k in order:
             here = found[k]
             starts = [] if neighbour is None else [neighbour.theta]
+            # The way back only hands good coefficients on to worse neighbours.
             if here is None:
-                own = cost.start(float(delays[k]))
-                starts += [] if own is None else [own]
-            trial = cost.minimise_from(float(delays[k]), starts) if starts else None
+                starts += cost.starts(float(delays[k]))
+            trial = cost.minimise_from(float(delays[k]), starts)
             if trial is not None and (here is None or trial.squared_error < here.squared_error):
                 found[k] = here = trial
             neighbour = here
@@ -101,7 +112,8 @@ def _hopeful(costs: Array, most: int) -> list[int]:
     return [k for k in lowest if costs[k] <= HOPELESS * costs[lowest[0]]]
 
 
-def _costs(found: list[Minimum | None]) -> Array:
+def costs_of(found: list[Minimum | None]) -> Array:
+    """Squared errors, NaN where nothing was found."""
     return np.array([np.nan if minimum is None else minimum.squared_error for minimum in found])
 
 

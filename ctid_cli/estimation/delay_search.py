@@ -8,44 +8,47 @@ of, filtered or not, samples or spectra, is the business of the *cost*.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from numba import njit
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.refined_iv import Equations, scaled_solve
+from ctid_cli.estimation.iteration import Equations, Steps, admissible, run, solve_scaled, with_best
 from ctid_cli.inference.status import Status
 
 #: The smallest delay step, as a fraction of the range of the delay.
 SMALLEST_STEP = 1e-5
-#: The delay counts as undetermined where projecting the coefficients out leaves less of the curvature.
+#: The delay counts as undetermined where projecting the coefficients out leaves less of the curvature; more has to be
+#: left before a bound counts as being in the way.
 LEAST_CURVATURE = 1e-14
+LEAST_AT_BOUND = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
     """Least cost at one delay."""
 
-    #: Delay [s].
-    delay: float
-    #: Coefficients there, ``(a_1 … a_n, b_0 … b_m)``, shape (n + m + 1,).
+    #: ``(a_1 … a_n, b_0 … b_m, delay [s])``, shape (n + m + 2,).
     theta: Array
     #: Sum of squared output errors [output unit^2].
     squared_error: float
-    #: Gauss-Newton step of the delay [s]; None where it is not known yet or the data do not determine it.
-    step: float | None = None
+    #: Gauss-Newton step of the delay [s]; NaN where the data do not determine it.
+    step: float = float("nan")
+
+    @property
+    def delay(self) -> float:
+        """The delay [s]."""
+        return float(self.theta[-1])
 
 
 class DelayCost(Protocol):
     """A cost as a function of the delay, minimised over the coefficients."""
 
     def minimise(self, delay: float, theta: Array | None) -> Minimum | None:
-        """Minimise over the coefficients at one delay."""
-
-    def step(self, minimum: Minimum) -> float | None:
-        """Gauss-Newton step of the delay from a minimum of this cost."""
+        """Minimise over the coefficients at one delay, from the coefficients at the head of theta."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +58,60 @@ class Descent:
     minimum: Minimum
     status: Status
     iterations: int
+
+
+@njit(cache=True, nogil=True)
+def delay_step(current: Equations, least_curvature: float, project_gradient: bool) -> float:
+    """Gauss-Newton step of the delay, the last parameter, with the coefficients projected out; NaN if undetermined.
+
+    At a minimum over the coefficients their gradient vanishes; elsewhere it has to be projected out as well.
+    """
+    hessian, gradient = current.hessian, current.instrument_error
+    last = gradient.size - 1
+    lengths, mixed = np.diag(hessian).copy(), hessian[:, last].copy()
+    solved, projection = solve_scaled(hessian, mixed, lengths, lengths, last)
+    if not solved:
+        return np.nan
+    # H = eps_tau' eps_tau - eps_tau' psi (psi' psi)^-1 psi' eps_tau; the sign of eps_tau cancels in it.
+    curvature = hessian[last, last] - projection[:last] @ mixed[:last]
+    if not curvature > least_curvature * hessian[last, last]:
+        return np.nan
+    slope = gradient[last]
+    if project_gradient:
+        slope -= projection[:last] @ gradient[:last]
+    return float(slope / curvature)
+
+
+@njit(cache=True, nogil=True)
+def best_of(
+    problem: Any, starts: Array, poles: int, steps: Steps, project_gradient: bool
+) -> tuple[Array, float, float]:
+    """Best coefficients from the denominators of several starts: parameters, squared error and step of the delay.
+
+    The delay is the last parameter and held. Without any admissible start the squared error is infinite.
+    """
+    free = starts.shape[1] - 1
+    found, least, step = starts[0], np.inf, np.nan
+    for k in range(starts.shape[0]):
+        # The numerator of a start is refitted: only the denominator matters.
+        start = with_best(problem, admissible(problem, starts[k].copy()), poles, free)
+        theta, current, _, _, _ = run(problem, start, free, steps)
+        if current.squared_error < least:
+            found, least = theta, current.squared_error
+            step = delay_step(current, LEAST_CURVATURE, project_gradient)
+    return found, least, step
+
+
+def best_minimum(
+    problem: Any, delay: float, starts: Sequence[Array], poles: int, steps: Steps, project_gradient: bool = True
+) -> Minimum | None:
+    """Least cost at a delay over the denominators of several starts, compiled as a whole."""
+    if not starts:
+        return None
+    thetas = np.array(starts)
+    thetas[:, -1] = delay
+    theta, squared_error, step = best_of(problem, thetas, poles, steps, project_gradient)
+    return Minimum(theta, squared_error, step) if np.isfinite(squared_error) else None
 
 
 def descend(
@@ -83,8 +140,8 @@ def descend(
     if on_step:
         on_step(current)
     for iteration in range(max_iterations):
-        step = cost.step(current)
-        if step is None or not np.isfinite(step):
+        step = current.step
+        if not np.isfinite(step):
             return Descent(current, Status.SINGULAR, iteration)
         if abs(step) > largest_step:
             step = largest_step if step > 0 else -largest_step
@@ -112,24 +169,9 @@ def descend(
     return Descent(current, Status.MAX_ITERATIONS, max_iterations)
 
 
-def delay_step(equations: Equations, least_curvature: float = LEAST_CURVATURE) -> float | None:
-    """Gauss-Newton step of the delay with the coefficients projected out."""
-    hessian, gradient = equations.hessian, equations.instrument_error
-    diagonal = np.diag(hessian)[:-1]
-    projection = scaled_solve(hessian[:-1, :-1], hessian[:-1, -1], diagonal, diagonal)
-    if projection is None:
-        return None
-    curvature = hessian[-1, -1] - projection @ hessian[:-1, -1]
-    if not curvature > least_curvature * hessian[-1, -1]:
-        return None
-    return float(gradient[-1] / curvature)
-
-
-def bound_in_the_way(equations: Equations, delay: float, bounds: tuple[float, float]) -> float | None:
-    """The bound that keeps the delay from a lower cost."""
-    step = delay_step(equations, least_curvature=1e-8)
-    if step is None:
-        return None
-    if delay + step < bounds[0]:
+def bound_in_the_way(current: Equations, delay: float, bounds: tuple[float, float]) -> float | None:
+    """The bound that keeps the delay, the last parameter, from a lower cost."""
+    target = delay + delay_step(current, LEAST_AT_BOUND, False)
+    if target < bounds[0]:
         return bounds[0]
-    return bounds[1] if delay + step > bounds[1] else None
+    return bounds[1] if target > bounds[1] else None

@@ -16,7 +16,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.common import check_record
+from ctid_cli.estimation.common import check_record, named
+from ctid_cli.estimation.iteration import GUARDED, Steps, iterate, solve_scaled
 from ctid_cli.estimation.pole_relocation import (
     Lines,
     find_poles,
@@ -25,8 +26,7 @@ from ctid_cli.estimation.pole_relocation import (
     residual_weights,
     spectral_lines,
 )
-from ctid_cli.estimation.problems import CoefficientProblem, least_squares_start, refit_numerator
-from ctid_cli.estimation.refined_iv import iterate, scaled_solve
+from ctid_cli.estimation.sampled import at_known_delay, least_squares_start
 from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.filtering.free_response import free_response, free_response_size
 from ctid_cli.filtering.submodels import SubmodelFilter
@@ -45,9 +45,7 @@ HIGHEST_ORDER = 12
 #: Cut-offs of the state-variable filter, how many of their estimates are refined, and steps of the refinement.
 CUTOFFS = 6
 REFINED = 3
-REFINEMENT_STEPS = 10
-REFINEMENT_HALVINGS = 4
-REFINEMENT_TOLERANCE = 1e-4
+REFINEMENT = Steps(max_iterations=10, tolerance=1e-4, rule=GUARDED, halvings=4)
 #: Ways of sharing poles out among terms of different structure that are tried.
 MOST_ARRANGEMENTS = 24
 #: Frequencies of a periodogram that share one noise level.
@@ -103,10 +101,9 @@ def automatic_start(record: Record, terms: Sequence[Term], delay: float = 0.0) -
             if fitted is not None and (best is None or fitted.criterion < best.criterion):
                 best, method = fitted, way
     if best is None:
-        where = f"{record.name}: " if record.name else ""
         raise DataError(
-            f"{where}no start was found: {data.count} samples show no modes of the structure asked for; take a longer "
-            "record, fewer poles, or give the start"
+            f"{named(record)}no start was found: {data.count} samples show no modes of the structure asked for; take "
+            "a longer record, fewer poles, or give the start"
         )
     text = f"{method}; numerators by least squares on the output error; the best of {len(sets)} sets of poles."
     if best.free:
@@ -152,28 +149,17 @@ def _transfer_function_poles(data: FilterData, order: int, delay: float) -> list
     structure = Structure(order, order - 1)
     if data.count <= structure.size:
         return None
-    problem = CoefficientProblem(data, structure, delay)
+    problem = at_known_delay(data, structure)
     duration = float(data.t[-1] - data.t[0])
     fastest = 0.5 * np.pi / float(np.median(np.diff(data.t)))
     starts: list[tuple[float, Array]] = []
     for cutoff in np.geomspace(min(4.0 * np.pi / duration, fastest), fastest, CUTOFFS):
-        theta = least_squares_start(data, structure, delay, float(cutoff))
-        if theta is None:
-            continue
-        theta = refit_numerator(data, structure, theta, delay)
-        equations = problem.equations(theta)
-        if equations is not None:
-            starts.append((equations.squared_error, theta))
+        theta = least_squares_start(data, structure, delay, float(cutoff), refit=True)
+        if theta is not None:
+            starts.append((problem.equations(theta).squared_error, theta))
     refined: list[tuple[float, Array]] = []
     for _, theta in sorted(starts, key=lambda start: start[0])[:REFINED]:
-        result = iterate(
-            problem,
-            theta,
-            max_iterations=REFINEMENT_STEPS,
-            tolerance=REFINEMENT_TOLERANCE,
-            variant="guarded",
-            halvings=REFINEMENT_HALVINGS,
-        )
+        result = iterate(problem, theta, REFINEMENT)
         if result is not None:
             refined.append((result.equations.squared_error, result.theta))
     if not refined:
@@ -328,9 +314,9 @@ class _Responses:
         best: _Gains | None = None
         for free, columns in ((False, self.forced), (True, np.hstack((self.forced, self.free)))):
             gram = columns.T @ columns
-            scales = np.diag(gram)
-            solution = scaled_solve(gram, columns.T @ y, scales, scales) if y.size > scales.size else None
-            if solution is None:
+            scales = np.diag(gram).copy()
+            solved, solution = solve_scaled(gram, columns.T @ y, scales, scales, scales.size)
+            if not solved or y.size <= scales.size:
                 continue
             error = y - columns @ solution
             criterion = _criterion(error) + DECISIVE * free * self.free.shape[1] * np.log(y.size)

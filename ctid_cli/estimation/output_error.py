@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.estimation.problems import with_stable_denominator
-from ctid_cli.estimation.refined_iv import Equations, scaled_solve
+from ctid_cli.estimation.iteration import Equations, inadmissible, solve_scaled
+from ctid_cli.estimation.stability import with_stable_denominator
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.sensitivity import Structure
@@ -84,7 +84,12 @@ class OutputErrorProblem:
         )
 
     @property
-    def count(self) -> int:
+    def free(self) -> int:
+        """Number of parameters to iterate on."""
+        return self.layout.size
+
+    @property
+    def samples(self) -> int:
         """Number of samples in the sums."""
         return sum(record.count for record in self.data)
 
@@ -103,7 +108,8 @@ class OutputErrorProblem:
 
     def admissible(self, theta: Array) -> Array:
         """Reflect unstable denominators."""
-        return with_stable_denominator(theta, self.structure.poles)
+        stable: Array = with_stable_denominator(theta, self.structure.poles)
+        return stable
 
     def sensitivities(self, theta: Array) -> list[tuple[Array, Array]] | None:
         """Derivatives of the simulated output, and the output error, of each experiment."""
@@ -143,20 +149,20 @@ class OutputErrorProblem:
         psi = np.column_stack([-through[:, ::-1], highest, filtered[:, ::-1]])
         return psi, rows[:, 3 * n + 1] - b[0] * u
 
-    def equations(self, theta: Array) -> Equations | None:
+    def equations(self, theta: Array) -> Equations:
         """Second moments of the iteration; instruments and regressors are both the sensitivities (Gauss-Newton)."""
+        nothing: Equations = inadmissible(self.layout.size)
         parts = self.sensitivities(theta)
         if parts is None:
-            return None
+            return nothing
         hessian = sum((psi.T @ psi for psi, _ in parts), np.zeros((self.layout.size, self.layout.size)))
         gradient = sum((psi.T @ eps for psi, eps in parts), np.zeros(self.layout.size))
         squared_error = sum(float(eps @ eps) for _, eps in parts)
         power = sum(
             float(np.sum((record.y_used - eps) ** 2)) for record, (_, eps) in zip(self.data, parts, strict=True)
         )
-        if not (np.isfinite(squared_error) and np.isfinite(hessian).all() and np.isfinite(gradient).all()):
-            return None
-        return Equations(hessian, gradient, hessian, squared_error, power)
+        finite = np.isfinite(squared_error) and np.isfinite(hessian).all() and np.isfinite(gradient).all()
+        return Equations(hessian, gradient, hessian, squared_error, power) if finite else nothing
 
     def linear_start(self, a: Array, delay: float) -> Array | None:
         """Best numerator, initial states and offsets for a given denominator and delay, by linear least squares."""
@@ -180,18 +186,18 @@ class OutputErrorProblem:
         if not free.any():
             return theta
         equations = self.equations(theta)
-        if equations is None:
+        if not np.isfinite(equations.squared_error):
             return None
         matrix = equations.hessian[np.ix_(free, free)]
-        diagonal = np.diag(matrix)
+        lengths = np.diag(matrix).copy()
         right = equations.instrument_error[free]
-        solution = scaled_solve(matrix, right, diagonal, diagonal)
-        if solution is None and least_norm and np.isfinite(matrix).all():
+        solved, solution = solve_scaled(matrix, right, lengths, lengths, right.size)
+        if not solved:
+            if not least_norm:
+                return None
             # Whether a singular matrix is exactly so is a matter of rounding: a start must not hang on that.
-            scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+            scale = np.sqrt(np.where(lengths > 0, lengths, 1.0))
             solution = np.linalg.lstsq(matrix / scale / scale[:, None], right / scale, rcond=None)[0] / scale
-        if solution is None:
-            return None
         theta[free] = solution
         return theta
 

@@ -12,14 +12,14 @@ Parseval, the mean square over the window of the output error behind the filter 
 
 from __future__ import annotations
 
-from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from ctid_cli.arrays import Array, ComplexArray, IndexArray
-from ctid_cli.estimation.problems import reflect_unstable, with_stable_denominator
-from ctid_cli.estimation.refined_iv import Equations, scaled_solve
+from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.estimation.iteration import Equations, compiled_as, inadmissible, solve_scaled
+from ctid_cli.estimation.stability import reflect_unstable, with_stable_denominator
 from ctid_cli.filtering.filter_data import plain_array
 from ctid_cli.filtering.spectra import RecordSpectra
 from ctid_cli.inference.sensitivity import Structure
@@ -38,62 +38,41 @@ ONE, MODEL, INPUT, DRIVE, OUTPUT, ERROR = range(6)
 PAIRS = 21
 
 
-class SpectralCoefficientProblem:
-    """Coefficients at a fixed delay: ``theta = (a_1 … a_n, b_0 … b_m)``."""
-
-    def __init__(self, spectra: RecordSpectra, structure: Structure, delay: float, weight: Array) -> None:
-        self.spectra = spectra
-        self.structure = structure
-        self.delay = delay
-        self.weight = weight
-        self.count = used_bins(weight)
-        self._places = _places(structure.poles, structure.zeros, False)
-
-    def split(self, theta: Array) -> tuple[Array, Array, float]:
-        """Denominator, numerator and delay [s] of a parameter vector."""
-        n = self.structure.poles
-        return np.concatenate(([1.0], theta[:n])), theta[n:], self.delay
-
-    def admissible(self, theta: Array) -> Array:
-        """Reflect unstable denominators."""
-        return with_stable_denominator(theta, self.structure.poles)
-
-    def equations(self, theta: Array) -> Equations | None:
-        """Second moments of the iteration, the transient projected out."""
-        if not np.isfinite(theta).all():
-            return None
-        a, b, delay = self.split(theta)
-        gram, power = _moments(self.spectra, self.count, self.weight, a, b, delay)
-        if not np.isfinite(gram).all():
-            return None
-        hessian, mixed, error = self._places
-        return Equations(gram.take(mixed), gram.take(error), gram.take(hessian), float(gram[-1, -1]), power)
-
-
-class SpectralDelayProblem(SpectralCoefficientProblem):
-    """Coefficients and delay together: ``theta = (a_1 … a_n, b_0 … b_m, delay)``.
+class SpectralProblem(NamedTuple):
+    """Coefficients at a held delay: ``theta = (a_1 … a_n, b_0 … b_m, delay)``.
 
     ``d eps/d tau = jw B/A U``. The end values of the delayed input, which enter the derivative of its finite spectrum
     as well, are a constant: the transient takes them.
     """
 
-    def __init__(
-        self, spectra: RecordSpectra, structure: Structure, bounds: tuple[float, float], weight: Array
-    ) -> None:
-        super().__init__(spectra, structure, 0.0, weight)
-        self.bounds = bounds
-        self._places = _places(structure.poles, structure.zeros, True)
+    frequencies: Array
+    outputs: ComplexArray
+    #: At the delay, as far as the weight reaches, shape (K,).
+    inputs: ComplexArray
+    weight: Array
+    poles: int
+    zeros: int
 
-    def split(self, theta: Array) -> tuple[Array, Array, float]:
-        """Denominator, numerator and delay [s] of a parameter vector."""
-        n = self.structure.poles
-        return np.concatenate(([1.0], theta[:n])), theta[n:-1], float(theta[-1])
+    @property
+    def free(self) -> int:
+        """Number of parameters to iterate on."""
+        return self.poles + self.zeros + 1
 
-    def equations(self, theta: Array) -> Equations | None:
+    def equations(self, theta: Array) -> Equations:
         """Second moments of the iteration, the transient projected out."""
-        if not self.bounds[0] <= theta[-1] <= self.bounds[1]:
-            return None
-        return super().equations(theta)
+        moments: Equations = _spectral_equations(self, theta)
+        return moments
+
+    def admissible(self, theta: Array) -> Array:
+        """Reflect unstable denominators."""
+        return with_stable_denominator(theta, self.poles)
+
+
+def spectral_problem(spectra: RecordSpectra, structure: Structure, delay: float, weight: Array) -> SpectralProblem:
+    """The coefficients of a record's spectra at a delay, with the weights of a filter."""
+    inputs = np.array(spectra.inputs(delay, used_bins(weight)))
+    weight = plain_array(weight)
+    return SpectralProblem(spectra.frequencies, spectra.outputs, inputs, weight, structure.poles, structure.zeros)
 
 
 def used_bins(weight: Array) -> int:
@@ -107,68 +86,24 @@ def enough_bins(weight: Array, structure: Structure) -> bool:
     return 2 * passed >= EQUATIONS_PER_PARAMETER * (structure.size + structure.poles)
 
 
-def spectral_least_squares_start(
-    spectra: RecordSpectra, structure: Structure, delay: float, svf_cutoff: float, weight: Array
-) -> Array | None:
+def spectral_least_squares_start(problem: SpectralProblem, delay: float, svf_cutoff: float) -> Array | None:
     """Least-squares estimate with the state-variable filter ``1/(p + w)^n``."""
-    n, m = structure.poles, structure.zeros
+    n, m = problem.poles, problem.zeros
     filter_denominator = np.asarray(np.poly(np.full(n, -svf_cutoff)), dtype=np.float64)
     # With a zero numerator the "output error" is y itself, and with F for A the regressors are the filtered signals:
     # A Y = B U + T divided by F reads Y = -sum (a_i - f_i) (jw)^(n-i)/F Y + B/F U + T/F.
-    gram, _ = _moments(spectra, used_bins(weight), weight, filter_denominator, np.zeros(m + 1), delay)
-    columns = _regressors(n, m, False)
-    normal = gram[columns[:, None], columns]
-    diagonal = normal.diagonal()
-    theta = scaled_solve(normal, gram[columns, -1], diagonal, diagonal)
-    if theta is None:
-        return None
-    stable = reflect_unstable(np.concatenate(([1.0], filter_denominator[1:] + theta[:n])))
-    return np.concatenate((stable[1:], theta[n:]))
-
-
-def spectral_refit_numerator(
-    spectra: RecordSpectra, structure: Structure, theta: Array, delay: float, weight: Array
-) -> Array:
-    """Best numerator for a given denominator, by linear least squares on the output error."""
-    n, m = structure.poles, structure.zeros
-    denominator = np.concatenate(([1.0], theta[:n]))
-    gram, _ = _moments(spectra, used_bins(weight), weight, denominator, np.zeros(m + 1), delay)
-    normal = gram[n : n + m + 1, n : n + m + 1]
-    diagonal = normal.diagonal()
-    numerator = scaled_solve(normal, gram[n : n + m + 1, -1], diagonal, diagonal)
-    return theta if numerator is None else np.concatenate((theta[:n], numerator))
-
-
-def _regressors(n: int, m: int, with_delay: bool) -> IndexArray:
-    """Columns of the moments that hold the regressors: the sensitivities but for the denominator's."""
-    columns = np.arange(n + m + 1 + int(with_delay))
-    columns[:n] += n + m + 2
-    return columns
-
-
-@lru_cache(maxsize=64)
-def _places(n: int, m: int, with_delay: bool) -> tuple[IndexArray, IndexArray, IndexArray]:
-    """Places of the Hessian, the instrumental-variable matrix and the gradient in the flattened moments."""
-    size = 2 * n + m + 3
-    regressors = _regressors(n, m, with_delay)
-    sensitivities = np.arange(regressors.size)
-    rows = size * sensitivities
-    return rows[:, None] + sensitivities, rows[:, None] + regressors, rows + size - 1
-
-
-def _moments(
-    spectra: RecordSpectra, count: int, weight: Array, a: Array, b: Array, delay: float
-) -> tuple[Array, float]:
-    """Moments at one model from the ``count`` lowest frequencies."""
-    gram, power = _projected_moments(
-        spectra.frequencies,
-        spectra.outputs,
-        spectra.inputs(delay, count),
-        plain_array(weight),
-        plain_array(a),
-        plain_array(b),
+    gram, _ = _projected_moments(
+        problem.frequencies, problem.outputs, problem.inputs, problem.weight, filter_denominator, np.zeros(m + 1)
     )
-    return gram, float(power)
+    regressors = np.arange(n + m + 1)
+    regressors[:n] += n + m + 2
+    normal = gram[regressors[:, None], regressors]
+    lengths = np.diag(normal).copy()
+    solved, coefficients = solve_scaled(normal, gram[regressors, -1], lengths, lengths, n + m + 1)
+    if not solved:
+        return None
+    stable = reflect_unstable(np.concatenate(([1.0], filter_denominator[1:] + coefficients[:n])))
+    return np.concatenate((stable[1:], coefficients[n:], [delay]))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -339,3 +274,25 @@ def _projected_moments(
             gram[i, j] = total * scale[i] * scale[j]
             gram[j, i] = gram[i, j]
     return gram, output_power
+
+
+@njit(cache=True, nogil=True)
+def _spectral_equations(problem: SpectralProblem, theta: Array) -> Equations:
+    """Second moments of the iteration, the delay included."""
+    n, m = problem.poles, problem.zeros
+    p = n + m + 2
+    if not np.isfinite(theta).all():
+        return inadmissible(p)
+    a = np.ones(n + 1)
+    a[1:] = theta[:n]
+    b = theta[n : p - 1].copy()
+    gram, power = _projected_moments(problem.frequencies, problem.outputs, problem.inputs, problem.weight, a, b)
+    if not np.isfinite(gram).all():
+        return inadmissible(p)
+    # The columns of the sensitivities come first; the regressors are the same but for the denominator's n.
+    hessian, mixed, gradient = gram[:p, :p].copy(), gram[:p, :p].copy(), gram[:p, -1].copy()
+    mixed[:, :n] = gram[:p, p : p + n]
+    return Equations(mixed, gradient, hessian, gram[-1, -1], power)
+
+
+compiled_as(SpectralProblem, _spectral_equations)

@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar, get_args
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.additive_estimate import Covariance, SubmodelEstimate, estimate_submodels
 from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
-from ctid_cli.estimation.common import Start, StartFrom, check_iteration, check_record
-from ctid_cli.estimation.modal_start import automatic_start
-from ctid_cli.estimation.refined_iv import StepRule
+from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_record, named
+from ctid_cli.estimation.iteration import RULES, StepRule, Steps
+from ctid_cli.estimation.modal_start import ModalStart, automatic_start
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.submodels import InitialState
 from ctid_cli.inference.derived import additive_derived
-from ctid_cli.inference.diagnostics import percent_from_r_squared
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored
-from ctid_cli.signals.checks import require_choice, require_not_negative
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
@@ -46,7 +45,7 @@ class AdditiveFit(Fit):
     """
 
     additive: AdditiveModel = field(kw_only=True)
-    start: AdditiveModel = field(kw_only=True, repr=False)
+    start: AdditiveModel = field(kw_only=True)
     start_method: str = field(kw_only=True)
     loop_radius: float = field(kw_only=True)
 
@@ -73,7 +72,7 @@ class AdditiveFit(Fit):
 
 
 @dataclass(frozen=True)
-class AdditiveSrivc:
+class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
     r"""Refined instrumental variables for a sum of submodels ``B_i / (p^l A_i)``.
 
     Parameters
@@ -137,7 +136,7 @@ class AdditiveSrivc:
     >>> for name in ("g1_b0", "g2_b0"):
     ...     print(f"{name} = {fit.parameters[name]:.3f} +- {fit.standard_errors[name]:.3f}")
     g1_b0 = 3.017 +- 0.007
-    g2_b0 = 0.999 +- 0.001
+    g2_b0 = 0.999 +- 1e-3
     """
 
     kind: ClassVar[str] = "additive_srivc"
@@ -154,16 +153,10 @@ class AdditiveSrivc:
     hold_output: Hold = "foh"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.terms:
             raise OptionError("terms", "terms must list at least one submodel, for example {poles: 2, zeros: 0}")
         check_terms(self.terms)
-        require_not_negative("delay", self.delay, "s")
-        require_choice("instruments", self.instruments, get_args(Instruments))
-        require_choice("initial_state", self.initial_state, get_args(InitialState))
-        require_choice("covariance", self.covariance, get_args(Covariance))
-        require_choice("variant", self.variant, get_args(StepRule))
-        require_choice("hold_output", self.hold_output, get_args(Hold))
-        check_iteration(self.max_iterations, self.tolerance)
         check_closed_loop(self.instruments, self.variant)
         if self.initial_state == "periodic":
             if self.instruments == "closed_loop":
@@ -176,48 +169,47 @@ class AdditiveSrivc:
                     "initial_state periodic needs terms without integrators: their output has no steady state",
                 )
 
-    def prepare(self, record: Record) -> PreparedAdditiveSrivc:
-        """Check a record and lay it out.
+    def _lay_out(self, record: Record) -> Submodels:
+        loop = loop_data(record, self.instruments)
+        # A record of one period has an input before its first sample: the same one.
+        data = filter_data(record, 0.0 if self.initial_state == "periodic" else self.delay, self.hold_output)
+        if self.initial_state == "periodic" and (data.interval == 0.0 or not record.valid.all()):
+            raise DataError(
+                f"{named(record)}one period of a steady state must be sampled on one regular clock without missing "
+                "samples; use initial_state 'estimated'"
+            )
+        problem = AdditiveProblem(data, self.terms, self.delay, loop, self.initial_state)
+        check_record(record, data, problem.free)
+        return Submodels(record, problem)
 
-        Parameters
-        ----------
-        record : Record
-            The record.
+    def _estimate(self, laid_out: Submodels, start: Start | None) -> AdditiveFit:
+        if start is not None and start.model is not None:
+            model, method = start.model, "The start was given."
+            if model.terms != self.terms:
+                given, wanted = _terms_text(model.terms), _terms_text(self.terms)
+                raise DataError(f"the start has the submodels {given} and the estimator {wanted}")
+        else:
+            model, method = laid_out.start.model, laid_out.start.method
+        estimate = estimate_submodels(
+            laid_out.problem,
+            model.theta,
+            Steps(self.max_iterations, self.tolerance, RULES[self.variant]),
+            self.covariance,
+        )
+        return _fit(laid_out.problem, estimate, model, method)
 
-        Returns
-        -------
-        PreparedAdditiveSrivc
-            Ready to fit.
 
-        Raises
-        ------
-        DataError
-            If nothing can be estimated from the record, or it lacks the loop that the instruments need.
-        """
-        return PreparedAdditiveSrivc(self, record)
+class Submodels:
+    """A record laid out for a sum of submodels, and the start that it suggests."""
 
-    def fit(self, record: Record, start: Start | None = None) -> AdditiveFit:
-        """Estimate the submodels.
+    def __init__(self, record: Record, problem: AdditiveProblem) -> None:
+        self.record = record
+        self.problem = problem
 
-        Parameters
-        ----------
-        record : Record
-            The record.
-        start : Start, optional
-            ``start.model`` has the degrees of the terms, and its delay is not used; without it a start is found from
-            the record.
-
-        Returns
-        -------
-        AdditiveFit
-            The estimate.
-
-        Raises
-        ------
-        DataError
-            If nothing can be estimated from the record or from that start.
-        """
-        return self.prepare(record).fit(start)
+    @cached_property
+    def start(self) -> ModalStart:
+        """Found once, from the record alone."""
+        return automatic_start(self.record, self.problem.terms, self.problem.delay)
 
 
 def check_terms(terms: tuple[Term, ...]) -> None:
@@ -235,49 +227,6 @@ def check_terms(terms: tuple[Term, ...]) -> None:
         )
 
 
-class PreparedAdditiveSrivc:
-    """A record checked and laid out for :class:`AdditiveSrivc`."""
-
-    def __init__(self, options: AdditiveSrivc, record: Record) -> None:
-        self.options = options
-        self.record = record
-        loop = loop_data(record, options.instruments)
-        # A record of one period has an input before its first sample: the same one.
-        data = filter_data(record, 0.0 if options.initial_state == "periodic" else options.delay, options.hold_output)
-        if options.initial_state == "periodic" and (data.interval == 0.0 or not record.valid.all()):
-            where = f"{record.name}: " if record.name else ""
-            raise DataError(
-                f"{where}one period of a steady state must be sampled on one regular clock without missing samples; "
-                "use initial_state 'estimated'"
-            )
-        self.problem = AdditiveProblem(data, options.terms, options.delay, loop, options.initial_state)
-        check_record(record, data, self.problem.size + self.problem.filter.free)
-        self._automatic: tuple[AdditiveModel, str] | None = None
-
-    def fit(self, start: Start | None = None) -> AdditiveFit:
-        """Estimate the submodels."""
-        options = self.options
-        if start is not None and start.model is not None:
-            model, method = start.model, "The start was given."
-            if model.terms != options.terms:
-                given, wanted = _terms_text(model.terms), _terms_text(options.terms)
-                raise DataError(f"the start has the submodels {given} and the estimator {wanted}")
-        else:
-            if self._automatic is None:
-                found = automatic_start(self.record, options.terms, options.delay)
-                self._automatic = found.model, found.method
-            model, method = self._automatic
-        estimate = estimate_submodels(
-            self.problem,
-            model.theta,
-            max_iterations=options.max_iterations,
-            tolerance=options.tolerance,
-            variant=options.variant,
-            covariance=options.covariance,
-        )
-        return _fit(self.problem, estimate, model, method)
-
-
 def _fit(problem: AdditiveProblem, estimate: SubmodelEstimate, start: AdditiveModel, method: str) -> AdditiveFit:
     """The result, with submodels by rising natural frequency."""
     try:
@@ -290,19 +239,11 @@ def _fit(problem: AdditiveProblem, estimate: SubmodelEstimate, start: AdditiveMo
     return AdditiveFit(
         model=unfactored(ordered),
         parameter_names=ordered.names,
-        covariance=estimate.covariance[np.ix_(order, order)],
-        status=estimate.status,
-        cost=estimate.squared_error / problem.data.count,
-        fit_percent=percent_from_r_squared(estimate.r2),
-        r2=estimate.r2,
-        count=problem.data.count,
-        iterations=estimate.iterations,
-        condition_number=estimate.condition_number,
-        history=estimate.history,
         additive=ordered,
         start=start,
         start_method=method,
         loop_radius=estimate.loop_radius,
+        **{**estimate.values, "covariance": estimate.values["covariance"][np.ix_(order, order)]},
     )
 
 

@@ -11,8 +11,9 @@ import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
+from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
 from ctid_cli.estimators import identification_warnings as warnings
-from ctid_cli.estimators.delay_profile import AppliedModel, DelayProfile, MeasuredFit, PreparedProfile
+from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.inference.conditioning import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR
 from ctid_cli.inference.covariance import condition_number
 from ctid_cli.inference.criteria import (
@@ -135,7 +136,7 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
     """
     checked = None if validation is None else _prepared_validation(options, validation)
     prepared = options.prepare(records)
-    fit = prepared.fit()
+    fit, refinement = prepared.fit(), prepared.laid_out
     residuals = np.concatenate(fit.residuals)
     output = np.concatenate([record.y[use] for record, use in zip(records, fit.used, strict=True)])
     tests = _tests(fit, records)
@@ -145,10 +146,10 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
     singular = not condition_number(hessian) <= NEARLY_SINGULAR
     unclear = {fit.parameter_names[k] for k in (free if singular else _undetermined(fit, covariance))}
     interval = None
-    if prepared.structure.delay and "delay" not in unclear:
-        interval = _delay_interval(prepared, fit, covariance)
+    if refinement.structure.delay and "delay" not in unclear:
+        interval = _delay_interval(refinement, fit, covariance)
     judged = None if checked is None or validation is None else _validate(checked, fit, validation)
-    size = prepared.structure.size - int(prepared.structure.delay)
+    size = refinement.structure.size - int(refinement.structure.delay)
     coefficients = covariance[:size, :size]
     return Identification(
         options=options,
@@ -169,7 +170,7 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
             *warnings.of_conditioning(fit, covariance, free, hessian),
             *warnings.of_interval(interval, options),
             *warnings.of_residuals(tests, len(records), FEWEST_TESTED),
-            *warnings.of_treatment(_gains(prepared, fit)),
+            *warnings.of_treatment(_gains(options, refinement, fit)),
             *(warnings.of_validation(fit.r2, judged.r2) if judged is not None else ()),
         ),
         validation=judged,
@@ -236,17 +237,17 @@ def _free_block(fit: MeasuredFit) -> tuple[IndexArray, Array]:
 # --- the delay -------------------------------------------------------------------------------------
 
 
-def _delay_interval(prepared: PreparedProfile, fit: MeasuredFit, covariance: Array) -> DelayInterval | None:
+def _delay_interval(refinement: Refinement, fit: MeasuredFit, covariance: Array) -> DelayInterval | None:
     """Profile-likelihood interval of a free delay, None where estimate plus or minus two errors is as good."""
-    place = prepared.structure.size - 1
+    place = refinement.structure.size - 1
     variance, white = float(covariance[place, place]), float(fit.covariance[place, place])
     if fit.status is Status.DELAY_AT_BOUND:
         variance = white = 1.0  # no standard error to inflate by
     squared_error = fit.cost * fit.count
     delay = float(fit.theta[place])
     inflation = max(variance / white, np.finfo(float).tiny)
-    squared_error_at = cache(lambda trial: prepared.squared_error_at(fit.theta, trial))
-    common = (squared_error, fit.count, fit.theta.size, prepared.options.delay_bounds)
+    squared_error_at = cache(lambda trial: refinement.squared_error_at(fit.theta, trial))
+    common = (squared_error, fit.count, fit.theta.size, refinement.measured.treatment.delay_bounds)
     error = float("nan") if fit.status is Status.DELAY_AT_BOUND else float(np.sqrt(variance))
     if not quadratic_is_doubtful(squared_error_at, delay, error, *common, inflation=inflation):
         return None
@@ -256,12 +257,12 @@ def _delay_interval(prepared: PreparedProfile, fit: MeasuredFit, covariance: Arr
 # --- results ---------------------------------------------------------------------------------------
 
 
-def _gains(prepared: PreparedProfile, fit: MeasuredFit) -> dict[str, float]:
+def _gains(options: DelayProfile, refinement: Refinement, fit: MeasuredFit) -> dict[str, float]:
     """Shares by which estimating what was taken as zero would lower the cost, where that is worth it."""
-    options, squared_error = prepared.options, fit.cost * fit.count
+    squared_error = fit.cost * fit.count
 
     def gain(added: int, **treatment: bool) -> float:
-        lowered = prepared.squared_error_with(fit, **treatment)
+        lowered = refinement.squared_error_with(fit.theta, fit.model.delay, **treatment)
         share = 1.0 - lowered / squared_error if squared_error > 0 else 0.0
         evidence = -fit.count * np.log(max(1.0 - share, 1e-300)) - added * len(fit.residuals) * np.log(fit.count)
         return share if share > WORTHWHILE and evidence > DECISIVE else 0.0
@@ -296,16 +297,16 @@ def _estimates(
     )
 
 
-def _prepared_validation(options: DelayProfile, record: Record) -> PreparedProfile:
+def _prepared_validation(options: DelayProfile, record: Record) -> Refinement:
     """Check the validation record before the fit takes its time."""
     try:
-        return options.prepare(record)
+        return options.prepare(record).laid_out
     except DataError as error:
         raise DataError(f"validation record: {error}") from None
 
 
-def _validate(prepared: PreparedProfile, fit: MeasuredFit, record: Record) -> Validation:
-    applied = prepared.errors_of(fit.model)
+def _validate(refinement: Refinement, fit: MeasuredFit, record: Record) -> Validation:
+    applied = refinement.errors_of(fit.model)
     y = record.y[applied.used[0]]
     simulated = y - applied.residuals[0]
     return Validation(record.name, applied, fit_percent(y, simulated), r_squared(y, simulated), y.size)

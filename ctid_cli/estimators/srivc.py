@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -11,32 +11,18 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.additive_estimate import Covariance, estimate_submodels
 from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
-from ctid_cli.estimation.common import (
-    Start,
-    StartFrom,
-    check_iteration,
-    check_record,
-    check_structure,
-    finish,
-    history_entry,
-)
-from ctid_cli.estimation.problems import (
-    CoefficientProblem,
-    least_squares_start,
-    refit_numerator,
-    with_stable_denominator,
-)
-from ctid_cli.estimation.refined_iv import Equations, Iterated, StepRule, iterate
+from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, check_record, finish, history_of
+from ctid_cli.estimation.iteration import RULES, StepRule, Steps, iterate
+from ctid_cli.estimation.sampled import SampledProblem, at_known_delay, least_squares_start
+from ctid_cli.estimation.stability import with_stable_denominator
 from ctid_cli.filtering.bank import standard_rows
-from ctid_cli.filtering.filter_data import FilterData, filter_data
-from ctid_cli.inference.diagnostics import percent_from_r_squared
-from ctid_cli.inference.fit import Fit, IterationRecord
+from ctid_cli.filtering.filter_data import filter_data
+from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.robust import sandwich_covariance
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
-from ctid_cli.signals.checks import require_choice, require_not_negative, require_positive
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
@@ -45,7 +31,7 @@ SrivcVariant = Literal["auto", "guarded", "plain", "relaxed"]
 
 
 @dataclass(frozen=True)
-class Srivc:
+class Srivc(Estimator[SampledProblem | AdditiveProblem, Fit]):
     """SRIVC: optimal instrumental variables for a transfer function with white output noise.
 
     Parameters
@@ -119,15 +105,9 @@ class Srivc:
     covariance: Covariance = field(default="white", metadata={"added_later": True})
 
     def __post_init__(self) -> None:
-        check_structure(self.poles, self.zeros)
-        require_choice("hold_output", self.hold_output, get_args(Hold))
-        require_choice("variant", self.variant, get_args(SrivcVariant))
-        require_choice("instruments", self.instruments, get_args(Instruments))
-        require_choice("covariance", self.covariance, get_args(Covariance))
+        super().__post_init__()
+        check_proper(self.poles, self.zeros)
         check_closed_loop(self.instruments, self.variant)
-        require_positive("svf_cutoff", self.svf_cutoff, "rad/s")
-        check_iteration(self.max_iterations, self.tolerance)
-        require_not_negative("delay", self.delay, "s")
 
     @property
     def step_rule(self) -> StepRule:
@@ -136,155 +116,62 @@ class Srivc:
             return "guarded" if self.instruments == "open_loop" else "relaxed"
         return self.variant
 
-    def prepare(self, record: Record) -> PreparedSrivc | PreparedSubmodelSrivc:
-        """Check a record and lay it out.
-
-        Parameters
-        ----------
-        record : Record
-            The record.
-
-        Returns
-        -------
-        PreparedSrivc or PreparedSubmodelSrivc
-            Ready to fit.
-
-        Raises
-        ------
-        DataError
-            If nothing can be estimated from the record, or it lacks the loop that the instruments need.
-        """
+    def _lay_out(self, record: Record) -> SampledProblem | AdditiveProblem:
+        loop = loop_data(record, self.instruments)
+        data = filter_data(record, self.delay, self.hold_output)
+        structure = Structure(self.poles, self.zeros)
+        check_record(record, data, structure.size)
         if self.step_rule == "relaxed" or self.instruments == "closed_loop":
-            return PreparedSubmodelSrivc(self, record)
-        return PreparedSrivc(self, record)
+            # In closed loop (CLSRIVC) and where steps are relaxed it is additive SRIVC with a single submodel.
+            return AdditiveProblem(data, (Term(self.poles, self.zeros),), self.delay, loop)
+        return at_known_delay(data, structure)
 
-    def fit(self, record: Record, start: Start | None = None) -> Fit:
-        """Estimate the coefficients.
-
-        Parameters
-        ----------
-        record : Record
-            The record.
-        start : Start, optional
-            Initial parameters, as the sum of submodels that they make; by least squares without them.
-
-        Returns
-        -------
-        Fit
-            The estimate.
-
-        Raises
-        ------
-        DataError
-            If nothing can be estimated from the record or from that start.
-        """
-        return self.prepare(record).fit(start)
-
-
-class PreparedSrivc:
-    """A record checked and laid out for :class:`Srivc`."""
-
-    def __init__(self, options: Srivc, record: Record) -> None:
-        self.options = options
-        self.data = filter_data(record, options.delay, options.hold_output)
-        self.structure = Structure(options.poles, options.zeros)
-        check_record(record, self.data, self.structure.size)
-
-    def fit(self, start: Start | None = None) -> Fit:
-        """Estimate the coefficients."""
-        options = self.options
-        problem = CoefficientProblem(self.data, self.structure, options.delay)
+    def _estimate(self, problem: SampledProblem | AdditiveProblem, start: Start | None) -> Fit:
+        structure = Structure(self.poles, self.zeros)
         if start is not None and start.model is not None:
-            theta: Array | None = given_coefficients(start.model, self.structure)
+            theta: Array | None = given_coefficients(start.model, structure, self.delay)
         else:
-            theta = initial_coefficients(problem, options.svf_cutoff, options.step_rule)
+            refit = self.step_rule != "plain" or isinstance(problem, AdditiveProblem)
+            theta = least_squares_start(problem.data, structure, self.delay, self.svf_cutoff, refit)
         if theta is None:
             raise DataError(Status.SINGULAR.value)
-        history: list[IterationRecord] = []
-
-        def record_step(theta: Array, equations: Equations) -> None:
-            cost = equations.squared_error / self.data.count
-            history.append(history_entry("refine", len(history), problem, theta, cost))
-
-        result = iterate(
-            problem,
-            theta,
-            max_iterations=options.max_iterations,
-            tolerance=options.tolerance,
-            variant=options.step_rule,
-            on_step=record_step,
-        )
+        if isinstance(problem, AdditiveProblem):
+            return self._as_submodel(problem, theta, structure)
+        result = iterate(problem, theta, Steps(self.max_iterations, self.tolerance, RULES[self.step_rule]))
         if result is None:
-            return finish(problem, theta, Status.DIVERGED, 0, history)
+            return finish(problem, theta, Status.DIVERGED, 0, [])
+        history = history_of("refine", problem, result)
         fit = finish(problem, result.theta, result.status, result.iterations, history)
-        return fit if options.covariance == "white" else self._with_sandwich(problem, result.theta, fit)
-
-    def _with_sandwich(self, problem: CoefficientProblem, theta: Array, fit: Fit) -> Fit:
-        a, b, delay = problem.split(theta)
-        rows = standard_rows(problem.data, a, b, delay)
-        structure = problem.structure
+        if self.covariance == "white":
+            return fit
+        rows = standard_rows(problem.data, *problem.split(result.theta))
         psi = rows[:, structure.sensitivity_rows] * structure.signs
-        covariance = sandwich_covariance(psi, rows[:, structure.error_row], regular=problem.data.interval > 0.0)
-        return replace(fit, covariance=covariance)
+        regular = problem.data.interval > 0.0
+        return replace(fit, covariance=sandwich_covariance(psi, rows[:, structure.error_row], regular=regular))
 
-
-class PreparedSubmodelSrivc:
-    """A record checked and laid out for :class:`Srivc` as additive SRIVC with a single submodel.
-
-    This is how it runs in closed loop (CLSRIVC), and in open loop where steps are relaxed.
-    """
-
-    def __init__(self, options: Srivc, record: Record) -> None:
-        self.options = options
-        loop = loop_data(record, options.instruments)
-        data = filter_data(record, options.delay, options.hold_output)
-        self.structure = Structure(options.poles, options.zeros)
-        check_record(record, data, self.structure.size)
-        self.problem = AdditiveProblem(data, (Term(options.poles, options.zeros),), options.delay, loop)
-
-    def fit(self, start: Start | None = None) -> Fit:
-        """Estimate the coefficients.
-
-        It is additive SRIVC with a single submodel; coefficients and covariance are converted to the monic form.
-        """
-        options, problem, structure = self.options, self.problem, self.structure
-        if start is not None and start.model is not None:
-            theta: Array | None = given_coefficients(start.model, structure)
-        else:
-            direct = CoefficientProblem(problem.data, structure, options.delay)
-            theta = initial_coefficients(direct, options.svf_cutoff, "guarded")
-        if theta is None:
-            raise DataError(Status.SINGULAR.value)
-        single = Submodel(theta[structure.poles :], np.concatenate(([1.0], theta[: structure.poles])))
+    def _as_submodel(self, problem: AdditiveProblem, theta: Array, structure: Structure) -> Fit:
+        """Estimate a sum of one submodel; coefficients and covariance are converted to the monic form."""
+        single = Submodel(theta[self.poles : -1], np.concatenate(([1.0], theta[: self.poles])))
         estimate = estimate_submodels(
             problem,
             AdditiveModel([single]).theta,
-            max_iterations=options.max_iterations,
-            tolerance=options.tolerance,
-            variant=options.step_rule,
-            covariance=options.covariance,
+            Steps(self.max_iterations, self.tolerance, RULES[self.step_rule]),
+            self.covariance,
         )
         additive = problem.model(estimate.theta)
         jacobian = unfactored_jacobian(additive)
         # The numerator has all its powers there, and the highest of them are zero.
-        kept = [*range(structure.poles), *range(jacobian.shape[0] - structure.zeros - 1, jacobian.shape[0])]
+        kept = [*range(self.poles), *range(jacobian.shape[0] - self.zeros - 1, jacobian.shape[0])]
+        covariance = jacobian[kept] @ estimate.values["covariance"] @ jacobian[kept].T
         return Fit(
             model=unfactored(additive),
             parameter_names=structure.names,
-            covariance=jacobian[kept] @ estimate.covariance @ jacobian[kept].T,
-            status=estimate.status,
-            cost=estimate.squared_error / problem.data.count,
-            fit_percent=percent_from_r_squared(estimate.r2),
-            r2=estimate.r2,
-            count=problem.data.count,
-            iterations=estimate.iterations,
-            condition_number=estimate.condition_number,
-            history=estimate.history,
+            **{**estimate.values, "covariance": covariance},
         )
 
 
-def given_coefficients(model: AdditiveModel, structure: Structure) -> Array:
-    """Initial coefficients from a sum of submodels."""
+def given_coefficients(model: AdditiveModel, structure: Structure, delay: float) -> Array:
+    """Initial parameters from a sum of submodels."""
     whole = unfactored(model)
     if whole.order != structure.poles or whole.numerator.size > structure.zeros + 1:
         raise DataError(
@@ -292,16 +179,5 @@ def given_coefficients(model: AdditiveModel, structure: Structure) -> Array:
             f"{structure.poles} and {structure.zeros}"
         )
     padded = np.concatenate((np.zeros(structure.zeros + 1 - whole.numerator.size), whole.numerator))
-    return with_stable_denominator(np.concatenate((whole.denominator[1:], padded)), structure.poles)
-
-
-def initial_coefficients(problem: CoefficientProblem, svf_cutoff: float, variant: StepRule) -> Array | None:
-    """Least-squares start; the guarded variant re-fits the numerator to the output error."""
-    data: FilterData = problem.data
-    theta = least_squares_start(data, problem.structure, problem.delay, svf_cutoff)
-    if theta is not None and variant == "guarded":
-        theta = refit_numerator(data, problem.structure, theta, problem.delay)
-    return theta
-
-
-__all__ = ["Iterated", "PreparedSrivc", "Srivc", "initial_coefficients"]
+    stable: Array = with_stable_denominator(np.concatenate((whole.denominator[1:], padded, [delay])), structure.poles)
+    return stable

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import ClassVar, get_args
+from dataclasses import dataclass
+from typing import ClassVar
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.common import Start, StartFrom, check_record, check_structure, finish, history_entry
-from ctid_cli.estimation.problems import CoefficientProblem, least_squares_start
+from ctid_cli.estimation.common import Estimator, Start, check_proper, check_record, finish, history_entry
+from ctid_cli.estimation.sampled import SampledProblem, at_known_delay, least_squares_start
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
-from ctid_cli.signals.checks import require_choice, require_not_negative, require_positive
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
 
 @dataclass(frozen=True)
-class Svf:
+class Svf(Estimator[SampledProblem, Fit]):
     """Least-squares estimate with the state-variable filter ``1/(p + svf_cutoff)^poles``.
 
     Parameters
@@ -51,7 +50,6 @@ class Svf:
     """
 
     kind: ClassVar[str] = "svf"
-    start_from: ClassVar[StartFrom | None] = None
 
     poles: int
     zeros: int
@@ -60,70 +58,19 @@ class Svf:
     hold_output: Hold = "foh"
 
     def __post_init__(self) -> None:
-        check_structure(self.poles, self.zeros)
-        require_choice("hold_output", self.hold_output, get_args(Hold))
-        require_positive("svf_cutoff", self.svf_cutoff, "rad/s")
-        require_not_negative("delay", self.delay, "s")
+        super().__post_init__()
+        check_proper(self.poles, self.zeros)
 
-    def prepare(self, record: Record) -> PreparedSvf:
-        """Check a record and lay it out.
+    def _lay_out(self, record: Record) -> SampledProblem:
+        data = filter_data(record, self.delay, self.hold_output)
+        structure = Structure(self.poles, self.zeros)
+        check_record(record, data, structure.size)
+        return at_known_delay(data, structure)
 
-        Parameters
-        ----------
-        record : Record
-            The record.
-
-        Returns
-        -------
-        PreparedSvf
-            Ready to fit.
-
-        Raises
-        ------
-        DataError
-            If nothing can be estimated from the record.
-        """
-        return PreparedSvf(self, record)
-
-    def fit(self, record: Record, start: Start | None = None) -> Fit:
-        """Estimate the coefficients.
-
-        Parameters
-        ----------
-        record : Record
-            The record.
-        start : Start, optional
-            Ignored: least squares needs no start.
-
-        Returns
-        -------
-        Fit
-            The estimate.
-
-        Raises
-        ------
-        DataError
-            If nothing can be estimated from the record.
-        """
-        return self.prepare(record).fit(start)
-
-
-class PreparedSvf:
-    """A record checked and laid out for :class:`Svf`."""
-
-    def __init__(self, options: Svf, record: Record) -> None:
-        self.options = options
-        self.data = filter_data(record, options.delay, options.hold_output)
-        self.structure = Structure(options.poles, options.zeros)
-        check_record(record, self.data, self.structure.size)
-
-    def fit(self, start: Start | None = None) -> Fit:
-        """Estimate the coefficients."""
-        options = self.options
-        theta = least_squares_start(self.data, self.structure, options.delay, options.svf_cutoff)
+    def _estimate(self, problem: SampledProblem, start: Start | None) -> Fit:
+        theta = least_squares_start(problem.data, problem.structure, self.delay, self.svf_cutoff)
         if theta is None:
             raise DataError(Status.SINGULAR.value)
-        problem = CoefficientProblem(self.data, self.structure, options.delay)
-        fit = finish(problem, theta, Status.LEAST_SQUARES, 1, [], accurate=False)
-        entry = history_entry("least squares", 0, problem, theta, fit.cost)
-        return replace(fit, history=(entry,))
+        squared_error = problem.equations(theta).squared_error
+        entry = history_entry("least squares", 0, problem, theta, squared_error)
+        return finish(problem, theta, Status.LEAST_SQUARES, 1, [entry])

@@ -2,33 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar, get_args
+from dataclasses import dataclass, replace
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.errors import DataError, OptionError
+from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import (
+    Estimator,
     Start,
     StartFrom,
-    check_iteration,
+    check_greatest_delay,
+    check_proper,
     check_record,
-    check_structure,
+    checked_bounds,
     finish,
     history_entry,
+    history_of,
     initial_delay,
 )
-from ctid_cli.estimation.delay_search import Descent, Minimum, bound_in_the_way, delay_step, descend
-from ctid_cli.estimation.problems import CoefficientProblem, DelayProblem
-from ctid_cli.estimation.refined_iv import Equations, Iterated, Variant, iterate
-from ctid_cli.estimators.srivc import initial_coefficients
-from ctid_cli.filtering.filter_data import FilterData, filter_data
+from ctid_cli.estimation.delay_search import LEAST_CURVATURE, Descent, Minimum, bound_in_the_way, delay_step, descend
+from ctid_cli.estimation.iteration import GUARDED, RULES, Iterated, Steps, Variant, iterate
+from ctid_cli.estimation.sampled import SampledProblem, least_squares_start
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.fit import Fit, IterationRecord
-from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
-from ctid_cli.signals.checks import require_choice, require_positive
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
@@ -39,7 +39,7 @@ SEARCH_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
-class TdSrivc:
+class TdSrivc(Estimator["Searches", Fit]):
     """Coefficients and delay by separable least squares: SRIVC for the coefficients, Gauss-Newton for the delay.
 
     Parameters
@@ -100,210 +100,119 @@ class TdSrivc:
     hold_output: Hold = "foh"
 
     def __post_init__(self) -> None:
-        check_structure(self.poles, self.zeros)
-        require_choice("hold_output", self.hold_output, get_args(Hold))
-        require_choice("variant", self.variant, get_args(Variant))
-        require_positive("svf_cutoff", self.svf_cutoff, "rad/s")
-        check_iteration(self.max_iterations, self.tolerance)
+        super().__post_init__()
+        check_proper(self.poles, self.zeros)
+        object.__setattr__(self, "delay_bounds", checked_bounds(self.delay_bounds))
+
+    def _lay_out(self, record: Record) -> Searches:
+        check_greatest_delay(record, self.delay_bounds[1])
+        problem = self._problem(record)
+        check_record(record, problem.data, problem.free)
+        if self.lowpass is None:
+            return Searches(problem, problem)
         try:
-            low, high = (float(bound) for bound in self.delay_bounds)
-        except (TypeError, ValueError):
-            low, high = np.nan, np.nan
-        if not 0 <= low < high < np.inf:
-            raise OptionError(
-                "delay_bounds",
-                f"delay_bounds must be two delays in seconds, the smaller (0 or more) first: got {self.delay_bounds!r}",
-            )
-        object.__setattr__(self, "delay_bounds", (low, high))
+            filtered = self.lowpass.apply(record)
+        except ValueError as error:
+            raise DataError(str(error)) from error
+        return Searches(self._problem(filtered), problem)
 
-    def prepare(self, record: Record) -> PreparedTdSrivc:
-        """Check a record, lay it out and filter it, once for any number of starts.
+    def _problem(self, record: Record) -> SampledProblem:
+        """Coefficients and delay together."""
+        data = filter_data(record, self.delay_bounds[1], self.hold_output)
+        return SampledProblem(data, self.poles, self.zeros, True, *self.delay_bounds)
 
-        Parameters
-        ----------
-        record : Record
-            The record.
-
-        Returns
-        -------
-        PreparedTdSrivc
-            Ready to fit from any start.
-
-        Raises
-        ------
-        DataError
-            If nothing can be estimated from the record.
-        """
-        return PreparedTdSrivc(self, record)
-
-    def fit(self, record: Record, start: Start | None = None) -> Fit:
-        """Estimate coefficients and delay.
-
-        Parameters
-        ----------
-        record : Record
-            The record.
-        start : Start, optional
-            Initial delay; the middle of the bounds by default.
-
-        Returns
-        -------
-        Fit
-            The estimate.
-
-        Raises
-        ------
-        DataError
-            If nothing can be estimated from the record, or the start lies outside the bounds.
-        """
-        return self.prepare(record).fit(start)
-
-
-class PreparedTdSrivc:
-    """A record checked, laid out and filtered for :class:`TdSrivc`."""
-
-    def __init__(self, options: TdSrivc, record: Record) -> None:
-        self.options = options
-        self.structure = Structure(options.poles, options.zeros)
-        greatest = options.delay_bounds[1]
-        if greatest >= record.t[-1] - record.input.t[0]:
-            raise DataError(
-                f"{record.name + ': ' if record.name else ''}the greatest delay, {greatest:g} s, is not shorter than "
-                f"the record, {record.t[-1] - record.input.t[0]:g} s"
-            )
-        self.data = filter_data(record, greatest, options.hold_output)
-        check_record(record, self.data, self.structure.size + 1)
-        self.search_data = self.data
-        if options.lowpass is not None:
-            try:
-                filtered = options.lowpass.apply(record)
-            except ValueError as error:
-                raise DataError(str(error)) from error
-            self.search_data = filter_data(filtered, greatest, options.hold_output)
-
-    def fit(self, start: Start | None = None) -> Fit:
-        """Estimate coefficients and delay from one start."""
-        options = self.options
-        delay = initial_delay(start, options.delay_bounds)
+    def _estimate(self, searches: Searches, start: Start | None) -> Fit:
+        delay = initial_delay(start, self.delay_bounds)
         history: list[IterationRecord] = []
-        found = _SampleCost(self.search_data, self.structure, options).descend(delay, None, "search", history)
+        found = self._descend(searches.first, delay, None, "search", history)
         if found is None:
             raise DataError(Status.SINGULAR.value)
-        if options.lowpass is None:
-            return self._finish(found, history, found.iterations)
-        return self.refine(found, history)
+        if self.lowpass is None:
+            return self._finish(searches.last, found, history)
+        return self._refine(searches.last, found, history)
 
-    def refine(self, found: Descent, history: list[IterationRecord]) -> Fit:
+    def _refine(self, problem: SampledProblem, found: Descent, history: list[IterationRecord]) -> Fit:
         """Go on from a delay and coefficients that a search on filtered data has found."""
-        cost = _SampleCost(self.data, self.structure, self.options)
-        refined = cost.descend(found.minimum.delay, found.minimum.theta, "refine", history)
-        if refined is None:
-            return self._finish(found, history, found.iterations)
-        return self._finish(refined, history, found.iterations + refined.iterations)
+        refined = self._descend(problem, found.minimum.delay, found.minimum.theta, "refine", history)
+        if refined is not None:
+            found = replace(refined, iterations=found.iterations + refined.iterations)
+        return self._finish(problem, found, history)
 
-    def _finish(self, found: Descent, history: list[IterationRecord], iterations: int) -> Fit:
-        """Polish, mind the bounds, and report."""
-        options = self.options
-        problem = DelayProblem(self.data, self.structure, options.delay_bounds)
-        theta, status = np.concatenate((found.minimum.theta, [found.minimum.delay])), found.status
-        if options.variant == "guarded":
-            polished = self._polish(problem, theta, history)
+    def _descend(
+        self, problem: SampledProblem, delay: float, theta: Array | None, stage: str, history: list[IterationRecord]
+    ) -> Descent | None:
+        """Search from a delay; the accepted steps go to the history."""
+        cost = SrivcCost(self, problem)
+        steps: list[Minimum] = []
+        found = descend(
+            cost,
+            delay,
+            theta,
+            self.delay_bounds,
+            max_iterations=self.max_iterations,
+            tolerance=cost.tolerance,
+            on_step=steps.append,
+        )
+        history += [history_entry(stage, k, problem, step.theta, step.squared_error) for k, step in enumerate(steps)]
+        return found
+
+    def _finish(self, problem: SampledProblem, found: Descent, history: list[IterationRecord]) -> Fit:
+        """Polish with joint iterations on coefficients and delay, mind the bounds, and report."""
+        theta, status, iterations = found.minimum.theta, found.status, found.iterations
+        if self.variant == "guarded":
+            # From the right basin they converge in a few steps.
+            polished = self._iterated(problem, theta)
+            history += history_of("joint", problem, polished)
             if polished is not None:
                 theta, iterations, status = polished.theta, iterations + polished.iterations, polished.status
         there = self._at_bound(problem, theta)
         if there is not None:
             status = Status.DELAY_AT_BOUND
-            if options.variant == "guarded":
-                theta, squared_error = there
-                history.append(history_entry("bound", 0, problem, theta, squared_error / self.data.count))
+            if self.variant == "guarded":
+                theta = there.theta
+                history.append(history_entry("bound", 0, problem, theta, there.equations.squared_error))
         return finish(problem, theta, status, iterations, history)
 
-    def _at_bound(self, problem: DelayProblem, theta: Array) -> tuple[Array, float] | None:
-        """The estimate with the delay on a bound and its sum of squares, if that is where the cost leads."""
+    def _at_bound(self, problem: SampledProblem, theta: Array) -> Iterated | None:
+        """The estimate with the delay on a bound, if that is where the cost leads."""
         here = problem.equations(theta)
-        bound = None if here is None else bound_in_the_way(here, float(theta[-1]), problem.bounds)
-        if here is None or bound is None:
+        bound = bound_in_the_way(here, float(theta[-1]), self.delay_bounds)
+        if bound is None:
             return None
-        coefficients = CoefficientProblem(self.data, self.structure, bound)
-        there = iterate(
-            coefficients,
-            theta[:-1],
-            max_iterations=self.options.max_iterations,
-            tolerance=self.options.tolerance,
-            variant="guarded",
-        )
-        if there is None or there.equations.squared_error > here.squared_error:
-            return None
-        return np.concatenate((there.theta, [bound])), there.equations.squared_error
+        there = self._iterated(problem._replace(free_delay=False), np.append(theta[:-1], bound))
+        return None if there is None or there.equations.squared_error > here.squared_error else there
 
-    def _polish(self, problem: DelayProblem, theta: Array, history: list[IterationRecord]) -> Iterated | None:
-        """Joint iterations on coefficients and delay: from the right basin they converge in a few steps."""
-        first = len(history)
-
-        def record_step(theta: Array, equations: Equations) -> None:
-            cost = equations.squared_error / problem.data.count
-            history.append(history_entry("joint", len(history) - first, problem, theta, cost))
-
-        return iterate(
-            problem,
-            theta,
-            max_iterations=self.options.max_iterations,
-            tolerance=self.options.tolerance,
-            variant="guarded",
-            on_step=record_step,
-        )
+    def _iterated(self, problem: SampledProblem, theta: Array) -> Iterated | None:
+        return iterate(problem, theta, Steps(self.max_iterations, self.tolerance, GUARDED))
 
 
-class _SampleCost:
-    """The cost of a record's samples; SRIVC estimates the coefficients."""
+class Searches(NamedTuple):
+    """Where to search first, on filtered samples if a filter is given, and where to finish."""
 
-    def __init__(self, data: FilterData, structure: Structure, options: TdSrivc) -> None:
-        self.data = data
-        self.structure = structure
+    first: SampledProblem
+    last: SampledProblem
+
+
+class SrivcCost:
+    """The cost of a record's samples as a function of the delay; SRIVC estimates the coefficients."""
+
+    def __init__(self, options: TdSrivc, problem: SampledProblem) -> None:
         self.options = options
-        self.joint = DelayProblem(data, structure, options.delay_bounds)
+        self.problem = problem._replace(free_delay=False)
         # The guarded variant ends with joint iterations: its search only has to find the basin.
         self.tolerance = options.tolerance if options.variant == "plain" else max(options.tolerance, SEARCH_TOLERANCE)
 
     def minimise(self, delay: float, theta: Array | None) -> Minimum | None:
         """SRIVC at one delay, from given coefficients or from the least-squares start."""
-        problem = CoefficientProblem(self.data, self.structure, delay)
-        options = self.options
+        options, problem = self.options, self.problem
         if theta is None:
-            theta = initial_coefficients(problem, options.svf_cutoff, options.variant)
+            refit = options.variant == "guarded"
+            theta = least_squares_start(problem.data, problem.structure, delay, options.svf_cutoff, refit)
             if theta is None:
                 return None
-        result = iterate(
-            problem,
-            theta,
-            max_iterations=INNER_ITERATIONS,
-            tolerance=self.tolerance,
-            variant=options.variant,
-        )
-        if result is None or not np.isfinite(result.theta).all():
+        steps = Steps(INNER_ITERATIONS, self.tolerance, RULES[options.variant])
+        result = iterate(problem, np.append(theta[:-1], delay), steps)
+        if result is None:
             return None
-        return Minimum(delay, result.theta, result.equations.squared_error)
-
-    def step(self, minimum: Minimum) -> float | None:
-        """Gauss-Newton step of the delay."""
-        equations = self.joint.equations(np.concatenate((minimum.theta, [minimum.delay])))
-        return None if equations is None else delay_step(equations)
-
-    def descend(self, delay: float, theta: Array | None, stage: str, history: list[IterationRecord]) -> Descent | None:
-        """Search from a delay; the accepted steps go to the history."""
-        first = len(history)
-
-        def log(minimum: Minimum) -> None:
-            joint = np.concatenate((minimum.theta, [minimum.delay]))
-            cost = minimum.squared_error / self.data.count
-            history.append(history_entry(stage, len(history) - first, self.joint, joint, cost))
-
-        return descend(
-            self,
-            delay,
-            theta,
-            self.options.delay_bounds,
-            max_iterations=self.options.max_iterations,
-            tolerance=self.tolerance,
-            on_step=log,
-        )
+        step = delay_step(result.equations, LEAST_CURVATURE, False)
+        return Minimum(result.theta, result.equations.squared_error, step)

@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 
-from ctid_cli.estimation.compiled_iteration import best_coefficients
-from ctid_cli.estimation.filtered_costs import Effort, SampledCost, filtered_costs
-from ctid_cli.estimation.problems import CoefficientProblem, least_squares_start
+from ctid_cli.estimation.filtered_costs import SampledCost, filtered_costs
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
+from tests.estimation.adapters import CoefficientProblem, best_coefficients, least_squares_start, steps
 from tests.estimators.records import CASE_1, CASE_2, SVF_CUTOFF, make_record, theta_of
 
 LONGEST = 15.0
@@ -19,7 +18,12 @@ DEGREES = {CASE_1: Structure(2, 0), CASE_2: Structure(4, 1)}
 CUTOFFS = {CASE_1: (0.202, 0.5, 2.02), CASE_2: (2.685, 8.0, 26.85)}
 BANDS = [(model, cutoff) for model, cutoffs in CUTOFFS.items() for cutoff in cutoffs]
 DELAYS = np.arange(0.0, 15.1, 0.5)
-THOROUGH = Effort(max_iterations=100, tolerance=1e-9, halvings=12)
+THOROUGH = steps(max_iterations=100, tolerance=1e-9, halvings=12)
+
+
+def with_delay(model):
+    """Coefficients to start from; the delay at the end is not used."""
+    return np.append(theta_of(model), 0.0)
 
 
 def percent(record, model, delays=DELAYS):
@@ -67,7 +71,7 @@ def test_best_coefficients_fit_both_records_alike(model, cutoff, regular):
         found = []
         for filtered in (lowpass.apply(record), lowpass.resample(record)):
             cost = SampledCost(filter_data(filtered, LONGEST), DEGREES[model], SVF_CUTOFF[model], THOROUGH)
-            minimum = cost.minimise(delay, theta_of(model))
+            minimum = cost.minimise(delay, with_delay(model))
             found.append(100 * np.sqrt(minimum.squared_error / cost.spread))
         assert found[1] == pytest.approx(found[0], abs=2.5)
 
@@ -111,7 +115,7 @@ def test_input_that_begins_before_the_output_counts(cutoff):
     # A clock that input and output do not share is resampled at intervals of its own: alike, not the same.
     assert one.spread * one.mean_factor == pytest.approx(two.spread * two.mean_factor, rel=0.05)
     for delay in (2.0, 7.0, 8.0):
-        errors = [cost.minimise(delay, theta_of(CASE_1)).squared_error / cost.spread for cost in (one, two)]
+        errors = [cost.minimise(delay, with_delay(CASE_1)).squared_error / cost.spread for cost in (one, two)]
         assert np.sqrt(errors[0]) == pytest.approx(np.sqrt(errors[1]), abs=0.03)
 
 
@@ -150,23 +154,22 @@ def test_costs_are_those_of_their_filters_in_order():
     for cost, lowpass, cutoff in zip(many, lowpasses, (0.2, 0.7, 1.5), strict=True):
         data = filter_data(lowpass.resample(record), LONGEST)
         np.testing.assert_array_equal(cost.data.y, data.y)
-        np.testing.assert_array_equal(cost.start(7.0), least_squares_start(data, DEGREES[CASE_1], 7.0, cutoff))
+        np.testing.assert_array_equal(cost.starts(7.0)[0][:-1], least_squares_start(data, DEGREES[CASE_1], 7.0, cutoff))
 
 
 def test_minimum_is_the_best_of_its_starts():
     record = make_record(snr_db=15, n=2000)
     cost = sampled(record, 2.02)
     least_squares = cost.minimise(7.7, None)
-    from_start = cost.minimise_from(7.7, [cost.start(7.7)])
+    from_start = cost.minimise_from(7.7, cost.starts(7.7))
     assert least_squares.theta.tolist() == from_start.theta.tolist()
-    starts = [theta_of(CASE_1), np.array([0.1, 1e-3, 1.0]), cost.start(7.7)]
+    starts = [with_delay(CASE_1), np.array([0.1, 1e-3, 1.0, 0.0]), *cost.starts(7.7)]
     alone = [cost.minimise(7.7, theta).squared_error for theta in starts]
     best = cost.minimise_from(7.7, starts)
     assert best.squared_error == min(alone) < max(alone)
     effort = {"max_iterations": 10, "tolerance": 1e-2, "halvings": 3}
-    theta, squared_error, step = best_coefficients(cost.data, cost.structure, 7.7, np.array(starts), **effort)
-    assert (best.theta.tolist(), best.squared_error, best.step) == (theta.tolist(), squared_error, step)
-    assert cost.step(best) == best.step
+    theta, squared_error, step = best_coefficients(cost.data, cost.structure, 7.7, np.array(starts)[:, :-1], **effort)
+    assert (best.theta[:-1].tolist(), best.squared_error, best.step) == (theta.tolist(), squared_error, step)
     assert (best.delay, cost.minimise_from(7.7, [])) == (7.7, None)
 
 
@@ -175,7 +178,7 @@ def test_input_that_rests_while_it_counts_has_no_minimum():
     t = 0.05 * np.arange(1000)
     record = Record(t, np.sin(t), HeldSignal(t, np.where(t < t[-1], 0.0, 1.0)))
     cost = sampled(record, 2.02)
-    assert cost.start(1.0) is None
+    assert cost.starts(1.0) == []
     assert cost.minimise(1.0, None) is None
 
 
@@ -191,6 +194,6 @@ def test_both_searches_find_the_minimum_where_it_is(search, regular):
     )
     for cost, cutoff in zip(costs, cutoffs, strict=True):
         delays = 8.0 + np.arange(-10, 11) * 0.02 * 2 * np.pi / cutoff
-        errors = [cost.minimise(d, theta_of(CASE_1)).squared_error for d in delays[delays < LONGEST]]
+        errors = [cost.minimise(d, with_delay(CASE_1)).squared_error for d in delays[delays < LONGEST]]
         assert abs(delays[int(np.argmin(errors))] - 8.0) <= 0.061 * 2 * np.pi / cutoff
         assert np.sqrt(min(errors) / cost.spread) < 0.01

@@ -9,7 +9,6 @@ from scipy.signal import cont2discrete, lfilter
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.additive_problem import AdditiveProblem, loop_data
 from ctid_cli.estimation.common import Start
-from ctid_cli.estimation.refined_iv import iterate
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc
 from ctid_cli.estimators.srivc import Srivc
 from ctid_cli.filtering.filter_data import filter_data
@@ -20,6 +19,7 @@ from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import factored, factored_jacobian, unfactored
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Loop, Record
+from tests.estimation.adapters import iterate
 from tests.estimators.additive_records import (
     INTERVAL,
     MODE,

@@ -270,10 +270,10 @@ def test_errors_of_a_model_from_rest_are_those_of_its_simulation():
     record, other = record_of(noise=0.1), record_of(noise=0.1, seed=1, irregular=True)
     options = DelayProfile(2, 0, (0, 3))
     fit = options.fit(record)
-    applied = options.prepare(other).errors_of(fit.model)
+    applied = options.prepare(other).laid_out.errors_of(fit.model)
     expected = other.y - simulate(fit.model, other.input, other.t)
     np.testing.assert_allclose(applied.residuals[0], expected, atol=1e-9)
-    again = options.prepare(record).errors_of(fit.model)
+    again = options.prepare(record).laid_out.errors_of(fit.model)
     np.testing.assert_allclose(again.residuals[0], fit.residuals[0], atol=1e-9)
     assert r_squared(record.y, record.y - again.residuals[0]) == pytest.approx(fit.r2)
 
@@ -283,7 +283,7 @@ def test_errors_of_a_model_with_its_own_state_and_offset(initial_state):
     record = record_of(noise=0.05, offset=4.0, past=100)
     options = DelayProfile(2, 0, (0, 3), initial_state=initial_state, offset="estimate")
     fit = options.fit(record)
-    applied = options.prepare(record).errors_of(fit.model)
+    applied = options.prepare(record).laid_out.errors_of(fit.model)
     # The model's own record: its state and offset are the best already.
     np.testing.assert_allclose(applied.residuals[0], fit.residuals[0], atol=1e-6)
     assert applied.offsets == pytest.approx(fit.offsets, abs=1e-6)
@@ -294,11 +294,13 @@ def test_squared_errors_around_the_estimate():
     prepared = options.prepare(record_of(noise=0.1, offset=0.4))
     fit = prepared.fit()
     lowest = fit.cost * fit.count
-    assert prepared.squared_error_at(fit.theta, fit.model.delay) == pytest.approx(lowest)
-    known = replace(options, delay_bounds=(0.6, 0.6)).fit(prepared.records)
-    assert prepared.squared_error_at(fit.theta, 0.6) == pytest.approx(known.cost * known.count, rel=1e-6)
-    better = replace(options, offset="estimate").fit(prepared.records)
-    assert prepared.squared_error_with(fit, offset=True) == pytest.approx(better.cost * better.count, rel=1e-6)
+    assert prepared.laid_out.squared_error_at(fit.theta, fit.model.delay) == pytest.approx(lowest)
+    known = replace(options, delay_bounds=(0.6, 0.6)).fit(prepared.laid_out.measured.records)
+    assert prepared.laid_out.squared_error_at(fit.theta, 0.6) == pytest.approx(known.cost * known.count, rel=1e-6)
+    better = replace(options, offset="estimate").fit(prepared.laid_out.measured.records)
+    assert prepared.laid_out.squared_error_with(fit.theta, fit.model.delay, offset=True) == pytest.approx(
+        better.cost * better.count, rel=1e-6
+    )
 
 
 # --- refusals --------------------------------------------------------------------------------------

@@ -7,10 +7,10 @@ import pytest
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Start
-from ctid_cli.estimation.problems import CoefficientProblem
+from ctid_cli.estimation.filter_search import LATTICE
 from ctid_cli.estimation.redundancy import SearchStatus
 from ctid_cli.estimators.td_srivc import TdSrivc
-from ctid_cli.estimators.useful_redundancy import LATTICE, UsefulRedundancy
+from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.sensitivity import Structure
@@ -18,6 +18,7 @@ from ctid_cli.inference.status import Status
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
+from tests.estimation.adapters import CoefficientProblem
 from tests.estimators.records import CASE_1, CASE_2, SVF_CUTOFF, assert_same_model, make_record
 
 BOUNDS = (0.0, 15.0)
@@ -127,10 +128,10 @@ def test_all_costs_have_their_minimum_at_the_true_delay(model, search):
     # are nearly zero there, and J0 is large everywhere else.
     record = make_record(model, n=3000)
     prepared = UsefulRedundancy(**options(model, search=search)).prepare(record)
-    periods, shortest = prepared.filters.periods, prepared.period
+    periods, shortest = prepared.laid_out.filtered.filters.periods, prepared.laid_out.filtered.period
     coarse = np.arange(0.0, 15.1, 1.0)
     fine = 8.0 + 0.1 * shortest * np.arange(-8, 9)
-    costs = np.array([prepared.member_costs(delay) for delay in np.concatenate((coarse, fine))])
+    costs = np.array([prepared.laid_out.filtered.member_costs(delay) for delay in np.concatenate((coarse, fine))])
     delays = np.concatenate((coarse, fine))
     assert (np.abs(delays[np.argmin(costs, axis=0)] - 8.0) <= 0.1 * periods).all()
     mean = costs.mean(axis=1)
@@ -143,32 +144,34 @@ def test_all_costs_have_their_minimum_at_the_true_delay(model, search):
 def test_reference_cost_is_the_mean_of_the_members_on_a_lattice(prepared):
     step = LATTICE * 2 * np.pi / BANDWIDTH[CASE_1]
     for place in (3, 20, 40):
-        mean = prepared.member_costs(place * step).mean()
+        mean = prepared.laid_out.filtered.member_costs(place * step).mean()
         for part in (-0.49, 0.0, 0.3, 0.49):
-            assert prepared.reference_cost((place + part) * step) == pytest.approx(mean, rel=1e-9)
-        assert abs(prepared.reference_cost((place + 0.51) * step) - mean) > 1e-3 * mean
-    assert prepared.member_costs(8.0).shape == (10,)
+            assert prepared.laid_out.filtered.reference_cost((place + part) * step) == pytest.approx(mean, rel=1e-9)
+        assert abs(prepared.laid_out.filtered.reference_cost((place + 0.51) * step) - mean) > 1e-3 * mean
+    assert prepared.laid_out.filtered.member_costs(8.0).shape == (10,)
 
 
 def test_lattice_points_beyond_a_bound_are_moved_onto_it():
     prepared = UsefulRedundancy(**options(delay_bounds=(1.0, 9.0))).prepare(make_record(snr_db=15))
     for bound in (1.0, 9.0):
-        assert prepared.reference_cost(bound) > 0
-    step = LATTICE * prepared.period
+        assert prepared.laid_out.filtered.reference_cost(bound) > 0
+    step = LATTICE * prepared.laid_out.filtered.period
     # The lattice points next to both bounds lie outside of them.
     assert round(1.0 / step) * step < 1.0
-    assert prepared.reference_cost(1.0) == prepared.member_costs(1.0).mean()
+    assert prepared.laid_out.filtered.reference_cost(1.0) == prepared.laid_out.filtered.member_costs(1.0).mean()
     assert round(9.0 / step) * step > 9.0
-    assert prepared.reference_cost(9.0) == prepared.member_costs(9.0).mean()
+    assert prepared.laid_out.filtered.reference_cost(9.0) == prepared.laid_out.filtered.member_costs(9.0).mean()
 
 
 def test_members_are_those_of_the_filter_set(prepared):
     expected = FilterSet(BANDWIDTH[CASE_1], 10, 10.0, 10)
-    assert prepared.filters == expected
-    assert len(prepared.costs) == 10
-    assert prepared.period == pytest.approx(2 * np.pi / BANDWIDTH[CASE_1])
+    assert prepared.laid_out.filtered.filters == expected
+    assert len(prepared.laid_out.filtered.costs) == 10
+    assert prepared.laid_out.filtered.period == pytest.approx(2 * np.pi / BANDWIDTH[CASE_1])
     other = UsefulRedundancy(**options(filters=4, beta=3.0, order=5)).prepare(make_record(snr_db=15, n=2000))
-    np.testing.assert_allclose(other.filters.cutoffs, BANDWIDTH[CASE_1] / np.array([3, 7 / 3, 5 / 3, 1]))
+    np.testing.assert_allclose(
+        other.laid_out.filtered.filters.cutoffs, BANDWIDTH[CASE_1] / np.array([3, 7 / 3, 5 / 3, 1])
+    )
     assert {lowpass.order for lowpass in other.filters.lowpasses} == {5}
 
 
@@ -184,7 +187,7 @@ def test_starts_do_not_influence_one_another(search):
     alone = {start: estimator.fit(record, Start(start)) for start in starts}
     for order in (starts, starts[::-1]):
         prepared = estimator.prepare(record)
-        prepared.reference_cost(7.9)
+        prepared.laid_out.filtered.reference_cost(7.9)
         for start in order + order[:1]:
             assert same(prepared.fit(Start(start)), alone[start])
 
@@ -202,7 +205,9 @@ def test_search_tells_how_it_went(model, replicate, start, search):
     assert (trajectory[0].point, trajectory[0].round, trajectory[0].path) == (start, 0, -1)
     costs = [visit.cost for visit in trajectory]
     assert all(after < before for before, after in pairwise(costs))
-    assert [visit.cost for visit in search.visits] == [prepared.reference_cost(v.point) for v in search.visits]
+    assert [visit.cost for visit in search.visits] == [
+        prepared.laid_out.filtered.reference_cost(v.point) for v in search.visits
+    ]
     assert (search.point, search.cost) == (trajectory[-1].point, trajectory[-1].cost)
     assert min(visit.cost for visit in search.visits) == search.cost
     # Each round follows every filter from the incumbent, and candidates are the ends of those paths.
@@ -248,7 +253,7 @@ def test_history_leads_from_incumbent_to_incumbent(prepared):
         assert {entry.stage for entry in block} == {f"filter {after.path + 1}"}
         assert [entry.iteration for entry in block] == list(range(len(block)))
         assert (block[0].delay, block[-1].delay) == (before.point, after.point)
-        data = prepared.costs[after.path].data
+        data = prepared.laid_out.filtered.costs[after.path].data
         for entry in block:
             theta = np.array([*entry.denominator[1:], *entry.numerator])
             error = CoefficientProblem(data, Structure(2, 0), entry.delay).equations(theta).squared_error

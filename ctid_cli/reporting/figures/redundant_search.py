@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.delay_search import Minimum
+from ctid_cli.estimation.filter_search import NOTHING, FilterSearch
 from ctid_cli.estimation.filtered_costs import FilteredCost
-from ctid_cli.estimators.useful_redundancy import NOTHING, PreparedUsefulRedundancy, RedundantFit, UsefulRedundancy
+from ctid_cli.estimators.useful_redundancy import RedundantFit, UsefulRedundancy
 from ctid_cli.simulation.dataset import DataSet
 
 #: How often the delays are gone through, up and down in turn: more does not lower the costs visibly.
@@ -70,14 +71,14 @@ def landscape(
     grid = np.asarray(delays, dtype=float)
     prepared = estimator.prepare(data_set.record)
     assert data_set.true_model is not None
-    fit = prepared.fit(Start(delay=initial_delay))
+    fit, search = prepared.fit(Start(delay=initial_delay)), prepared.laid_out.filtered
     return Landscape(
         delays=grid,
-        members=_least_costs(prepared.costs, grid, sweeps),
-        evaluated=np.array([prepared.reference_cost(delay) for delay in grid]),
+        members=_least_costs(search.costs, grid, sweeps),
+        evaluated=np.array([search.reference_cost(delay) for delay in grid]),
         true_delay=data_set.true_model.delay,
         fit=fit,
-        legs=_legs(prepared, fit),
+        legs=_legs(search, fit),
     )
 
 
@@ -94,8 +95,7 @@ def _least_costs(costs: Sequence[FilteredCost], delays: Array, sweeps: int) -> A
                 starts = [minimum.theta for minimum in known if minimum is not None]
                 # Least squares on a narrow band is hopeless in noise.
                 if sweep == 0 and (k == count - 1 or not starts):
-                    start = costs[k].start(float(delays[i]))
-                    starts += [] if start is None else [start]
+                    starts += costs[k].starts(float(delays[i]))
                 found = costs[k].minimise_from(float(delays[i]), starts)
                 old = here[k]
                 if found is not None and (old is None or found.squared_error < old.squared_error):
@@ -112,7 +112,7 @@ def _least_costs(costs: Sequence[FilteredCost], delays: Array, sweeps: int) -> A
     )
 
 
-def _legs(prepared: PreparedUsefulRedundancy, fit: RedundantFit) -> tuple[Leg, ...]:
+def _legs(search: FilterSearch, fit: RedundantFit) -> tuple[Leg, ...]:
     assert fit.search is not None
     legs = []
     for visit in fit.search.trajectory[1:]:
@@ -121,6 +121,6 @@ def _legs(prepared: PreparedUsefulRedundancy, fit: RedundantFit) -> tuple[Leg, .
             for path in fit.paths
             if (path.round, path.filter, float(path.delays[-1])) == (visit.round, visit.path, visit.point)
         )
-        costs = np.array([prepared.reference_cost(float(delay)) for delay in path.delays])
+        costs = np.array([search.reference_cost(float(delay)) for delay in path.delays])
         legs.append(Leg(path.filter, path.delays, costs, visit in fit.switches))
     return tuple(legs)

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from ctid_cli.estimation.problems import CoefficientProblem, DelayProblem
-from ctid_cli.estimation.refined_iv import PATIENCE, RELAXATIONS, Equations, iterate, relative_change, scaled_solve
+from ctid_cli.estimation.iteration import PATIENCE, RELAXATIONS, Equations, relative_change
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
+from tests.estimation.adapters import CoefficientProblem, DelayProblem, iterate, scaled_solve
 from tests.estimators.records import CASE_1, CASE_2, make_record, theta_of
 
 DEGREES = {CASE_1: Structure(2, 0), CASE_2: Structure(4, 1)}

@@ -1,24 +1,13 @@
 """The compiled iteration against the Python one, step by step and from start to end, and the parts it is made of."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ctid_cli.estimation import refined_iv
-from ctid_cli.estimation.compiled_iteration import best_coefficients, solve_scaled, stabilise
-from ctid_cli.estimation.delay_search import delay_step
-from ctid_cli.estimation.problems import (
-    CoefficientProblem,
-    DelayProblem,
-    is_hurwitz,
-    refit_numerator,
-    with_stable_denominator,
-)
-from ctid_cli.estimation.refined_iv import iterate, scaled_solve
+from ctid_cli.estimation.iteration import solve_scaled
+from ctid_cli.estimation.stability import is_hurwitz, with_stable_denominator
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.sensitivity import Structure
@@ -26,6 +15,8 @@ from ctid_cli.inference.status import Status
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
+from tests.estimation.adapters import CoefficientProblem, DelayProblem, best_coefficients, delay_step, refit_numerator
+from tests.estimation.reference_iteration import guarded, solved, stable
 from tests.estimators.records import CASE_1, CASE_2, make_record, theta_of
 
 SEARCH = {"max_iterations": 10, "tolerance": 1e-2, "halvings": 3}
@@ -34,22 +25,13 @@ LONGEST = 3.0
 RIGHT, NEAR, ANY = (0.0, 0.0371), (0.0, 0.0371, 0.3), (0.0, 0.0371, 0.3, 1.7182, 3.0)
 
 
-class GaussNewton(CoefficientProblem):
-    """Coefficients whose regressors are the sensitivities themselves."""
-
-    def equations(self, theta):
-        equations = super().equations(theta)
-        return None if equations is None else replace(equations, instrument_regressor=equations.hessian)
-
-
 def in_python(data, structure, delay, starts, gauss_newton=False, **effort):
-    """What `best_coefficients` promises, from the parts of the Python iteration."""
-    problem = (GaussNewton if gauss_newton else CoefficientProblem)(data, structure, delay)
+    """What `best_coefficients` promises, from the reference."""
+    problem = CoefficientProblem(data, structure, delay)
     results = []
     for start in starts:
-        stable = with_stable_denominator(start, structure.poles)
-        refitted = refit_numerator(data, structure, stable, delay)
-        result = iterate(problem, refitted, variant="guarded", **effort)
+        refitted = refit_numerator(data, structure, stable(start, structure.poles), delay)
+        result = guarded(problem, refitted, gauss_newton=gauss_newton, **effort)
         results += [] if result is None else [result]
     return min(results, key=lambda result: result.equations.squared_error, default=None)
 
@@ -152,7 +134,7 @@ def test_benchmark_coefficients_are_those_of_the_python_iteration(model, regular
 
 
 @pytest.mark.parametrize("seed", [6, 7, 28, 31, 36])
-def test_steps_that_give_less_than_they_promise_end_it(seed, monkeypatch):
+def test_steps_that_give_less_than_they_promise_end_it(seed):
     # A delay that is too long by a time constant: both stop after as many such steps, and far from where they would go.
     rng = np.random.default_rng(seed)
     t = 0.1 * np.arange(250)
@@ -164,8 +146,7 @@ def test_steps_that_give_less_than_they_promise_end_it(seed, monkeypatch):
     assert expected.status is Status.STALLED
     theta, squared_error, _ = best_coefficients(*problem, **FULL)
     assert distance(theta, squared_error, expected, data) < 1e-11
-    monkeypatch.setattr(refined_iv, "SLOW_STEPS", 1000)
-    patient = in_python(*problem, **FULL)
+    patient = in_python(*problem, **FULL, slow_steps=1000)
     assert patient.iterations > expected.iterations
     assert distance(theta, squared_error, patient, data) > 1e-8
 
@@ -265,25 +246,36 @@ def test_solve_scaled_is_numpy_on_the_scaled_equations(system):
     matrix, right, row_units, column_units = system
     condition = np.linalg.cond(matrix)
     assume(condition < 1e8)
-    out = np.full(right.size, np.nan)
     mixed = matrix * np.outer(row_units, column_units)
     before = mixed.copy()
-    assert solve_scaled(mixed, right * row_units, row_units**2, column_units**2, out)
+    found, out = solve_scaled(mixed, right * row_units, row_units**2, column_units**2, right.size)
+    assert found
     expected = np.linalg.solve(matrix, right)
     size = np.abs(expected).max() + np.abs(right).max()
     np.testing.assert_allclose(out * column_units, expected, rtol=0, atol=1e-13 * condition * size)
     assert np.array_equal(mixed, before)
-    also = scaled_solve(mixed, right * row_units, row_units**2, column_units**2)
+    also = solved(mixed, right * row_units, row_units**2, column_units**2)
     np.testing.assert_allclose(out * column_units, also * column_units, rtol=0, atol=1e-13 * condition * size)
+
+
+@given(systems(), st.integers(1, 8))
+def test_leading_equations_are_solved_by_themselves(system, count):
+    matrix, right, _, _ = system
+    count = min(count, right.size)
+    assume(np.linalg.cond(matrix[:count, :count]) < 1e8)
+    ones = np.ones(right.size)
+    _, whole = solve_scaled(matrix[:count, :count].copy(), right[:count].copy(), ones, ones, count)
+    _, part = solve_scaled(matrix, right, ones, ones, count)
+    assert np.array_equal(part, np.append(whole, np.zeros(right.size - count)))
 
 
 @given(st.integers(1, 6), st.integers(0, 5), st.sampled_from([np.nan, np.inf, 0.0, -1.0]))
 def test_scales_that_are_not_positive_are_refused(p, place, bad):
-    ones, wrong, out = np.ones(p), np.ones(p), np.empty(p)
+    ones, wrong = np.ones(p), np.ones(p)
     wrong[place % p] = bad
-    assert solve_scaled(np.eye(p), ones, ones, ones, out)
-    assert not solve_scaled(np.eye(p), ones, wrong, ones, out)
-    assert not solve_scaled(np.eye(p), ones, ones, wrong, out)
+    assert solve_scaled(np.eye(p), ones, ones, ones, p)[0]
+    assert not solve_scaled(np.eye(p), ones, wrong, ones, p)[0]
+    assert not solve_scaled(np.eye(p), ones, ones, wrong, p)[0]
 
 
 @pytest.mark.parametrize(
@@ -292,8 +284,7 @@ def test_scales_that_are_not_positive_are_refused(p, place, bad):
 def test_singular_equations_have_no_solution(matrix):
     matrix = np.array(matrix, dtype=float)
     ones = np.ones(matrix.shape[0])
-    assert not solve_scaled(matrix, ones, ones, ones, np.empty(ones.size))
-    assert scaled_solve(matrix, ones, ones, ones) is None
+    assert not solve_scaled(matrix, ones, ones, ones, ones.size)[0]
 
 
 @given(systems(), st.integers(0, 63))
@@ -303,16 +294,16 @@ def test_numbers_that_are_none_are_noticed(system, place):
     for number in (np.nan, np.inf):
         wrong = right.copy()
         wrong[place % right.size] = number
-        assert not solve_scaled(matrix, wrong, ones, ones, np.empty(right.size))
+        assert not solve_scaled(matrix, wrong, ones, ones, right.size)[0]
     matrix.flat[place % matrix.size] = np.nan
-    assert not solve_scaled(matrix, right, ones, ones, np.empty(right.size))
+    assert not solve_scaled(matrix, right, ones, ones, right.size)[0]
 
 
 def test_zero_pivots_are_no_obstacle():
     # Partial pivoting: the leading entry vanishes at every stage.
     matrix = np.array([[0.0, 0, 1], [0, 2, 0], [4, 0, 0]])
-    out = np.empty(3)
-    assert solve_scaled(matrix, np.array([1.0, 2, 3]), np.ones(3), np.ones(3), out)
+    found, out = solve_scaled(matrix, np.array([1.0, 2, 3]), np.ones(3), np.ones(3), 3)
+    assert found
     assert out.tolist() == [0.75, 1.0, 1.0]
 
 
@@ -331,11 +322,10 @@ def denominators(draw):
 
 
 @given(denominators(), st.lists(st.floats(-9, 9), max_size=3))
-def test_stabilise_is_the_reflection_of_the_python_iteration(a, numerator):
+def test_reflection_is_that_of_numpy(a, numerator):
     theta = np.concatenate((a[1:], numerator))
-    expected = with_stable_denominator(theta, a.size - 1)
-    found = theta.copy()
-    stabilise(found, a.size - 1)
+    expected = stable(theta, a.size - 1)
+    found = with_stable_denominator(theta, a.size - 1)
     assert is_hurwitz(np.append(1.0, found[: a.size - 1]))
     np.testing.assert_allclose(found, expected, rtol=1e-6)
     if is_hurwitz(a):
@@ -346,9 +336,9 @@ def test_stabilise_is_the_reflection_of_the_python_iteration(a, numerator):
 @pytest.mark.parametrize("a", [[0.0], [0.0, 4.0], [1.0, 1.0, 1.0], [2.0, 0.0], [0.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
 def test_roots_on_the_axis_are_moved_off_it(a):
     theta = np.array([*a, 7.0])
-    stabilise(theta, len(a))
-    np.testing.assert_allclose(theta, with_stable_denominator(np.array([*a, 7.0]), len(a)), rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(theta, [*a, 7.0], atol=1e-4)
+    moved = with_stable_denominator(theta, len(a))
+    np.testing.assert_allclose(moved, stable(theta, len(a)), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(moved, [*a, 7.0], atol=1e-4)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -357,6 +347,5 @@ def test_parameters_that_are_not_finite_are_left_alone(place, bad):
     theta = np.array([-1.0, 2.0, -3.0, 4.0])
     theta[place] = bad
     kept = theta.copy()
-    stabilise(theta, 3)
+    assert np.array_equal(with_stable_denominator(theta, 3), kept, equal_nan=True)
     assert np.array_equal(theta, kept, equal_nan=True)
-    assert with_stable_denominator(kept, 3) is kept

@@ -1,0 +1,155 @@
+"""Measured records laid out for estimation: means, state before the record, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.errors import DataError
+from ctid_cli.estimation.common import check_greatest_delay, check_record, named
+from ctid_cli.estimation.output_error import Layout
+from ctid_cli.filtering.filter_data import FilterData, filter_data
+from ctid_cli.inference.answer import output_bandwidth
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal, Hold
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import InitialState, Offset
+
+#: Time constants after which a free response counts as gone (1e-12), and most periods that are prepended for it.
+SETTLING = 28.0
+MOST_PERIODS = 200
+
+
+class Treatment(NamedTuple):
+    """How records are laid out."""
+
+    delay_bounds: tuple[float, float]
+    initial_state: InitialState
+    offset: Offset
+    hold_output: Hold
+
+
+class MeasuredRecords:
+    """Records of one system, laid out for filtering."""
+
+    def __init__(self, records: Sequence[Record], structure: Structure, treatment: Treatment) -> None:
+        if not records:
+            raise DataError("there is no record to estimate from")
+        self.structure = structure
+        self.treatment = treatment
+        self.layout = Layout(
+            structure, len(records), treatment.initial_state == "estimate", treatment.offset == "estimate"
+        )
+        self.offsets: list[float] = []
+        self.input_offsets: list[float] = []
+        self.records: list[Record] = []
+        for record in records:
+            self._check_input(record)
+            removed = treatment.offset == "remove"
+            centred, u0, y0 = _without_means(record) if removed else (record, 0.0, 0.0)
+            self.records.append(centred)
+            self.input_offsets.append(u0)
+            self.offsets.append(y0)
+        self.data = [self._lay_out(record) for record in self.records]
+        for record, data in zip(self.records, self.data, strict=True):
+            self._check(record, data)
+
+    @cached_property
+    def bandwidth(self) -> float:
+        """Highest frequency that matters in an output [rad/s]."""
+        return max(output_bandwidth(record) for record in self.records)
+
+    @property
+    def plain(self) -> bool:
+        """Whether there is but one record and nothing of its own to be estimated."""
+        return self.layout.own == 0 and len(self.data) == 1 and self.structure.zeros < self.structure.poles
+
+    def _check_input(self, record: Record) -> None:
+        """Refuse what an input cannot tell."""
+        low, high = self.treatment.delay_bounds
+        if high > 0:
+            check_greatest_delay(record, high)
+        if np.ptp(record.input.values) > 0.0:
+            return
+        constant = f"{named(record)}the input is constant ({record.input.values[0]:g}) over the whole record"
+        if low < high:
+            raise DataError(
+                f"{constant}: it holds no event from which a delay could be read; give a known delay, and an initial "
+                "state to be estimated"
+            )
+        if self.treatment.initial_state != "estimate":
+            raise DataError(
+                f"{constant}; only with an estimated initial state (initial_state 'estimate') can a model be read "
+                "from the free response"
+            )
+
+    def _check(self, record: Record, data: FilterData) -> None:
+        """Refuse what cannot be estimated; a constant input is no obstacle to an estimated initial state."""
+        if np.ptp(record.input.values) > 0.0 or not self.layout.initial_state:
+            check_record(record, data, self.layout.size)
+        elif data.count <= self.layout.size:
+            raise DataError(f"{data.count} usable samples for {self.layout.size} parameters; take a longer record")
+
+    def _lay_out(self, record: Record, periods: int = 0) -> FilterData:
+        """Filter data; ``periods`` copies of the record's input come before it, with masked outputs."""
+        treatment = self.treatment
+        if periods == 0:
+            # At rest the input before the record is known to be zero, whatever the delay; otherwise it is not known.
+            known_after = treatment.delay_bounds[1] if treatment.initial_state == "estimate" else 0.0
+            return filter_data(record, known_after, treatment.hold_output)
+        extended = _repeated(record, periods)
+        return filter_data(extended, record.t[0] - extended.input.t[0], treatment.hold_output)
+
+    @cached_property
+    def centred(self) -> FilterData:
+        """The first record without its means, for starts that know no offset and no initial state."""
+        if self.treatment.offset != "estimate":
+            return self.data[0]
+        return self._lay_out(_without_means(self.records[0])[0])
+
+    def make_periodic(self, a: Array) -> None:
+        """Put enough periods before each record for the free response of a model (a_1 … a_n) to be gone."""
+        model = TransferFunction([1.0], np.concatenate(([1.0], a)))
+        slowest = float(np.abs(model.poles.real).min())
+        for k, record in enumerate(self.records):
+            period = _period(record)
+            periods = int(np.ceil(SETTLING / (slowest * period))) if slowest > 0 else MOST_PERIODS
+            self.data[k] = self._lay_out(record, min(max(periods, 1), MOST_PERIODS))
+
+    def used(self) -> tuple[BoolArray, ...]:
+        """Which samples of each record enter the sums, without those of periods put before it."""
+        return tuple(
+            data.use[data.use.size - record.t.size :] for data, record in zip(self.data, self.records, strict=True)
+        )
+
+
+def _without_means(record: Record) -> tuple[Record, float, float]:
+    """Record less the mean of its output samples and the time average of its input."""
+    y0 = float(np.nanmean(record.y))
+    signal = record.input
+    u0 = float(np.mean(signal.at(record.t)))
+    centred = Record(record.t, record.y - y0, HeldSignal(signal.t, signal.values - u0, signal.hold), name=record.name)
+    return centred, u0, y0
+
+
+def _period(record: Record) -> float:
+    """Period of a record that repeats: its duration and one more interval."""
+    return record.duration + (record.interval or float(np.median(np.diff(record.t))))
+
+
+def _repeated(record: Record, periods: int) -> Record:
+    """Record with copies of its input before it and no outputs there."""
+    period = _period(record)
+    shifts = period * np.arange(-periods, 1)
+    t = (record.t + shifts[:, None]).ravel()
+    y = np.concatenate([np.full(periods * record.n_samples, np.nan), record.y])
+    signal = record.input
+    inside = signal.t < signal.t[0] + period * (1 - 1e-9)
+    tu = (signal.t[inside] + shifts[:, None]).ravel()
+    u = np.tile(signal.values[inside], periods + 1)
+    return Record(t, y, HeldSignal(tu, u, signal.hold), name=record.name)

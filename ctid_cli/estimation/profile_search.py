@@ -1,0 +1,212 @@
+"""Search over the delay of measured records: behind filters from coarse to fine, or on every sample."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ctid_cli.arrays import Array
+from ctid_cli.estimation.delay_grid import Level, costs_of, local_minima, scan, search_grid
+from ctid_cli.estimation.delay_search import Minimum, best_minimum
+from ctid_cli.estimation.filtered_costs import filtered_costs
+from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps, iterate
+from ctid_cli.estimation.measured_records import MeasuredRecords
+from ctid_cli.estimation.output_error import Layout, OutputErrorProblem
+from ctid_cli.estimation.sampled import at_known_delay, least_squares_start
+from ctid_cli.filtering.lowpass import Lowpass
+from ctid_cli.inference.sensitivity import Structure
+
+ProfileSearch = Literal["time", "spectral", "samples"]
+
+#: Local minima of the profile that are refined.
+MINIMA = 3
+#: How hard to work at each delay of the grid. Far from the true delay a pole may run to infinity, where no number of
+#: halvings helps. Gauss-Newton is a direction of descent also where the delay is wrong.
+GRID_EFFORT = Steps(max_iterations=15, tolerance=1e-2, rule=GAUSS_NEWTON, halvings=4)
+#: Delays on the grid: between these numbers, whatever the bandwidth asks for.
+FEWEST_DELAYS = 24
+MOST_DELAYS = 2000
+#: Most parts into which a step of the grid is divided around its minima.
+FINEST = 32
+#: A search behind filters: ratio of the cut-off frequencies of its levels, how many delays the first level may have
+#: before a coarser one is put before it, how many levels at most, and order and effort of each.
+LEVEL_RATIO = 3.0
+MOST_FIRST_DELAYS = 30
+MOST_LEVELS = 4
+LEVEL_ORDER = 10
+LEVEL_EFFORT = Steps(max_iterations=6, tolerance=2e-2, rule=GAUSS_NEWTON, halvings=3)
+#: Cut-offs of the state-variable filter that are tried, as multiples of the output's bandwidth.
+CUTOFFS = (0.2, 1.0, 5.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Cost over the grid of delays, minimised over all other parameters."""
+
+    #: Grid [s], shape (K,).
+    delays: Array
+    #: Mean squared output error [output unit^2]; NaN where the equations were singular, shape (K,).
+    costs: Array
+    #: Frequency below which the output has 95 % of its power [rad/s]; the spacing is at most a quarter of its period.
+    bandwidth: float
+    #: Cut-off frequency [rad/s] of the low-pass filter behind which the grid was searched, and to whose output the
+    #: costs belong; the spacing is then a quarter of its period. None where every sample was searched.
+    cutoff: float | None = None
+
+
+#: Minima from which to refine, none if nothing can be computed, and the profile; None at a known delay.
+Found = tuple[list[Minimum], Profile | None]
+
+
+class RecordsCost:
+    """The cost of all samples of the records as a function of the delay."""
+
+    def __init__(self, measured: MeasuredRecords, bandwidth: float, cutoffs: Sequence[float]) -> None:
+        self.measured = measured
+        self.bandwidth = bandwidth
+        self.cutoffs = cutoffs
+        self.coefficients = Structure(measured.structure.poles, measured.structure.zeros)
+
+    def starts(self, delay: float) -> list[Array]:
+        """Denominators of least-squares starts; the output's mean is left to the offset."""
+        n, m = self.coefficients.poles, self.coefficients.zeros
+        strictly_proper = Structure(n, min(m, n - 1))
+        found: list[Array] = []
+        for cutoff in self.cutoffs:
+            theta = least_squares_start(self.measured.centred, strictly_proper, delay, cutoff * self.bandwidth)
+            if theta is not None:
+                found.append(theta[:n])
+        # Without any, a system of the right speed, whatever the data say: a start for Gauss-Newton.
+        found = found or [np.asarray(np.poly(np.full(n, -0.5 * self.bandwidth))[1:], dtype=float)]
+        return [np.concatenate((a, np.zeros(m + 1), [delay])) for a in found]
+
+    def minimise_from(self, delay: float, starts: Sequence[Array]) -> Minimum | None:
+        """Least cost at a delay over the denominators of several starts."""
+        measured, n = self.measured, self.coefficients.poles
+        if measured.plain:
+            problem = at_known_delay(measured.data[0], self.coefficients)
+            return best_minimum(problem, delay, starts, n, GRID_EFFORT)
+        layout = Layout(self.coefficients, len(measured.data), measured.layout.initial_state, measured.layout.offset)
+        output_error = OutputErrorProblem(measured.data, layout, delay)
+        best: Minimum | None = None
+        for start in starts:
+            theta = output_error.linear_start(np.concatenate(([1.0], start[:n])), delay)
+            result = None if theta is None else iterate(output_error, theta, GRID_EFFORT)
+            if result is not None and (best is None or result.equations.squared_error < best.squared_error):
+                coefficients = result.theta[: self.coefficients.size]
+                best = Minimum(np.append(coefficients, delay), result.equations.squared_error)
+        return best
+
+
+def search_delay(measured: MeasuredRecords, search: ProfileSearch, svf_cutoff: float | None) -> Iterator[Found]:
+    """Look for the delay; what comes later is for where refining what came before led nowhere."""
+    bandwidth = svf_cutoff or measured.bandwidth
+    cost = RecordsCost(measured, bandwidth, (1.0,) if measured.structure.delay else CUTOFFS)
+    treatment = measured.treatment
+    # What filters see must be the answer to the input alone.
+    at_rest = treatment.initial_state == "rest" and treatment.offset != "estimate"
+    if search != "samples" and at_rest and len(measured.records) == 1 and measured.structure.delay:
+        yield _search_levels(cost, search)
+    yield _search_samples(cost)
+
+
+def _search_levels(cost: RecordsCost, search: Literal["time", "spectral"]) -> Found:
+    """Search behind low-pass filters."""
+    measured, bandwidth = cost.measured, cost.bandwidth
+    treatment = measured.treatment
+    cutoffs = _cutoffs(treatment.delay_bounds, bandwidth)
+    costs = filtered_costs(
+        measured.records[0],
+        [Lowpass(cutoff, LEVEL_ORDER) for cutoff in cutoffs],
+        cost.coefficients,
+        treatment.delay_bounds,
+        search=search,
+        start=0.0,
+        svf_cutoff=cutoffs,
+        hold_output=treatment.hold_output,
+        effort=LEVEL_EFFORT,
+    )
+    if costs[-1] is None:
+        return [], None
+    usable = [(level, cutoff) for level, cutoff in zip(costs, cutoffs, strict=True) if level is not None]
+    levels = [Level(level, 0.5 * np.pi / cutoff) for level, cutoff in usable]
+    found = search_grid(levels, treatment.delay_bounds, FEWEST_DELAYS)
+    first, cutoff = usable[0]
+    profile = Profile(found.delays, found.costs * first.mean_factor, bandwidth, cutoff)
+    minima = list(found.minima)
+    interval = measured.data[0].interval
+    if interval > 0.0:
+        # On a regular clock the cost has a kink at every interval, and local minima between them that a model too small
+        # for its system makes deep: every sample is asked about an eighth of a period around what the filters found.
+        reach = max(interval, 0.25 * np.pi / bandwidth)
+        parts = min(int(np.ceil(2.0 * reach / interval)), FINEST)
+        minima = [finer for centre in minima for finer in _local_grid(cost, [centre], reach, parts, 1)]
+    return minima, profile
+
+
+def _cutoffs(bounds: tuple[float, float], bandwidth: float) -> list[float]:
+    """Cut-off frequencies of the levels of a search [rad/s], lowest first."""
+    low, high = bounds
+    cutoffs = [bandwidth]
+    while (high - low) * cutoffs[0] / (0.5 * np.pi) > MOST_FIRST_DELAYS and len(cutoffs) < MOST_LEVELS:
+        cutoffs.insert(0, cutoffs[0] / LEVEL_RATIO)
+    return cutoffs
+
+
+def _search_samples(cost: RecordsCost) -> Found:
+    """Search on every sample."""
+    measured = cost.measured
+    delays = _grid(measured.treatment.delay_bounds, cost.bandwidth)
+    found = scan(cost, delays)
+    costs = costs_of(found)
+    if np.isnan(costs).all():
+        return [], None
+    if measured.treatment.initial_state == "periodic":
+        least = found[int(np.nanargmin(costs))]
+        assert least is not None
+        measured.make_periodic(least.theta[: cost.coefficients.poles])
+    count = sum(data.count for data in measured.data)
+    minima = [found[k] for k in local_minima(costs, MINIMA)]
+    chosen = [minimum for minimum in minima if minimum is not None]
+    if delays.size == 1:
+        return chosen, None
+    # Held inputs that change on the sampling clock put a kink into the cost at every sampling interval, and local
+    # minima between the kinks: a fine grid around those of the coarse one resolves a quarter of an interval.
+    spacing = float(delays[1] - delays[0])
+    interval = min(float(np.median(np.diff(record.t))) for record in measured.records)
+    parts = int(np.clip(np.ceil(4.0 * spacing / interval), 4, FINEST))
+    profile = Profile(delays, costs / count, cost.bandwidth)
+    return _local_grid(cost, chosen, spacing, parts, MINIMA) or chosen, profile
+
+
+def _grid(bounds: tuple[float, float], bandwidth: float) -> Array:
+    """Delays of the search: the spacing is at most a quarter period of the output's bandwidth."""
+    low, high = bounds
+    if low == high:
+        return np.array([low])
+    wanted = int(np.ceil((high - low) * bandwidth / (0.5 * np.pi))) + 1
+    return np.linspace(low, high, min(max(wanted, FEWEST_DELAYS), MOST_DELAYS))
+
+
+def _local_grid(cost: RecordsCost, centres: Sequence[Minimum], reach: float, parts: int, most: int) -> list[Minimum]:
+    """The lowest minima on fine grids of all samples around given ones."""
+    low, high = cost.measured.treatment.delay_bounds
+    fine: list[tuple[float, Minimum | None]] = []
+    for centre in centres:
+        for side in (-1, 1):
+            start = centre.theta
+            row: list[tuple[float, Minimum | None]] = []
+            for part in range(0 if side > 0 else 1, parts + 1):
+                delay = centre.delay + side * part * reach / parts
+                if low <= delay <= high:
+                    found = cost.minimise_from(delay, [start])
+                    start = start if found is None else found.theta
+                    row.append((delay, found))
+            fine += row if side > 0 else row[::-1]
+    fine.sort(key=lambda entry: entry[0])
+    minima = [minimum for _, minimum in fine]
+    lowest = [minima[k] for k in local_minima(costs_of(minima), most)]
+    return [minimum for minimum in lowest if minimum is not None]

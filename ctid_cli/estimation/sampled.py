@@ -1,0 +1,131 @@
+"""The estimation problem of a single transfer function on the samples of one record."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from ctid_cli.arrays import Array
+from ctid_cli.estimation.iteration import Equations, compiled_as, inadmissible, solve_scaled, with_best
+from ctid_cli.estimation.stability import reflect_unstable, with_stable_denominator
+from ctid_cli.filtering.bank import second_moments, standard_moments
+from ctid_cli.filtering.filter_data import FilterData
+from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT
+from ctid_cli.inference.sensitivity import Structure
+
+
+class SampledProblem(NamedTuple):
+    """Coefficients and delay: ``theta = (a_1 … a_n, b_0 … b_m, delay)``; the delay is held or free within bounds."""
+
+    data: FilterData
+    poles: int
+    zeros: int
+    free_delay: bool
+    low: float
+    high: float
+
+    @property
+    def structure(self) -> Structure:
+        """The parameters that are estimated."""
+        return Structure(self.poles, self.zeros, self.free_delay)
+
+    @property
+    def free(self) -> int:
+        """Number of parameters to iterate on."""
+        return self.poles + self.zeros + 1 + self.free_delay
+
+    @property
+    def samples(self) -> int:
+        """Number of samples in the sums."""
+        return self.data.count
+
+    def split(self, theta: Array) -> tuple[Array, Array, float]:
+        """Denominator, numerator and delay [s] of a parameter vector."""
+        return np.concatenate(([1.0], theta[: self.poles])), theta[self.poles : -1], float(theta[-1])
+
+    def equations(self, theta: Array) -> Equations:
+        """Second moments of the iteration."""
+        moments: Equations = sampled_equations(self, theta)
+        return moments
+
+    def admissible(self, theta: Array) -> Array:
+        """Reflect unstable denominators."""
+        return with_stable_denominator(theta, self.poles)
+
+
+def at_known_delay(data: FilterData, structure: Structure) -> SampledProblem:
+    """The coefficients at a delay that is held."""
+    return SampledProblem(data, structure.poles, structure.zeros, False, 0.0, np.inf)
+
+
+@njit(cache=True, nogil=True)
+def sampled_equations(problem: SampledProblem, theta: Array) -> Equations:
+    """Second moments of the iteration, the delay included."""
+    n, m = problem.poles, problem.zeros
+    p = n + m + 2
+    delay = theta[p - 1]
+    if not (problem.low <= delay <= problem.high and np.isfinite(theta).all()):
+        return inadmissible(p)
+    a = np.ones(n + 1)
+    a[1:] = theta[:n]
+    b = theta[n : p - 1].copy()
+    moments = standard_moments(a, b, delay, problem.data, False, MODAL_CONDITION_LIMIT)
+    if not np.isfinite(moments).all():
+        return inadmissible(p)
+    # Standard rows of the sensitivities and of the regressors: dx/da_i = -p^(n-i)/A x with the measured output in the
+    # regressor, dx/db_j = p^(m-j)/A u, dx/dtau = -p x.
+    psi, phi = np.empty(p, np.int64), np.empty(p, np.int64)
+    sign = np.ones(p)
+    for i in range(n):
+        psi[i], phi[i], sign[i] = 2 * n - i, 3 * n - i, -1.0
+    for j in range(m + 1):
+        psi[n + j] = phi[n + j] = m - j
+    psi[p - 1] = phi[p - 1] = 3 * n + 2
+    sign[p - 1] = -1.0
+    error_row = 3 * n + 1
+    mixed, hessian, gradient = np.empty((p, p)), np.empty((p, p)), np.empty(p)
+    for i in range(p):
+        gradient[i] = moments[psi[i], error_row] * sign[i]
+        for j in range(p):
+            mixed[i, j] = moments[psi[i], phi[j]] * (sign[i] * sign[j])
+            hessian[i, j] = moments[psi[i], psi[j]] * (sign[i] * sign[j])
+    # x = sum b_j p^(m-j)/A u.
+    power = 0.0
+    for i in range(m + 1):
+        for j in range(m + 1):
+            power += b[m - i] * moments[i, j] * b[m - j]
+    return Equations(mixed, gradient, hessian, moments[error_row, error_row], power)
+
+
+compiled_as(SampledProblem, sampled_equations)
+
+
+def least_squares_start(
+    data: FilterData, structure: Structure, delay: float, svf_cutoff: float, refit: bool = False
+) -> Array | None:
+    """Least-squares estimate with the state-variable filter ``1/(p + w)^n``; ``refit`` fits the numerator once more.
+
+    The numerator is refitted to the output error, for the denominator of the estimate. None where it is singular.
+    """
+    n, m = structure.poles, structure.zeros
+    filter_denominator = np.asarray(np.poly(np.full(n, -svf_cutoff)), dtype=np.float64)
+    # With a zero numerator the "output error" row is y itself.
+    moments = second_moments(data, filter_denominator, np.zeros(1), delay)
+    regressors, signs = structure.regressor_rows, structure.signs
+    gram = moments[np.ix_(regressors, regressors)] * np.outer(signs, signs)
+    # p^n/A_svf y = y - sum a_i p^(n-i)/A_svf y holds exactly at the samples.
+    highest = moments[3 * n + 1, regressors] - sum(
+        filter_denominator[i] * moments[3 * n + 1 - i, regressors] for i in range(1, n + 1)
+    )
+    lengths = np.diag(gram).copy()
+    solved, coefficients = solve_scaled(gram, highest * signs, lengths, lengths, gram.shape[0])
+    if not solved:
+        return None
+    stable = reflect_unstable(np.concatenate(([1.0], coefficients[:n])))
+    theta = np.concatenate((stable[1:], coefficients[n:], [delay]))
+    if not refit:
+        return theta
+    fitted: Array = with_best(at_known_delay(data, structure), theta, n, n + m + 1)
+    return fitted
