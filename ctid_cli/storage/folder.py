@@ -137,11 +137,13 @@ def check_free(folder: Path, manifest: Manifest, origins: Mapping[str, Origin], 
                 f"{folder} holds the experiment {log.experiment()!r}, not {experiment!r}; choose another results folder"
                 " (--out), or --fresh to move the old results aside"
             )
-        # What the plan does not ask for is left aside, wherever it came from.
-        cells = {cell["hash"] for cell in manifest["data_cells"]}
+        # Estimators that the plan does not name may be of another version, but not their data, nor the platform.
+        cells, some = {cell["hash"] for cell in manifest["data_cells"]}, next(iter(origins.values()))
         for data, estimator, made in sorted(log.made()):
-            if data in cells and made != origins.get(estimator, made) and not allow_mixed:
-                raise RefusedError(_other_origin(folder, made, origins[estimator]))
+            present = origins.get(estimator, some)
+            differs = made != present if estimator in origins else made.shared != present.shared
+            if data in cells and differs and not allow_mixed:
+                raise RefusedError(_other_origin(folder, made, present))
 
 
 def _other_origin(folder: Path, other: Origin, origin: Origin) -> str:

@@ -67,6 +67,11 @@ class Origin:
     #: Hashes of the estimators whose estimates come from here; empty if not known.
     estimators: tuple[str, ...] = field(default=(), compare=False)
 
+    @property
+    def shared(self) -> tuple[Any, ...]:
+        """What all estimates on the same data must have in common, whichever estimator made them."""
+        return self.code_version.partition("-")[0], self.platform, self.packages
+
     @classmethod
     def of(cls, code_version: str, platform: str, packages: Iterable[Any], estimators: Iterable[str] = ()) -> Self:
         """An origin from plain data."""
@@ -84,9 +89,8 @@ def gathered(pairs: Iterable[tuple[str, Origin]]) -> tuple[Origin, ...]:
 def are_mixed(origins: Iterable[Origin]) -> bool:
     """Whether data sets, or the estimates of any one estimator, come from several versions of the code or platforms."""
     origins = tuple(origins)
-    shared = {(origin.code_version.partition("-")[0], origin.platform, origin.packages) for origin in origins}
     named = [name for origin in origins for name in origin.estimators or ("",)]
-    return len(shared) > 1 or len(set(named)) < len(named)
+    return len({origin.shared for origin in origins}) > 1 or len(set(named)) < len(named)
 
 
 def origin_of(source: Any, estimator: Any) -> Origin:
