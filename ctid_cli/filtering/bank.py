@@ -46,6 +46,7 @@ def _double_chain(a: Array, b: Array) -> tuple[float, Array, Array, Array, Array
     for k in range(n):
         for i in range(n):
             powers[k, i] *= w0 ** (k - n)
+    # x = B/A u on the states of the first chain, which drives the second: z2' = F z2 + g (output z1).
     output = np.zeros(n)
     for i in range(m + 1):
         for j in range(n):
@@ -116,6 +117,7 @@ def _regular_chain(a: Array, b: Array, delay: float, data: FilterData, want_rows
     place(mapping, 2 * n + 1, 2 * n + 2, powers)
     mapping[3 * n + 1, 3 * n + 2] = 1.0
     _fill_derivative(a, b, mapping)
+    # The states step by whole intervals whatever the delay; y - x needs x at the instant read.
     sink = row_sink(q, data.use, want_rows)
     step = held_step(dynamics, gain, data.interval * w0)
     regular_chain_pass(step, output @ readout[:n], shift, n, data, sink)

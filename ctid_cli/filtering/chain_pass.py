@@ -53,6 +53,7 @@ def regular_chain_pass(
     w, w_next = np.zeros(ny), np.zeros(ny)
     filled, written = 0, 0
     keep_rows = sink.gram.size > 0 or sink.rows.size > 0
+    # Two arrays for each state, exchanged after a step: the sum for one entry needs all old ones.
     for k in range(y.size):
         # The input that arrives now left at sample j; before the first one the filter is at rest.
         j = k - shift
@@ -61,6 +62,7 @@ def regular_chain_pass(
             value = u[j]
             if data.input_foh and j < last:
                 change = u[j + 1] - value
+            # x at the instant that arrives, by the caller's read-out map of the states and the held input.
             x = output_map[nz] * value + output_map[nz + 1] * change
             for i in range(nz):
                 x += output_map[i] * z[i]
@@ -101,6 +103,7 @@ class _Transitions(NamedTuple):
 @njit(cache=True, nogil=True)
 def _transitions(dynamics: Array, gain: Array, longest: float) -> _Transitions:
     """Table for all steps up to the longest."""
+    # [z, v, v']' = M [z, v, v'] with v' constant over a step: no separate integrals of the input are needed.
     n = gain.size
     augmented = np.zeros((n + 2, n + 2))
     place(augmented, 0, 0, dynamics)
@@ -132,6 +135,8 @@ def _transitions(dynamics: Array, gain: Array, longest: float) -> _Transitions:
 def _step(table: _Transitions, step: float, state: Array, work: Array) -> None:
     """Advance ``state = [z, v, v']`` by ``step``, in place."""
     powers, augmented = table.powers, table.augmented
+    # Digits from the lowest up; the transitions commute. The table ends at the longest step, so that only rounding can
+    # ask its last level for more than one digit.
     size = state.size
     whole = np.floor(step / table.quantum)
     rest = step - whole * table.quantum
@@ -199,6 +204,7 @@ def irregular_chain_pass(
     keep_rows = sink.gram.size > 0 or sink.rows.size > 0
     j = -1  # the last break that has been reached
     for k in range(t.size):
+        # Breaks up to the instant whose input arrives now; one that is later by rounding only is taken with them.
         instant = t[k] - delay
         while j + 1 < tu.size and tu[j + 1] <= instant + slack:
             if j >= 0:
@@ -229,6 +235,7 @@ def irregular_chain_pass(
                 filled = 0
         if output.size:
             output[k] = x
+        # w, driven by the samples themselves: held, or joined by straight lines.
         if ny > 0 and k + 1 < t.size:
             filtered[ny] = y[k]
             filtered[ny + 1] = (y[k + 1] - y[k]) / (t[k + 1] - t[k]) if data.y_foh else 0.0

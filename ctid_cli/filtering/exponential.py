@@ -69,6 +69,7 @@ def exponential_minus_identity(matrix: Array) -> Array:
         for i in range(n):
             for j in range(n):
                 result[i, j] = (scaled[i, j] + work[i, j]) / degree
+    # (I + X)^2 - I = 2 X + X X.
     for _ in range(squarings):
         _multiply(result, result, work)
         for i in range(n):

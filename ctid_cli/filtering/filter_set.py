@@ -229,6 +229,17 @@ def check_filters(cutoffs: ArrayLike, largest_error: float, exact: bool = True) 
     low, high = breaks[:-1][wide], breaks[1:][wide]
     middle = 0.5 * (low + high)
     ends = np.array([_ends(middle, *landscape) for landscape in landscapes])
+    intervals, gaps = _served(low, high, ends, middle)
+    return FilterCheck(tuple(map(float, w)), float(largest_error), tuple(intervals), tuple(gaps), exact)
+
+
+def _served(
+    low: Array, high: Array, ends: Array, middle: Array
+) -> tuple[list[ServedInterval], list[tuple[float, float]]]:
+    """Pieces that filters serve, joined where these and their minima are the same, and those that none does.
+
+    ``ends`` is where the descent of each filter from the middle of each piece ends, shape (filters, pieces).
+    """
     nearest_first = np.argsort(ends, axis=0, kind="stable")
     helps = ends < middle
     intervals: list[ServedInterval] = []
@@ -244,7 +255,7 @@ def check_filters(cutoffs: ArrayLike, largest_error: float, exact: bool = True) 
             intervals[-1] = ServedInterval(last.low, float(high[k]), filters, minimum)
         else:
             intervals.append(ServedInterval(float(low[k]), float(high[k]), filters, minimum))
-    return FilterCheck(tuple(map(float, w)), float(largest_error), tuple(intervals), tuple(gaps), exact)
+    return intervals, gaps
 
 
 def _landscape(cutoff: float, largest_error: float, exact: bool) -> tuple[Array, Array]:

@@ -139,6 +139,7 @@ def _closed_loop(plant: SampledModel, law: SampledModel, r: Array, v: Array, bef
             arriving = u[k - shift] if k >= shift else 0.0
             x[k] = free + direct * arriving
             u[k] = held + D * (error - x[k])
+        # Both step on with what they have seen at this sample.
         _advance(F, g, arriving, z, z_next)
         _advance(A, B, error - x[k], s, s_next)
         z, z_next = z_next, z

@@ -159,12 +159,10 @@ def modal_pass(poles: ComplexArray, residues: ComplexArray, delay: float, data: 
             if j >= 0:
                 change = u[j + 1] - u[j] if input_foh else 0.0
                 for i in range(modes):
-                    if regular:
-                        weights = _stored(whole[i])
-                    elif share:
+                    if share:
                         weights = _stored(memory[j % ring, i])
                     else:
-                        weights = step_weights(poles[i], tu[j + 1] - tu[j])
+                        weights = _stored(whole[i]) if regular else step_weights(poles[i], tu[j + 1] - tu[j])
                     z[i], w[i] = _advance(weights, z[i], w[i], u[j], change)
             j += 1
         if use[k]:

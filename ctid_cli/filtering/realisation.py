@@ -100,6 +100,7 @@ def _simultaneous_roots(coefficients: Array, roots: ComplexArray) -> bool:
     for _ in range(40):
         settled = True
         for i in range(n):
+            # A and A' by Horner; the step -A/(A' - A sum 1/(root - other)) takes the other roots out of A.
             value, slope = complex(1.0, 0.0), complex(0.0, 0.0)
             for k in range(1, n + 1):
                 slope = slope * roots[i] + value
@@ -136,6 +137,7 @@ def _pair_conjugates(raw: ComplexArray) -> ComplexArray:
     roots = np.zeros(n, np.complex128)
     count = 0
     while count < n:
+        # The largest that is left.
         i = -1
         for k in range(n):
             if not used[k] and (i < 0 or abs(raw[k]) > abs(raw[i])):
@@ -173,6 +175,8 @@ def chain(roots: ComplexArray) -> tuple[Array, Array, Array]:
     previous = -1
     i = 0
     while i < n:
+        # A pair w^2/(s^2 + 2 d s + w^2): z1' = w z2, z2' = w v - w z1 - 2 d z2. A real pole r/(s + r): z' = r v - r z.
+        # An integrator has no static gain to bring to 1: its rate is 1.
         if roots[i].imag != 0.0:
             natural = abs(roots[i])
             dynamics[i, i + 1] = natural
@@ -209,6 +213,8 @@ def _expand(polynomial: Array, roots: ComplexArray, paired: BoolArray, cumulativ
     length = n
     i = n - 1
     while i >= 0:
+        # Q = q (s^2 + s1 s + s0) + remainder: q goes on to the faster sections, and the remainder is read off this one,
+        # whose states are 1/(s^2 + s1 s + s0) and s/(s^2 + s1 s + s0) of what it receives, up to their gains.
         if paired[i]:
             s1 = -2.0 * roots[i].real
             s0 = roots[i].real ** 2 + roots[i].imag ** 2

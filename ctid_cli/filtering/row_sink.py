@@ -46,6 +46,7 @@ def accumulate(block: Array, count: int, gram: Array) -> None:
         for j in range(i, q - 1, 2):
             right, right_next = block[j], block[j + 1]
             total, total_right, total_left, total_both = 0.0, 0.0, 0.0, 0.0
+            # Below the diagonal of a 2 x 2 tile one product too many is formed; it is overwritten at the end.
             for k in range(count):
                 total += left[k] * right[k]
                 total_right += left[k] * right_next[k]
@@ -55,6 +56,7 @@ def accumulate(block: Array, count: int, gram: Array) -> None:
             gram[i, j + 1] += total_right
             gram[i + 1, j] += total_left
             gram[i + 1, j + 1] += total_both
+    # The row left over, with all others.
     if q % 2 == 1:
         right = block[q - 1]
         for i in range(q):

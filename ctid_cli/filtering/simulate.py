@@ -95,6 +95,7 @@ def _response(a: Array, b: Array, delay: float, data: FilterData) -> Array:
     for i in range(n):
         for j in range(n):
             output_map[j] += b[i] / w0 ** (i + 1) * powers[n - 1 - i, j]
+    # Only the output is asked for: no rows, no moments.
     nothing = np.zeros((0, 0))
     sink = RowSink(nothing, nothing, nothing, np.zeros(data.t.size))
     if data.interval == 0.0:

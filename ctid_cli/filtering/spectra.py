@@ -243,10 +243,12 @@ def _window_spectrum(held: _HeldSpectrum, delay: float, gain: Array) -> ComplexA
     times, values, slopes, jumps, integral, foh, marks, sums, duration = held
     count = gain.size
     spectrum = np.zeros(count + 1, np.complex128)
+    # a and b; before its first break the signal is zero.
     begin, end = max(-delay, times[0]), duration - delay
     if end <= begin:
         return spectrum
     base = 2.0 * np.pi / duration
+    # v, r and the integral of v at both ends, from the last break before each.
     left, right = _last_at(times, begin), _last_at(times, end)
     before, after = begin - times[left], end - times[right]
     value_left, value_right = values[left] + slopes[left] * before, values[right] + slopes[right] * after
@@ -256,6 +258,7 @@ def _window_spectrum(held: _HeldSpectrum, delay: float, gain: Array) -> ComplexA
     if count == 0:
         return spectrum
     phases, total, early = np.zeros((2, count)), np.zeros((2, count)), np.zeros((2, count))
+    # D: kept sums up to the nearest marks, completed break by break.
     row, upper = _last_at(marks, left + 1), _last_at(marks, right + 1)
     for k in range(count):
         total[0, k] = sums[upper, 0, k]
@@ -265,6 +268,7 @@ def _window_spectrum(held: _HeldSpectrum, delay: float, gain: Array) -> ComplexA
     _add_jumps(times, jumps, marks[upper], right + 1, base, phases, total)
     _add_jumps(times, jumps, marks[row], left + 1, base, phases, early)
     _phases(base * delay, count, phases[0], phases[1])
+    # e_a, and the equation above.
     starts = np.zeros((2, count))
     if begin > -delay:
         _phases(base * (delay + begin), count, starts[0], starts[1])

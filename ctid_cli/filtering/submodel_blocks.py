@@ -86,6 +86,7 @@ def _mode_block(
     c_re, c_im = weights[3].real, weights[3].imag
     f_re, f_im = weights[4].real, weights[4].imag
     g_re, g_im = weights[5].real, weights[5].imag
+    # Nothing has arrived yet.
     for k in range(span.skip):
         put(block, single_row, k, 0.0j, paired)
         if double:
@@ -109,6 +110,7 @@ def _mode_block(
             new_re = (d_re * w_re - d_im * w_im) + (m_re * z_re - m_im * z_im) + (f_re * value + g_re * change)
             w_im = (d_re * w_im + d_im * w_re) + (m_re * z_im + m_im * z_re) + (f_im * value + g_im * change)
             w_re = new_re
+        # z+ = d z + b value + c change.
         new_re = (d_re * z_re - d_im * z_im) + (b_re * value + c_re * change)
         z_im = (d_re * z_im + d_im * z_re) + (b_im * value + c_im * change)
         z_re = new_re
@@ -138,6 +140,7 @@ def output_block(
     d_re, d_im = weights[0].real, weights[0].imag
     b_re, b_im = weights[2].real, weights[2].imag
     c_re, c_im = weights[3].real, weights[3].imag
+    # Decay d and the weights b of the earlier sample, c of the change to this one; rows of the state are read after it.
     for k in range(count):
         if begun:
             change = values[k] - before if foh else 0.0
@@ -178,6 +181,7 @@ def _integrator_block(clock: Clock, source: Source, span: Span, integrals: Array
         j = span.first + k
         value = u[j]
         change = u[j + 1] - value if source.foh and j < u.size - 1 else 0.0
+        # Read on a copy, a fraction of an interval further on; then advance from the break itself.
         for m in range(now.size):
             now[m] = integrals[m]
         if fraction > 0.0:
@@ -204,6 +208,7 @@ def input_block(
         _mode_block(clock, i, source, span, states[i], first[i], modes.poles[i].imag != 0.0, block)
     if integrals.size:
         _integrator_block(clock, source, span, integrals, block)
+    # The input as it arrives at the samples.
     for k in range(span.length):
         j = span.first + k
         change = clock.fraction * (u[j + 1] - u[j]) if source.foh and 0 <= j < last else 0.0
@@ -268,6 +273,7 @@ def loop_block(
             error = -x
             value = (held + first * error + reference[k]) * closing
         v[k] = value
+        # Whole intervals of the model on copies of its states, driven by the input that arrives.
         if j >= 0:
             driven = value if j == k else before
             for i in range(z_re.size):
@@ -275,6 +281,7 @@ def loop_block(
                 z_re[i] = (d_re[i] * re - d_im[i] * z_im[i]) + b_re[i] * driven
                 z_im[i] = (d_re[i] * z_im[i] + d_im[i] * re) + b_im[i] * driven
             _integrate(s, clock.interval, driven, 0.0)
+        # The controller's state sees the whole error, with what v_k itself has added to x_k.
         error -= own * value
         response = held + first * error
         for m in range(order):

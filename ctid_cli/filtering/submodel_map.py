@@ -227,6 +227,7 @@ def pooled_modes(theta: Array, degrees: IntArray, closed: bool) -> PooledModes:
             condition = np.inf  # theta has lost a pole
             break
         part = _Part(a, b, highest, integrators, offset, first_b)
+        # The same denominator monic and in falling powers, p^n first.
         monic = np.ones(own + 1)
         for k in range(own):
             monic[k + 1] = (a[own - 2 - k] if k < own - 1 else 1.0) / highest
@@ -238,6 +239,7 @@ def pooled_modes(theta: Array, degrees: IntArray, closed: bool) -> PooledModes:
             break
         if own > 1:
             condition = max(condition, modal_condition(roots, slopes, curvatures))
+        # One pole of each pair; psi, phi and x at it, then at the origin, then what acts without a pole.
         first_row = row
         for j in range(own):
             if roots[j].imag < 0.0:

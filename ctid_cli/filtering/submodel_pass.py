@@ -31,6 +31,7 @@ def _model_outputs(modes: PooledModes, first: IntArray, count: int, block: Array
     for i in range(outputs.shape[0]):
         for k in range(count):
             outputs[i, k] = 0.0
+    # Re(residue z_u), summed for each submodel; a pair has real and imaginary part as neighbouring rows.
     for i in range(modes.poles.size):
         source, target = layout.u_modes + first[i], modes.owner[i]
         re, im = modes.residues[i].real, modes.residues[i].imag
@@ -40,6 +41,7 @@ def _model_outputs(modes: PooledModes, first: IntArray, count: int, block: Array
         else:
             for k in range(count):
                 outputs[target, k] += re * block[source, k]
+    # The integrals belong to one submodel, as does the feed-through.
     for m in range(layout.integrals):
         for k in range(count):
             outputs[modes.origin_owner, k] += modes.origin[m] * block[layout.u_integrals + m, k]
@@ -104,6 +106,7 @@ def _submodel_pass(
         if closed:
             input_block(modes, first, clock, measured, span, states[:, 3:], integrals[1], block)
         _model_outputs(modes, first, count, block, outputs)
+        # eps = y - sum of x_i.
         for k in range(count):
             total = data.y[start + k]
             for i in range(submodels):
@@ -117,6 +120,7 @@ def _submodel_pass(
             row, paired, left = layout.value + 1 + first[i], poles[i].imag != 0.0, outputs[modes.owner[i]]
             last = before[modes.owner[i]]
             output_block(clock.whole[i], left, last, start > 0, data.y_foh, states[i], row, paired, count, block)
+        # The next block's first step starts from here.
         for i in range(submodels):
             before[i] = outputs[i, count - 1]
         written = emit(sink, _keep_used(data.use, start, count, block), written)
@@ -166,6 +170,7 @@ def filtered_submodels(
     """
     modes = pooled_modes(theta, degrees, loop.reference.size > 0)
     layout, submodels = modes.layout, degrees.shape[0]
+    # psi, phi and the model output, stacked.
     maps = np.zeros((2 * theta.size + 1, layout.width))
     sink = row_sink(layout.width, data.use, want_rows)
     if modes.condition < MODAL_CONDITION_LIMIT:
@@ -174,6 +179,7 @@ def filtered_submodels(
         place(maps, 2 * theta.size, 0, modes.output)
         shift, fraction = split_delay(delay, data.interval)
         states = np.zeros((modes.poles.size, 4), np.complex128)
+        # A periodic input comes already late by whole intervals, and begins in its steady state.
         if periodic:
             shift = 0
             states = _periodic_states(modes, submodels, loop, fraction, data)
