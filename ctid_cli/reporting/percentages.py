@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
 from typing import Any
 
@@ -139,9 +139,9 @@ def pooled_rows(study: Study, table: StudyTable, rows: Sequence[Row], options: S
     There is no interval: cells of one row share their data sets, so their estimates are not independent trials. The
     published percentage is the mean over the cells that have estimates, or over all cells where none has [%].
     """
+    import numpy as np
     import pandas as pd
 
-    isna: Callable[[Any], bool] = pd.isna
     places = {(row.experiment, *row.settings.values()) for row in table.rows}
     frame = pd.DataFrame(
         [
@@ -151,6 +151,7 @@ def pooled_rows(study: Study, table: StudyTable, rows: Sequence[Row], options: S
             and row["initial_delay"] in (None, *table.initial_delays)
         ]
     )
+    known = {name: {row[name] for row in rows} - {None} for name in options}
     pooled = []
     for key, group in frame.groupby(["method", "startless", *options], sort=False, dropna=False):
         method, startless, *own = key
@@ -160,17 +161,13 @@ def pooled_rows(study: Study, table: StudyTable, rows: Sequence[Row], options: S
         pooled.append(
             {
                 "method": method,
-                **{
-                    name: value
-                    for name, value in zip(options, own, strict=True)
-                    if value == value and value is not None
-                },
+                **{name: value for name, value in zip(options, own, strict=True) if value in known[name]},
                 "cells": len(places) * (1 if startless else len(table.initial_delays)),
                 "cells_run": len(run),
                 "n": n,
                 "converged": converged,
                 "percent": 100 * converged / n if n else None,
-                "published_percent": None if isna(published) else float(published),
+                "published_percent": None if np.isnan(published) else float(published),
                 "seconds": run["median_seconds"].dropna().tolist(),
             }
         )
