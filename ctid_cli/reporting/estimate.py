@@ -9,7 +9,7 @@ from typing import Any
 
 from ctid_cli.canonical import plain
 from ctid_cli.inference.uncertain_value import UncertainValue
-from ctid_cli.reporting.layout import markdown_table, number, text_table
+from ctid_cli.reporting.layout import Table, number
 
 #: Keys that every estimate carries in machine-readable output, in this order.
 ESTIMATE_KEYS = (
@@ -118,15 +118,15 @@ def parameter_object(item: UncertainValue) -> dict[str, Any]:
     return cleaned
 
 
-def parameter_table(found: Iterable[UncertainValue], style: str = "text") -> str:
-    """Parameters as an aligned or Markdown table."""
+def parameter_table(found: Iterable[UncertainValue]) -> str:
+    """Parameters as an aligned table."""
     header = ["parameter", "estimate", "standard error", "relative %", "95 % low", "95 % high", "unit", "status"]
     digits = {"estimate": 6, "standard_error": 3, "relative_percent": 2, "low": 5, "high": 5}
     rows = [
         [item.name, *(number(getattr(item, name), size) for name, size in digits.items()), item.unit, item.status]
         for item in found
     ]
-    return (text_table if style == "text" else markdown_table)(header, rows, "lrrrrrll")
+    return Table(header, rows, "lrrrrrll").draw()
 
 
 def as_object(estimate: Mapping[str, Any]) -> dict[str, Any]:

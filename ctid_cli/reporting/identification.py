@@ -13,7 +13,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
-from ctid_cli.reporting.layout import count, number, text_table
+from ctid_cli.reporting.layout import Table, count, number
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import warning_lines, wrapped
 
@@ -210,7 +210,7 @@ def _derived_table(rows: Sequence[UncertainValue]) -> str:
         for row in rows
     ]
     reasons = dict.fromkeys(row.reason for row in rows if row.reason)
-    return "\n".join([text_table(header, cells, "lrrrrl"), *map(wrapped, reasons)])
+    return "\n".join([Table(header, cells, "lrrrrl").draw(), *map(wrapped, reasons)])
 
 
 def _modes(result: Identification, units: Units) -> list[dict[str, float | None]]:

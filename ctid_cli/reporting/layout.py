@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from ctid_cli import text
+from ctid_cli.text import wrapped
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Report:
 def _drawn(item: str | Table) -> str:
     if isinstance(item, Table):
         return item.draw()
-    return item if "\n" in item else text.wrapped(item.removeprefix("### "))
+    return item if "\n" in item else wrapped(item.removeprefix("### "))
 
 
 def write_reports(reports: Sequence[Report], style: str) -> str:
@@ -89,11 +89,6 @@ def csv_text(rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = 
     writer.writeheader()
     writer.writerows(rows)
     return buffer.getvalue()
-
-
-def text_table(header: Sequence[str], rows: Sequence[Sequence[str]], align: str) -> str:
-    """A table as text."""
-    return Table(header, rows, align).draw()
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]], align: str) -> str:
@@ -150,8 +145,3 @@ def delay_label(initial_delay: float | str | None) -> str:
     if initial_delay is None:
         return "none"
     return initial_delay if isinstance(initial_delay, str) else f"{initial_delay:g} s"
-
-
-def wrapped(paragraph: str, indent: str = "", hanging: int = 0) -> list[str]:
-    """Lines of a paragraph."""
-    return text.wrapped(paragraph, indent, indent + " " * hanging).splitlines()

@@ -15,7 +15,7 @@ from ctid_cli.canonical import plain
 from ctid_cli.frequency.automatic import Settings
 from ctid_cli.frequency.flags import MEANINGS, Flag
 from ctid_cli.frequency.record_track import RecordTrack
-from ctid_cli.reporting.layout import count, number, text_table
+from ctid_cli.reporting.layout import Table, count, number
 from ctid_cli.signals.sampled_signal import SampledSignal
 from ctid_cli.text import warning_lines, wrapped
 
@@ -135,7 +135,7 @@ def track_text(signal: SampledSignal, settings: Settings, track: RecordTrack) ->
     header = ["tone", "frequency [Hz]", "spread [Hz]", "[rad/s]", unit, "valid"]
     rows = f"{count(track.t.size, 'row')}, one every {track.every:.4g} s"
     foot = f"Medians over the valid ones of {rows}; the spread is half the width of the central 68 %."
-    lines += ["", text_table(header, cells, "rrrrrr"), wrapped(foot)]
+    lines += ["", Table(header, cells, "rrrrrr").draw(), wrapped(foot)]
     return "\n".join([*lines, *warning_lines(track_warnings(track, settings))])
 
 

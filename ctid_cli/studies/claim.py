@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ctid_cli.reporting.layout import markdown_table, text_table
+from ctid_cli.reporting.layout import Table
 
 COLUMNS = ("experiment", "claim", "measured", "required", "holds")
 
@@ -46,6 +46,6 @@ def near(claim: str, value: float | None, target: float, tolerance: float) -> Cl
 
 def claims_table(claims: Sequence[Claim], style: str = "text") -> str:
     """Claims as a table, ``text`` or ``md``, and how many hold."""
-    table = text_table if style == "text" else markdown_table
+    table = Table(COLUMNS, [claim.cells for claim in claims], "lllll").draw(style)
     judged = [claim.holds for claim in claims if claim.holds is not None]
-    return f"{table(COLUMNS, [claim.cells for claim in claims], 'lllll')}\n\n{sum(judged)} of {len(judged)} hold\n"
+    return f"{table}\n\n{sum(judged)} of {len(judged)} hold\n"
