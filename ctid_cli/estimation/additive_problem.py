@@ -155,10 +155,4 @@ class AdditiveProblem:
         if moments is None:
             nothing: Equations = inadmissible(theta.size)
             return nothing
-        return Equations(
-            moments.instrument_regressor,
-            moments.instrument_error,
-            moments.hessian,
-            moments.squared_error,
-            moments.output_power,
-        )
+        return Equations(**vars(moments))

@@ -131,7 +131,7 @@ class WithInstrumentsAsRegressors:
 
     def equations(self, theta):
         found = self.problem.equations(theta)
-        return found and replace(found, instrument_regressor=found.hessian)
+        return found._replace(instrument_regressor=found.hessian)
 
     def admissible(self, theta):
         return self.problem.admissible(theta)

@@ -180,7 +180,7 @@ def test_hold_of_the_output_does_not_move_the_estimate(system, hold):
     class Newton:
         def equations(self, theta):
             found = problem.equations(theta)
-            return found and replace(found, instrument_regressor=found.hessian)
+            return found._replace(instrument_regressor=found.hessian)
 
         def admissible(self, theta):
             return problem.admissible(theta)

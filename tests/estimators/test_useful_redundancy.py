@@ -169,10 +169,9 @@ def test_members_are_those_of_the_filter_set(prepared):
     assert len(prepared.laid_out.filtered.costs) == 10
     assert prepared.laid_out.filtered.period == pytest.approx(2 * np.pi / BANDWIDTH[CASE_1])
     other = UsefulRedundancy(**options(filters=4, beta=3.0, order=5)).prepare(make_record(snr_db=15, n=2000))
-    np.testing.assert_allclose(
-        other.laid_out.filtered.filters.cutoffs, BANDWIDTH[CASE_1] / np.array([3, 7 / 3, 5 / 3, 1])
-    )
-    assert {lowpass.order for lowpass in other.filters.lowpasses} == {5}
+    filters = other.laid_out.filtered.filters
+    np.testing.assert_allclose(filters.cutoffs, BANDWIDTH[CASE_1] / np.array([3, 7 / 3, 5 / 3, 1]))
+    assert {lowpass.order for lowpass in filters.lowpasses} == {5}
 
 
 # Of the search ----------------------------------------------------------------------------------------
