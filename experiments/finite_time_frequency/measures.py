@@ -165,9 +165,8 @@ def efficiency(results: Results) -> Iterator[Row]:
 
 def cramer_rao(omega: Array, samples: int, interval: float, sigma: float) -> Array:
     """Smallest standard deviations [rad/s] of the frequencies of ``sum sin(w t)`` in white Gaussian noise."""
-    t = interval * np.arange(samples)
-    angle = np.outer(t, omega)
-    t = (t - t.mean())[:, None]
+    t = interval * (np.arange(samples) - 0.5 * (samples - 1))[:, None]
+    angle = t * omega
     J = np.hstack([t * np.cos(angle), np.cos(angle), np.sin(angle)])
     return np.asarray(sigma * np.sqrt(np.diag(np.linalg.inv(J.T @ J))[: len(omega)]))
 
