@@ -57,10 +57,7 @@ def _evaluated(found: StudyResults) -> Iterator[Claim]:
 
 def commit_of(found: StudyResults) -> str:
     """The commit of this repository that computed all results of a study; refuses any others."""
-    root = data_folder("experiments").parent
-    if not (root / ".git").exists():
-        raise UsageError(f"results are published from a checkout of the repository, and {root} is none")
-    changed = _git(root, "status", "--porcelain", "--", ".", ":(exclude)results/published")
+    changed = _git("status", "--porcelain", "--", ".", ":(exclude)results/published")
     if changed:
         raise RefusedError(f"nothing is published from files that are not committed:\n{changed}")
     present = present_versions()
@@ -75,10 +72,14 @@ def commit_of(found: StudyResults) -> str:
     origins = [origin for results in found.experiments.values() for origin in results.stored.origins]
     if len({(origin.platform, origin.packages) for origin in origins}) > 1:
         raise RefusedError(f"the experiments of {found.study.name} were computed on different platforms")
-    return _git(root, "rev-parse", "HEAD")
+    return _git("rev-parse", "HEAD")
 
 
-def _git(root: Path, *arguments: str) -> str:
+def _git(*arguments: str) -> str:
+    root = data_folder("experiments").parent
+    # An installed package may lie in a folder of some other repository.
+    if not (root / ".git").exists():
+        raise UsageError(f"results are published from a checkout of the repository, and {root} is none")
     try:
         done = subprocess.run(["git", "-C", root, *arguments], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError) as error:

@@ -137,8 +137,8 @@ def test_a_chaotic_iteration_is_compared_over_one_step():
 def clean(monkeypatch):
     """A checkout without changes, whose code computed the results."""
     answers = {"status": "", "rev-parse": "1234abcd"}
-    monkeypatch.setattr(publishing, "_git", lambda root, *arguments: answers[arguments[0]])
-    monkeypatch.setattr(publishing, "_is_current", lambda origin: True)
+    monkeypatch.setattr(publishing, "_git", lambda *arguments: answers[arguments[0]])
+    monkeypatch.setattr(publishing, "present_versions", lambda: {"c"})
     return answers
 
 
@@ -167,7 +167,7 @@ def test_changed_files_are_not_published(small, out, tmp_path, clean):
 
 
 def test_results_of_other_code_are_not_published(small, out, tmp_path, clean, monkeypatch):
-    monkeypatch.setattr(publishing, "_is_current", lambda origin: False)
+    monkeypatch.setattr(publishing, "present_versions", lambda: {"d"})
     with pytest.raises(RefusedError, match="was not computed by the code that is checked out"):
         publishing.publish(read_study(small, out), [], tmp_path)
 
@@ -175,7 +175,8 @@ def test_results_of_other_code_are_not_published(small, out, tmp_path, clean, mo
 def test_mixed_results_are_not_published(small, out, tmp_path, clean):
     found = read_study(small, out)
     (results,) = found.experiments.values()
-    stored = dataclasses.replace(results.stored, origins=(*results.stored.origins,) * 2)
+    other = dataclasses.replace(results.stored.origins[0], code_version="d")
+    stored = dataclasses.replace(results.stored, origins=(*results.stored.origins, other))
     mixed = dataclasses.replace(found, experiments={"two-tones": dataclasses.replace(results, stored=stored)})
     with pytest.raises(RefusedError, match="mixes results"):
         publishing.publish(mixed, [], tmp_path)
