@@ -157,6 +157,7 @@ class AdaptiveObserver(OnlineEstimator):
 @njit(cache=True, nogil=True)
 def place_poles(squares: Array, poles: Array, gains: Array) -> None:
     """Observer gains for given frequencies."""
+    # prod(s^2 + w_i^2) + sum (l_i1 s + l_i2) prod_(j != i)(s^2 + w_j^2) = prod(s + p_k), compared at s = j w_i.
     for i in range(squares.size):
         omega = np.sqrt(squares[i])
         value = complex(1.0, 0.0)

@@ -20,6 +20,11 @@ from ctid_cli.signals.checks import require_choice, require_integer, require_pos
 #: Estimators that take windows of the record, and those that integrate; the others delay.
 BATCH = ("esprit", "nonlinear_least_squares")
 INTEGRATING = ("adaptive_observer", "filter_regression")
+#: Why one is chosen.
+WHY = {
+    "esprit": "ESPRIT, the most exact one for a whole record without gaps",
+    "nonlinear_least_squares": "nonlinear least squares, since samples are missing",
+}
 #: Samples in a period of the highest tone, for estimators that take windows, that delay, and that integrate.
 WINDOW_SAMPLES = 4
 DELAY_SAMPLES = 12
@@ -144,25 +149,15 @@ def choose_settings(
             f"the record is too short or has too many gaps: {samples.size * interval:.4g} s are hardly more than "
             f"the {band.decimation.weights.size * interval:.4g} s of the filter before the estimator; use a longer one"
         )
-    shown = np.sort(peaks.omega[:tones]) / (2.0 * np.pi)
-    reasons = [
-        ("The strongest tone" if shown.size == 1 else f"The {shown.size} strongest tones")
-        + f" for most of the record: {_listed(shown)} Hz (median spectrum of segments of {peaks.segment:.4g} s)."
-    ]
-    if offset:
-        reasons.append(f"The mean, {offset:.4g}, is subtracted.")
-    if gaps and bridge:
-        reasons.append(f"Gaps of up to {bridge * interval:.3g} s are bridged by straight lines.")
-    reasons += band.sentences
     batch = chosen in BATCH
     length, sentence = _choose_window(thinned, thin, tones, band, chosen if batch else "esprit", window)
-    estimator, how = _estimator(chosen, band, tones, thin, length)
+    options, how = _options(chosen, band, tones, thin, length * thin)
+    estimator = resolve("frequency_estimator", chosen)(tones=band.expected.size, **options)
+    reasons = [*_preparation(peaks, tones, offset, bridge * interval if gaps else 0.0), *band.sentences]
     if method is None:
-        why = "ESPRIT, the most exact one for a whole record without gaps"
-        if chosen != "esprit":
-            why = "nonlinear least squares, since samples are missing"
-        reasons.append(f"Method: {chosen}: {why}.")
-    reasons += [how] if how else []
+        reasons.append(f"Method: {chosen}: {WHY[chosen]}.")
+    if how:
+        reasons.append(how)
     reasons.append(sentence if batch else f"Amplitudes are found from the last {length * thin:.4g} s before each row.")
     warnings = tuple(_doubts(peaks, tones, interval))
     return Settings(estimator, tones, band.expected, offset, band.decimation, thin, length, tuple(reasons), warnings)
@@ -170,6 +165,16 @@ def choose_settings(
 
 def _listed(frequencies: Array) -> str:
     return ", ".join(f"{frequency:.5g}" for frequency in frequencies)
+
+
+def _preparation(peaks: Peaks, tones: int, offset: float, bridged: float) -> Iterator[str]:
+    shown = np.sort(peaks.omega[:tones]) / (2.0 * np.pi)
+    which = "The strongest tone" if shown.size == 1 else f"The {shown.size} strongest tones"
+    yield f"{which} for most of the record: {_listed(shown)} Hz (median spectrum of segments of {peaks.segment:.4g} s)."
+    if offset:
+        yield f"The mean, {offset:.4g}, is subtracted."
+    if bridged:
+        yield f"Gaps of up to {bridged:.3g} s are bridged by straight lines."
 
 
 def _refuse_unusable(samples: Array, tones: int) -> None:
@@ -326,12 +331,6 @@ def _closest(expected: Array, tones: int, thin: float) -> float:
     distance = np.abs(expected[:tones, None] - marks)
     distance[np.arange(tones), 1 + np.arange(tones)] = np.inf
     return float(min(distance.min(), 2.0 * (np.pi / thin - expected[:tones].max())))
-
-
-def _estimator(kind: str, band: _Band, wanted: int, thin: float, length: int) -> tuple[Any, str]:
-    """The estimator, and a sentence about its options."""
-    options, told = _options(kind, band, wanted, thin, length * thin)
-    return resolve("frequency_estimator", kind)(tones=band.expected.size, **options), told
 
 
 def _options(kind: str, band: _Band, wanted: int, thin: float, window: float) -> tuple[dict[str, Any], str]:

@@ -58,6 +58,7 @@ def samples_between_verdicts(lag: int) -> int:
 @njit(cache=True, nogil=True)
 def contradicts(row: Array, theta: Array, levels: Array, fast: float, slow: float) -> bool:
     """Whether the newest row leaves a residual unlike those of the rows before."""
+    # levels: rows so far, mean squares of the newest residuals, of the usual ones, and of psi.
     n = theta.size
     residual = row[n]
     for i in range(n):
@@ -65,6 +66,7 @@ def contradicts(row: Array, theta: Array, levels: Array, fast: float, slow: floa
     square = residual * residual
     if not np.isfinite(square):
         return False
+    # Plain means at first, exponential ones once they span their time.
     levels[0] += 1.0
     levels[1] += max(fast, 1.0 / levels[0]) * (square - levels[1])
     usual = max(slow, 1.0 / levels[0])
@@ -101,6 +103,7 @@ def check_consistency(gram: Array, omega: Array, delay: float, negligible: float
         for k in range(i, 0, -1):
             theta[k] -= c * theta[k - 1]
         theta[0] -= c
+    # Far below the regressand nothing is inconsistent, and the best fit need not be found.
     residual = squared_residual(gram, theta)
     factor, scales = np.empty((n, n)), np.empty(n)
     if residual <= negligible * gram[n, n] or not factorise(gram, REGULARISATION, factor, scales):

@@ -74,6 +74,7 @@ def real_roots(coefficients: Array, work: Array, roots: Array) -> bool:
             return False
         x = (-work[1] + np.sqrt(spread)) / degree
         settled = False
+        # Falls from the right: a slope that is not positive there shows complex roots.
         for _ in range(NEWTON_STEPS):
             value, slope = horner(work, degree, x)
             if value == 0.0:
@@ -92,6 +93,7 @@ def real_roots(coefficients: Array, work: Array, roots: Array) -> bool:
         if not settled:
             return False
         roots[found] = x
+        # Horner's numbers are the coefficients of the quotient.
         for k in range(1, degree):
             work[k] += x * work[k - 1]
     if n == 1:
@@ -131,6 +133,7 @@ def root_real_parts(coefficients: Array, work: Array, roots: Array) -> bool:
     if n == 2:
         roots[0] = roots[1] = -0.5 * coefficients[1]
         return False
+    # In units of the size of the roots, so that no power of them overflows.
     scale = time_scale(coefficients)
     factor = 1.0
     for k in range(n + 1):
@@ -153,6 +156,7 @@ def bounded_roots(coefficients: Array, lowest: float, highest: float, work: Deco
             return COMPLEX_ROOTS
         polynomial[k + 1] = coefficients[k]
     flags = 0 if root_real_parts(polynomial, work.scratch[1], roots) else COMPLEX_ROOTS
+    # Order survives the clipping, so the frequencies stay sorted.
     for i in range(n):
         if roots[i] < lowest or roots[i] > highest:
             roots[i] = min(max(roots[i], lowest), highest)
@@ -174,6 +178,7 @@ def decode(theta: Array, delay: float, bottom: float, top: float, work: Decoding
 def root_sensitivities(roots: Array, slopes: Array, out: Array) -> None:
     """Derivatives of the frequencies with respect to the coefficients of their polynomial."""
     n = roots.size
+    # d x_i/d a_k = -x_i^(n-k)/prod_j(x_i - x_j): implicit derivative of the polynomial at its root.
     for i in range(n):
         slope = 1.0
         for j in range(n):
@@ -189,6 +194,7 @@ def root_sensitivities(roots: Array, slopes: Array, out: Array) -> None:
 def cosine_sensitivities(roots: Array, delay: float, slopes: Array, out: Array) -> None:
     """Derivatives of the frequencies with respect to the parameters of the delay regression."""
     for i in range(roots.size):
+        # d arccos(c)/h: infinite at the ends, where a cosine says nothing of its angle.
         square = 1.0 - roots[i] * roots[i]
         slopes[i] = -1.0 / (delay * np.sqrt(square)) if square > 0.0 else -np.inf
     root_sensitivities(roots, slopes, out)
@@ -240,6 +246,7 @@ def flag_uncertain(omega: Array, uncertainty: Array, rounding: Array, span: floa
         if room * enough < 2.0 * np.pi:
             short = 2.0 * np.pi / max(room * enough, TINY)
             uncertainty[i] *= short * short * short * short * short
+        # Rounding does not shrink with time, and is not enlarged by the lack of it.
         uncertainty[i] += rounding[i]
         if not uncertainty[i] <= CERTAIN_FRACTION * room:
             flag = UNCERTAIN

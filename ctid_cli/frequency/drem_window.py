@@ -128,6 +128,7 @@ def absorb_window(
     if np.isnan(scale):
         entry[:] = 0.0
     else:
+        # [Delta Psi, Psi^2, Delta^2, rounding^2, 1]; a missing sample leaves a zero entry, which weighs nothing.
         for i in range(n):
             entry[i] = mixed[n] * mixed[i]
             entry[n + i] = mixed[i] * mixed[i]
@@ -135,6 +136,7 @@ def absorb_window(
         entry[2 * n + 1] = (MIXING_ROUNDING * scale) ** 2
         entry[2 * n + 2] = 1.0
     back.place[0] = slide(back.entries, back.newer, back.place[0], sums)
+    # While Delta vanishes there is no estimate, not an old one: the window has forgotten it.
     for i in range(n):
         theta[i] = sums[i] / sums[2 * n] if sums[2 * n] > 0.0 else np.nan
     return sums[2 * n], sums[2 * n + 2]

@@ -212,6 +212,7 @@ def take_gradient_step(row: Array, gains: Array, coefficients: Array) -> None:
 @njit(cache=True, nogil=True)
 def estimate_frequencies(settings: Filter, state: Chain, factor: Array, scales: Array, work: Decoding) -> int:
     """Frequencies and their possible errors from the moments, and the flags that follow."""
+    # Singular moments determine nothing, whatever the gradient has made of them.
     n, moments = scales.size, state.moments
     coefficients, frequencies, possible_errors = state.estimate[0], state.estimate[1], state.estimate[2]
     if not factorise(moments, 0.0, factor, scales):
@@ -226,6 +227,7 @@ def estimate_frequencies(settings: Filter, state: Chain, factor: Array, scales: 
     for i in range(n):
         frequencies[i] = np.sqrt(roots[i])
         slopes[i] = 0.5 / frequencies[i] if frequencies[i] > 0.0 else np.inf
+    # d w/d w^2 = 1/(2 w), times the derivatives of the roots.
     root_sensitivities(roots, slopes, sensitivities)
     misfit = squared_residual(moments, coefficients)
     moment_uncertainty(moments, factor, scales, misfit, coefficients, sensitivities, possible_errors, rounding)
@@ -244,6 +246,7 @@ def advance_filter(samples: Array, output: Output, settings: Filter, state: Chai
     for k in range(samples.size):
         y = samples[k]
         flag = STARTING if counters[SEEN] < settings.hold else 0
+        # A gap breaks the chain: what is in it belongs to another time.
         if not np.isfinite(y):
             counters[REFILL] = settings.refill + 1
             flag |= GAP
@@ -259,6 +262,7 @@ def advance_filter(samples: Array, output: Output, settings: Filter, state: Chai
                 counters[REFILL] -= 1
                 flag |= GAP
             else:
+                # Derivatives of the filtered signal are combinations of the chain.
                 for i in range(n + 1):
                     row[i] = 0.0
                     for j in range(2 * n + 1):
@@ -267,6 +271,7 @@ def advance_filter(samples: Array, output: Output, settings: Filter, state: Chai
                 if settings.gains.size:
                     take_gradient_step(row, settings.gains, state.estimate[0])
                 counters[NEW] += 1
+        # Verdicts come after the hold, and only where new rows have come.
         counters[SEEN] += 1
         if counters[NEW] >= REFRESH and counters[SEEN] > settings.hold:
             counters[NEW] = 0

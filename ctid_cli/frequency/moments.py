@@ -22,6 +22,7 @@ def accumulate_row(row: Array, gram: Array, keep: float) -> None:
 @njit(cache=True, nogil=True)
 def squared_residual(gram: Array, theta: Array) -> float:
     """Sum of the squared residuals ``psi - phi' theta``."""
+    # psi'psi - 2 theta' Phi'psi + theta' Phi'Phi theta, from the lower triangle; a negative sum is rounding.
     n = theta.size
     total = gram[n, n]
     for i in range(n):
@@ -36,6 +37,7 @@ def squared_residual(gram: Array, theta: Array) -> float:
 def factorise(gram: Array, ridge: float, factor: Array, scales: Array) -> bool:
     """Cholesky factor of the regressors' second moments, scaled to a unit diagonal."""
     n = scales.size
+    # A unit diagonal makes the pivots below comparable with rounding, whatever the units of the columns.
     for i in range(n):
         scales[i] = np.sqrt(gram[i, i])
         if not (np.isfinite(scales[i]) and scales[i] > 0.0):
@@ -48,6 +50,7 @@ def factorise(gram: Array, ridge: float, factor: Array, scales: Array) -> bool:
             for k in range(j):
                 total -= factor[i, k] * factor[j, k]
             if i == j:
+                # What is left of a column that the others explain is rounding: not positive definite.
                 if not total > 4e-16 * n:
                     return False
                 factor[i, i] = np.sqrt(total)
@@ -60,6 +63,7 @@ def factorise(gram: Array, ridge: float, factor: Array, scales: Array) -> bool:
 def substitute(factor: Array, values: Array) -> None:
     """Solve ``L L' x = b`` in place."""
     n = values.size
+    # L first, from above; then L', from below.
     for i in range(n):
         total = values[i]
         for k in range(i):
@@ -102,6 +106,7 @@ def moment_uncertainty(
     Rounding of G moves a frequency by up to ``|G^-1 g|`` times the rounding errors.
     """
     n = theta.size
+    # Size of the terms that cancel in a residual: |psi| + sum |theta_k| |phi_k|.
     size = np.sqrt(gram[n, n])
     for k in range(n):
         size += abs(theta[k]) * scales[k]
@@ -109,6 +114,7 @@ def moment_uncertainty(
     for i in range(n):
         for k in range(n):
             direction[k] = sensitivities[i, k] / scales[k]
+        # G^-1 g with g the sensitivities of this frequency, both in the scaled columns of the factor.
         substitute(factor, direction)
         square, length = 0.0, 0.0
         for k in range(n):

@@ -106,6 +106,7 @@ def form_row(history: Array, newest: int, lag: int, table: Array, row: Array) ->
         complete = complete and np.isfinite(value)
         for k in range(count):
             row[k] += table[k, j] * value
+        # The ring holds 2 n lags and one sample: one step beyond its start at most.
         place -= lag
         if place < 0:
             place += history.size
@@ -120,6 +121,7 @@ def mix_rows(
     n = matrix.shape[0]
     size = rows.shape[0]
     place = newest - first * spacing
+    # Hadamard: no minor exceeds the product of the lengths of the rows, nor does its rounding by much.
     scale = 1.0
     for i in range(n):
         if place < 0:

@@ -219,6 +219,8 @@ def noise_covariance(table: Array, weights: Array, lag: int) -> Array:
 @njit(cache=True, nogil=True)
 def total_least_squares(gram: Array, whitener: Array, theta: Array) -> None:
     """Parameters for which the noise in all columns of the regression is least."""
+    # M G M' with M the inverse of the noise's lower factor: there the noise is the same in all directions. M is lower
+    # triangular, and of G the lower triangle is kept.
     size = gram.shape[0]
     half, full = np.zeros((size, size)), np.zeros((size, size))
     for i in range(size):
@@ -302,6 +304,7 @@ def halves_differ(clock: DelayClock, fit: Fit, work: Workspace) -> bool:
     gram[:] = fit.older + fit.newer
     if not (judges and levels[OLDER] > 0.0 and factorise(gram, 0.0, work.factor, work.scales)):
         return False
+    # Mean squared residual of one fit to both halves, against that of the newer half alone; then the rounding of sums.
     least_squares(gram, work.factor, work.scales, trial[0])
     weight = levels[OLDER] + levels[NEWER]
     together = squared_residual(gram, trial[0]) / weight
@@ -331,6 +334,7 @@ def refresh(clock: DelayClock, settings: Restarting, fit: Fit, work: Workspace) 
     n = work.scales.size
     theta, frequencies, levels, counters, gram = fit.estimate[0], fit.estimate[1], fit.levels, fit.counters, work.gram
     gram[:] = fit.older + fit.newer
+    # Tones that the rows do not tell apart leave a singular matrix; the last estimate is then kept, marked.
     counters[VERDICT] = UNDETERMINED
     if not factorise(gram, 0.0, work.factor, work.scales):
         return
@@ -378,6 +382,7 @@ def advance_restarting(samples: Array, output: Output, clock: DelayClock, settin
                 levels[RESIDUAL] += smoothing * (residual * residual - levels[RESIDUAL])
             counters[ROWS] += 1
             take_row(settings.memory, clock, fit, work)
+            # A second change while the delays were flushed leaves rows of two signals.
             mixed = False
             if counters[ROWS] >= counters[NEXT]:
                 mixed = halves_differ(clock, fit, work)
@@ -385,6 +390,7 @@ def advance_restarting(samples: Array, output: Output, clock: DelayClock, settin
             due = mixed or counters[ROWS] % REFRESH == 0 or counters[ROWS] <= EAGER_ROWS
             if due and counters[ROWS] >= FIRST_ROWS_PER_TONE * n:
                 refresh(clock, settings, fit, work)
+            # The alarm comes last: an estimate that has just been refreshed is judged by its own level.
             if counters[ROWS] < settings.enough:
                 flag = STARTING
             elif counters[ROWS] >= settings.armed and counters[JUDGES] > 0 and levels[RESIDUAL] > levels[ALARM]:
