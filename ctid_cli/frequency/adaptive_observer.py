@@ -189,15 +189,17 @@ def observer_slope(states: Array, y: float, squares: Array, gains: Array, slope:
 
 
 @njit(cache=True, nogil=True)
-def predict(before: float, change: float, interval: float, gains: Array, state: Observer, memory: Array) -> None:
+def predict(
+    before: float, change: float, interval: float, squares: Array, gains: Array, observer: Array, memory: Array
+) -> None:
     """Classical Runge-Kutta step for a signal that changes linearly; ``memory`` has the shape (3, n + 1, 2 n)."""
     stage, total, slope = memory[0], memory[1], memory[2]
-    states, now, sums, steps = state.states.ravel(), stage.ravel(), total.ravel(), slope.ravel()
+    states, now, sums, steps = observer.ravel(), stage.ravel(), total.ravel(), slope.ravel()
     now[:] = states
     sums[:] = 0.0
     # Where in the interval a slope is taken, its weight, and how far it leads to the next one.
     for share, weight, ahead in ((0.0, 1.0, 0.5), (0.5, 2.0, 0.5), (0.5, 2.0, 1.0), (1.0, 1.0, 1.0)):
-        observer_slope(stage, before + share * change, state.squares, gains, slope)
+        observer_slope(stage, before + share * change, squares, gains, slope)
         for i in range(states.size):
             sums[i] += weight * steps[i]
             now[i] = states[i] + ahead * interval * steps[i]
@@ -259,22 +261,25 @@ def adapt(
 @njit(cache=True, nogil=True)
 def advance_observer(samples: Array, output: Output, settings: Adaptation, state: Observer) -> None:
     """Observer, sensitivities and recursive Gauss-Newton steps."""
-    n = state.squares.size
+    n = output.omega.shape[1]
     gains, no_gains, xi = np.empty(2 * n), np.zeros(2 * n), np.empty(n + 1)
     memory, matrix, factor = np.empty((3, n + 1, 2 * n)), np.empty((n + 1, n + 1)), np.empty((n, n))
     scales, step, unit, no_rounding = np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
-    last, seen, average, moments = state.last, state.seen, state.average, state.moments
+    # Arrays are taken out of their tuples once: in the loop, each would cost two counts of its references.
+    squares, observer, moments, last, average, seen = state
+    omegas, uncertainty, flags = output
+    poles = settings.poles
     smoothing = settings.rate * settings.interval
     for k in range(samples.size):
         y = samples[k]
         flag = STARTING if seen[0] < settings.hold else 0
         present = np.isfinite(y) and np.isfinite(last[0])
         if seen[0] > 0 and present:
-            place_poles(state.squares, settings.poles, gains)
-            predict(last[0], y - last[0], settings.interval, gains, state, memory)
+            place_poles(squares, poles, gains)
+            predict(last[0], y - last[0], settings.interval, squares, gains, observer, memory)
         elif seen[0] > 0:
             # Without samples the observer runs on by itself.
-            predict(0.0, 0.0, settings.interval, no_gains, state, memory)
+            predict(0.0, 0.0, settings.interval, squares, no_gains, observer, memory)
         if present:
             flag |= adapt(y, settings, state, xi, step, matrix, factor, scales)
         else:
@@ -283,10 +288,10 @@ def advance_observer(samples: Array, output: Output, settings: Adaptation, state
         seen[0] += 1
         determined = factorise(moments, 0.0, factor, scales)
         for p in range(n):
-            omega = np.sqrt(state.squares[p])
+            omega = np.sqrt(squares[p])
             average[p] += smoothing * (omega - average[p])
-            output.omega[k, p] = omega
-            output.uncertainty[k, p] = np.nan
+            omegas[k, p] = omega
+            uncertainty[k, p] = np.nan
             if determined:
                 # Error of w_p that the mean squared residual makes in the worst direction: w_p^2 over 2 w_p.
                 unit[:] = 0.0
@@ -294,12 +299,12 @@ def advance_observer(samples: Array, output: Output, settings: Adaptation, state
                 substitute(factor, unit)
                 misfit = np.sqrt(max(unit[p], 0.0) / scales[p] * moments[n, n]) / (2.0 * omega)
                 # An estimate that still moves is not where it will be.
-                output.uncertainty[k, p] = misfit + abs(omega - average[p])
+                uncertainty[k, p] = misfit + abs(omega - average[p])
         if determined:
             # The effective length of an exponential window, and the delay of the observer.
             elapsed = seen[0] * settings.interval
-            span = min(elapsed, 2.0 / settings.rate + 1.0 / settings.poles[0])
-            flag |= flag_uncertain(output.omega[k], output.uncertainty[k], no_rounding, span, elapsed)
+            span = min(elapsed, 2.0 / settings.rate + 1.0 / poles[0])
+            flag |= flag_uncertain(omegas[k], uncertainty[k], no_rounding, span, elapsed)
         elif seen[0] > settings.hold:
             flag |= UNDETERMINED
-        output.flags[k] = flag
+        flags[k] = flag

@@ -34,15 +34,16 @@ class Decoding(NamedTuple):
     rounding: Array
     #: Derivatives of the frequencies with respect to the coefficients, shape (n, n).
     sensitivities: Array
-    #: Shape (2, n + 1).
-    scratch: Array
+    #: Coefficients of the polynomial, and what is left of it while roots are divided out, shape (n + 1,).
+    polynomial: Array
+    quotient: Array
 
 
 @njit(cache=True, nogil=True)
 def decoding_memory(tones: int) -> Decoding:
     """Memory for a number of tones."""
-    square, pair = np.empty((tones, tones)), np.empty((2, tones + 1))
-    return Decoding(np.empty(tones), np.empty(tones), np.empty(tones), square, pair)
+    roots, slopes, rounding = np.empty(tones), np.empty(tones), np.empty(tones)
+    return Decoding(roots, slopes, rounding, np.empty((tones, tones)), np.empty(tones + 1), np.empty(tones + 1))
 
 
 @njit(cache=True, nogil=True)
@@ -145,17 +146,18 @@ def root_real_parts(coefficients: Array, work: Array, roots: Array) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def bounded_roots(coefficients: Array, lowest: float, highest: float, work: Decoding) -> int:
+def bounded_roots(
+    coefficients: Array, lowest: float, highest: float, polynomial: Array, quotient: Array, roots: Array
+) -> int:
     """Real parts of the roots of ``x^n + a_1 x^(n-1) + ... + a_n``, largest first, within bounds; returns flags."""
     n = coefficients.size
-    roots, polynomial = work.roots, work.scratch[0]
     polynomial[0] = 1.0
     for k in range(n):
         if not np.isfinite(coefficients[k]):
             roots[:] = np.nan
             return COMPLEX_ROOTS
         polynomial[k + 1] = coefficients[k]
-    flags = 0 if root_real_parts(polynomial, work.scratch[1], roots) else COMPLEX_ROOTS
+    flags = 0 if root_real_parts(polynomial, quotient, roots) else COMPLEX_ROOTS
     # Order survives the clipping, so the frequencies stay sorted.
     for i in range(n):
         if roots[i] < lowest or roots[i] > highest:
@@ -165,12 +167,21 @@ def bounded_roots(coefficients: Array, lowest: float, highest: float, work: Deco
 
 
 @njit(cache=True, nogil=True)
-def decode(theta: Array, delay: float, bottom: float, top: float, work: Decoding, omega: Array) -> int:
+def decode(
+    theta: Array,
+    delay: float,
+    bottom: float,
+    top: float,
+    polynomial: Array,
+    quotient: Array,
+    roots: Array,
+    omega: Array,
+) -> int:
     """Frequencies that belong to the parameters of the delay regression, ascending; flags what was wrong."""
-    flags = bounded_roots(theta, bottom, top, work)
+    flags = bounded_roots(theta, bottom, top, polynomial, quotient, roots)
     # The largest cosine is that of the lowest frequency.
     for i in range(theta.size):
-        omega[i] = np.arccos(work.roots[i]) / delay
+        omega[i] = np.arccos(roots[i]) / delay
     return flags
 
 

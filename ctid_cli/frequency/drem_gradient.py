@@ -11,7 +11,7 @@ from numba import njit
 
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.inputs import one_for_each
-from ctid_cli.frequency.mixing import MIXING_ROUNDING, MixingOptions, Work, back_end
+from ctid_cli.frequency.mixing import MIXING_ROUNDING, MixingOptions, back_end
 from ctid_cli.frequency.regression import theta_of
 from ctid_cli.frequency.tracking import Recursion
 from ctid_cli.signals.checks import require_integer, require_positive
@@ -139,11 +139,11 @@ class DremGradient(MixingOptions):
 
 @njit(cache=True, nogil=True)
 def absorb_gradient(
-    scale: float, count: int, tuning: Gains, back: Gradient, theta: Array, work: Work
+    scale: float, count: int, tuning: Gains, back: Gradient, theta: Array, mixed: Array
 ) -> tuple[float, int]:
     """Exact solution of ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)`` over one interval, Delta and Psi held."""
     n = theta.size
-    z, q, recent, gains, mixed = back.sums[0], back.sums[1], back.recent, tuning.gains, work.mixed
+    z, q, recent, gains = back.sums[0], back.sums[1], back.recent, tuning.gains
     if np.isnan(scale):
         return recent[n], count
     delta = mixed[n]
@@ -169,12 +169,12 @@ def absorb_gradient(
 
 
 @njit(cache=True, nogil=True)
-def weigh_gradient(tuning: Gains, back: Gradient, theta: Array, work: Work) -> tuple[float, float]:
+def weigh_gradient(tuning: Gains, back: Gradient, theta: Array, errors: Array) -> tuple[float, float]:
     """Errors of theta that the recent residuals show, rounding of Delta relative to Delta, rows that carry weight."""
     n = theta.size
     recent, q = back.recent, back.sums[1, tuning.fastest]
     for i in range(n):
-        work.errors[i] = np.sqrt(recent[i] / recent[n])
+        errors[i] = np.sqrt(recent[i] / recent[n])
     # (sum w)^2/sum w^2 for the weights w with which the rows enter the fastest parameter.
     remembered = q * q / recent[n + 2] if recent[n + 2] > 0.0 else 0.0
     return np.sqrt(recent[n + 1] / recent[n]), remembered

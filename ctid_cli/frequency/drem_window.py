@@ -11,7 +11,7 @@ from numba import njit
 from ctid_cli.arrays import Array, IntArray
 from ctid_cli.errors import OptionError
 from ctid_cli.frequency.delay_options import ROWS_PER_TONE
-from ctid_cli.frequency.mixing import MIXING_ROUNDING, MixingOptions, Work, back_end
+from ctid_cli.frequency.mixing import MIXING_ROUNDING, MixingOptions, back_end
 from ctid_cli.frequency.regression import whole_delay
 from ctid_cli.frequency.tracking import Recursion
 
@@ -120,11 +120,11 @@ def slide(window: Array, newer: Array, place: int, sums: Array) -> int:
 
 @njit(cache=True, nogil=True)
 def absorb_window(
-    scale: float, count: int, tuning: None, back: Window, theta: Array, work: Work
+    scale: float, count: int, tuning: None, back: Window, theta: Array, mixed: Array
 ) -> tuple[float, float]:
     """Least squares on each scalar regression, ``theta_k = sum Delta Psi_k/sum Delta^2`` over the window."""
     n = theta.size
-    entry, sums, mixed = back.entries[back.place[0]], back.sums, work.mixed
+    entry, sums = back.entries[back.place[0]], back.sums
     if np.isnan(scale):
         entry[:] = 0.0
     else:
@@ -143,14 +143,14 @@ def absorb_window(
 
 
 @njit(cache=True, nogil=True)
-def weigh_window(tuning: None, back: Window, theta: Array, work: Work) -> tuple[float, float]:
+def weigh_window(tuning: None, back: Window, theta: Array, errors: Array) -> tuple[float, float]:
     """Scatter of the scalar regressions of the window, rounding of Delta relative to Delta, rows in the window."""
     n, sums = theta.size, back.sums
     for i in range(n):
         # Mean of (Psi - Delta theta)^2 over that of Delta^2; as a difference it is known up to rounding only.
         square = sums[n + i] / sums[2 * n]
         scatter = square - theta[i] * theta[i]
-        work.errors[i] = np.sqrt(scatter) if scatter > SCATTER_ROUNDING * square else 0.0
+        errors[i] = np.sqrt(scatter) if scatter > SCATTER_ROUNDING * square else 0.0
     return np.sqrt(sums[2 * n + 1] / sums[2 * n]), sums[2 * n + 2]
 
 

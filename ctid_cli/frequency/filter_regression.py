@@ -185,16 +185,18 @@ def derivative_rows(tones: int, pole: float) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def filter_sample(y: float, step: tuple[Array, Array, Array], chain: Array, moved: Array) -> None:
+def filter_sample(
+    y: float, transition: Array, from_value: Array, from_change: Array, chain: Array, moved: Array
+) -> None:
     """Chain of filters over one interval, exactly for a signal that is linear between its samples."""
-    transition, from_value, from_change = step
     for i in range(moved.size):
         moved[i] = from_value[i] * chain[0] + from_change[i] * (y - chain[0])
         # Lower triangular: a filter sees only those before it.
         for j in range(i + 1):
             moved[i] += transition[i, j] * chain[1 + j]
     chain[0] = y
-    chain[1:] = moved
+    for i in range(moved.size):
+        chain[1 + i] = moved[i]
 
 
 @njit(cache=True, nogil=True)
@@ -220,7 +222,7 @@ def estimate_frequencies(settings: Filter, state: Chain, factor: Array, scales: 
     if settings.gains.size == 0:
         least_squares(moments, factor, scales, coefficients)
     roots, slopes, sensitivities, rounding = work.roots, work.slopes, work.sensitivities, work.rounding
-    verdict = bounded_roots(coefficients, settings.lowest, settings.highest, work)
+    verdict = bounded_roots(coefficients, settings.lowest, settings.highest, work.polynomial, work.quotient, roots)
     # The roots are squared frequencies: ascending, as frequencies are shown.
     for i in range(n // 2):
         roots[i], roots[n - 1 - i] = roots[n - 1 - i], roots[i]
@@ -242,7 +244,11 @@ def advance_filter(samples: Array, output: Output, settings: Filter, state: Chai
     n = output.omega.shape[1]
     row, moved = np.empty(n + 1), np.empty(2 * n)
     factor, scales, memory = np.empty((n, n)), np.empty(n), decoding_memory(n)
-    chain, counters = state.chain, state.counters
+    # Arrays are taken out of their tuples once: in the loop, each would cost two counts of its references.
+    chain, moments, estimate, counters = state
+    omegas, uncertainty, flags = output
+    (transition, from_value, from_change), derivatives, gains = settings.step, settings.derivatives, settings.gains
+    coefficients = estimate[0]
     for k in range(samples.size):
         y = samples[k]
         flag = STARTING if counters[SEEN] < settings.hold else 0
@@ -257,7 +263,7 @@ def advance_filter(samples: Array, output: Output, settings: Filter, state: Chai
             flag |= GAP if counters[REFILL] > 0 else STARTING
             counters[REFILL] = max(counters[REFILL] - 1, 0)
         else:
-            filter_sample(y, settings.step, chain, moved)
+            filter_sample(y, transition, from_value, from_change, chain, moved)
             if counters[REFILL] > 0:
                 counters[REFILL] -= 1
                 flag |= GAP
@@ -266,10 +272,10 @@ def advance_filter(samples: Array, output: Output, settings: Filter, state: Chai
                 for i in range(n + 1):
                     row[i] = 0.0
                     for j in range(2 * n + 1):
-                        row[i] += settings.derivatives[i, j] * chain[j]
-                accumulate_row(row, state.moments, settings.keep)
-                if settings.gains.size:
-                    take_gradient_step(row, settings.gains, state.estimate[0])
+                        row[i] += derivatives[i, j] * chain[j]
+                accumulate_row(row, moments, settings.keep)
+                if gains.size:
+                    take_gradient_step(row, gains, coefficients)
                 counters[NEW] += 1
         # Verdicts come after the hold, and only where new rows have come.
         counters[SEEN] += 1
@@ -277,6 +283,6 @@ def advance_filter(samples: Array, output: Output, settings: Filter, state: Chai
             counters[NEW] = 0
             counters[VERDICT] = estimate_frequencies(settings, state, factor, scales, memory)
         for i in range(n):
-            output.omega[k, i] = state.estimate[1, i]
-            output.uncertainty[k, i] = state.estimate[2, i]
-        output.flags[k] = flag | counters[VERDICT]
+            omegas[k, i] = estimate[1, i]
+            uncertainty[k, i] = estimate[2, i]
+        flags[k] = flag | counters[VERDICT]

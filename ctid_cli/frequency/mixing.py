@@ -82,19 +82,6 @@ class Front(NamedTuple):
     possible_errors: Array
 
 
-class Work(NamedTuple):
-    """Memory for one sample."""
-
-    row: Array
-    matrix: Array
-    minors: Array
-    #: Psi and Delta, shape (n + 1,).
-    mixed: Array
-    #: What the scalar regressions say may be wrong with theta, shape (n,).
-    errors: Array
-    decoding: Decoding
-
-
 PLACE, ROW, USED = range(3)
 SINCE_VERDICT, VERDICT, QUIET = range(3)
 
@@ -134,71 +121,53 @@ class MixingOptions(DelayRegression):
         return Recursion(advance_mixed, settings, (front, back), self._weights(interval), past, self._notes(clock))
 
 
-def absorb(scale: float, count: int, tuning: Any, back: Any, theta: Array, work: Work) -> tuple[float, float]:
-    """A back end takes in ``work.mixed`` and estimates theta; weight of its data, and how many rows it rests on.
+def absorb(scale: float, count: int, tuning: Any, back: Any, theta: Array, mixed: Array) -> tuple[float, float]:
+    """A back end takes in ``[Psi Delta]`` and estimates theta; weight of its data, and how many rows it rests on.
 
     ``scale`` is the product of the lengths of the rows, NaN if they cannot be used.
     """
     raise NotImplementedError
 
 
-def weigh(tuning: Any, back: Any, theta: Array, work: Work) -> tuple[float, float]:
-    """A back end says how wrong theta may be: ``work.errors``, rounding relative to theta, and rows that count."""
+def weigh(tuning: Any, back: Any, theta: Array, errors: Array) -> tuple[float, float]:
+    """A back end says how wrong theta may be: errors, rounding relative to theta, and rows that count."""
     raise NotImplementedError
 
 
 def back_end(state: type, absorbing: Callable[..., Any], weighing: Callable[..., Any]) -> None:
     """Let the loop find the kernels of a back end by the type of its state."""
 
-    @overload(absorb, strict=False)
-    def choose_absorb(scale: Any, count: Any, tuning: Any, back: Any, theta: Any, work: Any) -> Any:
+    @overload(absorb, strict=False, inline="always")
+    def choose_absorb(scale: Any, count: Any, tuning: Any, back: Any, theta: Any, mixed: Any) -> Any:
         return absorbing.py_func if back.instance_class is state else None  # type: ignore[attr-defined]
 
     @overload(weigh, strict=False)
-    def choose_weigh(tuning: Any, back: Any, theta: Any, work: Any) -> Any:
+    def choose_weigh(tuning: Any, back: Any, theta: Any, errors: Any) -> Any:
         return weighing.py_func if back.instance_class is state else None  # type: ignore[attr-defined]
 
 
 @njit(cache=True, nogil=True)
-def mix_next(sample: float, keep: float, clock: DelayClock, mixing: Mixing, front: Front, work: Work) -> float:
-    """Scalar regressions at the newest sample, in ``work.mixed``; their scale, NaN if they cannot be used."""
-    counters, mixed = front.counters, work.mixed
-    counters[PLACE] = following(counters[PLACE], front.samples.size)
-    counters[ROW] = following(counters[ROW], front.rows.shape[0])
-    front.samples[counters[PLACE]] = sample
-    # The second delay comes first: it leaves its own row in work.row.
-    if counters[PLACE] % clock.every == 0:
-        observe_second_delay(front.samples, counters[PLACE], clock.second_lag, clock.table, work.row, front.check, keep)
-    form_row(front.samples, counters[PLACE], clock.lag, clock.table, work.row)
-    for i in range(mixed.size):
-        front.rows[counters[ROW], i] = work.row[i]
-    scale = mixing.normalisation * mix_rows(
-        front.rows, counters[ROW], mixing.first_row, mixing.spacing, mixing.plan, work.matrix, work.minors, mixed
-    )
-    for i in range(mixed.size):
-        mixed[i] *= mixing.normalisation
-    # A missing sample makes a row and all its minors NaN; squares beyond the largest number are of no use either.
-    delta = mixed[mixed.size - 1]
-    if not (np.isfinite(scale * scale) and np.isfinite(delta * delta)):
-        return np.nan
-    counters[USED] += 1
-    return scale
-
-
-@njit(cache=True, nogil=True)
 def judge_mixed(
-    omega: Array, relative: float, span: float, elapsed: float, clock: DelayClock, front: Front, work: Work
+    theta: Array,
+    omega: Array,
+    relative: float,
+    span: float,
+    elapsed: float,
+    clock: DelayClock,
+    check: Array,
+    errors: Array,
+    memory: Decoding,
+    possible_errors: Array,
 ) -> int:
-    """What may be wrong with the frequencies: ``front.possible_errors``, and the flags that follow."""
-    # theta is wrong by at most work.errors, and by rounding in Delta and Psi; the decoding multiplies both.
-    memory = work.decoding
+    """What may be wrong with the frequencies, and the flags that follow."""
+    # theta is wrong by at most its errors, and by rounding in Delta and Psi; the decoding multiplies both.
     cosine_sensitivities(memory.roots, clock.delay, memory.slopes, memory.sensitivities)
-    propagate(memory.sensitivities, work.errors, front.possible_errors)
+    propagate(memory.sensitivities, errors, possible_errors)
     for i in range(omega.size):
-        work.errors[i] = (1.0 + abs(front.theta[i])) * relative
-    propagate(memory.sensitivities, work.errors, memory.rounding)
-    flag = flag_uncertain(omega, front.possible_errors, memory.rounding, span, elapsed)
-    return flag | check_consistency(front.check, omega, clock.second_delay, NEGLIGIBLE)
+        errors[i] = (1.0 + abs(theta[i])) * relative
+    propagate(memory.sensitivities, errors, memory.rounding)
+    flag = flag_uncertain(omega, possible_errors, memory.rounding, span, elapsed)
+    return flag | check_consistency(check, omega, clock.second_delay, NEGLIGIBLE)
 
 
 @njit(cache=True, nogil=True)
@@ -206,37 +175,58 @@ def advance_mixed(
     samples: Array, output: Output, clock: DelayClock, mixing: Mixing, tuning: Any, front: Front, back: Any
 ) -> None:
     """Delays, mixing, a back end, decoding and verdict, sample by sample."""
-    n = output.omega.shape[1]
+    # Arrays are taken out of their tuples once: in the loop, each would cost two counts of its references.
+    omegas, uncertainty, flags = output
+    history, rows, theta, check, counters, doubts, levels, possible_errors = front
+    table, plan, n = clock.table, mixing.plan, omegas.shape[1]
     row, matrix, minors, mixed = np.empty(n + 1), np.empty((n, n + 1)), np.empty(2 ** (n + 1)), np.empty(n + 1)
-    work = Work(row, matrix, minors, mixed, np.empty(n), decoding_memory(n))
-    theta, counters, doubts = front.theta, front.counters, front.doubts
+    errors, memory = np.empty(n), decoding_memory(n)
+    roots, polynomial, quotient = memory.roots, memory.polynomial, memory.quotient
     # The check at the second delay, the newest residuals and the usual ones forget over different times.
     keep = 1.0 - clock.every / (CHECK_SPANS * n * clock.lag)
     fast, slow = 1.0 / max(1.0, DETECTOR_SPAN * clock.lag), 1.0 / (USUAL_SPANS * n * clock.lag)
     # How far the rows of one mixed regression reach back [samples].
-    reach = front.rows.shape[0] + 2 * n * clock.lag
+    reach = rows.shape[0] + 2 * n * clock.lag
     for k in range(samples.size):
-        scale = mix_next(samples[k], keep, clock, mixing, front, work)
+        counters[PLACE] = following(counters[PLACE], history.size)
+        counters[ROW] = following(counters[ROW], rows.shape[0])
+        history[counters[PLACE]] = samples[k]
+        # The second delay comes first: it leaves its own row behind.
+        if counters[PLACE] % clock.every == 0:
+            observe_second_delay(history, counters[PLACE], clock.second_lag, table, row, check, keep)
+        form_row(history, counters[PLACE], clock.lag, table, row)
+        for i in range(n + 1):
+            rows[counters[ROW], i] = row[i]
+        scale = mix_rows(rows, counters[ROW], mixing.first_row, mixing.spacing, plan, matrix, minors, mixed)
+        scale *= mixing.normalisation
+        for i in range(n + 1):
+            mixed[i] *= mixing.normalisation
+        # A missing sample makes a row and all its minors NaN; squares beyond the largest number are of no use either.
         flag = 0
-        if np.isnan(scale):
+        if np.isfinite(scale * scale) and np.isfinite(mixed[n] * mixed[n]):
+            counters[USED] += 1
+        else:
+            scale = np.nan
             flag = GAP if counters[USED] > 0 else STARTING
-        weight, rows = absorb(scale, counters[USED], tuning, back, theta, work)
-        started = rows >= mixing.enough
+        weight, used = absorb(scale, counters[USED], tuning, back, theta, mixed)
+        started = used >= mixing.enough
         if not started:
             flag |= STARTING
         # Initial frequencies are shown as well, though nothing bears them out.
-        omega = output.omega[k]
+        omega = omegas[k]
         if weight > 0.0 or np.isfinite(theta[0]):
-            flag |= decode(theta, clock.delay, clock.bottom, clock.top, work.decoding, omega)
+            flag |= decode(theta, clock.delay, clock.bottom, clock.top, polynomial, quotient, roots, omega)
         else:
             omega[:] = np.nan
         if weight > 0.0:
             # A residual unlike the ones before is doubted at once; otherwise a verdict is given now and then.
-            contradicted = started and contradicts(row, theta, front.levels, fast, slow)
+            contradicted = started and contradicts(row, theta, levels, fast, slow)
             if doubts[SINCE_VERDICT] == 0 or contradicted:
-                relative, remembered = weigh(tuning, back, theta, work)
+                relative, remembered = weigh(tuning, back, theta, errors)
                 span, elapsed = (reach + remembered) * clock.interval, (reach + counters[USED]) * clock.interval
-                verdict = judge_mixed(omega, relative, span, elapsed, clock, front, work)
+                verdict = judge_mixed(
+                    theta, omega, relative, span, elapsed, clock, check, errors, memory, possible_errors
+                )
                 if verdict & UNCERTAIN or contradicted:
                     verdict |= UNCERTAIN
                     if started:
@@ -247,9 +237,9 @@ def advance_mixed(
             doubts[SINCE_VERDICT] = (doubts[SINCE_VERDICT] + 1) % clock.every if started else 0
             doubts[QUIET] += 1
             for i in range(n):
-                output.uncertainty[k, i] = front.possible_errors[i]
+                uncertainty[k, i] = possible_errors[i]
         else:
-            output.uncertainty[k, :] = np.nan
+            uncertainty[k, :] = np.nan
             if counters[USED] > 0:
                 flag |= UNDETERMINED
-        output.flags[k] = flag | doubts[VERDICT]
+        flags[k] = flag | doubts[VERDICT]

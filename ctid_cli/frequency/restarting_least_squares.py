@@ -251,7 +251,7 @@ def judge(
     estimate may judge new samples if it is certain, or has been there for so long that a misfit is no beginner's.
     """
     memory, omega, errors = work.decoding, found[0], found[1]
-    flags = decode(theta, clock.delay, clock.bottom, clock.top, memory, omega)
+    flags = decode(theta, clock.delay, clock.bottom, clock.top, memory.polynomial, memory.quotient, memory.roots, omega)
     cosine_sensitivities(memory.roots, clock.delay, memory.slopes, memory.sensitivities)
     misfit = squared_residual(gram, theta)
     moment_uncertainty(gram, work.factor, work.scales, misfit, theta, memory.sensitivities, errors, memory.rounding)
@@ -269,23 +269,6 @@ def begin_anew(fit: Fit, compared: int) -> None:
     fit.counters[VERDICT] = 0
     # The first comparison needs an older half.
     fit.counters[NEXT] = compared // 2
-
-
-@njit(cache=True, nogil=True)
-def take_row(keep_most: float, clock: DelayClock, fit: Fit, work: Workspace) -> None:
-    """Add ``work.row`` to the newer half; forget exponentially what exceeds the memory."""
-    levels, counters = fit.levels, fit.counters
-    keep = 1.0
-    if levels[OLDER] + levels[NEWER] > keep_most - 0.5:
-        keep = 1.0 - 1.0 / keep_most
-        levels[OLDER] *= keep
-        fit.older[:] *= keep
-    levels[NEWER] = keep * levels[NEWER] + 1.0
-    accumulate_row(work.row, fit.newer, keep)
-    # The row itself is not needed any more: the one at the second delay takes its place.
-    if counters[PLACE] % clock.every == 0:
-        place = counters[PLACE]
-        observe_second_delay(fit.samples, place, clock.second_lag, clock.table, work.row, fit.check, keep**clock.every)
 
 
 @njit(cache=True, nogil=True)
@@ -358,12 +341,15 @@ def advance_restarting(samples: Array, output: Output, clock: DelayClock, settin
     n = output.omega.shape[1]
     row, gram, factor, scales = np.empty(n + 1), np.empty((n + 1, n + 1)), np.empty((n, n)), np.empty(n)
     work = Workspace(row, gram, factor, scales, np.empty((3, n)), decoding_memory(n))
-    levels, counters, theta = fit.levels, fit.counters, fit.estimate[0]
+    # Arrays are taken out of their tuples once: in the loop, each would cost two counts of its references.
+    omegas, uncertainty, flags = output
+    history, newer, older, check, estimate, levels, counters = fit
+    table, theta = clock.table, estimate[0]
     smoothing = 1.0 / settings.detector
     for k in range(samples.size):
-        counters[PLACE] = following(counters[PLACE], fit.samples.size)
-        fit.samples[counters[PLACE]] = samples[k]
-        complete = form_row(fit.samples, counters[PLACE], clock.lag, clock.table, row)
+        counters[PLACE] = following(counters[PLACE], history.size)
+        history[counters[PLACE]] = samples[k]
+        complete = form_row(history, counters[PLACE], clock.lag, table, row)
         flag = 0
         if counters[FLUSH] > 0:
             # Samples from before the change are still in the delays: hold the estimate.
@@ -381,7 +367,19 @@ def advance_restarting(samples: Array, output: Output, clock: DelayClock, settin
                     residual -= theta[i] * row[i]
                 levels[RESIDUAL] += smoothing * (residual * residual - levels[RESIDUAL])
             counters[ROWS] += 1
-            take_row(settings.memory, clock, fit, work)
+            # What exceeds the memory is forgotten exponentially.
+            keep = 1.0
+            if levels[OLDER] + levels[NEWER] > settings.memory - 0.5:
+                keep = 1.0 - 1.0 / settings.memory
+                levels[OLDER] *= keep
+                for i in range(n + 1):
+                    for j in range(i + 1):
+                        older[i, j] *= keep
+            levels[NEWER] = keep * levels[NEWER] + 1.0
+            accumulate_row(row, newer, keep)
+            # The row itself is not needed any more: the one at the second delay takes its place.
+            if counters[PLACE] % clock.every == 0:
+                observe_second_delay(history, counters[PLACE], clock.second_lag, table, row, check, keep**clock.every)
             # A second change while the delays were flushed leaves rows of two signals.
             mixed = False
             if counters[ROWS] >= counters[NEXT]:
@@ -398,6 +396,6 @@ def advance_restarting(samples: Array, output: Output, clock: DelayClock, settin
                 counters[ROWS] = 0
                 flag = CHANGED
         for i in range(n):
-            output.omega[k, i] = fit.estimate[1, i]
-            output.uncertainty[k, i] = fit.estimate[2, i]
-        output.flags[k] = flag | counters[VERDICT]
+            omegas[k, i] = estimate[1, i]
+            uncertainty[k, i] = estimate[2, i]
+        flags[k] = flag | counters[VERDICT]

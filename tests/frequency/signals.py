@@ -55,7 +55,9 @@ def regression_rows(y, n, lag):
 def frequencies_of(theta, delay, *, lowest=0.0, highest=None):
     """Frequencies that belong to the parameters of the delay regression, and their flags."""
     theta = np.ascontiguousarray(theta, dtype=float)
-    omega = np.empty(theta.size)
+    omega, memory = np.empty(theta.size), decoding_memory(theta.size)
     bottom = -1.0 if highest is None else np.cos(highest * delay)
-    flags = decode(theta, delay, bottom, np.cos(lowest * delay), decoding_memory(theta.size), omega)
+    flags = decode(
+        theta, delay, bottom, np.cos(lowest * delay), memory.polynomial, memory.quotient, memory.roots, omega
+    )
     return omega, Flag(flags)
