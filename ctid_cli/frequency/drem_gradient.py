@@ -143,7 +143,8 @@ def absorb_gradient(
 ) -> tuple[float, int]:
     """Exact solution of ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)`` over one interval, Delta and Psi held."""
     n = theta.size
-    z, q, recent, gains = back.sums[0], back.sums[1], back.recent, tuning.gains
+    sums, recent = back
+    gains, initial = tuning.gains, tuning.initial
     if np.isnan(scale):
         return recent[n], count
     delta = mixed[n]
@@ -162,9 +163,10 @@ def absorb_gradient(
         if i == tuning.fastest:
             recent[n + 2] = (1.0 - m) ** 2 * recent[n + 2] + m * m
         # The part of the rows and that of the initial value are kept apart, so that no difference cancels.
-        z[i] += gain * delta * mixed[i] - m * z[i]
-        q[i] += m * (1.0 - q[i])
-        theta[i] = z[i] / q[i] if tuning.finite_time and q[i] > 0.0 else z[i] + (1.0 - q[i]) * tuning.initial[i]
+        sums[0, i] += gain * delta * mixed[i] - m * sums[0, i]
+        sums[1, i] += m * (1.0 - sums[1, i])
+        z, q = sums[0, i], sums[1, i]
+        theta[i] = z / q if tuning.finite_time and q > 0.0 else z + (1.0 - q) * initial[i]
     return recent[n], count
 
 

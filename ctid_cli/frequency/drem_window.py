@@ -124,18 +124,20 @@ def absorb_window(
 ) -> tuple[float, float]:
     """Least squares on each scalar regression, ``theta_k = sum Delta Psi_k/sum Delta^2`` over the window."""
     n = theta.size
-    entry, sums = back.entries[back.place[0]], back.sums
+    entries, newer, sums, place = back
+    here = place[0]
     if np.isnan(scale):
-        entry[:] = 0.0
+        for i in range(sums.size):
+            entries[here, i] = 0.0
     else:
         # [Delta Psi, Psi^2, Delta^2, rounding^2, 1]; a missing sample leaves a zero entry, which weighs nothing.
         for i in range(n):
-            entry[i] = mixed[n] * mixed[i]
-            entry[n + i] = mixed[i] * mixed[i]
-        entry[2 * n] = mixed[n] * mixed[n]
-        entry[2 * n + 1] = (MIXING_ROUNDING * scale) ** 2
-        entry[2 * n + 2] = 1.0
-    back.place[0] = slide(back.entries, back.newer, back.place[0], sums)
+            entries[here, i] = mixed[n] * mixed[i]
+            entries[here, n + i] = mixed[i] * mixed[i]
+        entries[here, 2 * n] = mixed[n] * mixed[n]
+        entries[here, 2 * n + 1] = (MIXING_ROUNDING * scale) ** 2
+        entries[here, 2 * n + 2] = 1.0
+    place[0] = slide(entries, newer, here, sums)
     # While Delta vanishes there is no estimate, not an old one: the window has forgotten it.
     for i in range(n):
         theta[i] = sums[i] / sums[2 * n] if sums[2 * n] > 0.0 else np.nan
