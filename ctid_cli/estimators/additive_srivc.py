@@ -136,7 +136,7 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
     >>> for name in ("g1_b0", "g2_b0"):
     ...     print(f"{name} = {fit.parameters[name]:.3f} +- {fit.standard_errors[name]:.3f}")
     g1_b0 = 3.017 +- 0.007
-    g2_b0 = 0.999 +- 1e-3
+    g2_b0 = 0.999 +- 0.001
     """
 
     kind: ClassVar[str] = "additive_srivc"

@@ -20,10 +20,11 @@ LISTED = 10
 
 def status_object(status: ExperimentStatus, estimates: Sequence[Mapping[str, Any]] | None) -> dict[str, Any]:
     """Progress of an experiment for ``ctid status --json``."""
-    content = asdict(status) | {"folder": str(status.folder)}
+    content = asdict(status) | {"folder": str(status.folder), "todo": status.todo}
     content["groups"] = [
-        {"estimator": group.pop("estimator"), "cell": group.pop("cell"), **group.pop("swept"), **group}
-        for group in content["groups"]
+        {"estimator": group.estimator, "cell": group.cell, **group.swept}
+        | {name: getattr(group, name) for name in ("planned", "done", "todo", "failed")}
+        for group in status.groups
     ]
     return content if estimates is None else content | {"estimates": [as_object(row) for row in estimates]}
 

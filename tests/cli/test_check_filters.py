@@ -89,7 +89,9 @@ def test_json(ctid):
 )
 @pytest.mark.parametrize("as_json", [(), ("--json",)])
 def test_bad_values(ctid, changed, message, as_json):
-    done = ctid(*CASE_2, *changed, *as_json, code=2)
+    option, value = changed
+    place = CASE_2.index(option) + 1
+    done = ctid(*CASE_2[:place], value, *CASE_2[place + 1 :], *as_json, code=2)
     assert done.stdout == ""
     assert done.stderr.startswith("ctid: ")
     assert message in done.stderr
@@ -103,7 +105,7 @@ def test_missing_options_are_named(ctid):
 def test_help_of_the_group_and_of_the_check(ctid):
     text = ctid("check", "--help").stdout
     assert "FILE" in text.splitlines()[0]
-    assert "--input COLUMN" in text
+    assert "--input NAME" in text
     assert re.search(r"^  filters +Say whether a set of low-pass filters ", text, re.MULTILINE)
     text = ctid("check", "filters", "-h").stdout
     assert text.splitlines()[0].endswith("check filters [OPTIONS]")

@@ -104,12 +104,12 @@ def test_the_table_of_an_experiment(ctid, done):
 
 
 def test_an_unexpected_error_is_one_line_and_a_file(ctid, done, monkeypatch):
-    from ctid_cli.reporting import report
+    from ctid_cli.reporting import tables
 
-    def broken(*_):
+    def broken(*_, **__):
         raise ZeroDivisionError("nobody expected this")
 
-    monkeypatch.setattr(report, "build_tables", broken)
+    monkeypatch.setattr(tables, "build_tables", broken)
     message = ctid("table", "tiny", "--out", done, code=1).stderr
     assert message.count("\n") == 1
     file = re.search(r"report it with (\S+)$", message.strip()).group(1)
@@ -121,12 +121,12 @@ def test_an_unexpected_error_is_one_line_and_a_file(ctid, done, monkeypatch):
 
 
 def test_ctrl_c_outside_a_run(ctid, done, monkeypatch):
-    from ctid_cli.reporting import report
+    from ctid_cli.reporting import tables
 
-    def interrupted(*_):
+    def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(report, "build_tables", interrupted)
+    monkeypatch.setattr(tables, "build_tables", interrupted)
     ctid("table", "tiny", "--out", done, code=130)
 
 

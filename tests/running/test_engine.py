@@ -135,9 +135,9 @@ def test_events_tell_the_story_in_order(tmp_path: Path) -> None:
     assert [event.done for event in done] == [1, 2, 3, 4, 5, 6]
     assert {event.total for event in done} == {6}
     row = done[0].rows[0]
-    results = set(no_result()) - {"parameters"}
+    results = set(no_result()) - {"parameters", "measures"}
     assert {"id", "experiment", "estimator", "cell", "replicate", "start", "seconds", "level"} | results <= set(row)
-    assert "parameters" not in row, "only experiments with submodels have them"
+    assert not {"parameters", "measures"} & set(row), "only experiments with submodels, or on signals, have them"
 
 
 def test_an_estimate_is_reported_only_after_it_is_stored(tmp_path: Path) -> None:
