@@ -28,7 +28,7 @@ test: $(VENV)/.test-installed
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n logical --dist loadfile
 
 reproduce: $(VENV)/.installed
 	$(BIN)/ctid study run $(if $(RUNS),--runs $(RUNS)) --jobs $(JOBS) --out "$(OUT)"
