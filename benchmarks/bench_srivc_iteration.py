@@ -5,7 +5,7 @@ import time
 import numpy as np
 
 from ctid_cli.estimation.iteration import RULES, Steps, iterate
-from ctid_cli.estimation.sampled import at_known_delay
+from ctid_cli.estimation.sampled_problem import at_known_delay
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.sensitivity import Structure

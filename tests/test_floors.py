@@ -58,3 +58,8 @@ def test_the_check_sees_every_kind_of_import():
     assert sorted(imported(text, {"a", "b", "b.c", "d", "e.g"})) == ["a", "b", "b.c", "d", "e.g"]
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
     assert circle({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
+
+
+def test_no_two_files_share_a_name():
+    names = [path.name for path in ROOT.rglob("*.py") if path.name != "__init__.py"]
+    assert sorted(names) == sorted(set(names))

@@ -46,8 +46,8 @@ def fit(
     from ctid_cli.errors import UsageError
     from ctid_cli.estimators.delay_profile import DelayProfile
     from ctid_cli.estimators.identification import identify
-    from ctid_cli.reporting.identification import common_units, identification_object, identification_text
     from ctid_cli.reporting.identification_plot import identification_svg
+    from ctid_cli.reporting.identification_report import common_units, identification_object, identification_text
     from ctid_cli.signals.measurement import read_measurement
 
     bounds = _delay_bounds(delay)

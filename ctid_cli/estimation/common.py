@@ -12,7 +12,7 @@ import numpy as np
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.iteration import Equations, Iterated
-from ctid_cli.estimation.sampled import SampledProblem
+from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
 from ctid_cli.inference.diagnostics import percent_from_r_squared

@@ -12,7 +12,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.delay_search import DelayCost, Minimum, best_minimum
 from ctid_cli.estimation.iteration import GUARDED, Steps
-from ctid_cli.estimation.sampled import SampledProblem, at_known_delay, least_squares_start
+from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, least_squares_start
 from ctid_cli.estimation.spectral_problem import (
     SpectralProblem,
     enough_bins,

@@ -26,7 +26,7 @@ from ctid_cli.estimation.pole_relocation import (
     residual_weights,
     spectral_lines,
 )
-from ctid_cli.estimation.sampled import at_known_delay, least_squares_start
+from ctid_cli.estimation.sampled_problem import at_known_delay, least_squares_start
 from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.filtering.free_response import free_response, free_response_size
 from ctid_cli.filtering.submodels import SubmodelFilter

@@ -15,7 +15,7 @@ from ctid_cli.estimation.filtered_costs import filtered_costs
 from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps, iterate
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.output_error import Layout, OutputErrorProblem
-from ctid_cli.estimation.sampled import at_known_delay, least_squares_start
+from ctid_cli.estimation.sampled_problem import at_known_delay, least_squares_start
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.sensitivity import Structure
 

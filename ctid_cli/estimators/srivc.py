@@ -13,7 +13,7 @@ from ctid_cli.estimation.additive_estimate import Covariance, estimate_submodels
 from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, check_record, finish, history_of
 from ctid_cli.estimation.iteration import RULES, StepRule, Steps, iterate
-from ctid_cli.estimation.sampled import SampledProblem, at_known_delay, least_squares_start
+from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, least_squares_start
 from ctid_cli.estimation.stability import with_stable_denominator
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import filter_data

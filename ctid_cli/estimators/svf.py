@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Estimator, Start, check_proper, check_record, finish, history_entry
-from ctid_cli.estimation.sampled import SampledProblem, at_known_delay, least_squares_start
+from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, least_squares_start
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.sensitivity import Structure

@@ -24,7 +24,7 @@ from ctid_cli.estimation.common import (
 )
 from ctid_cli.estimation.delay_search import LEAST_CURVATURE, Descent, Minimum, bound_in_the_way, delay_step, descend
 from ctid_cli.estimation.iteration import GUARDED, RULES, Iterated, Steps, Variant, iterate
-from ctid_cli.estimation.sampled import SampledProblem, least_squares_start
+from ctid_cli.estimation.sampled_problem import SampledProblem, least_squares_start
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.fit import Fit, IterationRecord

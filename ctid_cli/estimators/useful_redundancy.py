@@ -15,7 +15,7 @@ from ctid_cli.estimation.filter_search import LATTICE, FilterPath, FilterSearch,
 from ctid_cli.estimation.filtered_costs import Search, filtered_costs
 from ctid_cli.estimation.iteration import GAUSS_NEWTON, GUARDED, Steps
 from ctid_cli.estimation.redundancy import RedundantMinimum, Visit
-from ctid_cli.estimation.sampled import SampledProblem
+from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.inference.answer import output_bandwidth

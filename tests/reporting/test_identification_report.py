@@ -13,14 +13,14 @@ from ctid_cli.estimators.identification import identify
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.identification import (
+from ctid_cli.reporting.identification_plot import identification_svg
+from ctid_cli.reporting.identification_report import (
     common_units,
     derived_of,
     identification_object,
     identification_text,
     parameters_of,
 )
-from ctid_cli.reporting.identification_plot import identification_svg
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Record
