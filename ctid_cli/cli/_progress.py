@@ -141,7 +141,7 @@ class Reporter(_Progress):
             now - self._last >= LINE_EVERY or event.done == event.total
         ):
             self._last = now
-            left = f", ETA {seconds((event.total - event.done) / speed)}" if event.done < event.total else ""
+            left = f", ETA {seconds((event.total - event.done) / speed)}" if 0 < event.done < event.total else ""
             self._say(f"{event.done}/{event.total} data sets, {rate}, {self.failed} failed{left}")
 
 
