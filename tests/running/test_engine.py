@@ -67,7 +67,7 @@ def read_ids(process: subprocess.Popen[str], lines: int) -> list[str]:
     return ids
 
 
-def finish(process: subprocess.Popen[str], within: float = 60) -> tuple[list[str], str]:
+def finish(process: subprocess.Popen[str], within: float = 300) -> tuple[list[str], str]:
     """The remaining ids and the error output of a run, once it and its workers have ended."""
     assert process.stdout is not None
     assert process.stderr is not None
