@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from ctid_cli.estimation import delay_search, iteration, sampled, spectral_problem
+from ctid_cli.estimation import delay_search, iteration, sampled_problem, spectral_problem
 from ctid_cli.estimation.iteration import GAUSS_NEWTON, HALVINGS, RULES, Equations, Steps, inadmissible
 from ctid_cli.estimation.stability import with_stable_denominator
 
@@ -53,7 +53,7 @@ class CoefficientProblem(Coefficients):
     """Coefficients from samples at a delay."""
 
     def __init__(self, data, structure, delay):
-        super().__init__(sampled.at_known_delay(data, structure), delay)
+        super().__init__(sampled_problem.at_known_delay(data, structure), delay)
         self.data = data
 
 
@@ -68,7 +68,7 @@ class DelayProblem:
     """Coefficients and delay from samples; no equations are None."""
 
     def __init__(self, data, structure, bounds):
-        self.inner = sampled.SampledProblem(data, structure.poles, structure.zeros, True, *map(float, bounds))
+        self.inner = sampled_problem.SampledProblem(data, structure.poles, structure.zeros, True, *map(float, bounds))
 
     def equations(self, theta):
         found = self.inner.equations(theta)
@@ -133,7 +133,7 @@ def best_coefficients(data, structure, delay, starts, *, gauss_newton=False, **e
     """Coefficients, squared error and step of the delay, or None."""
     starts = [np.append(start, 0.0) for start in np.atleast_2d(starts)]
     rule = "gauss_newton" if gauss_newton else "guarded"
-    problem = sampled.at_known_delay(data, structure)
+    problem = sampled_problem.at_known_delay(data, structure)
     found = delay_search.best_minimum(problem, delay, starts, structure.poles, steps(variant=rule, **effort))
     if found is None:
         return None
@@ -146,7 +146,7 @@ def _refitted(problem, structure, theta, delay):
 
 
 def refit_numerator(data, structure, theta, delay):
-    return _refitted(sampled.at_known_delay(data, structure), structure, theta, delay)
+    return _refitted(sampled_problem.at_known_delay(data, structure), structure, theta, delay)
 
 
 def spectral_refit_numerator(spectra, structure, theta, delay, weight):
@@ -155,7 +155,7 @@ def spectral_refit_numerator(spectra, structure, theta, delay, weight):
 
 
 def least_squares_start(data, structure, delay, svf_cutoff):
-    theta = sampled.least_squares_start(data, structure, delay, svf_cutoff)
+    theta = sampled_problem.least_squares_start(data, structure, delay, svf_cutoff)
     return None if theta is None else theta[:-1]
 
 
