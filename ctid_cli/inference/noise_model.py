@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.signal import lfilter, lfiltic
 
 from ctid_cli.arrays import Array
 
@@ -34,6 +33,8 @@ class NoiseModel:
         result = np.zeros(max(count, self.order + 1))
         result[: self.order + 1] = self.first_autocovariances
         if self.order:
+            from scipy.signal import lfilter, lfiltic  # slow to import
+
             # The Yule-Walker recursion: autocovariances beyond the order follow the noise-free difference equation.
             state = lfiltic([1.0], self.coefficients, self.first_autocovariances[:0:-1])
             rest = np.zeros(result.size - self.order - 1)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.signal import correlate
 from scipy.special import chdtrc
 
 from ctid_cli.arrays import Array
@@ -127,6 +126,8 @@ def _cross_correlation(
     e: Array, u: Array, lags: int, quantile: float, psi: Array | None
 ) -> tuple[Array, float, float, int]:
     """Cross-correlation at -lags … lags, its band, the portmanteau statistic and the rank of its covariance."""
+    from scipy.signal import correlate  # slow to import
+
     e, u = e - e.mean(), u - u.mean()
     count = e.size
     # A constant leaves rounding behind when its mean is taken off.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.signal import lfilter
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.covariance import condition_number
@@ -70,6 +69,8 @@ def sandwich_covariance(psi: Array | Sequence[Array], residuals: Array | Sequenc
 
 def _long_run_covariance(scores: Sequence[Array]) -> Array:
     """Covariance of the sum of the rows of independent blocks, an autoregression for every column."""
+    from scipy.signal import lfilter  # slow to import
+
     models = [fit_noise_model([block[:, j] for block in scores]) for j in range(scores[0].shape[1])]
     start = max(model.order for model in models)
     white = [
