@@ -8,6 +8,7 @@ from its docstring. Every scalar option may be a list of values to sweep. Metada
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import itertools
 import json
 import math
@@ -22,6 +23,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    GetJsonSchemaHandler,
     SerializerFunctionWrapHandler,
     ValidationError,
     create_model,
@@ -36,7 +38,7 @@ from ctid_cli.kinds import classes
 from ctid_cli.signals.sampling import geometric_sizes
 from ctid_cli.specification.fields import LATER, ByShape, Coefficients, Number, OneOf, Swept, Text, Whole
 from ctid_cli.specification.messages import Complaint, explained, several_wrong
-from ctid_cli.specification.option_docs import OptionDoc, option_docs
+from ctid_cli.specification.option_docs import option_docs
 from ctid_cli.specification.yaml_source import KeyPath
 
 #: Combinations that one section may sweep, and data cells that one experiment may hold.
@@ -76,25 +78,39 @@ class Section(BaseModel):
             if LATER not in fields[name].metadata or value != fields[name].get_default()
         }
 
+    @classmethod
+    def descriptions(cls) -> dict[str, str]:
+        """What is said about each key: by the docstring of the section, or of the option dataclass it was made from."""
+        docs = {"kind": "Which one it is"} | option_docs(cls.target or cls) | option_docs(cls)
+        return {name: docs.get(name, "") for name in cls.model_fields}
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        reference = handler(core_schema)
+        schema = handler.resolve_ref_schema(reference)
+        schema["description"] = inspect.cleandoc(cls.__doc__ or "").partition("\n\n")[0]
+        for name, text in cls.descriptions().items():
+            schema["properties"][name] |= {"description": text} if text else {}
+        return reference
+
     @model_validator(mode="wrap")
     @classmethod
     def _in_plain_words(cls, value: Any, handler: ModelWrapValidatorHandler[Section]) -> Section:
-        descriptions = {name: info.description or "" for name, info in cls.model_fields.items()}
-        required = list(cls.requirements(value)) if isinstance(value, Mapping) else []
+        required = cls.requirements(value) if isinstance(value, Mapping) else ()
         problems = [(path, message, True) for path, message in required]
-        section = None
         try:
             section = handler(value)
         except ValidationError as error:
-            problems += [explained(detail, descriptions) for detail in error.errors(include_url=False)]
-        if section is not None and not problems:
-            found = list(_option_complaints(section)) if cls.target is not None else []
-            problems = [(path, message, False) for path, message in found or section.complaints()]
-        if problems or section is None:
-            other = cls.elsewhere
-            said = [(at, other.get(str(at[0]), text) if at else text, key) for at, text, key in problems]
-            raise several_wrong(cls.__name__, said)
-        return section
+            problems += [explained(detail, cls.descriptions()) for detail in error.errors(include_url=False)]
+        else:
+            if not problems:
+                found = _option_complaints(section) or section.complaints()
+                problems = [(path, message, False) for path, message in found]
+            if not problems:
+                return section
+        other = cls.elsewhere
+        said = [(at, other.get(str(at[0]), text) if at else text, key) for at, text, key in problems]
+        raise several_wrong(cls.__name__, said)
 
     @classmethod
     def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
@@ -140,11 +156,15 @@ def _part(value: Any, path: KeyPath) -> Any:
 
 
 class Geometric(Section):
-    """Whole numbers to sweep, spaced geometrically and rounded."""
+    """Whole numbers to sweep, spaced geometrically and rounded.
 
-    geometric: Annotated[list[Whole], Field(min_length=3, max_length=3)] = Field(
-        description="three whole numbers, the first value, the last, and how many there are"
-    )
+    Parameters
+    ----------
+    geometric : list of int
+        three whole numbers, the first value, the last, and how many there are
+    """
+
+    geometric: Annotated[list[Whole], Field(min_length=3, max_length=3)]
 
     def complaints(self) -> Iterator[Complaint]:
         """Say why there are no such numbers."""
@@ -164,10 +184,10 @@ class Geometric(Section):
 
 def section_for(target: type, kind: str = "", *, sweeping: bool = True, without: str = "") -> type[Section]:
     """Section of an option dataclass."""
-    hints, docs = get_type_hints(target), option_docs(target)
+    hints = get_type_hints(target)
     fields: dict[str, Any] = {}
     if kind:
-        fields["kind"] = (Literal[kind], Field(description="Which one it is"))
+        fields["kind"] = (Literal[kind], ...)
     for option in dataclasses.fields(target):
         if not option.init or option.name == without:
             continue
@@ -177,8 +197,7 @@ def section_for(target: type, kind: str = "", *, sweeping: bool = True, without:
             form = Annotated[Any, Swept(form, **(spaced if option.metadata.get("geometric") else {}))]
         if option.metadata.get("added_later"):
             form = Annotated[form, LATER]
-        description = docs.get(option.name, OptionDoc()).text or None
-        fields[option.name] = (form, Field(**_default(option), description=description))
+        fields[option.name] = (form, _default(option))
     summary = (target.__doc__ or target.__name__).strip().splitlines()[0]
     section = create_model(target.__name__, __base__=Section, __doc__=summary, **fields)
     section.target = target
@@ -250,16 +269,14 @@ def _list_form(items: tuple[Any, ...]) -> Any:
     return Annotated[list[Number], Field(min_length=length or 1, max_length=length)]
 
 
-def _default(option: dataclasses.Field[Any]) -> dict[str, Any]:
+def _default(option: dataclasses.Field[Any]) -> Any:
     """The default as a file would give it."""
-    if option.default is dataclasses.MISSING:
-        return {}
     default: Any = option.default
+    if default is dataclasses.MISSING:
+        return ...
     if dataclasses.is_dataclass(default) and not isinstance(default, type):
-        default = dataclasses.asdict(default)
-    elif isinstance(default, tuple):
-        default = list(default)
-    return {"default": default}
+        return dataclasses.asdict(default)
+    return list(default) if isinstance(default, tuple) else default
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -308,13 +325,14 @@ def replaced(section: AnySection, path: KeyPath, value: Any) -> AnySection:
     return section.model_copy(update={name: inner})
 
 
-def _option_complaints(section: Section) -> Iterator[Complaint]:
-    """Say what the option dataclass has against the values of a section."""
+def _option_complaints(section: Section) -> list[Complaint]:
+    """What the option dataclass, if any, has against the values of a section."""
+    if section.target is None:
+        return []
     axes = dict(_axes(section))
     count = math.prod(map(len, axes.values()))
     if count > MAX_COMBINATIONS:
-        yield (), f"the lists in this section combine to {count} cases; at most {MAX_COMBINATIONS} are allowed"
-        return
+        return [((), f"the lists in this section combine to {count} cases; at most {MAX_COMBINATIONS} are allowed")]
     failures: list[Failure] = []
     for swept, one in _combinations(section):
         try:
@@ -326,7 +344,7 @@ def _option_complaints(section: Section) -> Iterator[Complaint]:
                 failures.append(((*refused.path, place), refused.message, {}))
             else:
                 failures.append((refused.path, refused.message, swept))
-    yield from grouped(failures, count)
+    return grouped(failures, count)
 
 
 def grouped(failures: Iterable[Failure], total: int) -> list[Complaint]:

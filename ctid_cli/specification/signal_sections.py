@@ -17,16 +17,24 @@ from ctid_cli.specification.sections import Options, Section, WithKey
 
 
 class RegularDurationSection(Section):
-    """Samples at equal intervals, from 0 s, as many as fit into a time."""
+    """Samples at equal intervals, from 0 s, as many as fit into a time.
+
+    Parameters
+    ----------
+    kind : {"regular"}
+        Which one it is
+    interval : float
+        Sampling interval [s]
+    duration : float
+        Length of the record, in place of the number of samples [s]
+    """
 
     target: ClassVar[type | None] = RegularSampling
     elsewhere = {"samples": "gives the length a second time, 'duration' has it already; keep one of the two"}  # noqa: RUF012
 
-    kind: Literal["regular"] = Field(description="Which one it is")
-    interval: Annotated[float | list[float], Swept(Positive)] = Field(description="Sampling interval [s]")
-    duration: Annotated[float | list[float], Swept(Positive)] = Field(
-        description="Length of the record, in place of the number of samples [s]"
-    )
+    kind: Literal["regular"]
+    interval: Annotated[float | list[float], Swept(Positive)]
+    duration: Annotated[float | list[float], Swept(Positive)]
 
     def build(self) -> RegularSampling:
         """The sampling scheme."""
@@ -46,15 +54,21 @@ AnySamplingSection = Annotated[Section, WithKey("duration", RegularDurationSecti
 
 
 class TracksSection(Section):
-    """What is stored of the frequencies over time, and where their errors are measured."""
+    """What is stored of the frequencies over time, and where their errors are measured.
 
-    interval: Positive = Field(default=0.05, description="Time from one stored estimate to the next [s]")
-    window: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] | None = Field(
-        default=None, description="First and last instant of the window of rms and bias [s]; the last 10 s"
-    )
-    runs: int = Field(
-        default=1, ge=0, le=1_000_000, description="Store the tracks of so many data sets of every data cell"
-    )
+    Parameters
+    ----------
+    interval : float, default 0.05
+        Time from one stored estimate to the next [s]
+    window : list of float, optional
+        First and last instant of the window of rms and bias [s]; the last 10 s
+    runs : int, default 1
+        Store the tracks of so many data sets of every data cell
+    """
+
+    interval: Positive = 0.05
+    window: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] | None = None
+    runs: int = Field(default=1, ge=0, le=1_000_000)
 
     def complaints(self) -> Iterator[Complaint]:
         """Say that the window is empty."""

@@ -40,32 +40,42 @@ MeasuredSection = Annotated[Any, Options(MeasuredSource, without="loop", sweepin
 
 
 class MonteCarloSection(Section):
-    """How many data sets, and which."""
+    """How many data sets, and which.
 
-    runs: int = Field(ge=1, le=1_000_000, description="Data sets of every data cell")
-    seed: int = Field(
-        ge=0, le=MAX_WHOLE, description="Seed of all random numbers; with the same seed the same data sets come out"
-    )
+    Parameters
+    ----------
+    runs : int
+        Data sets of every data cell
+    seed : int
+        Seed of all random numbers; with the same seed the same data sets come out
+    """
+
+    runs: int = Field(ge=1, le=1_000_000)
+    seed: int = Field(ge=0, le=MAX_WHOLE)
 
 
 class SuccessSection(Section):
-    """When an estimate counts as converged; all that is given must hold."""
+    """When an estimate counts as converged; all that is given must hold.
 
-    delay_relative_error: Positive | None = Field(
-        default=None, description="Largest error of the delay, as a fraction of the true delay [-]"
-    )
-    fit_percent: Annotated[float, Field(le=100.0, allow_inf_nan=False)] | None = Field(
-        default=None, description="Least fit of the simulated output [%]"
-    )
-    parameter_relative_error: Annotated[Positive | None, LATER] = Field(
-        default=None, description="Largest error of a parameter of the submodels, as a fraction of the true value [-]"
-    )
-    band: Annotated[Positive | None, LATER] = Field(
-        default=None, description="Largest error of a settled frequency of a signal [rad/s]"
-    )
-    by: Annotated[Positive | None, LATER] = Field(
-        default=None, description="Frequencies must settle so soon after the start and after their last step [s]"
-    )
+    Parameters
+    ----------
+    delay_relative_error : float, optional
+        Largest error of the delay, as a fraction of the true delay [-]
+    fit_percent : float, optional
+        Least fit of the simulated output [%]
+    parameter_relative_error : float, optional
+        Largest error of a parameter of the submodels, as a fraction of the true value [-]
+    band : float, optional
+        Largest error of a settled frequency of a signal [rad/s]
+    by : float, optional
+        Frequencies must settle so soon after the start and after their last step [s]
+    """
+
+    delay_relative_error: Positive | None = None
+    fit_percent: Annotated[float, Field(le=100.0, allow_inf_nan=False)] | None = None
+    parameter_relative_error: Annotated[Positive | None, LATER] = None
+    band: Annotated[Positive | None, LATER] = None
+    by: Annotated[Positive | None, LATER] = None
 
     def complaints(self) -> Iterator[Complaint]:
         """Say that nothing is asked for."""
@@ -76,40 +86,54 @@ class SuccessSection(Section):
 
 
 class Spec(Section):
-    """One experiment: simulated or measured data or a signal, estimators, starts, and what counts as success."""
+    """One experiment: simulated or measured data or a signal, estimators, starts, and what counts as success.
 
-    experiment: Annotated[Text, _EXPERIMENT] = Field(
-        description="Name of the experiment and of its results folder; '/' makes folders in folders"
-    )
-    system: AnySystemSection | None = Field(default=None, description="The system to simulate")
-    excitation: ExcitationSection | None = Field(default=None, description="The input of the system, in open loop")
-    loop: Annotated[LoopSection | None, LATER] = Field(
-        default=None, description="What makes the input from the output, in place of excitation"
-    )
-    signal: Annotated[SignalSection | None, LATER] = Field(
-        default=None, description="A sum of sinusoids whose frequencies are estimated, in place of a system"
-    )
-    disturbance: Annotated[DisturbanceOrNone | None, LATER] = Field(
-        default=None, description="What is added to the signal; none by default"
-    )
-    sampling: AnySamplingSection | None = Field(default=None, description="When the output is sampled")
-    noise: NoiseSection | None = Field(default=None, description="What is added to the output; none by default")
-    data: MeasuredSection | None = Field(
-        default=None, description="A measured record, in place of system, excitation, sampling and noise"
-    )
-    estimators: Annotated[dict[Annotated[str, _NAME], EstimatorSection], Field(min_length=1)] = Field(
-        description="estimators by the names that tables show, for example 'mine: {kind: td_srivc, …}'"
-    )
-    starts: StartsSection | None = Field(
-        default=None, description="Initial delays and parameters; by default every estimator chooses its own"
-    )
-    monte_carlo: MonteCarloSection | None = Field(
-        default=None, description="Number of data sets and their seed; needed where anything is random"
-    )
-    success: SuccessSection | None = Field(default=None, description="When an estimate counts as converged")
-    tracks: Annotated[TracksSection | None, LATER] = Field(
-        default=None, description="What is stored of the frequencies of a signal over time; nothing by default"
-    )
+    Parameters
+    ----------
+    experiment : str
+        Name of the experiment and of its results folder; '/' makes folders in folders
+    system : mapping, optional
+        The system to simulate
+    excitation : mapping, optional
+        The input of the system, in open loop
+    loop : mapping, optional
+        What makes the input from the output, in place of excitation
+    signal : mapping, optional
+        A sum of sinusoids whose frequencies are estimated, in place of a system
+    disturbance : mapping or "none", optional
+        What is added to the signal; none by default
+    sampling : mapping, optional
+        When the output is sampled
+    noise : mapping, optional
+        What is added to the output; none by default
+    data : mapping, optional
+        A measured record, in place of system, excitation, sampling and noise
+    estimators : mapping of mappings
+        estimators by the names that tables show, for example 'mine: {kind: td_srivc, …}'
+    starts : mapping, optional
+        Initial delays and parameters; by default every estimator chooses its own
+    monte_carlo : mapping, optional
+        Number of data sets and their seed; needed where anything is random
+    success : mapping, optional
+        When an estimate counts as converged
+    tracks : mapping, optional
+        What is stored of the frequencies of a signal over time; nothing by default
+    """
+
+    experiment: Annotated[Text, _EXPERIMENT]
+    system: AnySystemSection | None = None
+    excitation: ExcitationSection | None = None
+    loop: Annotated[LoopSection | None, LATER] = None
+    signal: Annotated[SignalSection | None, LATER] = None
+    disturbance: Annotated[DisturbanceOrNone | None, LATER] = None
+    sampling: AnySamplingSection | None = None
+    noise: NoiseSection | None = None
+    data: MeasuredSection | None = None
+    estimators: Annotated[dict[Annotated[str, _NAME], EstimatorSection], Field(min_length=1)]
+    starts: StartsSection | None = None
+    monte_carlo: MonteCarloSection | None = None
+    success: SuccessSection | None = None
+    tracks: Annotated[TracksSection | None, LATER] = None
 
     _warnings: tuple[str, ...] = PrivateAttr(default=())
     _text: str = PrivateAttr(default="")

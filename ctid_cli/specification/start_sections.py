@@ -14,11 +14,15 @@ from ctid_cli.specification.system_sections import AdditiveSection
 
 
 class UniformStart(Section):
-    """An initial delay drawn anew for every data set."""
+    """An initial delay drawn anew for every data set.
 
-    uniform: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] = Field(
-        description="least and greatest value [s]"
-    )
+    Parameters
+    ----------
+    uniform : list of float
+        least and greatest value [s]
+    """
+
+    uniform: Annotated[list[NotNegative], Field(min_length=2, max_length=2)]
 
     def complaints(self) -> Iterator[Complaint]:
         """Say why the range is none."""
@@ -28,12 +32,16 @@ class UniformStart(Section):
 
 
 class RelativeStart(Section):
-    """Initial parameters drawn anew for every data set, around those of the simulated system."""
+    """Initial parameters drawn anew for every data set, around those of the simulated system.
+
+    Parameters
+    ----------
+    relative_uniform : float
+        Every parameter is multiplied by a random number from 1 - this to 1 + this [-]
+    """
 
     # Below 1 parameters keep their sign.
-    relative_uniform: Annotated[float, Field(gt=0.0, lt=1.0, allow_inf_nan=False)] = Field(
-        description="Every parameter is multiplied by a random number from 1 - this to 1 + this [-]"
-    )
+    relative_uniform: float = Field(gt=0.0, lt=1.0, allow_inf_nan=False)
 
 
 class GivenStart(AdditiveSection):
@@ -65,16 +73,19 @@ _LISTED = AfterValidator(lambda value: value if isinstance(value, list) else [va
 
 
 class StartsSection(Section):
-    """Where estimators start that need, or take, an initial delay or initial parameters."""
+    """Where estimators start that need, or take, an initial delay or initial parameters.
 
-    initial_delay: Annotated[list[float | UniformStart], _DELAYS, _LISTED] | None = Field(
-        default=None, description="Initial delays [s]; {uniform: [low, high]} draws one for every data set"
-    )
-    parameters: Annotated[Annotated[list[RelativeStart | GivenStart], _PARAMETERS, _LISTED] | None, LATER] = Field(
-        default=None,
-        description="Initial parameters, drawn around those of the simulated system or given; by default every "
-        "estimator makes its own",
-    )
+    Parameters
+    ----------
+    initial_delay : float, mapping or list of these, optional
+        Initial delays [s]; {uniform: [low, high]} draws one for every data set
+    parameters : mapping or list of mappings, optional
+        Initial parameters, drawn around those of the simulated system or given; by default every estimator makes its
+        own
+    """
+
+    initial_delay: Annotated[list[float | UniformStart], _DELAYS, _LISTED] | None = None
+    parameters: Annotated[Annotated[list[RelativeStart | GivenStart], _PARAMETERS, _LISTED] | None, LATER] = None
 
     def complaints(self) -> Iterator[Complaint]:
         """Say that there is no start."""

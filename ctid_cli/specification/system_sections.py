@@ -21,13 +21,23 @@ MAX_ORDER = 12
 
 
 class SystemSection(Section):
-    """The system to simulate: ``G(s) = B(s)/A(s) exp(-delay s)``, strictly proper and stable."""
+    """The system to simulate: ``G(s) = B(s)/A(s) exp(-delay s)``, strictly proper and stable.
+
+    Parameters
+    ----------
+    numerator : list of float
+        coefficients of B in descending powers of s
+    denominator : list of float
+        coefficients of A in descending powers of s
+    delay : float, default 0.0
+        Pure delay [s]
+    """
 
     target: ClassVar[type | None] = TransferFunction
 
-    numerator: Coefficients = Field(description="coefficients of B in descending powers of s")
-    denominator: Coefficients = Field(description="coefficients of A in descending powers of s")
-    delay: Annotated[float | list[float], Swept(NotNegative)] = Field(default=0.0, description="Pure delay [s]")
+    numerator: Coefficients
+    denominator: Coefficients
+    delay: Annotated[float | list[float], Swept(NotNegative)] = 0.0
 
     def complaints(self) -> Iterator[Complaint]:
         """Say why the system cannot be simulated."""
@@ -52,15 +62,23 @@ class SystemSection(Section):
 
 
 class SubmodelSection(Section):
-    """One term of a sum: ``G_i(s) = B_i(s) / (s^l A_i(s))``."""
+    """One term of a sum: ``G_i(s) = B_i(s) / (s^l A_i(s))``.
+
+    Parameters
+    ----------
+    numerator : list of float
+        coefficients of B_i in descending powers of s
+    denominator : list of float
+        coefficients of A_i in descending powers of s, without the integrators
+    integrators : int, default 0
+        Number l of further poles at the origin
+    """
 
     target: ClassVar[type | None] = Submodel
 
-    numerator: Coefficients = Field(description="coefficients of B_i in descending powers of s")
-    denominator: Coefficients = Field(
-        description="coefficients of A_i in descending powers of s, without the integrators"
-    )
-    integrators: int = Field(default=0, ge=0, description="Number l of further poles at the origin")
+    numerator: Coefficients
+    denominator: Coefficients
+    integrators: int = Field(default=0, ge=0)
 
     def complaints(self) -> Iterator[Complaint]:
         """Say why this is no submodel."""
@@ -72,13 +90,17 @@ class SubmodelSection(Section):
 
 
 class AdditiveSection(Section):
-    """A sum of submodels that have no pole in common: ``G(s) = G_1(s) + … + G_K(s)``."""
+    """A sum of submodels that have no pole in common: ``G(s) = G_1(s) + … + G_K(s)``.
+
+    Parameters
+    ----------
+    additive : list of mappings
+        submodels {numerator: […], denominator: […]}
+    """
 
     target: ClassVar[type | None] = AdditiveModel
 
-    additive: Annotated[list[SubmodelSection], Field(min_length=1)] = Field(
-        description="submodels {numerator: […], denominator: […]}"
-    )
+    additive: Annotated[list[SubmodelSection], Field(min_length=1)]
 
     def build(self) -> AdditiveModel:
         """The sum."""
@@ -92,13 +114,17 @@ _TWICE = "gives the system a second time, 'additive' has it already; keep one of
 
 
 class AdditiveSystemSection(AdditiveSection):
-    """The system to simulate as a sum of stable submodels, which may have integrators."""
+    """The system to simulate as a sum of stable submodels, which may have integrators.
+
+    Parameters
+    ----------
+    delay : float, default 0.0
+        Pure delay [s], common to all submodels
+    """
 
     elsewhere = {"numerator": _TWICE, "denominator": _TWICE}  # noqa: RUF012 - of the base class
 
-    delay: Annotated[float | list[float], Swept(NotNegative)] = Field(
-        default=0.0, description="Pure delay [s], common to all submodels"
-    )
+    delay: Annotated[float | list[float], Swept(NotNegative)] = 0.0
 
     def complaints(self) -> Iterator[Complaint]:
         """Say why the system cannot be simulated."""
