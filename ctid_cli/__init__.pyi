@@ -10,8 +10,7 @@ from .signals.record import Loop as Loop, Record as Record
 from .signals.csv_file import read_record as read_record
 from .signals.excitation import Gaussian as Gaussian, Multisine as Multisine, Prbs as Prbs, Step as Step
 from .signals.sampling import RegularSampling as RegularSampling, UniformIntervals as UniformIntervals
-from .signals.noise import WhiteNoise as WhiteNoise
-from .signals.arma_noise import ArmaNoise as ArmaNoise
+from .signals.noise import ArmaNoise as ArmaNoise, WhiteNoise as WhiteNoise
 
 # Models
 from .models.transfer_function import TransferFunction as TransferFunction

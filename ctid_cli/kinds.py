@@ -23,13 +23,13 @@ KINDS: dict[str, dict[str, str]] = {
     },
     "noise": {
         "white": "ctid_cli.signals.noise:WhiteNoise",
-        "arma": "ctid_cli.signals.arma_noise:ArmaNoise",
+        "arma": "ctid_cli.signals.noise:ArmaNoise",
     },
     "disturbance": {
         "uniform": "ctid_cli.signals.sinusoids:UniformDisturbance",
         "sine": "ctid_cli.signals.sinusoids:SineDisturbance",
         "white": "ctid_cli.signals.noise:WhiteNoise",
-        "arma": "ctid_cli.signals.arma_noise:ArmaNoise",
+        "arma": "ctid_cli.signals.noise:ArmaNoise",
     },
     "estimator": {
         "svf": "ctid_cli.estimators.svf:Svf",

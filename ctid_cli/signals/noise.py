@@ -1,17 +1,16 @@
-"""What is added to the output: levels, the contract of every noise, and white noise."""
+"""What is added to the output: white noise, and white innovations through a rational filter."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
-from ctid_cli.errors import DataError
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.signals.checks import require_finite, require_not_negative
 
 #: Unit of every way to say how strong noise is.
@@ -23,46 +22,40 @@ LEVEL_UNITS = {
 }
 
 
-def require_one_level(levels: Mapping[str, float | None]) -> None:
-    """Refuse anything but exactly one level, a signal-to-noise ratio or a number that is not negative."""
-    given = [name for name, value in levels.items() if value is not None]
-    if len(given) != 1:
-        choices = [f"{name} [{LEVEL_UNITS[name]}]" for name in levels]
-        found = f"{' and '.join(given)} were" if given else "none was"
-        raise ValueError(f"noise needs exactly one of {', '.join(choices)}; {found} given.")
-    name = given[0]
-    value = levels[name]
-    assert value is not None
-    check = require_finite if name == "snr_db" else require_not_negative
-    check(name, value, LEVEL_UNITS[name])
+class Noise:
+    """What is added to an output: white innovations through a filter, at an absolute or a relative level.
 
-
-def variance_at(snr_db: float, noise_free: Array | None) -> float:
-    """Variance of noise with a signal-to-noise ratio."""
-    if noise_free is None:
-        raise DataError("a signal-to-noise ratio says how strong noise is only beside a noise-free output; give that")
-    power = float(np.mean(noise_free**2))
-    if power == 0.0:
-        raise DataError(
-            "the noise-free output is zero, so no noise has a signal-to-noise ratio to it; "
-            "is the delay longer than the record? Give noise.variance, or a longer record"
-        )
-    return power / 10 ** (snr_db / 10)
-
-
-class Noise(ABC):
-    """What is added to an output: white innovations through a filter, at an absolute or a relative level."""
+    It is stationary from the first sample on.
+    """
 
     kind: ClassVar[str]
     #: Whether samples at different instants are correlated.
     coloured: ClassVar[bool]
 
+    snr_db: float | None
+    variance: float | None
+
     @property
-    @abstractmethod
     def filter(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Numerator and denominator in rising powers of q^-1 of what white innovations pass through."""
+        return (1.0,), (1.0,)
 
-    @abstractmethod
+    @property
+    def _given_innovation_variance(self) -> float | None:
+        """Variance of the innovations [output unit^2], where the level says it."""
+        raise NotImplementedError
+
+    def _require_one_level(self) -> None:
+        """Refuse anything but exactly one level, a signal-to-noise ratio or a number that is not negative."""
+        levels = {name: getattr(self, name) for name in LEVEL_UNITS if hasattr(self, name)}
+        given = [name for name, value in levels.items() if value is not None]
+        if len(given) != 1:
+            choices = [f"{name} [{LEVEL_UNITS[name]}]" for name in levels]
+            found = f"{' and '.join(given)} were" if given else "none was"
+            raise ValueError(f"noise needs exactly one of {', '.join(choices)}; {found} given.")
+        check = require_finite if given == ["snr_db"] else require_not_negative
+        check(given[0], levels[given[0]], LEVEL_UNITS[given[0]])
+
     def innovation_variance_of(self, noise_free: Array | None = None) -> float:
         """Variance of the innovations.
 
@@ -81,10 +74,25 @@ class Noise(ABC):
         DataError
             If a signal-to-noise ratio is asked for and the noise-free output is missing or zero throughout.
         """
+        given = self._given_innovation_variance
+        if given is not None:
+            return given
+        variance = self.variance
+        if self.snr_db is not None:
+            if noise_free is None:
+                raise DataError("a signal-to-noise ratio is a level only beside a noise-free output; give that")
+            power = float(np.mean(noise_free**2))
+            if power == 0.0:
+                raise DataError(
+                    "the noise-free output is zero, so no noise has a signal-to-noise ratio to it; is the delay longer "
+                    "than the record? Give noise.variance, or a longer record"
+                )
+            variance = power / 10 ** (self.snr_db / 10)
+        assert variance is not None
+        return variance / self._unit_variance
 
-    @abstractmethod
     def variance_of(self, noise_free: Array | None = None) -> float:
-        """Variance of the noise.
+        """Variance of the noise: that for unit innovations times theirs.
 
         Parameters
         ----------
@@ -95,16 +103,11 @@ class Noise(ABC):
         -------
         float
             Variance [output unit^2].
-
-        Raises
-        ------
-        DataError
-            If a signal-to-noise ratio is asked for and the noise-free output is missing or zero throughout.
         """
+        return self._unit_variance * self.innovation_variance_of(noise_free)
 
-    @abstractmethod
     def autocovariance(self, lags: ArrayLike, noise_free: Array | None = None) -> Array:
-        """Covariance of samples at a distance.
+        """Covariance of samples at a distance, from the first state's stationary covariance on.
 
         Parameters
         ----------
@@ -118,10 +121,19 @@ class Noise(ABC):
         ndarray, shape (M,)
             Covariance [output unit^2].
         """
+        distances = np.abs(np.asarray(lags, dtype=int))
+        transition, gain, direct = self._state_space
+        covariances = np.zeros(int(distances.max(initial=0)) + 1)
+        covariances[0] = self._unit_variance
+        if gain.size:
+            state = transition @ self._state_covariance[:, 0] + gain * direct
+            for k in range(1, covariances.size):
+                covariances[k] = state[0]
+                state = transition @ state
+        return np.asarray(self.innovation_variance_of(noise_free) * covariances[distances], dtype=float)
 
-    @abstractmethod
     def generate(self, noise_free: Array, rng: np.random.Generator) -> Array:
-        """Noise for one record.
+        """Noise for one record: filtered innovations; the first state is drawn from its stationary distribution.
 
         Parameters
         ----------
@@ -140,6 +152,45 @@ class Noise(ABC):
         DataError
             If a signal-to-noise ratio is asked for and the noise-free output is zero throughout.
         """
+        initial = self._state_root @ rng.standard_normal(self._state_root.shape[0])
+        shape: Array = rng.standard_normal(noise_free.size)
+        if self.coloured:
+            from scipy.signal import lfilter
+
+            shape = lfilter(*self.filter, shape, zi=initial)[0]
+        return float(np.sqrt(self.innovation_variance_of(noise_free))) * shape
+
+    @cached_property
+    def _state_space(self) -> tuple[Array, Array, float]:
+        """Transposed direct form, whose state is that of ``scipy.signal.lfilter``: F, G and h_0."""
+        states = max(map(len, self.filter)) - 1
+        leading = self.filter[1][0]
+        numerator, denominator = (np.pad(part, (0, states + 1 - len(part))) / leading for part in self.filter)
+        transition = np.eye(states, k=1)
+        transition[:, :1] -= denominator[1:, None]
+        return transition, numerator[1:] - denominator[1:] * numerator[0], float(numerator[0])
+
+    @cached_property
+    def _state_covariance(self) -> Array:
+        from scipy.linalg import solve_discrete_lyapunov
+
+        transition, gain, _ = self._state_space
+        if not gain.size:
+            return np.zeros((0, 0))
+        covariance: Array = solve_discrete_lyapunov(transition, np.outer(gain, gain))
+        return np.asarray(0.5 * (covariance + covariance.T), dtype=float)
+
+    @cached_property
+    def _state_root(self) -> Array:
+        """Symmetric root of the state's covariance, which may be singular: common zeros of C and D, or an empty G."""
+        values, vectors = np.linalg.eigh(self._state_covariance)
+        return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T, dtype=float)
+
+    @cached_property
+    def _unit_variance(self) -> float:
+        """Variance for unit innovations."""
+        direct = self._state_space[2]
+        return direct**2 + (float(self._state_covariance[0, 0]) if self._state_covariance.size else 0.0)
 
 
 @dataclass(frozen=True)
@@ -179,35 +230,87 @@ class WhiteNoise(Noise):
     variance: float | None = field(default=None, metadata={"added_later": True})
 
     def __post_init__(self) -> None:
-        require_one_level(
-            {"snr_db": self.snr_db, "standard_deviation": self.standard_deviation, "variance": self.variance}
-        )
+        self._require_one_level()
+
+    @property
+    def _given_innovation_variance(self) -> float | None:
+        return None if self.standard_deviation is None else self.standard_deviation**2
+
+
+@dataclass(frozen=True)
+class ArmaNoise(Noise):
+    r"""Autoregressive moving-average noise ``v = C(q^-1) / D(q^-1) e`` with Gaussian white innovations e.
+
+    Parameters
+    ----------
+    numerator : tuple of float
+        Coefficients of C in rising powers of q^-1, the first not zero.
+    denominator : tuple of float
+        Coefficients of D in rising powers of q^-1, the first not zero, its zeros inside the unit circle.
+    innovation_variance : float, optional
+        Variance of e [output unit^2].
+    variance : float, optional
+        Variance of v [output unit^2].
+    snr_db : float, optional
+        Signal-to-noise ratio [dB]: ten times the decimal logarithm of the mean square of the noise-free
+        output over the variance of v. Exactly one of the three is given.
+
+    Raises
+    ------
+    ValueError
+        If the filter is unstable or no filter, or not exactly one level is given.
+
+    Notes
+    -----
+    With ``z+ = F z + G e``, ``v = z_1 + h_0 e`` (the transposed direct form), the first state is drawn from its
+    stationary distribution, whose covariance solves ``P = F P F' + G G'``. Hence every sample has the same variance.
+    For unit innovations it is ``P_11 + h_0^2``, and the covariance at lag k > 0 is the first entry of
+    ``F^(k-1) (F P e_1 + G h_0)``.
+
+    The same standard normal numbers are drawn at every level, first those of the state, so that levels differ by a
+    factor only and longer records begin with the shorter ones.
+
+    Examples
+    --------
+    >>> from ctid_cli.signals.noise import ArmaNoise
+    >>> noise = ArmaNoise(numerator=(1.0, 0.5), denominator=(1.0, -0.85), innovation_variance=0.02)
+    >>> round(noise.variance_of(), 6)
+    0.151351
+    """
+
+    kind: ClassVar[str] = "arma"
+    coloured: ClassVar[bool] = True
+
+    numerator: tuple[float, ...]
+    denominator: tuple[float, ...]
+    innovation_variance: float | None = None
+    variance: float | None = None
+    snr_db: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("numerator", "denominator"):
+            coefficients = tuple(getattr(self, name))
+            if not coefficients:
+                raise OptionError(name, f"{name} must hold at least one coefficient.")
+            for value in coefficients:
+                require_finite(name, value, "-", label=f"a coefficient of {name}")
+            if coefficients[0] == 0:
+                raise OptionError(name, f"the first coefficient of {name} is zero; it belongs to q^0 and must not be.")
+            object.__setattr__(self, name, tuple(float(value) for value in coefficients))
+        largest = float(np.abs(np.roots(self.denominator)).max(initial=0.0))
+        if largest >= 1.0:
+            raise OptionError(
+                "denominator",
+                f"denominator has a zero of magnitude {largest:.6g}: the noise would grow without bound; "
+                "all must lie inside the unit circle.",
+            )
+        self._require_one_level()
 
     @property
     def filter(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Numerator and denominator in rising powers of q^-1 of what white innovations pass through."""
-        return (1.0,), (1.0,)
+        return self.numerator, self.denominator
 
-    def innovation_variance_of(self, noise_free: Array | None = None) -> float:
-        """Variance of the noise itself."""
-        if self.standard_deviation is not None:
-            return self.standard_deviation**2
-        if self.variance is not None:
-            return self.variance
-        assert self.snr_db is not None
-        return variance_at(self.snr_db, noise_free)
-
-    def variance_of(self, noise_free: Array | None = None) -> float:
-        """Variance of the innovations."""
-        return self.innovation_variance_of(noise_free)
-
-    def autocovariance(self, lags: ArrayLike, noise_free: Array | None = None) -> Array:
-        """The variance at lag 0, zero elsewhere."""
-        return np.where(np.asarray(lags) == 0, self.variance_of(noise_free), 0.0)
-
-    def generate(self, noise_free: Array, rng: np.random.Generator) -> Array:
-        """Independent samples."""
-        shape = rng.standard_normal(noise_free.size)
-        if self.standard_deviation is not None:
-            return self.standard_deviation * shape
-        return float(np.sqrt(self.variance_of(noise_free))) * shape
+    @property
+    def _given_innovation_variance(self) -> float | None:
+        return self.innovation_variance

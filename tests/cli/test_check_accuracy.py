@@ -12,7 +12,7 @@ from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.running.plan import build_plan
-from ctid_cli.signals.arma_noise import ArmaNoise
+from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.specification.load import load_spec
 
 # The simulation examples of Gonzalez, Classens, Rojas, Welsh and Oomen, sections 6.1 and 6.2.

@@ -16,8 +16,8 @@ from ctid_cli.inference.finite_record import (
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.arma_noise import ArmaNoise
 from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record
 
 MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([0.1, 1.0], [0.025, 0.01, 1.0])], 0.13)

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals.arma_noise import ArmaNoise
-from ctid_cli.signals.noise import WhiteNoise
+from ctid_cli.signals.noise import ArmaNoise, WhiteNoise
 from ctid_cli.signals.streams import stream
 
 ZEROS = np.zeros(500)
@@ -111,9 +110,9 @@ def test_a_trivial_filter_is_white_noise():
     [
         (
             {"innovation_variance": None},
-            "exactly one of innovation_variance .*, variance .*, snr_db .*; none was given",
+            "exactly one of snr_db .*, variance .*, innovation_variance .*; none was given",
         ),
-        ({"variance": 1.0}, "innovation_variance and variance were given"),
+        ({"variance": 1.0}, "variance and innovation_variance were given"),
         ({"innovation_variance": -1.0}, r"innovation_variance must be zero or a positive number \[output unit\^2\]"),
         ({"denominator": (1.0, -1.0)}, "denominator has a zero of magnitude 1: the noise would grow without bound"),
         ({"denominator": (1.0, 0.0, 1.44)}, "denominator has a zero of magnitude 1.2"),

@@ -8,7 +8,7 @@ from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import SpecError
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.running.plan import build_plan
-from ctid_cli.signals.arma_noise import ArmaNoise
+from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.sampling import geometric_sizes
 from ctid_cli.specification.load import load_spec, spec_from_canonical
 
