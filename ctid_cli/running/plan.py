@@ -16,7 +16,7 @@ from ctid_cli.running.cells import DataCell, EstimatorCell, Plan, starts_of
 from ctid_cli.simulation.dataset import LoopOptions, SimulatedSource, Source, located
 from ctid_cli.simulation.frequency_measures import Measuring
 from ctid_cli.simulation.frequency_runs import FrequencyEstimation, SignalSource
-from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, variants
+from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, replaced, variants
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.start_points import NO_START, start_points
 from ctid_cli.specification.yaml_source import KeyPath
@@ -32,9 +32,8 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
         raise UsageError(f"the number of data sets must be 1 or more, not {runs}")
     count = 1
     if spec.data is None and spec.monte_carlo is not None:
-        spec = spec if runs is None else spec.with_runs(runs)
-        assert spec.monte_carlo is not None
-        count = spec.monte_carlo.runs
+        count = spec.monte_carlo.runs if runs is None else runs
+        spec = replaced(spec, ("monte_carlo", "runs"), count)
     parts = _data_variants(spec)
     cells = math.prod(len(cases) for cases in parts.values())
     if cells > MAX_COMBINATIONS:

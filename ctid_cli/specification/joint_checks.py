@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -61,16 +61,8 @@ def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool
         yield from too_long or signal_complaints(spec)
         return
     extents = _extents(spec, samplings) if files_are_good else []
-    for name, section in spec.estimators.items():
-        if section.kind in KINDS["frequency_estimator"]:
-            continue
-        at = ("estimators", name)
-        cases = variants(section)
-        yield from over({(): cases, ("sampling",): extents}, partial(_of_record, at))
-        if spec.loop is None and not broken & {"loop", "data", "excitation"}:
-            yield from over({(): cases}, partial(_of_instruments, at))
-        if spec.starts is not None:
-            yield from over({(): cases}, partial(_of_delays, name, spec.starts.initial_delay or []))
+    open_loop = spec.loop is None and not broken & {"loop", "data", "excitation"}
+    yield from _estimator_complaints(spec, extents, open_loop=open_loop)
     if spec.starts is not None:
         yield from _start_complaints(spec, spec.starts, broken)
     yield from _success_complaints(spec)
@@ -92,11 +84,10 @@ def joint_warnings(spec: Spec) -> list[Complaint]:
         warnings.append((("monte_carlo", "runs"), "a measured record is one data set; it is run once"))
     if spec.starts is not None:
         taken = {variants(section)[0].options.start_from for section in spec.estimators.values()}
-        unused = "no estimator here uses a start of this kind; each is run once"
-        if spec.starts.initial_delay and "delay" not in taken:
-            warnings.append((("starts", "initial_delay"), unused))
-        if spec.starts.parameters and "parameters" not in taken:
-            warnings.append((("starts", "parameters"), unused))
+        for name, kind in (("initial_delay", "delay"), ("parameters", "parameters")):
+            if getattr(spec.starts, name) and kind not in taken:
+                unused = "no estimator here uses a start of this kind; each is run once"
+                warnings.append((("starts", name), unused))
     return warnings
 
 
@@ -123,12 +114,9 @@ def _mean_interval(sampling: Any) -> float:
 def _slow(fastest: float, sampling: Any) -> Iterator[Complaint]:
     interval = _mean_interval(sampling)
     if interval * fastest > math.pi:
+        slow = f"sampling every {interval:g} s is slower than twice the fastest pole ({fastest:.4g} rad/s)"
         key: KeyPath = ("sampling", "interval") if hasattr(sampling, "interval") else ("sampling",)
-        yield (
-            key,
-            f"sampling every {interval:g} s is slower than twice the fastest pole ({fastest:.4g} rad/s, "
-            f"{fastest / (2 * math.pi):.4g} Hz): intervals below {math.pi / fastest:.4g} s see it",
-        )
+        yield key, f"{slow}; intervals below {math.pi / fastest:.4g} s see it"
 
 
 def _too_long(at: KeyPath, sampling: Any) -> Iterator[Complaint]:
@@ -144,33 +132,38 @@ def _of_record(at: KeyPath, options: Any, extent: _Extent) -> Iterator[Complaint
     terms = getattr(options, "terms", None)
     coefficients = options.poles + options.zeros + 1 if terms is None else sum(term.size for term in terms)
     parameters = int(coefficients + (bounds is not None))
-    total, left = extent.samples_after(0.0), extent.samples_after(latest)
+    left = extent.samples_after(latest)
     if latest >= extent.duration and latest > 0:
-        yield (
-            (*at, key),
-            f"a delay of {latest:g} s is not shorter than the record ({extent.duration:g} s), so no sample would be "
-            "left to use; lower it, or take more samples",
-        )
+        longer = f"a delay of {latest:g} s is not shorter than the record ({extent.duration:g} s)"
+        yield (*at, key), f"{longer}; lower it, or take more samples"
     elif left <= parameters:
-        masked = f" after the first {latest:g} s" if left < total else ""
-        yield (
-            at,
-            f"{left} samples{masked} are too few for {parameters} parameters; "
-            "take more samples, fewer poles or zeros, or a smaller largest delay",
-        )
+        masked = f" after the first {latest:g} s" if left < extent.samples_after(0.0) else ""
+        few = f"{left} samples{masked} are too few for {parameters} parameters"
+        yield at, f"{few}; take more samples, fewer poles or zeros, or a smaller largest delay"
 
 
 # --------------------------------------------------------------------------------------------------------------------
 # Estimators, starts and success
 
 
+def _estimator_complaints(spec: Spec, extents: Sequence[Variant], *, open_loop: bool) -> Iterator[Complaint]:
+    """What each estimator of a system has against the record, the loop and the initial delays."""
+    for name, section in spec.estimators.items():
+        if section.kind in KINDS["frequency_estimator"]:
+            continue
+        at, cases = ("estimators", name), variants(section)
+        yield from over({(): cases, ("sampling",): extents}, partial(_of_record, at))
+        if open_loop:
+            yield from over({(): cases}, partial(_of_instruments, at))
+        if spec.starts is not None:
+            yield from over({(): cases}, partial(_of_delays, name, spec.starts.initial_delay or []))
+
+
 def _of_instruments(at: KeyPath, options: Any) -> Iterator[Complaint]:
     if getattr(options, "instruments", None) == "closed_loop":
-        yield (
-            (*at, "instruments"),
-            "closed-loop instruments are made of the reference and the controller, and both are missing: give "
-            "loop to simulate, or data.reference and loop.controller for a measured record",
-        )
+        needs = "need the reference and the controller, and both are missing"
+        give = "give loop, or data.reference and loop.controller for a measured record"
+        yield (*at, "instruments"), f"closed-loop instruments {needs}; {give}"
 
 
 def _of_delays(name: str, delays: Sequence[float | UniformStart], options: Any) -> Iterator[Complaint]:
@@ -186,11 +179,12 @@ def _of_delays(name: str, delays: Sequence[float | UniformStart], options: Any) 
 
 
 def _start_complaints(spec: Spec, starts: StartsSection, broken: frozenset[str]) -> Iterator[Complaint]:
-    random = [k for k, point in enumerate(starts.initial_delay or []) if isinstance(point, UniformStart)]
+    points, given = starts.initial_delay or [], starts.parameters or []
+    random = [k for k, point in enumerate(points) if isinstance(point, UniformStart)]
     if random and spec.monte_carlo is None and "monte_carlo" not in broken:
         yield ("starts", "initial_delay", random[0]), "a random start needs a seed; add monte_carlo: {runs: 1, seed: 1}"
-    drawn = [k for k, parameters in enumerate(starts.parameters or []) if isinstance(parameters, RelativeStart)]
-    for k, parameters in enumerate(starts.parameters or []):
+    drawn = [k for k, parameters in enumerate(given) if isinstance(parameters, RelativeStart)]
+    for k, parameters in enumerate(given):
         path = ("starts", "parameters", k)
         if not isinstance(parameters, RelativeStart):
             yield from _structure_complaints(spec, path, parameters.options())
@@ -218,51 +212,39 @@ def _of_structure(name: str, model: AdditiveModel, path: KeyPath, options: Any) 
         return
     if hasattr(options, "terms"):
         if model.terms != tuple(options.terms):
-            yield (
-                path,
-                f"the start has the submodels {_terms_text(model.terms)}, which are not, in this order, the terms "
-                f"{_terms_text(options.terms)} of estimator {name!r}",
-            )
+            wanted = f"{_terms_text(options.terms)} of estimator {name!r}"
+            yield path, f"the start has the submodels {_terms_text(model.terms)}, not, in this order, {wanted}"
         return
     fraction = unfactored(model)
     zeros = fraction.numerator.size - 1
     if fraction.order != options.poles or zeros > options.zeros:
-        yield (
-            path,
-            f"the start has {fraction.order} poles and {zeros} zeros as one fraction, which are not the "
-            f"{options.poles} poles and {options.zeros} zeros of estimator {name!r}",
-        )
+        wanted = f"{options.poles} poles and {options.zeros} zeros of estimator {name!r}"
+        yield path, f"the start has {fraction.order} poles and {zeros} zeros as one fraction, not the {wanted}"
 
 
 def _terms_text(terms: Sequence[Term]) -> str:
-    texts = []
-    for term in terms:
-        integrators = f", integrators: {term.integrators}" if term.integrators else ""
-        texts.append(f"{{poles: {term.poles}, zeros: {term.zeros}{integrators}}}")
-    return ", ".join(texts)
+    parts = [{name: value for name, value in asdict(term).items() if value or name != "integrators"} for term in terms]
+    return ", ".join(str(part).replace("'", "") for part in parts)
 
 
 def _success_complaints(spec: Spec) -> Iterator[Complaint]:
     rule, other = spec.success, "use fit_percent, or leave it out"
-    if rule is None:
-        return
-    if rule.delay_relative_error is not None:
-        path = ("success", "delay_relative_error")
+    for name, unknown in (("delay_relative_error", "true values"), ("parameter_relative_error", "parameters")):
+        if rule is None or getattr(rule, name) is None:
+            continue
+        path = ("success", name)
         if spec.data is not None:
-            yield path, f"the true delay of a measured record is not known; {other}"
-        elif spec.system is not None and 0.0 in np.atleast_1d(spec.system.delay):
-            yield path, f"a relative error needs a true delay above zero; {other}"
-    if rule.parameter_relative_error is not None:
-        path = ("success", "parameter_relative_error")
-        if spec.data is not None:
-            yield path, f"the parameters of a measured record are not known; {other}"
-        elif spec.system is not None:
-            model = variants(spec.system)[0].options
-            if not isinstance(model, AdditiveModel):
-                yield path, "is about the parameters of submodels; give the system as system.additive, or leave it out"
-            elif 0.0 in model.theta:
-                zero = model.names[model.theta.tolist().index(0.0)]
-                yield path, f"a relative error needs true parameters other than zero, and {zero} is zero; leave it out"
+            yield path, f"the {unknown} of a measured record are not known; {other}"
+        elif spec.system is None:
+            continue
+        elif name == "delay_relative_error":
+            if 0.0 in np.atleast_1d(spec.system.delay):
+                yield path, f"a relative error needs a true delay above zero; {other}"
+        elif not isinstance(model := variants(spec.system)[0].options, AdditiveModel):
+            yield path, "is about the parameters of submodels; give the system as system.additive, or leave it out"
+        elif 0.0 in model.theta:
+            zero = model.names[model.theta.tolist().index(0.0)]
+            yield path, f"a relative error needs true parameters other than zero, and {zero} is zero; leave it out"
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -274,27 +256,21 @@ def _loop_complaints(spec: Spec, section: Section) -> Iterator[Complaint]:
     yield from over({(): variants(spec.noise)}, _of_ratio)
     samplings = variants(spec.sampling)
     if any(not hasattr(variant.options, "interval") for variant in samplings):
-        yield (
-            ("sampling", "kind"),
-            "must be regular in a loop: the controller is discrete and acts at every sample, at equal intervals",
-        )
+        yield ("sampling", "kind"), "must be regular in a loop: the controller is discrete and acts at every sample"
         return
-    clocks = {}
-    for case in samplings:  # how many samples there are makes no difference
-        swept: dict[KeyPath, Any] = {path: value for path, value in case.swept.items() if path == ("interval",)}
-        clocks[case.options.interval] = Variant({}, swept, case.options)
+    # How many samples there are makes no difference.
+    clocks = {
+        case.options.interval: replace(case, swept={path: v for path, v in case.swept.items() if path == ("interval",)})
+        for case in samplings
+    }
     parts: dict[KeyPath, list[Variant]] = {("system",): variants(spec.system), ("loop",): variants(section)}
-    parts["sampling",] = list(clocks.values())
-    yield from over(parts, _of_stability, MAX_TRIALS)
+    yield from over(parts | {("sampling",): list(clocks.values())}, _of_stability, MAX_TRIALS)
 
 
 def _of_ratio(noise: Any) -> Iterator[Complaint]:
     if noise.snr_db is not None:
-        yield (
-            ("noise", "snr_db"),
-            "in a loop the noise feeds back into the output, so no output is known before it; give the noise's "
-            "variance" + (", or its innovation_variance" if noise.coloured else ""),
-        )
+        other = ", or its innovation_variance" if noise.coloured else ""
+        yield ("noise", "snr_db"), f"in a loop the noise feeds back into the output; give the noise's variance{other}"
 
 
 def _of_stability(system: Any, loop: LoopOptions, sampling: Any) -> Iterator[Complaint]:
@@ -309,15 +285,11 @@ def _of_stability(system: Any, loop: LoopOptions, sampling: Any) -> Iterator[Com
         yield path, str(error)
         return
     except np.linalg.LinAlgError:
-        overflow = f"its numbers overflow at intervals of {interval:g} s; scale the coefficients"
-        yield path, f"the loop cannot be simulated: {overflow}"
+        yield path, f"the loop: its numbers overflow at intervals of {interval:g} s; scale the coefficients"
         return
     if not radius < 1.0:
-        yield (
-            path,
-            f"the loop of the true system and this controller is unstable: at intervals of {interval:g} s its largest "
-            f"pole has the magnitude {radius:.6g}, which must be below 1; lower the gain",
-        )
+        largest = f"at intervals of {interval:g} s its largest pole has the magnitude {radius:.6g}"
+        yield path, f"the loop with the true system is unstable: {largest}, which must be below 1; lower the gain"
 
 
 def _simulation_complaints(spec: Spec, extents: Sequence[Variant]) -> Iterator[Complaint]:
@@ -348,8 +320,5 @@ def _simulation_complaints(spec: Spec, extents: Sequence[Variant]) -> Iterator[C
 
 def _of_delay(system: Any, extent: _Extent) -> Iterator[Complaint]:
     if system.delay >= extent.duration:
-        yield (
-            ("system", "delay"),
-            f"a delay of {system.delay:g} s is not shorter than the record ({extent.duration:g} s); "
-            "the output would be noise alone",
-        )
+        message = f"a delay of {system.delay:g} s is not shorter than the record ({extent.duration:g} s)"
+        yield ("system", "delay"), f"{message}; the output would be noise alone"

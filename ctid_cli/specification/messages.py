@@ -30,7 +30,7 @@ SENTENCES = {
     "int_type": "must be a whole number{unit}, not {shown}",
     "string_type": "must be a text, not {shown}",
     "string_too_short": "must not be empty",
-    "literal_error": "must be one of {expected}, not {shown}",
+    "literal_error": "must be one of {allowed}, not {shown}",
     "greater_than": "must be a number{unit} above {gt:.15g}, not {shown}",
     "greater_than_equal": "must be a number{unit} of at least {ge:.15g}, not {shown}",
     "less_than": "must be a number{unit} below {lt:.15g}, not {shown}",
@@ -66,9 +66,10 @@ def several_wrong(title: str, problems: Iterable[Located]) -> ValidationError:
 
 def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Located:
     """Place and sentence of an error in a section whose fields have the given descriptions."""
+    parts = [str(part) for part in error["loc"]]
     path = tuple(part for part in error["loc"] if not str(part).startswith(TAG) and part != "[key]")
     kind, value, context = error["type"], error["input"], error.get("ctx", {})
-    at_key = context.get("at_key", False) or kind in ("missing", "extra_forbidden") or "[key]" in error["loc"]
+    at_key = context.get("at_key", False) or kind in ("missing", "extra_forbidden") or "[key]" in parts
     if kind == "no_kind" and not isinstance(value, Mapping):
         kind, context = "no_form", {"allowed": f"a mapping with a 'kind' (one of {context['allowed']})"}
     elif kind == "no_kind":
@@ -77,21 +78,24 @@ def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Located:
         kind, value = "finite_number", float("inf")  # an integer beyond all floating-point numbers
     if kind not in SENTENCES:
         return path, error["msg"], at_key
+    words = _words(path, descriptions) | {"shown": shown(value)} | context
+    if kind == "literal_error":
+        words["allowed"] = context["expected"].replace(" or ", ", ")
+    hints = [tag.removeprefix(TAG) for tag in parts if tag.startswith(HINT)]
+    return path, SENTENCES[kind].format(**words) + _hint(kind, value, words) + "".join(hints), at_key
+
+
+def _words(path: KeyPath, descriptions: Mapping[str, str]) -> dict[str, Any]:
+    """What a sentence may say about a field, and about the others of its section."""
     field = str(path[0]) if path else ""
     description = descriptions.get(field, "")
     unit = re.search(r" \[[^\]-][^\]]*\]", description)
-    words = {
-        "shown": shown(value),
+    return {
         "unit": unit[0] if unit else "",
         "meaning": f": {description}" if description else "",
         "keys": ", ".join(descriptions),
         "near": did_you_mean(field, descriptions) or ";",
-        **context,
     }
-    if kind == "literal_error":
-        words["expected"] = context["expected"].replace(" or ", ", ")
-    hints = [tag.removeprefix(TAG) for tag in map(str, error["loc"]) if tag.startswith(HINT)]
-    return path, SENTENCES[kind].format(**words) + _hint(kind, value, words) + "".join(hints), at_key
 
 
 def _hint(kind: str, value: Any, words: Mapping[str, Any]) -> str:
@@ -105,8 +109,7 @@ def _hint(kind: str, value: Any, words: Mapping[str, Any]) -> str:
     if kind == "string_type" and isinstance(value, (bool, int, float)):
         return f"; write it in quotes: '{shown(value)}'"
     if kind in ("literal_error", "no_kind") and isinstance(value, str):
-        allowed = words["allowed"] if kind == "no_kind" else words["expected"]
-        return did_you_mean(value, allowed.replace("'", "").split(", "))
+        return did_you_mean(value, words["allowed"].replace("'", "").split(", "))
     return ""
 
 

@@ -13,7 +13,7 @@ import itertools
 import json
 import math
 import types
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -140,8 +140,13 @@ class Section(BaseModel):
             raise
         except (ValueError, ArithmeticError, CtidError) as error:
             message = str(error).strip() or f"these values were refused ({type(error).__name__})"
-            field = getattr(error, "field", "")
-            raise RefusedOptionsError((field,) if field in type(self).model_fields else (), message) from None
+            raise RefusedOptionsError(place_of(error, type(self).model_fields), message) from None
+
+
+def place_of(error: Exception, options: Container[str]) -> KeyPath:
+    """The option that an error is about, if it is about one of them."""
+    field = getattr(error, "field", "")
+    return (field,) if field in options else ()
 
 
 def _part(value: Any, path: KeyPath) -> Any:

@@ -17,7 +17,7 @@ from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
 from ctid_cli.simulation.frequency_measures import true_frequencies
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.sections import over, variants
+from ctid_cli.specification.sections import over, place_of, variants
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.yaml_source import KeyPath
 
@@ -31,18 +31,16 @@ def world_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
     on_signal = spec.signal is not None
     if not on_signal and ("signal" in broken or (spec.system is None and spec.data is None)):
         return
+    wanted = "frequency_estimator" if on_signal else "estimator"
+    here, does = "a signal; allowed:", "identifies a system from its input and output"
+    if not on_signal:
+        here, does = "a system; give signal, or one of", "estimates the frequencies of a signal"
     for name, section in spec.estimators.items():
-        kind = section.kind
-        if on_signal and kind not in KINDS["frequency_estimator"]:
-            message = f"{kind} identifies a system from its input and output, and this experiment has a signal"
-            yield ("estimators", name, "kind"), f"{message}; allowed: {', '.join(KINDS['frequency_estimator'])}"
-        elif not on_signal and kind in KINDS["frequency_estimator"]:
-            message = f"{kind} estimates the frequencies of a signal, and this experiment has a system"
-            yield ("estimators", name, "kind"), f"{message}; give signal in its place, or another estimator"
-    if spec.success is None:
-        return
+        if section.kind not in KINDS[wanted]:
+            message = f"{section.kind} {does}, and this experiment has {here} {', '.join(KINDS[wanted])}"
+            yield ("estimators", name, "kind"), message
     for name in _OF_SYSTEMS if on_signal else _OF_SIGNALS:
-        if getattr(spec.success, name) is not None:
+        if getattr(spec.success, name, None) is not None:
             other = "a signal has none of it; use band and by" if on_signal else "is about the frequencies of a signal"
             yield ("success", name), f"{other}, or leave it out"
 
@@ -57,12 +55,10 @@ def signal_complaints(spec: Spec) -> Iterator[Complaint]:
     yield from over({("signal",): signals, ("sampling",): clocks}, partial(_of_clock, spec))
     disturbances = [case.options for case in variants(spec.disturbance)] or [None]
     for name, section in spec.estimators.items():
-        if section.kind not in KINDS["frequency_estimator"]:
-            continue
-        at = ("estimators", name)
-        cases = variants(section)
-        yield from over({(): cases, ("sampling",): clocks}, partial(_of_estimator, at))
-        yield from over({(): cases, ("signal",): signals[:1]}, partial(_of_tones, at, disturbances))
+        if section.kind in KINDS["frequency_estimator"]:
+            at, cases = ("estimators", name), variants(section)
+            yield from over({(): cases, ("sampling",): clocks}, partial(_of_estimator, at))
+            yield from over({(): cases, ("signal",): signals[:1]}, partial(_of_tones, at, disturbances))
 
 
 def signal_warnings(spec: Spec) -> list[Complaint]:
@@ -70,8 +66,7 @@ def signal_warnings(spec: Spec) -> list[Complaint]:
     signal = variants(spec.signal)[0].options
     warnings: list[Complaint] = []
     for name, section in spec.estimators.items():
-        cases = variants(section)
-        at = ("estimators", name)
+        at, cases = ("estimators", name), variants(section)
         warnings += over({(): cases}, partial(_aliased, at, signal.highest_frequency))
         warnings += over({(): cases, ("sampling",): variants(spec.sampling)}, partial(_rounded, at))
         if not cases[0].options.online and signal.frequency_steps:
@@ -81,11 +76,8 @@ def signal_warnings(spec: Spec) -> list[Complaint]:
 
 def _aliased(at: KeyPath, highest: float, options: Any) -> Iterator[Complaint]:
     if hasattr(options, "h") and highest > math.pi / options.h:
-        yield (
-            (*at, "h"),
-            f"with h = {options.h:g} s, frequencies above pi/h = {math.pi / options.h:.4g} rad/s are seen as lower "
-            f"ones, and the signal has {highest:g} rad/s",
-        )
+        limit = f"with h = {options.h:g} s, frequencies above pi/h = {math.pi / options.h:.4g} rad/s"
+        yield (*at, "h"), f"{limit} are seen as lower ones, and the signal has {highest:g} rad/s"
 
 
 def _rounded(at: KeyPath, options: Any, clock: RegularSampling) -> Iterator[Complaint]:
@@ -107,23 +99,22 @@ def _of_tones(at: KeyPath, disturbances: list[Any], options: Any, signal: SumOfS
 def _of_clock(spec: Spec, signal: SumOfSinusoids, clock: RegularSampling) -> Iterator[Complaint]:
     interval = float(clock.interval)
     duration = interval * clock.samples
-    highest = signal.highest_frequency
-    if highest >= math.pi / interval:
-        message = f"samples every {interval:g} s show frequencies below {math.pi / interval:.4g} rad/s, and the signal "
-        yield ("sampling", "interval"), f"{message}has {highest:g} rad/s"
+    highest, limit = signal.highest_frequency, math.pi / interval
+    if highest >= limit:
+        message = f"samples every {interval:g} s show frequencies below {limit:.4g} rad/s, the signal has {highest:g}"
+        yield ("sampling", "interval"), message
     for step in signal.steps:
         if step >= duration - interval:
             message = f"a step at {step:g} s comes after the last sample, at {duration - interval:g} s"
             yield ("signal", "tones"), message
     if spec.tracks is not None:
-        if spec.tracks.interval < interval * (1.0 - 1e-9) or spec.tracks.interval > duration:
-            message = f"must lie between the sampling interval, {interval:g} s, and the length of the record, "
-            yield ("tracks", "interval"), f"{message}{duration:g} s"
-        window = spec.tracks.window
-        if window is not None and (window[1] > duration * (1 + 1e-9) or window[1] - window[0] < interval):
+        if not interval * (1.0 - 1e-9) <= spec.tracks.interval <= duration:
+            yield ("tracks", "interval"), f"must lie from the sampling interval, {interval:g} s, to {duration:g} s"
+        low, high = spec.tracks.window or (0.0, duration)
+        if high > duration * (1 + 1e-9) or high - low < interval:
             yield ("tracks", "window"), f"must hold samples of the record, which ends at {duration:g} s"
-    by = None if spec.success is None else spec.success.by
-    if by is not None and by > duration:
+    by = getattr(spec.success, "by", None) or 0.0
+    if by > duration:
         yield ("success", "by"), f"{by:g} s come after the end of the record, {duration:g} s"
 
 
@@ -144,8 +135,7 @@ def _of_online(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
     filled = 2 * options.tones * getattr(options, "h", 0.0) + rows * getattr(options, "d", 0.0)
     filled += getattr(options, "prefilter", 0.0) + getattr(options, "difference", 0.0)
     if filled >= duration:
-        message = f"its delays are filled after {filled:g} s, and the record ends at {duration:g} s; take a smaller h"
-        yield ("h",), message
+        yield ("h",), f"its delays are filled after {filled:g} s, the record ends at {duration:g} s; take a smaller h"
         return
     try:
         with np.errstate(all="ignore"):
@@ -153,7 +143,7 @@ def _of_online(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
     except ArithmeticError:
         yield (), "these values are too large or too small to compute with"
     except ValueError as error:
-        yield _field(error, options), str(error)
+        yield place_of(error, vars(options)), str(error)
 
 
 def _of_batch(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
@@ -161,17 +151,10 @@ def _of_batch(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
     if initial is not None:
         highest = math.pi / clock.interval
         if max(initial) >= highest:
-            message = f"initial_frequencies must be below {highest:.4g} rad/s, pi over the sampling interval"
-            yield ("initial_frequencies",), message
+            yield ("initial_frequencies",), f"must be below {highest:.4g} rad/s, pi over the sampling interval"
         return
     start = options if isinstance(options, Esprit) else Esprit(tones=options.tones, averaging=options.averaging)
     try:
         start.blocks(clock.samples, clock.interval)
     except (ValueError, DataError) as error:
-        yield _field(error, options), str(error)
-
-
-def _field(error: Exception, options: Any) -> KeyPath:
-    """The option that an error is about, if it is about one of them."""
-    field = getattr(error, "field", "")
-    return (field,) if hasattr(options, field) else ()
+        yield place_of(error, vars(options)), str(error)

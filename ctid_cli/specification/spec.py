@@ -143,36 +143,26 @@ class Spec(Section):
     def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
         """Say which sections are missing or too many."""
         present = {name for name in cls.model_fields if raw.get(name) is not None}
-        if "signal" in present:
-            for name in _OF_SYSTEMS:
-                if name in present:
-                    other = "; what is added to a signal is its disturbance" if name == "noise" else ""
-                    message = "belongs to the identification of a system, not to a signal; keep one of the two"
-                    yield (name,), f"{message}{other}"
-            if "sampling" not in present:
-                example = "{kind: regular, interval: 0.001, duration: 60}"
-                yield ("sampling",), f"is missing; a signal needs it, for example {example}"
-        else:
-            for name in ("disturbance", "tracks"):
-                if name in present:
-                    yield (name,), "belongs to a signal, and there is none; add signal, or leave it out"
+        of_other, about = (_OF_SYSTEMS, "system") if "signal" in present else (("disturbance", "tracks"), "signal")
+        for name in of_other:
+            if name in present:
+                other = "; what is added to a signal is its disturbance" if name == "noise" else ""
+                yield (name,), f"belongs to a {about}, and there is none here; leave it out{other}"
+        if "signal" not in present:
             yield from _of_a_record(raw, present) if "data" in present else _of_a_simulation(raw, present)
+        elif "sampling" not in present:
+            yield ("sampling",), "is missing; for example {kind: regular, interval: 0.001, duration: 60}"
         random = _random_section(raw, present)
         if random and "monte_carlo" not in present:
-            yield (
-                ("monte_carlo",),
-                f"is missing, and the {random} is random; add it, for example {{runs: 100, seed: 1}}",
-            )
+            yield ("monte_carlo",), f"is missing, and the {random} is random; for example {{runs: 100, seed: 1}}"
 
     def complaints(self) -> Iterator[Complaint]:
         """Say which estimators are the same."""
         seen: dict[str, str] = {}
         for name, section in self.estimators.items():
-            for variant in variants(section):
-                other = seen.setdefault(canonical_json(variant.values), name)
-                if other != name:
-                    yield ("estimators", name), f"the same settings as {other!r}; its estimates would be the same too"
-                    break
+            others = [seen.setdefault(canonical_json(variant.values), name) for variant in variants(section)]
+            for other in [other for other in others if other != name][:1]:
+                yield ("estimators", name), f"the same settings as {other!r}; its estimates would be the same too"
 
     @property
     def measured(self) -> MeasuredSource | None:
@@ -211,20 +201,13 @@ class Spec(Section):
         """The specification with all defaults, as plain data."""
         return self.model_dump(mode="json")
 
-    def with_runs(self, runs: int) -> Spec:
-        """The same experiment with another number of data sets."""
-        if self.monte_carlo is None:
-            return self
-        return self.model_copy(update={"monte_carlo": self.monte_carlo.model_copy(update={"runs": runs})})
-
 
 def _of_a_record(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complaint]:
     for name in (*_SIMULATED, "noise"):
         if name in present:
             yield (name,), "belongs to simulated data, and 'data' names a measured record; keep one of the two"
     if _given(raw, "loop", "reference") is not None:
-        message = "belongs to simulated data; the reference of a measured record is a column, data.reference"
-        yield ("loop", "reference"), message
+        yield ("loop", "reference"), "belongs to simulated data; that of a record is a column, data.reference"
     column = _given(raw, "data", "reference") is not None
     if column and "loop" not in present:
         yield ("data", "reference"), "needs the controller too; add loop: {controller: {…}}"
@@ -236,15 +219,10 @@ def _of_a_simulation(raw: Mapping[str, Any], present: set[str]) -> Iterator[Comp
     if {"loop", "excitation"} <= present:
         yield ("excitation",), "the loop makes the input; keep one of the two (a reference stands in loop.reference)"
     elif isinstance(raw.get("loop"), Mapping) and raw["loop"].get("reference") is None:
-        example = "{kind: gaussian, standard_deviation: 1.0}"
-        yield ("loop", "reference"), f"is missing; add what the loop is driven by, for example {example}"
+        yield ("loop", "reference"), "is missing; for example {kind: gaussian, standard_deviation: 1.0}"
     missing = [name for name in _SIMULATED if name not in present | ({"excitation"} if "loop" in present else set())]
     if len(missing) == len(_SIMULATED):
-        yield (
-            (),
-            "there are no data: give system, excitation and sampling to simulate them, data for a record, or signal "
-            "and sampling to estimate frequencies",
-        )
+        yield (), "there are no data: give system, excitation and sampling; or data; or signal and sampling"
         return
     for name in missing:
         yield (name,), "is missing; data are simulated with system, excitation (or loop) and sampling"

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +103,13 @@ class YamlSource:
     def problem(self, path: KeyPath, message: str, *, key: bool = False) -> Problem:
         """A problem at a key path."""
         return self.place(path, key=key).problem(path, message)
+
+    def graft(self, path: KeyPath, other: YamlSource, key: Place) -> None:
+        """Take over the places of another text, whose values now stand at a key path."""
+        for places, new in ((self.keys, other.keys | {(): key}), (self.values, other.values)):
+            for old in [p for p in places if p[: len(path)] == path]:
+                del places[old]
+            places.update({path + p: place for p, place in new.items()})
 
     def build(self, node: Any, path: KeyPath = (), parents: tuple[Any, ...] = ()) -> Any:
         """The value of a node; what is wrong with it goes to the problems."""
@@ -239,36 +246,31 @@ def apply_overrides(source: YamlSource, overrides: Iterable[str]) -> None:
 def _apply_override(source: YamlSource, override: str, number: int) -> None:
     key, equals, text = override.partition("=")
     path: KeyPath = tuple(part.strip() for part in key.split("."))
+    here = Place(OVERRIDE_FILE, number, 1)
 
     def refuse(message: str) -> SpecError:
-        return SpecError([Problem(OVERRIDE_FILE, number, 1, key.strip(), f"{message} (in --set {override!r})")])
+        return SpecError([replace(here.problem((), f"{message} (in --set {override!r})"), key=key.strip())])
 
     if not equals or not all(path):
         raise refuse("an override is written key.path=value, for example noise.snr_db=[5,15]")
-    column = len(key) + 2
-    value = parse_yaml(text, OVERRIDE_FILE, line=number, column=column)
-    if not isinstance(source.tree, dict):
-        raise refuse("there is no mapping in the file to set this in")
+    value = parse_yaml(text, OVERRIDE_FILE, line=number, column=len(key) + 2)
     node = source.tree
-    for depth, part in enumerate(path[:-1], start=1):
-        if part not in node and path[0] == "estimators" and depth == 2:
+    for depth, part in enumerate(path):
+        if not isinstance(node, dict):
+            where = f"{path_text(path[:depth])} is not a mapping" if depth else "there is no mapping in the file"
+            raise refuse(f"{where}, so nothing can be set inside it")
+        if depth == len(path) - 1:
+            node[part] = value.tree
+            break
+        if part not in node and path[0] == "estimators" and depth == 1:
             known = ", ".join(sorted(node)) or "none"
             raise refuse(f"there is no estimator {part!r}{did_you_mean(str(part), node)} Estimators here: {known}")
-        if node.setdefault(part, {}) is None:
+        if node.get(part) is None:
             node[part] = {}
         node = node[part]
-        if not isinstance(node, dict):
-            raise refuse(f"{path_text(path[:depth])} is not a mapping, so nothing can be set inside it")
         for places in (source.keys, source.values):
-            places.setdefault(path[:depth], Place(OVERRIDE_FILE, number, 1))
-    node[path[-1]] = value.tree
-    for places in (source.keys, source.values):
-        for old in [p for p in places if p[: len(path)] == path]:
-            del places[old]
-    source.keys[path] = Place(OVERRIDE_FILE, number, 1)
-    source.values[path] = Place(OVERRIDE_FILE, number, column)
-    source.keys.update({path + p: place for p, place in value.keys.items()})
-    source.values.update({path + p: place for p, place in value.values.items()})
+            places.setdefault(path[: depth + 1], here)
+    source.graft(path, value, here)
 
 
 def _syntax_message(error: yaml.MarkedYAMLError) -> str:
