@@ -10,7 +10,14 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.models.transfer_function import ContinuousModel, TransferFunction, sorted_roots
+from ctid_cli.models.transfer_function import (
+    ContinuousModel,
+    TransferFunction,
+    checked_delay,
+    polynomials,
+    set_fields,
+    sorted_roots,
+)
 from ctid_cli.signals.checks import require_integer
 
 #: Poles nearer to each other than this fraction of their magnitude count as one: a double root of rounded coefficients
@@ -47,15 +54,11 @@ class Term:
     integrators: int = 0
 
     def __post_init__(self) -> None:
-        require_integer("poles", self.poles, 0, label="the number of poles of a submodel")
-        require_integer("zeros", self.zeros, 0, label="the number of zeros of a submodel")
-        require_integer("integrators", self.integrators, 0, label="the number of integrators of a submodel")
+        for name in ("poles", "zeros", "integrators"):
+            require_integer(name, getattr(self, name), 0, label=f"the number of {name} of a submodel")
         if self.zeros > self.order:
-            raise OptionError(
-                "zeros",
-                f"a submodel must not have more zeros than poles; got {self.zeros} zeros and {self.order} poles "
-                "(integrators included).",
-            )
+            given = f"{self.zeros} zeros and {self.order} poles, integrators included"
+            raise OptionError("zeros", f"a submodel must not have more zeros than poles; got {given}")
 
     @property
     def order(self) -> int:
@@ -104,35 +107,15 @@ class Submodel(ContinuousModel):
     integrators: int = 0
 
     def __init__(self, numerator: ArrayLike, denominator: ArrayLike, integrators: int = 0) -> None:
-        b = np.atleast_1d(np.array(numerator, dtype=float))
-        a = np.atleast_1d(np.array(denominator, dtype=float))
-        if a.ndim != 1 or b.ndim != 1 or not a.size or not b.size:
-            raise DataError("numerator and denominator must be lists of coefficients in descending powers of p")
-        if not (np.isfinite(a).all() and np.isfinite(b).all()):
-            raise DataError("a coefficient of a submodel is not a finite number")
-        if a[0] == 0:
-            raise DataError(
-                "the first denominator coefficient of a submodel is zero; drop leading zeros", "denominator"
-            )
+        b, a = polynomials(numerator, denominator, "a submodel", "p")
         if a[-1] == 0:
-            raise DataError(
-                "the last denominator coefficient of a submodel is zero; give poles at the origin as integrators",
-                "denominator",
-            )
+            text = "the last denominator coefficient of a submodel is zero; give poles at the origin as integrators"
+            raise DataError(text, "denominator")
         require_integer("integrators", integrators, 0, label="the number of integrators of a submodel")
         if b.size > a.size + integrators:
-            raise DataError(
-                f"a submodel with more zeros ({b.size - 1}) than poles ({a.size - 1 + integrators}) has no response to "
-                "a jump; give it fewer numerator coefficients",
-                "numerator",
-            )
-        b = b / a[-1]
-        a = a / a[-1]
-        b.setflags(write=False)
-        a.setflags(write=False)
-        object.__setattr__(self, "numerator", b)
-        object.__setattr__(self, "denominator", a)
-        object.__setattr__(self, "integrators", int(integrators))
+            counts = f"more zeros ({b.size - 1}) than poles ({a.size - 1 + integrators})"
+            raise DataError(f"a submodel with {counts} has no response to a jump", "numerator")
+        set_fields(self, numerator=b / a[-1], denominator=a / a[-1], integrators=int(integrators))
 
     def term(self) -> Term:
         """Structure of the submodel.
@@ -167,9 +150,7 @@ class Submodel(ContinuousModel):
     @property
     def natural_frequency(self) -> float:
         """Least magnitude of the poles [rad/s]: 0 with integrators, infinite for a pure gain."""
-        if not self.order:
-            return float("inf")
-        return float(np.abs(self.poles).min())
+        return float(np.abs(self.poles).min(initial=np.inf))
 
     @property
     def dc_gain(self) -> float:
@@ -231,11 +212,8 @@ class AdditiveModel(ContinuousModel):
         terms = tuple(submodels)
         if not terms:
             raise DataError("an additive model needs at least one submodel")
-        if not (np.isfinite(delay) and delay >= 0):
-            raise DataError(f"a delay must be a finite number of seconds, zero or more; got {delay}")
         _require_identifiable(terms)
-        object.__setattr__(self, "submodels", terms)
-        object.__setattr__(self, "delay", float(delay))
+        set_fields(self, submodels=terms, delay=checked_delay(delay))
 
     @classmethod
     def from_theta(cls, theta: ArrayLike, terms: Sequence[Term], delay: float = 0.0) -> AdditiveModel:
@@ -364,8 +342,8 @@ def _require_identifiable(submodels: tuple[Submodel, ...]) -> None:
     biproper = [f"g{i}" for i, submodel in enumerate(submodels, 1) if submodel.relative_degree == 0]
     if len(biproper) > 1:
         raise DataError(
-            f"{' and '.join(biproper)} have as many zeros as poles each; only one submodel may, since the direct "
-            "feedthrough could be split between them at will. Give the others fewer numerator coefficients."
+            f"{' and '.join(biproper)} have as many zeros as poles each; only one submodel may, or the direct "
+            "feedthrough could be split between them at will"
         )
     poles = [submodel.poles for submodel in submodels]
     for j, second in enumerate(poles):
@@ -373,7 +351,4 @@ def _require_identifiable(submodels: tuple[Submodel, ...]) -> None:
             shared = same_pole(first[:, None], second).any(axis=1)
             if shared.any():
                 place = pole_text(complex(first[np.argmax(shared)]))
-                raise DataError(
-                    f"g{i + 1} and g{j + 1} have the pole {place} in common; submodels must not share poles, "
-                    "integrators included. Put that pole into one of them."
-                )
+                raise DataError(f"g{i + 1} and g{j + 1} have the pole {place} in common; put it into one of them")

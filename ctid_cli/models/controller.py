@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
-from ctid_cli.models.transfer_function import sorted_roots
+from ctid_cli.models.transfer_function import monic, polynomials, set_fields, sorted_roots
 from ctid_cli.signals.checks import require_finite, require_positive
 
 
@@ -40,28 +40,11 @@ class DiscreteController:
     denominator: Array
 
     def __init__(self, numerator: ArrayLike, denominator: ArrayLike) -> None:
-        b = np.atleast_1d(np.array(numerator, dtype=float))
-        a = np.atleast_1d(np.array(denominator, dtype=float))
-        if a.ndim != 1 or b.ndim != 1 or not a.size or not b.size:
-            raise DataError("numerator and denominator must be lists of coefficients in descending powers of q")
-        if not (np.isfinite(a).all() and np.isfinite(b).all()):
-            raise DataError("a coefficient of the controller is not a finite number")
-        if a[0] == 0:
-            raise DataError(
-                "the first denominator coefficient of the controller is zero; drop leading zeros", "denominator"
-            )
-        b = np.trim_zeros(b, "f")
-        b = (b if b.size else np.zeros(1)) / a[0]
-        a = a / a[0]
+        b, a = monic(*polynomials(numerator, denominator, "the controller", "q"))
         if b.size > a.size:
-            raise DataError(
-                f"a controller with more zeros ({b.size - 1}) than poles ({a.size - 1}) would need samples of the "
-                "future; give the denominator at least as many coefficients as the numerator"
-            )
-        b.setflags(write=False)
-        a.setflags(write=False)
-        object.__setattr__(self, "numerator", b)
-        object.__setattr__(self, "denominator", a)
+            counts = f"more zeros ({b.size - 1}) than poles ({a.size - 1})"
+            raise DataError(f"a controller with {counts} would need samples of the future; give fewer numerator terms")
+        set_fields(self, numerator=b, denominator=a)
 
     @classmethod
     def from_pid(cls, kp: float, ki: float, kd: float) -> DiscreteController:
@@ -95,12 +78,9 @@ class DiscreteController:
             require_finite(name, gain, "input unit/output unit")
         summing = np.array([1.0, -1.0]) if ki else np.ones(1)
         lag = np.array([1.0, 0.0]) if kd else np.ones(1)
-        numerator: NDArray[np.floating] = kp * np.polymul(summing, lag)
-        if ki:
-            numerator = np.polyadd(numerator, np.polymul([ki, 0.0], lag))
-        if kd:
-            numerator = np.polyadd(numerator, np.polymul([kd, -kd], summing))
-        return cls(numerator, np.polymul(summing, lag))
+        denominator = np.polymul(summing, lag)
+        integrating, differencing = np.polymul([ki, 0.0], lag), np.polymul([kd, -kd], summing)
+        return cls(np.polyadd(np.polyadd(kp * denominator, integrating), differencing), denominator)
 
     @property
     def order(self) -> int:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import TypeVar
 
 import numpy as np
@@ -22,10 +23,6 @@ from ctid_cli.models.additive import AdditiveModel, Submodel, Term, pole_text, s
 from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
 
 Number = TypeVar("Number", np.float64, np.complex128)
-
-
-class FactoringError(DataError):
-    """A transfer function that is no sum of submodels of the structure asked for, and why."""
 
 
 def unfactored(model: AdditiveModel) -> TransferFunction:
@@ -62,31 +59,30 @@ def unfactored_jacobian(model: AdditiveModel) -> Array:
 
 
 def factored(model: TransferFunction, terms: Sequence[Term] | None = None) -> AdditiveModel:
-    r"""Partial fractions of a transfer function, collected into submodels."""
+    r"""Partial fractions of a transfer function, collected into submodels by rising natural frequency."""
     fractions = _partial_fractions(model)
-    submodels = []
-    for group in _groups(fractions, terms):
-        a, b, _, _ = _collected(fractions, group)
-        submodels.append(Submodel(b[::-1], a[::-1], group.integrators))
-    return AdditiveModel(submodels, model.delay)
+    submodels = [_collected(fractions, group) for group in _groups(fractions, terms)]
+    return AdditiveModel(submodels, model.delay).sorted()
 
 
-def factored_jacobian(model: TransferFunction, terms: Sequence[Term] | None = None) -> Array:
-    r"""Derivatives of the parameters of :func:`factored` with respect to the coefficients of the transfer function.
+def factored_jacobian(
+    model: TransferFunction, terms: Sequence[Term] | None = None, coefficients: int | None = None
+) -> Array:
+    r"""Derivatives of the parameters of :func:`factored` by the coefficients ``a_1 … a_n, b_m … b_0`` of the fraction.
 
-    From ``A(p) = 0`` and ``r = B(p)/A'(p)``,
-
-    .. math:: dp = -\frac{dA(p)}{A'(p)}, \qquad
-              dr = \frac{dB(p) + B'(p)\,dp - r\,(dA'(p) + A''(p)\,dp)}{A'(p)},
-
-    and ``A''(p_k)/A'(p_k)`` is twice the sum of ``1/(p_k - p_j)`` over the other poles.
+    Factoring undoes the sum of submodels whose numerators have full length, so they are the inverse of those of the
+    sum. This holds for numerators of any length: of a full one the last ``coefficients`` are those of the model, or as
+    many as are estimated. Poles at the origin stay there: their coefficients are not moved.
     """
-    fractions = _partial_fractions(model)
-    rows = []
-    for group in _groups(fractions, terms):
-        _, _, from_a, from_b = _collected(fractions, group)
-        rows += [from_a[1:], from_b]
-    return np.concatenate(rows)
+    n = model.order
+    away = int(np.flatnonzero(model.denominator)[-1])
+    there = np.delete(unfactored_jacobian(factored(model, terms)), np.s_[away:n], axis=0)
+    # Units of the coefficients may differ by hundreds of decades.
+    rows = np.abs(there).max(axis=1, keepdims=True)
+    columns = np.abs(there / rows).max(axis=0)
+    back = np.linalg.inv(there / rows / columns) / columns[:, None] / rows[:, 0]
+    last = model.numerator.size if coefficients is None else coefficients
+    return np.hstack((back[:, :away], np.zeros((back.shape[0], n - away)), back[:, back.shape[1] - last :]))
 
 
 def pole_jacobian(denominator: ArrayLike, poles: ArrayLike) -> ComplexArray:
@@ -126,7 +122,7 @@ def _joined(submodels: Sequence[Submodel]) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class _PartialFractions:
-    """The terms of the sum at the head of this file, each with its derivatives by ``a_1 … a_n, b_0 … b_m``.
+    """The terms of the sum at the head of this file.
 
     Complex pairs come first, at places k and ``pairs + k``, then real poles; both kinds from the slowest on.
     """
@@ -136,10 +132,6 @@ class _PartialFractions:
     gains: ComplexArray
     at_origin: Array
     direct: Array  # one value, or none if the model is strictly proper
-    poles_slope: ComplexArray
-    gains_slope: ComplexArray
-    at_origin_slope: Array
-    direct_slope: Array
 
 
 @dataclass(frozen=True)
@@ -153,165 +145,78 @@ class _Group:
 
 def _partial_fractions(model: TransferFunction) -> _PartialFractions:
     if model.relative_degree < 0:
-        raise FactoringError("a model with more zeros than poles is no sum of submodels")
-    n, m = model.order, model.numerator.size - 1
+        raise DataError("a model with more zeros than poles is no sum of submodels")
     a, b = model.denominator, model.numerator
     away = np.trim_zeros(a, "b")
     origin = a.size - away.size
-    pairs, p = _poles(away)
+    roots = sorted_roots(away)[::-1]
+    upper = roots[roots.imag > 0]
+    p = np.concatenate((upper, upper.conj(), roots[roots.imag == 0]))
     close = same_pole(p[:, None], p) & ~np.eye(p.size, dtype=bool)
     if close.any():
         place = pole_text(complex(p[np.argmax(close.any(axis=1))]))
-        raise FactoringError(
-            f"the pole {place} is repeated: partial fractions over distinct poles do not exist. A model with fewer "
-            "poles may do."
-        )
-    slope = p**origin * _slope_at_roots(p)
-    residues = np.polyval(b, p) / slope
-    bending = 2 * (1.0 / (p[:, None] - p + np.eye(p.size)) - np.eye(p.size)).sum(axis=1) + 2 * origin / p
-    # Derivatives: columns a_1 … a_n (those of the origin's zero coefficients stay zero), then b_0 … b_m.
-    moved_p = np.zeros((p.size, n + m + 1), dtype=complex)
-    moved_p[:, : p.size] = pole_jacobian(away, p)
-    moved_r = (np.polyval(np.polyder(b), p) / slope - residues * bending)[:, None] * moved_p
-    powers = np.arange(n - 1, origin - 1, -1)
-    moved_r[:, : p.size] -= (residues / slope)[:, None] * powers * p[:, None] ** np.maximum(powers - 1, 0)
-    moved_r[:, n:] += p[:, None] ** np.arange(m, -1, -1) / slope[:, None]
-
-    at_origin, moved_origin = _powers_at_origin(b, away, origin)
+        raise DataError(f"the pole {place} is repeated: there are no partial fractions; use a model with fewer poles")
+    residues = np.polyval(b, p) / (p**origin * _slope_at_roots(p))
+    at_origin = np.zeros(0)
+    if origin:
+        # The power series of s^l G(s), by long division in rising powers.
+        rising = np.concatenate((b[::-1], np.zeros(model.order)))[: model.order]
+        at_origin = np.polydiv(rising, away[::-1])[0][:origin]
     direct = b[:1] if model.relative_degree == 0 else b[:0]
-    moved_direct = np.zeros((direct.size, n + m + 1))
-    moved_direct[:, n] = 1.0
-    return _PartialFractions(
-        pairs,
-        p,
-        -residues / p,
-        at_origin,
-        direct,
-        moved_p,
-        -moved_r / p[:, None] + (residues / p**2)[:, None] * moved_p,
-        moved_origin,
-        moved_direct,
-    )
-
-
-def _poles(a: Array) -> tuple[int, ComplexArray]:
-    """Number of complex pairs, and the roots as :class:`_PartialFractions` orders them."""
-    roots = sorted_roots(a)[::-1]
-    upper = roots[roots.imag > 0]
-    return upper.size, np.concatenate((upper, upper.conj(), roots[roots.imag == 0]))
-
-
-def _powers_at_origin(b: Array, away: Array, origin: int) -> tuple[Array, Array]:
-    """``c_0 … c_(l-1)``, the power series of ``s^l G(s)`` at the origin, and their derivatives."""
-    poles = away.size - 1
-    moved = np.zeros((origin, poles + origin + b.size))
-    if not origin:
-        return np.zeros(0), moved
-    inverse = np.zeros(origin)
-    remainder = np.eye(1, origin)[0]
-    for k in range(origin):
-        inverse[k] = remainder[k] / away[-1]
-        covered = away[::-1][: origin - k]
-        remainder[k : k + covered.size] -= inverse[k] * covered
-    series = np.convolve(inverse, b[::-1])[:origin]
-    quotient = np.convolve(inverse, series)
-    for i in range(poles):
-        moved[:, i] = -_shifted(quotient, poles - 1 - i, poles + quotient.size)[:origin]
-    for j in range(b.size):
-        moved[:, poles + origin + j] = _shifted(inverse, b.size - 1 - j, b.size + origin)[:origin]
-    return series, moved
+    return _PartialFractions(upper.size, p, -residues / p, at_origin, direct)
 
 
 def _groups(fractions: _PartialFractions, terms: Sequence[Term] | None) -> list[_Group]:
-    """Which terms of the sum form a submodel, in order of rising natural frequency."""
-    pairs, integrators = fractions.pairs, fractions.at_origin.size
-    real = range(2 * pairs, fractions.poles.size)
-    if terms is None:
-        groups = [_Group((k, pairs + k)) for k in range(pairs)] + [_Group((k,)) for k in real]
-        if integrators:
-            groups.append(_Group((), integrators))
-        if fractions.direct.size:
-            groups.append(_Group((), 0, True))
-    else:
-        groups = _groups_of_terms(fractions, terms)
-
-    def natural_frequency(group: _Group) -> float:
-        return 0.0 if group.integrators else min((abs(fractions.poles[k]) for k in group.places), default=np.inf)
-
-    return sorted(groups, key=natural_frequency)
-
-
-def _groups_of_terms(fractions: _PartialFractions, terms: Sequence[Term]) -> list[_Group]:
+    """Which terms of the sum form a submodel."""
     pairs, n, integrators = fractions.pairs, fractions.poles.size, fractions.at_origin.size
+    couples, lone = [(k, pairs + k) for k in range(pairs)], range(2 * pairs, n)
+    if terms is None:
+        groups = [_Group(couple) for couple in couples] + [_Group((k,)) for k in lone]
+        groups += [_Group((), integrators)] * (integrators > 0)
+        return groups + [_Group((), 0, True)] * fractions.direct.size
     asked = sum(term.poles for term in terms), sorted(term.integrators for term in terms if term.integrators)
     if asked != (n, [integrators] * (integrators > 0)):
-        raise FactoringError(
+        raise DataError(
             f"the terms have {asked[0]} poles and {sum(asked[1])} integrators, the latter in {len(asked[1])} of them; "
             f"the model has {n} poles and {integrators} at the origin, which one term must take together"
         )
     room = sum(term.poles // 2 for term in terms)
     if pairs > room:
-        raise FactoringError(
-            f"the model has {pairs} complex pairs of poles, and the terms have room for {room}; let more terms have "
-            "two poles"
+        raise DataError(
+            f"the model has {pairs} complex pairs of poles, the terms room for {room}; let more have two poles"
         )
-    places: list[list[int]] = [[] for _ in terms]
-    waiting = list(range(pairs))
-    for taken, term in zip(places, terms, strict=True):
-        while waiting and term.poles - len(taken) >= 2:
-            k = waiting.pop(0)
-            taken += [k, pairs + k]
-    waiting = list(range(2 * pairs, n))
-    for taken, term in zip(places, terms, strict=True):
-        while len(taken) < term.poles:
-            taken.append(waiting.pop(0))
-    biproper = [term.zeros == term.order for term in terms]
-    if fractions.direct.size and sum(biproper) != 1:
-        raise FactoringError(
-            "the model has as many zeros as poles: exactly one term must have as many zeros as poles, to take its "
-            f"direct feedthrough; {sum(biproper)} of the terms have"
+    direct = [fractions.direct.size > 0 and term.zeros == term.order for term in terms]
+    if fractions.direct.size != sum(direct):
+        raise DataError(
+            "the model has as many zeros as poles, so exactly one term must too, to take its direct feedthrough; "
+            f"{sum(direct)} of the terms have"
         )
+    left, alone = iter(couples), iter(lone)
+    taken = [[k for couple in islice(left, term.poles // 2) for k in couple] for term in terms]
     return [
-        _Group(tuple(taken), term.integrators, bool(fractions.direct.size) and direct)
-        for taken, term, direct in zip(places, terms, biproper, strict=True)
+        _Group((*places, *islice(alone, term.poles - len(places))), term.integrators, takes)
+        for places, term, takes in zip(taken, terms, direct, strict=True)
     ]
 
 
-def _collected(fractions: _PartialFractions, group: _Group) -> tuple[Array, Array, Array, Array]:
-    """Denominator and numerator of one submodel, constant term first, and their derivatives, one row each."""
+def _collected(fractions: _PartialFractions, group: _Group) -> Submodel:
+    """The terms of one submodel over their common denominator."""
     places, shift = list(group.places), group.integrators
-    p, g = fractions.poles[places], fractions.gains[places]
-    T = -1.0 / p
-    moved_T = fractions.poles_slope[places] / p[:, None] ** 2
-    moved_g = fractions.gains_slope[places]
+    T, g = -1.0 / fractions.poles[places], fractions.gains[places]
     size = T.size + shift + 1
 
-    def product(*left_out: int) -> ComplexArray:
+    def product(left_out: int | None = None) -> ComplexArray:
         result = np.ones(1, dtype=complex)
         for k in range(T.size):
-            if k not in left_out:
+            if k != left_out:
                 result = np.convolve(result, [1.0, T[k]])
         return result
 
-    a = product()
-    b = np.zeros(size, dtype=complex)
-    moved_a = np.zeros((size, moved_g.shape[1]), dtype=complex)
-    moved_b = np.zeros_like(moved_a)
+    # Constant terms first. What multiplies the whole denominator: the powers of 1/s and the direct feedthrough.
+    a, b = product(), np.zeros(size, dtype=complex)
     for k in range(T.size):
-        rest = product(k)
-        b += g[k] * _shifted(rest, shift, size)
-        moved_a += np.outer(_shifted(rest, 1, size), moved_T[k])
-        moved_b += np.outer(_shifted(rest, shift, size), moved_g[k])
-        for j in range(T.size):
-            if j != k:
-                moved_b += g[k] * np.outer(_shifted(product(k, j), shift + 1, size), moved_T[j])
-    # What multiplies the whole denominator: the powers of 1/s and the direct feedthrough.
-    whole = [(fractions.at_origin[j], fractions.at_origin_slope[j], j) for j in range(shift)]
-    if group.direct:
-        whole.append((fractions.direct[0], fractions.direct_slope[0], shift))
-    for value, slope, places_up in whole:
-        b += value * _shifted(a, places_up, size)
-        moved_b += np.outer(_shifted(a, places_up, size), slope)
-        moved_b[places_up:] += value * moved_a[: size - places_up]
+        b += g[k] * _shifted(product(k), shift, size)
+    for k, value in enumerate((*fractions.at_origin[:shift], *fractions.direct[: int(group.direct)])):
+        b += value * _shifted(a, k, size)
     length = size if group.direct else size - 1
-    return a.real, b.real[:length], moved_a.real[: T.size + 1], moved_b.real[:length]
+    return Submodel(b.real[:length][::-1], a.real[::-1], shift)

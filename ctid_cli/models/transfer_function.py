@@ -62,24 +62,8 @@ class TransferFunction(ContinuousModel):
     delay: float = 0.0
 
     def __init__(self, numerator: ArrayLike, denominator: ArrayLike, delay: float = 0.0) -> None:
-        b = np.atleast_1d(np.array(numerator, dtype=float))
-        a = np.atleast_1d(np.array(denominator, dtype=float))
-        if a.ndim != 1 or b.ndim != 1 or not a.size or not b.size:
-            raise DataError("numerator and denominator must be lists of coefficients in descending powers of s")
-        if not (np.isfinite(a).all() and np.isfinite(b).all()):
-            raise DataError("a coefficient of the transfer function is not a finite number")
-        if a[0] == 0:
-            raise DataError("the first denominator coefficient is zero; drop leading zeros", "denominator")
-        if not (np.isfinite(delay) and delay >= 0):
-            raise DataError(f"a delay must be a finite number of seconds, zero or more; got {delay}")
-        b = np.trim_zeros(b, "f")
-        b = (b if b.size else np.zeros(1)) / a[0]
-        a = a / a[0]
-        b.setflags(write=False)
-        a.setflags(write=False)
-        object.__setattr__(self, "numerator", b)
-        object.__setattr__(self, "denominator", a)
-        object.__setattr__(self, "delay", float(delay))
+        b, a = monic(*polynomials(numerator, denominator, "the transfer function", "s"))
+        set_fields(self, numerator=b, denominator=a, delay=checked_delay(delay))
 
     @property
     def order(self) -> int:
@@ -122,3 +106,36 @@ def sorted_roots(coefficients: Array) -> ComplexArray:
     """Roots of a polynomial, largest magnitude first."""
     roots = np.asarray(np.roots(coefficients), dtype=complex)
     return roots[np.lexsort((roots.imag, -np.abs(roots)))]
+
+
+def polynomials(numerator: ArrayLike, denominator: ArrayLike, owner: str, variable: str) -> tuple[Array, Array]:
+    """Coefficients of a fraction, refused where they form none."""
+    b, a = (np.atleast_1d(np.array(part, dtype=float)) for part in (numerator, denominator))
+    if a.ndim != 1 or b.ndim != 1 or not a.size or not b.size:
+        raise DataError(f"numerator and denominator must be lists of coefficients in descending powers of {variable}")
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        raise DataError(f"a coefficient of {owner} is not a finite number")
+    if a[0] == 0:
+        raise DataError(f"the first denominator coefficient of {owner} is zero; drop leading zeros", "denominator")
+    return b, a
+
+
+def monic(b: Array, a: Array) -> tuple[Array, Array]:
+    """A fraction over the leading coefficient of its denominator, without leading zeros of the numerator."""
+    b = np.trim_zeros(b, "f")
+    return (b if b.size else np.zeros(1)) / a[0], a / a[0]
+
+
+def checked_delay(delay: float) -> float:
+    """A delay, refused where it is negative or not finite."""
+    if not (np.isfinite(delay) and delay >= 0):
+        raise DataError(f"a delay must be a finite number of seconds, zero or more; got {delay}")
+    return float(delay)
+
+
+def set_fields(instance: object, **values: object) -> None:
+    """Set the fields of a frozen instance; arrays can no longer be written to."""
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+        object.__setattr__(instance, name, value)

@@ -81,7 +81,7 @@ def test_model_never_changes():
         ([[1.0]], [1.0, 2.0], 0.0, "lists of coefficients in descending powers"),
         ([1.0], [1.0, np.nan], 0.0, "not a finite number"),
         ([np.inf], [1.0, 2.0], 0.0, "not a finite number"),
-        ([1.0], [0.0, 2.0], 0.0, "first denominator coefficient is zero"),
+        ([1.0], [0.0, 2.0], 0.0, "first denominator coefficient of the transfer function is zero"),
         ([1.0], [1.0, 2.0], -0.5, "zero or more; got -0.5"),
         ([1.0], [1.0, 2.0], np.nan, "a finite number of seconds"),
     ],
