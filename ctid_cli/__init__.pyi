@@ -39,7 +39,7 @@ from .estimators.delay_profile import MeasuredFit as MeasuredFit
 from .estimators.useful_redundancy import RedundantFit as RedundantFit
 from .inference.status import Status as Status
 from .inference.diagnostics import fit_percent as fit_percent
-from .inference.cramer_rao import cramer_rao_bound as cramer_rao_bound
+from .inference.finite_record import cramer_rao_bound as cramer_rao_bound
 
 # Useful redundancy for a cost of one's own
 from .filtering.lowpass import Lowpass as Lowpass

@@ -128,7 +128,7 @@ def _covariance(problem: AdditiveProblem, theta: Array, equations: Equations, ki
     if rows is None:
         return np.full((theta.size, theta.size), np.nan)
     psi, _, error, _ = rows
-    return sandwich_covariance(psi, error, regular=problem.data.interval > 0.0)
+    return sandwich_covariance([psi], [error], regular=problem.data.interval > 0.0)
 
 
 def _loop_radius(problem: AdditiveProblem, theta: Array) -> float:

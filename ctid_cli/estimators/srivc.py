@@ -147,7 +147,7 @@ class Srivc(Estimator[SampledProblem | AdditiveProblem, Fit]):
         rows = standard_rows(problem.data, *problem.split(result.theta))
         psi = rows[:, structure.sensitivity_rows] * structure.signs
         regular = problem.data.interval > 0.0
-        return replace(fit, covariance=sandwich_covariance(psi, rows[:, structure.error_row], regular=regular))
+        return replace(fit, covariance=sandwich_covariance([psi], [rows[:, structure.error_row]], regular=regular))
 
     def _as_submodel(self, problem: AdditiveProblem, theta: Array, structure: Structure) -> Fit:
         """Estimate a sum of one submodel; coefficients and covariance are converted to the monic form."""

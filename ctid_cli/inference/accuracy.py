@@ -10,7 +10,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.models.additive import AdditiveModel, Term
-from ctid_cli.models.factoring import FactoringError, factored, unfactored_jacobian
+from ctid_cli.models.factoring import factored, factored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 
 
@@ -25,6 +25,18 @@ class ParameterAccuracy:
     #: Covariance of their estimates, shape (p, p).
     covariance: Array
 
+    @classmethod
+    def of(
+        cls, model: AdditiveModel | TransferFunction, covariance: Array, zeros: int | None = None, delay: bool = False
+    ) -> ParameterAccuracy:
+        """Accuracy of the parameters of a model, or of a fraction with more zeros or with its delay estimated too."""
+        if isinstance(model, AdditiveModel):
+            return cls(model, model.names, model.theta, covariance)
+        own = model.numerator.size - 1
+        m = own if zeros is None else zeros
+        parts = [model.denominator[1:], np.zeros(m - own), model.numerator, np.full(int(delay), model.delay)]
+        return cls(model, Structure(model.order, m, delay).names, np.concatenate(parts), covariance)
+
     @property
     def standard_errors(self) -> Array:
         """Square roots of the variances, in the units of the parameters, shape (p,)."""
@@ -32,48 +44,15 @@ class ParameterAccuracy:
         return errors
 
     def factored(self, terms: Sequence[Term] | None = None) -> ParameterAccuracy:
-        """Accuracy of the sum of submodels into which an estimated transfer function is factored.
-
-        By the delta method. Factoring undoes the sum of submodels whose numerators have full length, so its derivatives
-        are the inverse of those of the sum; this holds for estimated numerators of any length.
-        """
+        """Accuracy of the submodels into which an estimated transfer function is factored, by the delta method."""
         if isinstance(self.model, AdditiveModel):
             return self
         additive = factored(self.model, terms)
-        n = self.model.order
-        delays = int(self.names[-1:] == ("delay",))
-        coefficients = len(self.names) - n - delays
-        inverse = np.linalg.inv(unfactored_jacobian(additive))
-        if n + coefficients > inverse.shape[1]:
-            raise FactoringError(
-                "the estimated numerator has the degree of the denominator, and the true one a lower one: submodels of "
-                "the true system leave no room for a direct feedthrough"
-            )
-        # Of a numerator of full length the last coefficients are estimated; the delay is the same in both forms.
-        columns = np.r_[:n, inverse.shape[1] - coefficients : inverse.shape[1]]
-        size = inverse.shape[0]
+        # The delay is the same in both forms.
+        own = len(self.names) - int(self.names[-1] == "delay")
+        size, delays = additive.theta.size, len(self.names) - own
         jacobian = np.zeros((size + delays, len(self.names)))
-        jacobian[:size, : n + coefficients] = inverse[:, columns]
-        jacobian[size:, n + coefficients :] = np.eye(delays)
-        return ParameterAccuracy(
-            additive,
-            additive.names + self.names[len(self.names) - delays :],
-            np.concatenate([additive.theta, self.values[len(self.names) - delays :]]),
-            jacobian @ self.covariance @ jacobian.T,
-        )
-
-
-def estimated_parameters(
-    model: AdditiveModel | TransferFunction, zeros: int | None = None, *, delay: bool = False
-) -> tuple[tuple[str, ...], Array]:
-    """Names and true values of what is estimated."""
-    if isinstance(model, AdditiveModel):
-        if zeros is not None or delay:
-            raise ValueError("an additive model has its degrees in its terms and a known delay; leave both out")
-        return model.names, model.theta
-    own = model.numerator.size - 1
-    m = own if zeros is None else zeros
-    if not own <= m <= model.order:
-        raise ValueError(f"zeros must be from {own}, as the model has, to its {model.order} poles; got {zeros}")
-    parts = [model.denominator[1:], np.zeros(m - own), model.numerator, np.full(int(delay), model.delay)]
-    return Structure(model.order, m, delay).names, np.concatenate(parts)
+        jacobian[:size, :own] = factored_jacobian(self.model, terms, own - self.model.order)
+        jacobian[size:, own:] = np.eye(delays)
+        names, values = additive.names + self.names[own:], np.concatenate([additive.theta, self.values[own:]])
+        return ParameterAccuracy(additive, names, values, jacobian @ self.covariance @ jacobian.T)

@@ -6,6 +6,9 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 
+#: Beyond this condition number the inverse holds no correct digit: NaN says so, a tidy number would not.
+LARGEST_CONDITION = 1e14
+
 
 def white_noise_covariance(hessian: Array, squared_error: float, count: int) -> Array:
     r"""Covariance ``s^2 (sum psi psi')^-1`` with ``s^2 = sum eps^2 / (N - p)``.
@@ -14,21 +17,26 @@ def white_noise_covariance(hessian: Array, squared_error: float, count: int) -> 
     variables then are as good as maximum likelihood, so this is also the Cramér-Rao bound with the estimated variance.
     """
     size = hessian.shape[0]
-    undefined = np.full((size, size), np.nan)
-    diagonal = np.diag(hessian)
-    if count <= size or not np.isfinite(hessian).all() or (diagonal <= 0).any():
-        return undefined
-    scale = 1.0 / np.sqrt(diagonal)
-    correlation = hessian * np.outer(scale, scale)
-    # Beyond 1/eps the inverse holds no correct digit: NaN says so, a tidy number would not.
-    if condition_number(hessian) > 1e14:
-        return undefined
-    try:
-        inverse = np.linalg.inv(correlation)
-    except np.linalg.LinAlgError:
-        return undefined
+    found = unit_inverse(hessian) if count > size else None
+    if found is None:
+        return np.full((size, size), np.nan)
+    inverse, scale = found
     covariance: Array = inverse * np.outer(scale, scale) * squared_error / (count - size)
     return 0.5 * (covariance + covariance.T)
+
+
+def sandwich(inverse: Array, scale: Array, middle: Array, left: float = 1.0) -> Array:
+    """``M^-1 Sigma M^-1`` over a divisor, from what `unit_inverse` makes of M and from Sigma in its units."""
+    covariance: Array = inverse @ middle @ inverse * np.outer(scale, scale) / left
+    return 0.5 * (covariance + covariance.T)
+
+
+def unit_inverse(hessian: Array) -> tuple[Array, Array] | None:
+    """Inverse of ``sum psi psi'`` with unit diagonal, and the scales of psi that make it so; None if singular."""
+    if not condition_number(hessian) <= LARGEST_CONDITION:
+        return None
+    scale = 1.0 / np.sqrt(np.diag(hessian))
+    return np.asarray(np.linalg.inv(hessian * np.outer(scale, scale))), scale
 
 
 def condition_number(hessian: Array) -> float:

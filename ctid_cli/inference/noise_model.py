@@ -53,23 +53,18 @@ class NoiseModel:
         return product
 
 
-def fit_noise_model(residuals: Array | Sequence[Array], max_order: int | None = None) -> NoiseModel:
+def fit_noise_model(blocks: Sequence[Array], max_order: int | None = None) -> NoiseModel:
     """Yule-Walker model of the noise, of the order that Akaike's criterion chooses.
 
     The autocovariances are ``sum v(t) v(t - lag) / N``, about a mean of zero; no product reaches from one experiment
     into another. An ARMA noise is approximated: the order grows with the record.
     """
-    blocks = [residuals] if isinstance(residuals, np.ndarray) else list(residuals)
     count = sum(block.size for block in blocks)
     if max_order is None:
         max_order = min(int(10 * np.log10(max(count, 1))), count // 4)
-    covariances = np.array(
-        [
-            sum(float(block[lag:] @ block[: max(block.size - lag, 0)]) for block in blocks)
-            for lag in range(max_order + 1)
-        ]
-    )
-    covariances /= max(count, 1)
+    lags = range(max_order + 1)
+    products = [sum(float(block[k:] @ block[: max(block.size - k, 0)]) for block in blocks) for k in lags]
+    covariances = np.array(products) / max(count, 1)
     coefficients = np.ones(1)
     variance = float(covariances[0])
     best = NoiseModel(coefficients, covariances[:1], variance)

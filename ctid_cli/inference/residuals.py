@@ -143,7 +143,7 @@ def _cross_correlation(
             shifted[:k, column] = u[-k:]
     cross = shifted.T @ e / scale
 
-    noise = fit_noise_model(e)
+    noise = fit_noise_model([e])
     colour = noise.autocovariance(count) / noise.first_autocovariances[0]
     input_autocorrelation = correlate(u, u, method="fft")[count - 1 :] / float(u @ u)
     # sum over all lags, both signs

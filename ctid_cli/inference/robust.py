@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.covariance import condition_number
+from ctid_cli.inference.covariance import sandwich, unit_inverse
 from ctid_cli.inference.noise_model import fit_noise_model
 
 
-def sandwich_covariance(psi: Array | Sequence[Array], residuals: Array | Sequence[Array], *, regular: bool) -> Array:
+def sandwich_covariance(psi: Sequence[Array], residuals: Sequence[Array], *, regular: bool) -> Array:
     r"""Covariance ``M^-1 Sigma M^-1`` of an unweighted output-error estimate under coloured output noise.
 
     With noise v independent of the input (open loop) and ``M = sum psi psi'`` [1]_,
@@ -33,38 +33,21 @@ def sandwich_covariance(psi: Array | Sequence[Array], residuals: Array | Sequenc
 
     With feedback from the output to the input the noise is not independent of psi, and neither form holds.
     """
-    sensitivities = [psi] if isinstance(psi, np.ndarray) else list(psi)
-    errors = [residuals] if isinstance(residuals, np.ndarray) else list(residuals)
-    if [block.shape[0] for block in sensitivities] != [block.size for block in errors]:
-        raise ValueError("psi and residuals must have one block per experiment, of the same number of samples")
-    size = sensitivities[0].shape[1]
-    present = [np.isfinite(block) for block in errors]
-    sensitivities = [block[use] for block, use in zip(sensitivities, present, strict=True) if use.any()]
-    errors = [block[use] for block, use in zip(errors, present, strict=True) if use.any()]
-    count = sum(block.size for block in errors)
-    undefined = np.full((size, size), np.nan)
-
-    hessian = sum((block.T @ block for block in sensitivities), np.zeros((size, size)))
-    if count <= size or not condition_number(hessian) <= 1e14:
-        return undefined
-    scale = 1.0 / np.sqrt(np.diag(hessian))
-    sensitivities = [block * scale for block in sensitivities]
-    inverse = np.linalg.inv(hessian * np.outer(scale, scale))
+    size, count = psi[0].shape[1], sum(block.size for block in residuals)
+    found = unit_inverse(sum((block.T @ block for block in psi), np.zeros((size, size)))) if count > size else None
+    if found is None:
+        return np.full((size, size), np.nan)
+    inverse, scale = found
+    scaled = [block * scale for block in psi]
     if regular:
-        noise = fit_noise_model(errors)
-        sigma = np.zeros((size, size))
-        for block in sensitivities:
-            sigma += block.T @ noise.covariance_times(block)
+        noise = fit_noise_model(residuals)
+        sigma = sum((block.T @ noise.covariance_times(block) for block in scaled), np.zeros((size, size)))
         variance = float(noise.first_autocovariances[0])
         left = 1.0 - float(np.trace(inverse @ sigma)) / (count * variance) if variance > 0 else 1.0
     else:
-        scores = [block * error[:, None] for block, error in zip(sensitivities, errors, strict=True)]
-        sigma = _long_run_covariance(scores)
+        sigma = _long_run_covariance([block * error[:, None] for block, error in zip(scaled, residuals, strict=True)])
         left = 1.0 - size / count
-    if left <= 0:
-        return undefined
-    covariance: Array = inverse @ sigma @ inverse * np.outer(scale, scale) / left
-    return 0.5 * (covariance + covariance.T)
+    return sandwich(inverse, scale, sigma, left) if left > 0 else np.full((size, size), np.nan)
 
 
 def _long_run_covariance(scores: Sequence[Array]) -> Array:
@@ -82,5 +65,4 @@ def _long_run_covariance(scores: Sequence[Array]) -> Array:
         return np.full((len(models), len(models)), np.nan)
     gain = np.array([model.coefficients.sum() for model in models])
     total = sum((block.T @ block for block in white), np.zeros((len(models), len(models))))
-    covariance: Array = total / np.outer(gain, gain) * sum(block.shape[0] for block in scores) / used
-    return covariance
+    return np.asarray(total / np.outer(gain, gain) * sum(block.shape[0] for block in scores) / used)

@@ -18,7 +18,6 @@ from ctid_cli.filtering.filter_data import plain_array, split_delay
 from ctid_cli.filtering.realisation import chain, scaled_roots
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.checks import require_positive
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +58,6 @@ def sensitivity_system(
 
     and for a monic transfer function with descending powers, k becomes n - i for ``a_i`` and m - j for ``b_j``.
     """
-    require_positive("interval", interval, "s")
     shift, fraction = split_delay(model.delay, interval)
     blocks = [_held(*block, interval, fraction) for block in _blocks(model, zeros)]
     states = sum(block.A.shape[0] for block in blocks)

@@ -157,11 +157,11 @@ def _partial_fractions(model: TransferFunction) -> _PartialFractions:
         place = pole_text(complex(p[np.argmax(close.any(axis=1))]))
         raise DataError(f"the pole {place} is repeated: there are no partial fractions; use a model with fewer poles")
     residues = np.polyval(b, p) / (p**origin * _slope_at_roots(p))
-    at_origin = np.zeros(0)
+    at_origin: Array = np.zeros(0)
     if origin:
         # The power series of s^l G(s), by long division in rising powers.
         rising = np.concatenate((b[::-1], np.zeros(model.order)))[: model.order]
-        at_origin = np.polydiv(rising, away[::-1])[0][:origin]
+        at_origin = np.asarray(np.polydiv(rising, away[::-1])[0][:origin])
     direct = b[:1] if model.relative_degree == 0 else b[:0]
     return _PartialFractions(upper.size, p, -residues / p, at_origin, direct)
 

@@ -13,18 +13,9 @@ from ctid_cli.arrays import Array
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.inference.accuracy import ParameterAccuracy, estimated_parameters
-from ctid_cli.inference.asymptotic import (
-    closed_loop_accuracy,
-    open_loop_accuracy,
-    output_variance,
-    require_uncorrelated_input,
-)
-from ctid_cli.inference.finite_record import (
-    additive_sensitivities,
-    finite_record_covariance,
-    unfactored_sensitivities,
-)
+from ctid_cli.inference.accuracy import ParameterAccuracy
+from ctid_cli.inference.asymptotic import limiting_accuracy, output_variance, require_uncorrelated_input
+from ctid_cli.inference.finite_record import finite_record_covariance, sensitivities
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import factored, unfactored
 from ctid_cli.models.transfer_function import TransferFunction
@@ -175,27 +166,24 @@ def _of_long_records(source: SimulatedSource, estimated: _Estimated) -> Expected
     assert noise is not None
     signal = source.excitation if loop is None else loop.reference
     assert isinstance(signal, Gaussian)
-    options: dict[str, Any] = {"noise_filter": noise.filter, "samples": sampling.samples, "zeros": estimated.zeros}
-    place, deviation = (estimated.model, sampling.interval), signal.standard_deviation
+    options: dict[str, Any] = {}
     if loop is None:
-        power = output_variance(*place, input_standard_deviation=deviation)
-        parameters = open_loop_accuracy(
-            *place,
-            input_standard_deviation=deviation,
-            # A level relative to the output counts from its mean square.
-            innovation_variance=noise.innovation_variance_of(np.sqrt([power])),
-            **options,
-        )
+        # A level relative to the output counts from its mean square.
+        power = output_variance(estimated.model, sampling.interval, signal.standard_deviation)
+        variance = noise.innovation_variance_of(np.sqrt([power]))
     else:
-        parameters = closed_loop_accuracy(
-            *place,
-            loop.controller,
-            reference_standard_deviation=deviation,
-            innovation_variance=noise.innovation_variance_of(),
-            enters=loop.enters,
-            instruments="closed_loop" if estimated.instruments == "closed_loop" else "open_loop",
-            **options,
-        )
+        variance = noise.innovation_variance_of()
+        options = {"controller": loop.controller, "enters": loop.enters, "instruments": estimated.instruments}
+    parameters = limiting_accuracy(
+        estimated.model,
+        sampling.interval,
+        standard_deviation=signal.standard_deviation,
+        innovation_variance=variance,
+        noise_filter=noise.filter,
+        samples=sampling.samples,
+        zeros=estimated.zeros,
+        **options,
+    )
     product, matrices = "sigma^2 M^-1", "M = E psi psi'"
     if noise.coloured:
         product = "M^-1 Sigma M^-1"
@@ -215,7 +203,7 @@ def _of_records(source: SimulatedSource, estimated: _Estimated, why: str) -> Exp
     if not np.isfinite(covariance).all():
         raise DataError("the data would not determine the parameters, even without noise")
     sought = estimated.delay_from is not None
-    names, values = estimated_parameters(estimated.model, estimated.zeros, delay=sought)
+    parameters = ParameterAccuracy.of(estimated.model, covariance, estimated.zeros, sought)
     if source.noise.coloured:
         start = "(psi' psi)^-1 psi' R psi (psi' psi)^-1, R the covariance matrix of the noise"
     else:
@@ -224,7 +212,7 @@ def _of_records(source: SimulatedSource, estimated: _Estimated, why: str) -> Exp
         start = f"{'the Cramér-Rao bound ' if best else ''}sigma^2 (psi' psi)^-1"
     where = "in the first data set" if sets == 1 else f"averaged over the first {sets} data sets"
     formula = f"{start}, psi {_sensitivities(source, estimated)}, {where}, as {why}"
-    return ExpectedAccuracy(ParameterAccuracy(estimated.model, names, values, covariance), samples, False, formula)
+    return ExpectedAccuracy(parameters, samples, False, formula)
 
 
 def _record_covariance(source: SimulatedSource, estimated: _Estimated, replicate: int) -> Array:
@@ -239,12 +227,8 @@ def _record_covariance(source: SimulatedSource, estimated: _Estimated, replicate
         reference, controller, enters = record.loop.reference, source.loop.controller, source.loop.enters
         loop = simulate_loop(source.system, controller, reference, 0.0, record.interval, enters)
         signal = HeldSignal(record.t, loop.u)
-    model = estimated.model
-    if isinstance(model, AdditiveModel):
-        psi = additive_sensitivities(model, signal, record.t)
-    else:
-        sought = estimated.delay_from is not None
-        psi = unfactored_sensitivities(model, signal, record.t, estimated.zeros, estimate_delay=sought)
+    sought = estimated.delay_from is not None
+    psi = sensitivities(estimated.model, signal, record.t, estimated.zeros, estimate_delay=sought)
     if estimated.delay_from is not None:
         psi = psi[record.t >= record.input.t[0] + estimated.delay_from]
     lags = np.arange(psi.shape[0] if source.noise.coloured else 1)

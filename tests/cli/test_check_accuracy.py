@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from ctid_cli.inference.asymptotic import closed_loop_accuracy
-from ctid_cli.inference.cramer_rao import cramer_rao_bound
+from ctid_cli.inference.asymptotic import limiting_accuracy
+from ctid_cli.inference.finite_record import cramer_rao_bound
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
@@ -134,11 +134,11 @@ def test_where_the_reference_enters(accuracy):
     # Before the controller, whose gain is a few hundredths, it says far less.
     spec = CLOSED.replace("reference: {kind: gaussian}", "reference: {kind: gaussian}, enters: input")
     plant = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
-    expected = closed_loop_accuracy(
+    expected = limiting_accuracy(
         plant,
         0.05,
         DiscreteController.from_pid(0.0115, 0.00725, 0.00454),
-        reference_standard_deviation=1.0,
+        standard_deviation=1.0,
         innovation_variance=0.01,
         samples=19650,
         enters="input",

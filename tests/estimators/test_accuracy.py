@@ -5,7 +5,7 @@ import pytest
 
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimators.td_srivc import TdSrivc
-from ctid_cli.inference.cramer_rao import cramer_rao_bound
+from ctid_cli.inference.finite_record import cramer_rao_bound
 from ctid_cli.inference.status import Status
 from tests.estimators.records import CASE_1, make_record
 

@@ -6,8 +6,8 @@ from scipy.signal import cont2discrete, lfilter, tf2ss
 
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.inference.asymptotic import closed_loop_accuracy, open_loop_accuracy, output_variance
-from ctid_cli.inference.finite_record import additive_sensitivities, unfactored_sensitivities
+from ctid_cli.inference.asymptotic import WHITE, limiting_accuracy, output_variance, require_uncorrelated_input
+from ctid_cli.inference.finite_record import sensitivities
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import factored, factored_jacobian, unfactored
@@ -27,8 +27,8 @@ FOUR_MODES = AdditiveModel([mode(pole, gain) for pole, gain in zip(POLES, (3.0, 
 TWO_MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
 PID = DiscreteController.from_pid(0.0115, 0.00725, 0.00454)
 COLOURED = ([1.0, 0.5], [1.0, -0.85])
-OPEN = {"input_standard_deviation": 1.0, "innovation_variance": 0.02, "noise_filter": COLOURED, "samples": 1}
-CLOSED = {"reference_standard_deviation": 1.0, "innovation_variance": 0.01, "samples": 1}
+OPEN = {"standard_deviation": 1.0, "innovation_variance": 0.02, "noise_filter": COLOURED, "samples": 1}
+CLOSED = {"standard_deviation": 1.0, "innovation_variance": 0.01, "samples": 1}
 
 
 def variances(accuracy, letter):
@@ -42,42 +42,40 @@ def largest_relative_error(covariance, expected):
 
 
 def test_known_variances_of_four_modes_in_open_loop():
-    additive = open_loop_accuracy(FOUR_MODES, INTERVAL, **OPEN)
+    additive = limiting_accuracy(FOUR_MODES, INTERVAL, **OPEN)
     np.testing.assert_allclose(variances(additive, "b0"), [35.60, 2.700, 0.4405, 0.2240], rtol=2e-4)
     np.testing.assert_allclose(variances(additive, "a1"), [0.48853, 0.029072, 0.0021642, 0.014862], rtol=5e-5)
     np.testing.assert_allclose(variances(additive, "a2"), [0.11691, 1.3780e-3, 3.0539e-5, 6.0108e-5], rtol=5e-5)
-    unconstrained = open_loop_accuracy(unfactored(FOUR_MODES), INTERVAL, **OPEN).factored()
+    unconstrained = limiting_accuracy(unfactored(FOUR_MODES), INTERVAL, **OPEN).factored()
     np.testing.assert_allclose(variances(unconstrained, "b0"), [36.75, 3.645, 0.5341, 0.2322], rtol=2e-4)
     np.testing.assert_allclose(variances(unconstrained, "a1"), [0.49374, 0.033565, 0.0023801, 0.014823], rtol=5e-5)
     np.testing.assert_allclose(variances(unconstrained, "a2"), [0.23860, 2.9082e-3, 6.4791e-5, 1.7786e-4], rtol=5e-5)
     # The white formula at the same total variance is no substitute.
-    white = open_loop_accuracy(
-        FOUR_MODES, INTERVAL, input_standard_deviation=1.0, innovation_variance=0.151351, samples=1
-    )
+    white = limiting_accuracy(FOUR_MODES, INTERVAL, standard_deviation=1.0, innovation_variance=0.151351, samples=1)
     assert variances(additive, "b0")[0] / variances(white, "b0")[0] == pytest.approx(11, rel=0.05)
 
 
 def test_known_signal_to_noise_ratio():
     noise = 0.02 * (1 + 1.35**2 / (1 - 0.85**2))
-    output = output_variance(FOUR_MODES, INTERVAL, input_standard_deviation=1.0)
+    output = output_variance(FOUR_MODES, INTERVAL, 1.0)
     assert output == pytest.approx(1.16984, rel=1e-5)
     assert 10 * np.log10(output / noise) == pytest.approx(8.881, abs=5e-4)
-    assert output_variance(FOUR_MODES, INTERVAL, input_standard_deviation=3.0) == pytest.approx(9 * output)
-    assert output_variance(unfactored(FOUR_MODES), INTERVAL, input_standard_deviation=1.0) == pytest.approx(output)
+    assert output_variance(FOUR_MODES, INTERVAL, 3.0) == pytest.approx(9 * output)
+    assert output_variance(unfactored(FOUR_MODES), INTERVAL, 1.0) == pytest.approx(output)
 
 
 def test_known_variances_of_two_modes_in_closed_loop():
-    additive = closed_loop_accuracy(TWO_MODES, INTERVAL, PID, **CLOSED)
+    additive = limiting_accuracy(TWO_MODES, INTERVAL, PID, **CLOSED)
     np.testing.assert_allclose(variances(additive, "a1"), [0.20003, 1.28798e-3], rtol=3e-5)
     np.testing.assert_allclose(variances(additive, "a2"), [0.035010, 1.52180e-5], rtol=3e-5)
     np.testing.assert_allclose(variances(additive, "b0"), [14.287, 6.7705], rtol=4e-5)
-    unconstrained = closed_loop_accuracy(unfactored(TWO_MODES), INTERVAL, PID, **CLOSED)
+    unconstrained = limiting_accuracy(unfactored(TWO_MODES), INTERVAL, PID, **CLOSED)
     factors = unconstrained.factored()
     np.testing.assert_allclose(variances(factors, "a1"), [0.22218, 1.37704e-3], rtol=3e-5)
     np.testing.assert_allclose(variances(factors, "a2"), [0.090118, 2.49911e-5], rtol=3e-5)
     np.testing.assert_allclose(variances(factors, "b0"), [14.683, 8.0467], rtol=4e-5)
     # The input is S (r - v), and v has the variance 0.01: with the input itself the noise excites too.
-    direct = closed_loop_accuracy(unfactored(TWO_MODES), INTERVAL, PID, instruments="open_loop", **CLOSED)
+    direct = limiting_accuracy(unfactored(TWO_MODES), INTERVAL, PID, instruments="open_loop", **CLOSED)
     np.testing.assert_allclose(1.01 * direct.covariance, unconstrained.covariance, rtol=1e-6)
 
 
@@ -117,7 +115,7 @@ H_POWER = np.abs((1 + 0.5 / Z) / (1 - 0.85 / Z)) ** 2
 def test_open_loop_is_an_integral_over_the_unit_circle():
     rows, _ = spectra(FOUR_MODES, Z)
     expected = sandwich(rows, 4.0, 0.02 * H_POWER)
-    accuracy = open_loop_accuracy(FOUR_MODES, INTERVAL, **OPEN | {"input_standard_deviation": 2.0})
+    accuracy = limiting_accuracy(FOUR_MODES, INTERVAL, **OPEN | {"standard_deviation": 2.0})
     assert largest_relative_error(accuracy.covariance, expected) < 1e-8
 
 
@@ -128,14 +126,14 @@ def test_closed_loop_is_an_integral_over_the_unit_circle(enters):
     numerator, denominator = (np.polyval(part, Z) for part in (PID.numerator, PID.denominator))
     S = (numerator if enters == "controller" else denominator) / (denominator + G * numerator)
     power = 0.25 * np.abs(S) ** 2
-    options = {"reference_standard_deviation": 0.5, "innovation_variance": 0.01, "enters": enters, "samples": 1}
-    accuracy = closed_loop_accuracy(TWO_MODES, INTERVAL, PID, **options)
+    options = {"standard_deviation": 0.5, "innovation_variance": 0.01, "enters": enters, "samples": 1}
+    accuracy = limiting_accuracy(TWO_MODES, INTERVAL, PID, **options)
     assert largest_relative_error(accuracy.covariance, sandwich(rows, power, 0.01)) < 1e-8
-    coloured = closed_loop_accuracy(TWO_MODES, INTERVAL, PID, noise_filter=COLOURED, **options)
+    coloured = limiting_accuracy(TWO_MODES, INTERVAL, PID, noise_filter=COLOURED, **options)
     assert largest_relative_error(coloured.covariance, sandwich(rows, power, 0.01 * H_POWER)) < 1e-8
     # Where the reference enters at the input, the noise still comes through the controller.
     noise = 0.01 * np.abs(numerator / (denominator + G * numerator)) ** 2
-    direct = closed_loop_accuracy(TWO_MODES, INTERVAL, PID, instruments="open_loop", **options)
+    direct = limiting_accuracy(TWO_MODES, INTERVAL, PID, instruments="open_loop", **options)
     assert largest_relative_error(direct.covariance, sandwich(rows, power + noise, 0.01)) < 1e-8
 
 
@@ -158,16 +156,15 @@ FAST = AdditiveModel([Submodel([0.5, 1.0], [0.04, 0.1, 1.0]), Submodel([0.7], [0
 
 
 def test_a_delay_matters_in_open_loop_only_by_its_fraction_of_an_interval():
-    options = {"input_standard_deviation": 2.0, "innovation_variance": 0.3, "noise_filter": COLOURED, "samples": 1}
+    options = {"standard_deviation": 2.0, "innovation_variance": 0.3, "noise_filter": COLOURED, "samples": 1}
     count = 1200
     times = INTERVAL * np.arange(count)
     for model in (FAST, unfactored(FAST)):
-        sensitivities = additive_sensitivities if model is FAST else unfactored_sensitivities
         expected = sum_of_responses(sensitivities(model, pulse(count), times), 2.0, 0.3, COLOURED)
-        accuracy = open_loop_accuracy(model, INTERVAL, **options)
+        accuracy = limiting_accuracy(model, INTERVAL, **options)
         assert largest_relative_error(accuracy.covariance, expected) < 1e-8
     moved = [
-        open_loop_accuracy(AdditiveModel(FAST.submodels, delay), INTERVAL, **options).covariance
+        limiting_accuracy(AdditiveModel(FAST.submodels, delay), INTERVAL, **options).covariance
         for delay in (0.0, 0.13, 0.43)
     ]
     np.testing.assert_allclose(moved[2], moved[1], rtol=1e-9)
@@ -193,21 +190,21 @@ STIFF = DiscreteController.from_pid(8.0, 0.0, 8.0)
 def test_closed_loop_is_a_sum_over_impulse_responses(model, controller, enters):
     count = 1200
     z = simulate_loop(model, controller, pulse(count).values, 0.0, INTERVAL, enters).u
-    psi = additive_sensitivities(model, pulse(count, z), INTERVAL * np.arange(count))
-    options = {"reference_standard_deviation": 1.5, "innovation_variance": 0.1, "enters": enters, "samples": 1}
-    accuracy = closed_loop_accuracy(model, INTERVAL, controller, noise_filter=COLOURED, **options)
+    psi = sensitivities(model, pulse(count, z), INTERVAL * np.arange(count))
+    options = {"standard_deviation": 1.5, "innovation_variance": 0.1, "enters": enters, "samples": 1}
+    accuracy = limiting_accuracy(model, INTERVAL, controller, noise_filter=COLOURED, **options)
     assert largest_relative_error(accuracy.covariance, sum_of_responses(psi, 1.5, 0.1, COLOURED)) < 1e-7
-    white = closed_loop_accuracy(model, INTERVAL, controller, **options)
+    white = limiting_accuracy(model, INTERVAL, controller, **options)
     assert largest_relative_error(white.covariance, sum_of_responses(psi, 1.5, 0.1)) < 1e-7
 
 
 def test_a_loop_without_a_controller_is_open():
-    open_loop = open_loop_accuracy(FAST, INTERVAL, **OPEN)
-    loop = closed_loop_accuracy(
+    open_loop = limiting_accuracy(FAST, INTERVAL, **OPEN)
+    loop = limiting_accuracy(
         FAST,
         INTERVAL,
         DiscreteController([0.0], [1.0]),
-        reference_standard_deviation=1.0,
+        standard_deviation=1.0,
         innovation_variance=0.02,
         noise_filter=COLOURED,
         samples=1,
@@ -219,34 +216,34 @@ def test_a_loop_without_a_controller_is_open():
 def test_a_reaction_at_once_of_the_model_is_solved_for():
     # y = b u + ..., biproper: u (1 + C(inf) b) = ...; a pure gain in a proportional loop has S = C/(1 + b C).
     gain = AdditiveModel([Submodel([2.0], [1.0])])
-    accuracy = closed_loop_accuracy(gain, INTERVAL, DiscreteController([0.25], [1.0]), **CLOSED)
+    accuracy = limiting_accuracy(gain, INTERVAL, DiscreteController([0.25], [1.0]), **CLOSED)
     assert accuracy.covariance.item() == pytest.approx(0.01 * (1.5 / 0.25) ** 2)
     with pytest.raises(DataError, match="correlated with the noise at the same sample"):
-        closed_loop_accuracy(gain, INTERVAL, DiscreteController([0.25], [1.0]), instruments="open_loop", **CLOSED)
+        require_uncorrelated_input(gain, INTERVAL, DiscreteController([0.25], [1.0]), WHITE)
     with pytest.raises(DataError, match="no solution"):
-        closed_loop_accuracy(gain, INTERVAL, DiscreteController([-0.5], [1.0]), **CLOSED)
+        limiting_accuracy(gain, INTERVAL, DiscreteController([-0.5], [1.0]), **CLOSED)
 
 
 def test_standard_errors_follow_the_units_and_the_number_of_samples():
-    base = open_loop_accuracy(FOUR_MODES, INTERVAL, **OPEN)
-    longer = open_loop_accuracy(FOUR_MODES, INTERVAL, **OPEN | {"samples": 400})
+    base = limiting_accuracy(FOUR_MODES, INTERVAL, **OPEN)
+    longer = limiting_accuracy(FOUR_MODES, INTERVAL, **OPEN | {"samples": 400})
     np.testing.assert_allclose(longer.standard_errors, np.sqrt(np.diag(base.covariance)) / 20)
-    louder = open_loop_accuracy(FOUR_MODES, INTERVAL, **OPEN | {"input_standard_deviation": 10.0})
+    louder = limiting_accuracy(FOUR_MODES, INTERVAL, **OPEN | {"standard_deviation": 10.0})
     np.testing.assert_allclose(100 * louder.covariance, base.covariance, rtol=1e-9)
     # In another unit of time, c of the old one: a_k scales with c^-k.
     unit = 1e-3
     scaled = AdditiveModel(
         [Submodel(s.numerator, s.denominator * unit ** np.arange(2, -1, -1)) for s in FOUR_MODES.submodels]
     )
-    other = open_loop_accuracy(scaled, INTERVAL * unit, **OPEN)
+    other = limiting_accuracy(scaled, INTERVAL * unit, **OPEN)
     np.testing.assert_allclose(scaled.theta / other.standard_errors, base.values / base.standard_errors, rtol=1e-8)
 
 
 def test_the_two_forms_tell_the_same_of_one_submodel():
     # One term with a numerator of full length is the unfactored model in other coordinates.
     model = AdditiveModel([Submodel([0.5, 1.0], [0.04, 0.1, 1.0])], 0.07)
-    expected = open_loop_accuracy(model, INTERVAL, **OPEN)
-    accuracy = open_loop_accuracy(unfactored(model), INTERVAL, **OPEN).factored()
+    expected = limiting_accuracy(model, INTERVAL, **OPEN)
+    accuracy = limiting_accuracy(unfactored(model), INTERVAL, **OPEN).factored()
     assert accuracy.names == expected.names
     np.testing.assert_allclose(accuracy.values, expected.values, rtol=1e-12)
     np.testing.assert_allclose(accuracy.covariance, expected.covariance, rtol=1e-9)
@@ -255,7 +252,7 @@ def test_the_two_forms_tell_the_same_of_one_submodel():
 
 def test_factoring_passes_the_covariance_on_by_its_derivatives():
     model = unfactored(TWO_MODES)
-    accuracy = closed_loop_accuracy(model, INTERVAL, PID, **CLOSED)
+    accuracy = limiting_accuracy(model, INTERVAL, PID, **CLOSED)
     jacobian = factored_jacobian(model)
     expected = jacobian @ accuracy.covariance @ jacobian.T
     assert largest_relative_error(accuracy.factored().covariance, expected) < 1e-9
@@ -263,8 +260,8 @@ def test_factoring_passes_the_covariance_on_by_its_derivatives():
 
 def test_a_longer_numerator_costs_accuracy():
     model = unfactored(TWO_MODES)
-    short = closed_loop_accuracy(model, INTERVAL, PID, **CLOSED)
-    long = closed_loop_accuracy(model, INTERVAL, PID, zeros=3, **CLOSED)
+    short = limiting_accuracy(model, INTERVAL, PID, **CLOSED)
+    long = limiting_accuracy(model, INTERVAL, PID, zeros=3, **CLOSED)
     assert short.names == ("a1", "a2", "a3", "a4", "b0", "b1", "b2")
     assert long.names == ("a1", "a2", "a3", "a4", "b0", "b1", "b2", "b3")
     assert (np.diag(long.covariance)[:4] > np.diag(short.covariance)[:4]).all()
@@ -285,30 +282,17 @@ def test_a_longer_numerator_costs_accuracy():
 
 
 def test_refusals_say_why():
-    with pytest.raises(DataError, match=r"an integrator counts.*record of given length"):
-        open_loop_accuracy(RIGID, INTERVAL, **OPEN)
-    assert output_variance(RIGID, INTERVAL, input_standard_deviation=1.0) == np.inf
-    with pytest.raises(DataError, match=r"pole at the origin.*additive model keeps its integrators fixed"):
-        closed_loop_accuracy(unfactored(RIGID), INTERVAL, STIFF, **CLOSED)
-    with pytest.raises(DataError, match=r"loop is not stable.*magnitude 1\."):
-        closed_loop_accuracy(TWO_MODES, INTERVAL, DiscreteController(5 * PID.numerator, PID.denominator), **CLOSED)
-    closed_loop_accuracy(TWO_MODES, INTERVAL, DiscreteController(2 * PID.numerator, PID.denominator), **CLOSED)
+    with pytest.raises(DataError, match="no limit for long records"):
+        limiting_accuracy(RIGID, INTERVAL, **OPEN)
+    with pytest.raises(DataError, match=r"loop, is not stable.*magnitude 1"):
+        limiting_accuracy(unfactored(RIGID), INTERVAL, STIFF, **CLOSED)
+    with pytest.raises(DataError, match=r"loop, is not stable.*magnitude 1\."):
+        limiting_accuracy(TWO_MODES, INTERVAL, DiscreteController(5 * PID.numerator, PID.denominator), **CLOSED)
+    limiting_accuracy(TWO_MODES, INTERVAL, DiscreteController(2 * PID.numerator, PID.denominator), **CLOSED)
     with pytest.raises(DataError, match=r"coloured.*ask for closed_loop instruments"):
-        closed_loop_accuracy(TWO_MODES, INTERVAL, PID, noise_filter=COLOURED, instruments="open_loop", **CLOSED)
-    with pytest.raises(DataError, match="noise filter is not stable"):
-        open_loop_accuracy(TWO_MODES, INTERVAL, **OPEN | {"noise_filter": ([1.0], [1.0, -1.0])})
+        require_uncorrelated_input(TWO_MODES, INTERVAL, PID, COLOURED)
     silent = AdditiveModel([Submodel([0.0], [0.25, 0.25, 1.0])])
     cancelling = TransferFunction([1.0, 1.0], [1.0, 3.0, 2.0])
     for model in (silent, cancelling):
         with pytest.raises(DataError, match="no effect of their own on the output"):
-            open_loop_accuracy(model, INTERVAL, **OPEN)
-    with pytest.raises(ValueError, match=r"zeros must be from 2.*to its 4 poles; got 1"):
-        open_loop_accuracy(unfactored(TWO_MODES), INTERVAL, zeros=1, **OPEN)
-    with pytest.raises(ValueError, match="leave both out"):
-        open_loop_accuracy(TWO_MODES, INTERVAL, zeros=1, **OPEN)
-    with pytest.raises(ValueError, match="interval must be a positive number"):
-        open_loop_accuracy(TWO_MODES, 0.0, **OPEN)
-    with pytest.raises(ValueError, match="input_standard_deviation must be a positive"):
-        open_loop_accuracy(TWO_MODES, INTERVAL, **OPEN | {"input_standard_deviation": 0.0})
-    with pytest.raises(ValueError, match="instruments must be"):
-        closed_loop_accuracy(TWO_MODES, INTERVAL, PID, instruments="direct", **CLOSED)
+            limiting_accuracy(model, INTERVAL, **OPEN)

@@ -5,17 +5,11 @@ import pytest
 from scipy.linalg import toeplitz
 
 from ctid_cli.filtering.sampled import simulate_additive
-from ctid_cli.inference.asymptotic import open_loop_accuracy
+from ctid_cli.inference.asymptotic import limiting_accuracy
 from ctid_cli.inference.covariance import white_noise_covariance
-from ctid_cli.inference.cramer_rao import cramer_rao_bound
-from ctid_cli.inference.finite_record import (
-    additive_sensitivities,
-    finite_record_covariance,
-    unfactored_sensitivities,
-)
+from ctid_cli.inference.finite_record import cramer_rao_bound, finite_record_covariance, sensitivities
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
-from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record
@@ -40,7 +34,7 @@ def clock(regular):
 @pytest.mark.parametrize("model", [MODES, BODY, FREE_BODY, GAIN], ids=["modes", "1 integrator", "2", "gain"])
 def test_sensitivities_are_differences_of_the_output(model, regular, hold):
     signal, times = held(hold), clock(regular)
-    psi = additive_sensitivities(model, signal, times)
+    psi = sensitivities(model, signal, times)
     assert psi.shape == (400, len(model.names))
     for k, value in enumerate(model.theta):
         step = 1e-5 * abs(value)
@@ -58,16 +52,16 @@ def test_sensitivities_are_differences_of_the_output(model, regular, hold):
 def test_the_two_forms_obey_the_chain_rule(zeros, regular):
     signal, times = held(), clock(regular)
     model = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])], 0.13)
-    psi = unfactored_sensitivities(unfactored(model), signal, times, zeros)
+    psi = sensitivities(unfactored(model), signal, times, zeros)
     jacobian = unfactored_jacobian(model)
     assert np.abs(jacobian[4]).max() == 0.0  # there is no b of degree 3 in the sum
     chained = psi @ (np.delete(jacobian, 4, axis=0) if zeros is None else jacobian)
-    expected = additive_sensitivities(model, signal, times)
+    expected = sensitivities(model, signal, times)
     assert (np.abs(chained - expected).max(axis=0) < 1e-9 * np.abs(expected).max(axis=0)).all()
 
 
 def test_covariance_is_the_double_sum_over_all_pairs_of_samples():
-    psi = additive_sensitivities(MODES, held(), clock(True))
+    psi = sensitivities(MODES, held(), clock(True))
     noise = ArmaNoise(numerator=(1.0, 0.5), denominator=(1.0, -0.85), innovation_variance=0.02)
     autocovariances = noise.autocovariance(np.arange(400))
     inverse = np.linalg.inv(psi.T @ psi)
@@ -84,7 +78,7 @@ def test_covariance_is_the_double_sum_over_all_pairs_of_samples():
 
 
 def test_white_noise_gives_the_white_formula():
-    psi = additive_sensitivities(MODES, held(), clock(False))
+    psi = sensitivities(MODES, held(), clock(False))
     expected = white_noise_covariance(psi.T @ psi, 0.3 * (400 - psi.shape[1]), 400)
     np.testing.assert_allclose(finite_record_covariance(psi, 0.3), expected, rtol=1e-9)
 
@@ -94,15 +88,15 @@ def test_long_records_approach_the_limit():
     times = 0.05 * np.arange(count)
     signal = HeldSignal(times, 2.0 * np.random.default_rng(0).standard_normal(count))
     noise = ArmaNoise(numerator=(1.0, 0.5), denominator=(1.0, -0.85), innovation_variance=0.02)
-    limit = open_loop_accuracy(
+    limit = limiting_accuracy(
         MODES,
         0.05,
-        input_standard_deviation=2.0,
+        standard_deviation=2.0,
         innovation_variance=0.02,
         noise_filter=noise.filter,
         samples=count,
     )
-    psi = additive_sensitivities(MODES, signal, times)
+    psi = sensitivities(MODES, signal, times)
     covariance = finite_record_covariance(psi, noise.autocovariance(np.arange(2000)))
     ratios = np.sqrt(np.diag(covariance)) / limit.standard_errors
     # The least damped mode has the time constant 5 s: some hundred independent stretches.
@@ -117,15 +111,10 @@ def test_covariance_is_undefined_where_the_data_say_nothing():
     assert np.isnan(finite_record_covariance(np.ones((1, 2)), 1.0)).all()
 
 
-def test_a_numerator_of_full_degree_is_refused():
-    with pytest.raises(ValueError, match="to below its 1 poles; got 1"):
-        unfactored_sensitivities(TransferFunction([1.0], [1.0, 1.0]), held(), clock(True), zeros=1)
-
-
 @pytest.mark.parametrize("regular", [True, False])
 def test_with_an_estimated_delay_it_is_the_cramer_rao_bound(regular):
     model = unfactored(AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])], 0.13))
     signal, times = held("foh"), clock(regular)
-    psi = unfactored_sensitivities(model, signal, times, estimate_delay=True)
+    psi = sensitivities(model, signal, times, estimate_delay=True)
     expected = cramer_rao_bound(model, Record(times, np.zeros(400), signal), 0.3)
     np.testing.assert_allclose(finite_record_covariance(psi, 0.09), expected, rtol=1e-6)

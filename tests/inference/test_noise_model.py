@@ -14,7 +14,7 @@ def ar2(count, seed=0):
 
 def test_solves_the_yule_walker_equations():
     v = ar2(400)
-    model = fit_noise_model(v)
+    model = fit_noise_model([v])
     r = np.array([v[k:] @ v[: v.size - k] for k in range(model.order + 1)]) / v.size
     assert model.order >= 2
     np.testing.assert_allclose(model.first_autocovariances, r, rtol=1e-12)
@@ -23,7 +23,7 @@ def test_solves_the_yule_walker_equations():
 
 
 def test_finds_order_coefficients_and_variance():
-    model = fit_noise_model(ar2(100_000), max_order=2)
+    model = fit_noise_model([ar2(100_000)], max_order=2)
     np.testing.assert_allclose(model.coefficients, [1.0, -1.5, 0.7], atol=0.01)
     assert model.innovation_variance == pytest.approx(1.0, abs=0.02)
 
@@ -39,7 +39,7 @@ def test_autocovariance_is_that_of_the_impulse_response():
 
 
 def test_covariance_times_columns_is_the_toeplitz_product():
-    model = fit_noise_model(ar2(300))
+    model = fit_noise_model([ar2(300)])
     columns = np.random.default_rng(1).standard_normal((37, 2))
     expected = toeplitz(model.autocovariance(37)) @ columns
     np.testing.assert_allclose(model.covariance_times(columns), expected, rtol=1e-12, atol=1e-9)
@@ -47,7 +47,7 @@ def test_covariance_times_columns_is_the_toeplitz_product():
 
 def test_white_noise_has_order_zero_and_no_later_autocovariance():
     v = np.array([1.0, -1.0, -1.0, 1.0, 1.0, -1.0, -1.0, 1.0])
-    model = fit_noise_model(v, max_order=1)  # products at lag one: -1 1 -1 1 -1 1 -1, r(1)/r(0) = -1/8
+    model = fit_noise_model([v], max_order=1)  # products at lag one: -1 1 -1 1 -1 1 -1, r(1)/r(0) = -1/8
     assert model.order == 0
     np.testing.assert_array_equal(model.autocovariance(3), [1.0, 0.0, 0.0])
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.inference.asymptotic import open_loop_accuracy
+from ctid_cli.inference.asymptotic import limiting_accuracy
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.reporting.expected_accuracy import long_record_variances
 from ctid_cli.reporting.parameter_errors import mse_ratio, parameter_errors, parameter_estimates
@@ -237,16 +237,16 @@ def test_theory_is_that_of_each_estimators_own_form(plan):
     found = variances_of(plan)
     system = plan.data_cells[0].source.system.sorted()
     options = {
-        "input_standard_deviation": 1.0,
+        "standard_deviation": 1.0,
         "innovation_variance": 0.02,
         "noise_filter": ([1.0], [1.0, -0.5]),
         "samples": 10**6,
     }
-    additive = open_loop_accuracy(system, 0.05, **options)
+    additive = limiting_accuracy(system, 0.05, **options)
     assert [found["additive"][name] for name in additive.names] == pytest.approx(
         1e6 * additive.standard_errors**2, rel=1e-9
     )
-    srivc = open_loop_accuracy(unfactored(system), 0.05, zeros=2, **options).factored()
+    srivc = limiting_accuracy(unfactored(system), 0.05, zeros=2, **options).factored()
     assert [found["srivc"][name] for name in srivc.names] == pytest.approx(1e6 * srivc.standard_errors**2, rel=1e-6)
     assert variances_of(plan, cell=1) == found
 
