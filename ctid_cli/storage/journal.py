@@ -13,7 +13,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,10 @@ _UPGRADE = (
     "ALTER TABLE sessions DROP COLUMN origin",
 )
 _SEALED = "sealed"
+#: Columns of the identity of an estimate.
+_KEY = "data_hash, replicate, estimator_hash, start"
+#: In format 1 it is the run that has the origin.
+_WITH_RUNS = "FROM estimates JOIN sessions ON session = number"
 
 
 @dataclass(frozen=True)
@@ -87,52 +91,39 @@ class Journal:
 
     def made(self) -> set[tuple[str, str, Origin]]:
         """Data cells and estimators of the stored estimates, and where these come from."""
-        with self._guard("read"):
-            known = self._known_origins()
-            rows = self._connection.execute(
-                "SELECT DISTINCT data_hash, estimator_hash, origin FROM estimates JOIN sessions ON session = number"
-            )
-            return {(data, estimator, known[origin]) for data, estimator, origin in rows}
+        known = self._known_origins()
+        rows = self._rows(
+            "SELECT DISTINCT data_hash, estimator_hash, origin FROM estimates JOIN sessions ON session = number"
+        )
+        return {(data, estimator, known[origin]) for data, estimator, origin in rows}
 
     def _known_origins(self) -> dict[int, Origin]:
-        rows = self._connection.execute("SELECT number, code_version, platform, packages FROM origins")
-        return {number: Origin.of(code, platform, json.loads(packages)) for number, code, platform, packages in rows}
+        rows = self._rows("SELECT number, code_version, platform, packages FROM origins")
+        with self._guard("read"):
+            return {number: Origin.of(code, machine, json.loads(packages)) for number, code, machine, packages in rows}
 
     def sessions(self) -> list[dict[str, Any]]:
         """Every run that has written here, the oldest first."""
+        rows = self._rows("SELECT info, number, started, stopped, reason FROM sessions ORDER BY number")
+        names = ("session", "started", "stopped", "reason")
         with self._guard("read"):
-            rows = self._connection.execute(
-                "SELECT number, started, stopped, reason, info FROM sessions ORDER BY number"
-            )
-            return [
-                {"session": number, "started": started, "stopped": stopped, "reason": reason, **json.loads(info)}
-                for number, started, stopped, reason, info in rows
-            ]
+            return [dict(zip(names, values, strict=True)) | json.loads(info) for info, *values in rows]
 
     def keys(self) -> set[Key]:
         """Which estimates are stored."""
-        with self._guard("read"):
-            rows = self._connection.execute("SELECT data_hash, replicate, estimator_hash, start FROM estimates")
-            return {Key(*row) for row in rows}
+        return {Key(*row) for row in self._rows(f"SELECT {_KEY} FROM estimates")}
 
     def statuses(self) -> dict[Key, str]:
         """Status of every stored estimate."""
-        with self._guard("read"):
-            rows = self._connection.execute(
-                "SELECT data_hash, replicate, estimator_hash, start, json_extract(result, '$.status') FROM estimates"
-            )
-            return {Key(*row[:4]): row[4] for row in rows}
+        rows = self._rows(f"SELECT json_extract(result, '$.status'), {_KEY} FROM estimates")
+        return {Key(*parts): status for status, *parts in rows}
 
     def entries(self) -> dict[Key, Entry]:
         """Every stored estimate, each compared with its checksum."""
-        found = {}
+        found, origins = {}, self._known_origins()
         with self._guard("read"):
-            origins = self._known_origins()
-            rows = self._connection.execute(
-                "SELECT data_hash, replicate, estimator_hash, start, result, checksum, seconds, session, origin"
-                " FROM estimates JOIN sessions ON session = number"
-            )
-            for *parts, result, checksum, seconds, session, origin in rows:
+            rows = self._connection.execute(f"SELECT result, checksum, seconds, session, origin, {_KEY} {_WITH_RUNS}")
+            for result, checksum, seconds, session, origin, *parts in rows:
                 key = Key(*parts)
                 if _checksum(key, result) != checksum:
                     raise StorageError(f"{self.path} is damaged: estimate {key.id} has changed since it was written")
@@ -141,10 +132,9 @@ class Journal:
 
     def check(self) -> None:
         """Refuse a file that SQLite finds damaged."""
-        with self._guard("read"):
-            found = self._connection.execute("PRAGMA quick_check(1)").fetchone()
-        if found != ("ok",):
-            raise StorageError(f"{self.path} is damaged: {found[0] if found else 'no answer'}")
+        found = self._rows("PRAGMA quick_check(1)")
+        if found != [("ok",)]:
+            raise StorageError(f"{self.path} is damaged: {found[0][0] if found else 'no answer'}")
 
     def begin(self, manifest: Manifest, origins: Mapping[str, Origin], started: str, info: dict[str, Any]) -> int:
         """Note that a run begins, and where the estimates of each estimator will come from."""
@@ -196,26 +186,23 @@ class Journal:
         with suppress(sqlite3.Error):
             self._connection.close()
 
-    def _meta(self, name: str) -> str | None:
+    def _rows(self, query: str, *values: str) -> list[Any]:
         with self._guard("read"):
-            row = self._connection.execute("SELECT value FROM meta WHERE name = ?", (name,)).fetchone()
-        return None if row is None else str(row[0])
+            return self._connection.execute(query, values).fetchall()
+
+    def _meta(self, name: str) -> str | None:
+        rows = self._rows("SELECT value FROM meta WHERE name = ?", name)
+        return str(rows[0][0]) if rows else None
 
     def _set_meta(self, name: str, value: str) -> None:
         self._connection.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (name, value))
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
-        with self._guard("write"):
-            self._connection.execute("BEGIN IMMEDIATE")
-            try:
-                yield self._connection
-                self._connection.execute("COMMIT")
-            except BaseException:
-                # SQLite has rolled back by itself if the disk is full.
-                with suppress(sqlite3.Error):
-                    self._connection.execute("ROLLBACK")
-                raise
+        # The connection commits, or rolls back what an exception has left undone.
+        with self._guard("write"), self._connection as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            yield connection
 
     @contextmanager
     def _guard(self, action: str) -> Iterator[None]:
@@ -231,29 +218,24 @@ class Journal:
 
 def open_journal(path: Path) -> Journal:
     """Open a journal for writing, and make it if there is none."""
-    try:
-        connection = sqlite3.connect(path, isolation_level=None, timeout=0.0)
-    except sqlite3.Error as error:
-        raise StorageError(f"{path} cannot be opened ({error})") from error
-    try:
-        connection.execute("PRAGMA locking_mode=EXCLUSIVE")
-        connection.execute("PRAGMA journal_mode=WAL")
-        connection.execute("PRAGMA synchronous=FULL")
-        new = not connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone()
-        if new or _format(connection, path) < FORMAT:
-            connection.execute("BEGIN IMMEDIATE")
-            for statement in _SCHEMA if new else _UPGRADE:
-                connection.execute(statement)
-            connection.execute(f"PRAGMA application_id={APPLICATION}")
-            connection.execute(f"PRAGMA user_version={FORMAT}")
-            connection.execute("COMMIT")
-    except sqlite3.Error as error:
-        connection.close()
-        raise StorageError(f"{path} is damaged or cannot be written ({error})") from error
-    except BaseException:
-        connection.close()
-        raise
-    return Journal(connection, path)
+    with ExitStack() as stack:
+        try:
+            connection = sqlite3.connect(path, isolation_level=None, timeout=0.0)
+            stack.callback(connection.close)
+            for setting in ("locking_mode=EXCLUSIVE", "journal_mode=WAL", "synchronous=FULL"):
+                connection.execute(f"PRAGMA {setting}")
+            new = not connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone()
+            if new or _format(connection, path) < FORMAT:
+                connection.execute("BEGIN IMMEDIATE")
+                for statement in _SCHEMA if new else _UPGRADE:
+                    connection.execute(statement)
+                connection.execute(f"PRAGMA application_id={APPLICATION}")
+                connection.execute(f"PRAGMA user_version={FORMAT}")
+                connection.execute("COMMIT")
+        except sqlite3.Error as error:
+            raise StorageError(f"{path} is damaged or no journal, or cannot be written ({error})") from error
+        stack.pop_all()
+        return Journal(connection, path)
 
 
 @contextmanager
@@ -267,29 +249,24 @@ def read_journal(path: Path) -> Iterator[Journal | None]:
         yield None
         return
     log = path.with_name(path.name + "-wal")
-    with tempfile.TemporaryDirectory(prefix="ctid-") as scratch:
+    with ExitStack() as stack:
         try:
             if log.exists() and log.stat().st_size:
-                copy = Path(scratch) / FILE_NAME
+                copy = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ctid-"))) / FILE_NAME
                 shutil.copyfile(path, copy)
                 shutil.copyfile(log, copy.with_name(copy.name + "-wal"))
                 connection = sqlite3.connect(copy, isolation_level=None)
             else:
                 address = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
                 connection = sqlite3.connect(address, uri=True, isolation_level=None)
+            stack.callback(connection.close)
+            planned = connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone()
+            if planned:
+                _format(connection, path)
+                planned = connection.execute("SELECT 1 FROM meta WHERE name = 'manifest'").fetchone()
         except (sqlite3.Error, OSError) as error:
-            raise StorageError(f"{path} cannot be read ({error})") from error
-        try:
-            try:
-                empty = not connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone()
-                if not empty:
-                    _format(connection, path)
-                    empty = not connection.execute("SELECT 1 FROM meta WHERE name = 'manifest'").fetchone()
-            except sqlite3.Error as error:
-                raise StorageError(f"{path} is damaged or not a journal ({error})") from error
-            yield None if empty else Journal(connection, path)
-        finally:
-            connection.close()
+            raise StorageError(f"{path} cannot be read, is damaged or not a journal ({error})") from error
+        yield Journal(connection, path) if planned else None
 
 
 def _format(connection: sqlite3.Connection, path: Path) -> int:
