@@ -18,7 +18,7 @@ from ctid_cli.running.plan import build_plan
 from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name, measure_names
 from ctid_cli.simulation.frequency_runs import FrequencyFit, SignalDataSet
 from ctid_cli.specification.load import spec_from_canonical
-from ctid_cli.storage.store import FoundEstimate, read_stored, spec_folder
+from ctid_cli.storage.store import FoundEstimate, spec_folder
 
 #: A repeated estimate agrees if no parameter moved by more than this fraction; other processors give other last bits.
 AGREEMENT = 1e-6
@@ -38,10 +38,10 @@ def detail_object(found: FoundEstimate, again: Repeated | None, out: Path) -> di
     """One estimate for ``ctid show --json``."""
     content = as_object(found.row) | {
         "parameters": [parameter_object(item) for item in _parameters(found)],
-        "data": found.data,
-        "settings": found.estimator,
-        "seed": found.seed,
-        "origins": [asdict(origin) for origin in found.origins],
+        "data": found.slot.cell["content"],
+        "settings": found.slot.estimator["content"],
+        "seed": found.stored.manifest["seed"],
+        "origins": [asdict(origin) for origin in found.stored.origins],
         "redo": _redo_command(found, out),
     }
     return content if again is None else content | asdict(again)
@@ -58,10 +58,10 @@ def detail_text(found: FoundEstimate, again: Repeated | None, out: Path) -> str:
     if row.get("converged") is not None:
         head.append("It meets the success rule." if row["converged"] else "It does not meet the success rule.")
     origin = [
-        f"Data (cell {row['cell']}, seed {found.seed}, data set {row['replicate']}):",
-        *_settings(found.data),
+        f"Data (cell {row['cell']}, seed {found.stored.manifest['seed']}, data set {row['replicate']}):",
+        *_settings(found.slot.cell["content"]),
         "Estimator:",
-        *_settings(found.estimator),
+        *_settings(found.slot.estimator["content"]),
     ]
     of_signal = "measures" in row
     what = "frequencies" if of_signal else "parameters"
@@ -75,7 +75,7 @@ def detail_text(found: FoundEstimate, again: Repeated | None, out: Path) -> str:
 
 
 def _parameters(found: FoundEstimate) -> list[UncertainValue]:
-    return parameters(found.row, found.estimator.get("delay_bounds"))
+    return parameters(found.row, found.slot.estimator["content"].get("delay_bounds"))
 
 
 def _fitted(found: FoundEstimate) -> list[list[str]]:
@@ -115,7 +115,7 @@ def _redo_command(found: FoundEstimate, out: Path) -> str:
 def repeat(found: FoundEstimate) -> Repeated:
     """Make the data set of an estimate and the estimate once more."""
     row = found.row
-    plan = build_plan(spec_from_canonical(read_stored(found.folder).manifest["spec"], spec_folder(found.folder)))
+    plan = build_plan(spec_from_canonical(found.stored.manifest["spec"], spec_folder(found.folder)))
     for task in plan.tasks():
         cell = plan.data_cells[task.cell]
         if (cell.hash, task.replicate) != (row["cell"], row["replicate"]):
@@ -123,7 +123,7 @@ def repeat(found: FoundEstimate) -> Repeated:
         for key, estimator, start in plan.keys(task):
             if key.id == row["id"]:
                 data = cell.dataset(task.replicate)
-                drawn = start.draw(found.seed, task.replicate, data.true_model)
+                drawn = start.draw(found.stored.manifest["seed"], task.replicate, data.true_model)
                 fit = estimator.estimator.prepare(data.record).fit(drawn)
                 if isinstance(fit, FrequencyFit) and isinstance(data, SignalDataSet):
                     sides = (row.get("measures") or {}, data.result_of(fit, None, None)["measures"])

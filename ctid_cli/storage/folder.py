@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ctid_cli.errors import RefusedError, StorageError, UsageError
+from ctid_cli.errors import RefusedError, StorageError
 from ctid_cli.storage import journal
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import Manifest
@@ -33,6 +33,9 @@ RUNNING = "running.json"
 
 #: How long to wait for a command that only reads to let go of the folder [s].
 PATIENCE = 2.0
+
+
+_ELSEWHERE = "choose another results folder (--out), or --fresh to move the old results aside"
 
 
 class InUseError(RefusedError):
@@ -126,17 +129,13 @@ def check_free(folder: Path, manifest: Manifest, origins: Mapping[str, Origin], 
     with reading_journal(folder) as log:
         if log is None:
             if (folder / SEALED).exists():
-                raise RefusedError(
-                    f"{folder} holds {SEALED} without the {journal.FILE_NAME} it was made from, so nothing can be added"
-                    " to it; choose another results folder (--out), or --fresh to move it aside"
-                )
+                why = f"{SEALED} without the {journal.FILE_NAME} it was made from, so nothing can be added to it"
+                raise RefusedError(f"{folder} holds {why}; {_ELSEWHERE}")
             return
         log.check()
         if log.experiment() != experiment:
-            raise RefusedError(
-                f"{folder} holds the experiment {log.experiment()!r}, not {experiment!r}; choose another results folder"
-                " (--out), or --fresh to move the old results aside"
-            )
+            other = f"the experiment {log.experiment()!r}, not {experiment!r}"
+            raise RefusedError(f"{folder} holds {other}; {_ELSEWHERE}")
         # Estimators that the plan does not name may be of another version, but not their data, nor the platform.
         cells, some = {cell["hash"] for cell in manifest["data_cells"]}, next(iter(origins.values()))
         for data, estimator, made in sorted(log.made()):
@@ -147,20 +146,13 @@ def check_free(folder: Path, manifest: Manifest, origins: Mapping[str, Origin], 
 
 
 def _other_origin(folder: Path, other: Origin, origin: Origin) -> str:
-    differences = []
-    if other.code_version != origin.code_version:
-        versions = dict(other.packages)
-        differences.append(f"code version {other.code_version} then, {origin.code_version} now")
-        pairs = [(name, versions.get(name), now) for name, now in origin.packages]
-        differences += [f"{name} {then} then, {now} now" for name, then, now in pairs if then != now]
-    if other.platform != origin.platform:
-        differences.append(f"numeric platform {other.platform!r} then, {origin.platform!r} now")
-    if not differences:
-        differences.append(f"packages {dict(other.packages)} then, {dict(origin.packages)} now")
-    return (
-        f"{folder} holds results of other code or arithmetic ({'; '.join(differences)}); use --fresh to move them aside"
-        " and compute all anew, or --allow-mixed to add to them, which is recorded"
-    )
+    then, now = dict(other.packages), dict(origin.packages)
+    pairs = [("code version", other.code_version, origin.code_version)]
+    pairs += [(name, then.get(name), now.get(name)) for name in then | now]
+    pairs += [("numeric platform", other.platform, origin.platform)]
+    differences = "; ".join(f"{name} {old} then, {new} now" for name, old, new in pairs if old != new)
+    ways = "use --fresh to move them aside and compute all anew, or --allow-mixed to add to them, which is recorded"
+    return f"{folder} holds results of other code or arithmetic ({differences}); {ways}"
 
 
 @contextmanager
@@ -216,14 +208,3 @@ def experiment_folders(results: Path) -> list[Path]:
         if journal.FILE_NAME in files or SEALED in files:
             found.append(Path(path))
     return sorted(found)
-
-
-def no_results(folder: Path) -> UsageError:
-    """The error for a folder that no experiment was run into."""
-    return UsageError(f"there are no results in {folder}; 'ctid run' writes them")
-
-
-def require_experiment(folder: Path) -> None:
-    """Refuse a folder that no experiment was run into."""
-    if not (folder / journal.FILE_NAME).exists() and not (folder / SEALED).exists():
-        raise no_results(folder)

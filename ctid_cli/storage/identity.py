@@ -255,21 +255,9 @@ def _openblas_kernels() -> Iterator[str]:
         root = Path(str(package.__file__)).parent
         for folder in (root.parent / f"{package.__name__}.libs", root / ".dylibs"):
             for file in sorted(folder.glob("*openblas*")):
-                name = _core_name(file)
-                if name:
-                    yield name
-
-
-def _core_name(library: Path) -> str | None:
-    try:
-        loaded = ctypes.CDLL(str(library))
-    except OSError:
-        return None
-    for name in _CORE_NAME_FUNCTIONS:
-        function = getattr(loaded, name, None)
-        if function is not None:
-            function.argtypes = []
-            function.restype = ctypes.c_char_p
-            core = function()
-            return core.decode("ascii", "replace") if core else None
-    return None
+                with suppress(OSError):
+                    library = ctypes.CDLL(str(file))
+                    for name in [name for name in _CORE_NAME_FUNCTIONS if hasattr(library, name)][:1]:
+                        function = getattr(library, name)
+                        function.restype = ctypes.c_char_p
+                        yield (function() or b"unknown").decode("ascii", "replace")

@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from ctid_cli.canonical import canonical_json
-from ctid_cli.errors import RefusedError, StorageError
+from ctid_cli.errors import StorageError
 from ctid_cli.storage.identity import Origin, gathered
-from ctid_cli.storage.manifest import Key, Manifest, Outcome
+from ctid_cli.storage.manifest import Key, Manifest, Outcome, refuse_newer
 
 FILE_NAME = "journal.sqlite"
 #: Raised by one whenever an older ctid could misread the file.
@@ -92,9 +92,7 @@ class Journal:
     def made(self) -> set[tuple[str, str, Origin]]:
         """Data cells and estimators of the stored estimates, and where these come from."""
         known = self._known_origins()
-        rows = self._rows(
-            "SELECT DISTINCT data_hash, estimator_hash, origin FROM estimates JOIN sessions ON session = number"
-        )
+        rows = self._rows(f"SELECT DISTINCT data_hash, estimator_hash, origin {_WITH_RUNS}")
         return {(data, estimator, known[origin]) for data, estimator, origin in rows}
 
     def _known_origins(self) -> dict[int, Origin]:
@@ -275,11 +273,7 @@ def _format(connection: sqlite3.Connection, path: Path) -> int:
     (written_by,) = connection.execute("PRAGMA user_version").fetchone()
     if application != APPLICATION:
         raise StorageError(f"{path} is an SQLite file, but not a journal of ctid")
-    if written_by > FORMAT:
-        raise RefusedError(
-            f"{path} has format {written_by}; this ctid reads formats up to {FORMAT}. Use the newer ctid that wrote it,"
-            " another results folder (--out), or --fresh to move the old results aside"
-        )
+    refuse_newer(path, written_by, FORMAT)
     return int(written_by)
 
 

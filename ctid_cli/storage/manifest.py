@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from ctid_cli.errors import RefusedError
 from ctid_cli.storage import columns
 
 Manifest = dict[str, Any]
@@ -52,6 +54,15 @@ class Slot(NamedTuple):
     def swept(self) -> dict[str, Any]:
         """Values of the swept fields."""
         return {**self.cell["swept"], **self.estimator["swept"]}
+
+
+def refuse_newer(path: Path, written: int, known: int) -> None:
+    """Refuse a file whose format is younger than this program."""
+    if written > known:
+        raise RefusedError(
+            f"{path} has format {written}; this ctid reads formats up to {known}. Use the newer ctid that wrote it, "
+            "another results folder (--out), or --fresh to move the old results aside"
+        )
 
 
 def slots(manifest: Manifest) -> Iterator[Slot]:

@@ -18,12 +18,12 @@ import h5py
 import numpy as np
 
 from ctid_cli.canonical import canonical_json
-from ctid_cli.errors import RefusedError, StorageError
+from ctid_cli.errors import StorageError
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, unpack_track
 from ctid_cli.storage import columns
 from ctid_cli.storage.identity import Origin
-from ctid_cli.storage.manifest import Key, Manifest, assemble, row_columns, slots, swept_names
+from ctid_cli.storage.manifest import Key, Manifest, assemble, refuse_newer, row_columns, slots, swept_names
 
 #: Raised by one whenever an older ctid could misread the file.
 FORMAT = 1
@@ -58,9 +58,7 @@ def seal_image(
                 _write_column(group, column, [row[column.name] for row in rows])
         swept = group.create_group("swept")
         for name in swept_names(manifest):
-            values = [row.get(name) for row in rows]
-            numbers = all(v is None or (isinstance(v, int | float) and not isinstance(v, bool)) for v in values)
-            _write(swept, name, _floats(values) if numbers else _encode([canonical_json(value) for value in values]))
+            _write(swept, name, _swept_values([row.get(name) for row in rows]))
         for key in dict.fromkeys(slot.key for slot in stored):
             if results[key].get("track") is not None:
                 _write_track(file.require_group("tracks").create_group(key.id), results[key]["track"])
@@ -97,12 +95,7 @@ def _checked(path: Path) -> Iterator[tuple[h5py.File, str]]:
         with _open(path) as file:
             if file.attrs.get("format") != KIND:
                 raise StorageError(f"{path} is an HDF5 file, but not one that 'ctid run' has written")
-            version = int(file.attrs["format_version"])
-            if version > FORMAT:
-                raise RefusedError(
-                    f"{path} has format {version}; this ctid reads formats up to {FORMAT}."
-                    " Use the newer ctid that wrote it"
-                )
+            refuse_newer(path, int(file.attrs["format_version"]), FORMAT)
             checksum = str(file.attrs["checksum"])
             if _content_checksum(file) != checksum:
                 raise StorageError(f"{path} is damaged: its content does not agree with its checksum")
@@ -136,7 +129,8 @@ def _write_plan(file: h5py.File, manifest: Manifest, origins: Sequence[Origin]) 
         }
     )
     # The order of swept fields in the manifest is that of the specification, and columns follow it.
-    for name, text in (("spec", canonical_json(manifest["spec"])), ("manifest", json.dumps(manifest, allow_nan=False))):
+    texts = {"spec": canonical_json(manifest["spec"]), "manifest": json.dumps(manifest, allow_nan=False)}
+    for name, text in texts.items():
         # A byte array, because HDF5 strings end at their first zero byte, and attributes have a length limit.
         file.create_dataset(name, data=np.frombuffer(text.encode("utf-8"), dtype=np.uint8), track_times=False)
 
@@ -154,6 +148,12 @@ def _write(group: h5py.Group, name: str, values: np.ndarray[Any, Any]) -> h5py.D
     return group.create_dataset(name, data=values, track_times=False, **packing)
 
 
+def _swept_values(values: Sequence[Any]) -> np.ndarray[Any, Any]:
+    if all(value is None or type(value) in (int, float) for value in values):
+        return _floats(values)
+    return _encode([canonical_json(value) for value in values])
+
+
 def _write_column(group: h5py.Group, column: columns.Column, rows: Sequence[Any]) -> None:
     name = column.name
     match column.type:
@@ -165,25 +165,26 @@ def _write_column(group: h5py.Group, column: columns.Column, rows: Sequence[Any]
                 written.attrs["missing"] = _MISSING
         case "coefficients":
             lengths = np.array([_MISSING if row is None else len(row) for row in rows], dtype=np.int64)
-            padded = np.full((len(rows), max([1, *lengths.tolist()])), np.nan)
+            padded = np.full((len(rows), lengths.max(initial=1)), np.nan)
             for k, row in enumerate(rows):
                 padded[k, : len(row or ())] = _floats(row or ())
             _write(group, name, padded).attrs["padding"] = "NaN, behind the last coefficient; descending powers"
             _write(group, f"{name}_length", lengths)
         case "by name":
-            names = column.names(rows)
-            present = np.array([[part in (row or ()) for part in names] for row in rows], dtype=np.uint8)
-            values = [_floats([(row or {}).get(part) for part in names]) for row in rows]
-            shape = (len(rows), len(names))
-            _write(group, name, np.array(values, dtype=np.float64).reshape(shape))
-            _write(group, f"{name}_present", present.reshape(shape))
-            _write(group, f"{name.removesuffix('s')}_names", _encode(names))
+            _write_named(group, name, column.names(rows), [row or {} for row in rows])
         case _:
             # "random" is no number: where the search started is in start_delay, and the label in start.
-            numbers = [row if isinstance(row, int | float) else None for row in rows]
-            written = _write(group, name, _floats(numbers))
+            written = _write(group, name, _floats([None if isinstance(row, str) else row for row in rows]))
             if column.unit:
                 written.attrs["unit"] = column.unit
+
+
+def _write_named(group: h5py.Group, name: str, parts: list[str], rows: Sequence[Mapping[str, Any]]) -> None:
+    shape = (len(rows), len(parts))
+    _write(group, name, _floats([row.get(part) for row in rows for part in parts]).reshape(shape))
+    present = np.array([part in row for row in rows for part in parts], dtype=np.uint8)
+    _write(group, f"{name}_present", present.reshape(shape))
+    _write(group, f"{name.removesuffix('s')}_names", _encode(parts))
 
 
 def _results(group: h5py.Group) -> dict[Key, dict[str, Any]]:
@@ -205,23 +206,21 @@ def _read_column(group: h5py.Group, column: columns.Column) -> list[Any]:
     name = column.name
     if column.type == "str":
         return _decode(group[name])
-    values = group[name][()].tolist()
+    values = _plain(group[name])
     match column.type:
         case "int64" | "Int64":
             return [None if value == _MISSING else value for value in values]
         case "coefficients":
-            lengths = group[f"{name}_length"][()].tolist()
-            return [
-                None if length == _MISSING else [_none(value) for value in row[:length]]
-                for row, length in zip(values, lengths, strict=True)
-            ]
+            lengths = _plain(group[f"{name}_length"])
+            return [None if n == _MISSING else row[:n] for row, n in zip(values, lengths, strict=True)]
         case "by name":
             names = _decode(group[f"{name.removesuffix('s')}_names"])
+            masks = _plain(group[f"{name}_present"])
             return [
-                {part: _none(value) for part, value, there in zip(names, row, mask, strict=True) if there} or None
-                for row, mask in zip(values, group[f"{name}_present"][()].tolist(), strict=True)
+                {part: value for part, value, there in zip(names, row, mask, strict=True) if there} or None
+                for row, mask in zip(values, masks, strict=True)
             ]
-    return [_none(value) for value in values]
+    return values
 
 
 def _content_checksum(file: h5py.File) -> str:
@@ -258,5 +257,10 @@ def _floats(values: Sequence[Any]) -> np.ndarray[Any, Any]:
     return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
 
 
-def _none(value: float) -> float | None:
-    return None if value != value else value
+def _plain(dataset: h5py.Dataset) -> list[Any]:
+    """Numbers, None where there is none."""
+    values = dataset[()]
+    found = values.astype(object)
+    found[values != values] = None
+    numbers: list[Any] = found.tolist()
+    return numbers

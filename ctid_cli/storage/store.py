@@ -73,14 +73,16 @@ class Stored:
 
 @dataclass(frozen=True)
 class FoundEstimate:
-    """One estimate in full."""
+    """One estimate among those of its plan."""
 
     folder: Path
-    row: dict[str, Any]
-    data: dict[str, Any]
-    estimator: dict[str, Any]
-    seed: int | None
-    origins: tuple[Origin, ...]
+    stored: Stored
+    slot: Slot
+
+    @cached_property
+    def row(self) -> dict[str, Any]:
+        """Its row."""
+        return self.stored.row(self.slot)
 
 
 @dataclass(frozen=True)
@@ -132,18 +134,15 @@ def seal(folder: Path, log: journal.Journal) -> tuple[int, str]:
     table = csv.writer(times, lineterminator="\n")
     table.writerow(("id", "seconds", "session"))
     table.writerows((key.id, entries[key].seconds, entries[key].session) for key in stored.results)
-    target = folder / SEALED
+    target, safe = folder / SEALED, f"all {len(entries)} estimates are safe in {log.path}"
     try:
         place.write_safely(folder / TIMINGS, times.getvalue().encode())
         place.write_safely(target, image)
     except OSError as error:
-        reason = error.strerror or error
-        raise StorageError(
-            f"{target} could not be written ({reason}); all {len(entries)} estimates are safe in {log.path}."
-            " Make room and run the same command again"
-        ) from error
+        reason = f"{target} could not be written ({error.strerror or error})"
+        raise StorageError(f"{reason}; {safe}. Make room and run the same command again") from error
     if verify_sealed(target) != checksum:
-        raise StorageError(f"{target} reads back otherwise than it was written; all estimates are safe in {log.path}")
+        raise StorageError(f"{target} reads back otherwise than it was written; {safe}")
     log.mark_sealed(checksum)
     return count, checksum
 
@@ -159,19 +158,19 @@ def read_stored(folder: Path) -> Stored:
 @contextmanager
 def _reading(folder: Path) -> Iterator[journal.Journal | None]:
     """The journal of an experiment; None where there is only the sealed file to read, for instance during a run."""
-    place.require_experiment(folder)
     sealed = (folder / SEALED).exists()
     with ExitStack() as stack:
         log = None
-        try:
-            stack.enter_context(place.lock(folder, shared=True, patience=0.2))
-            log = stack.enter_context(place.reading_journal(folder))
-        except InUseError:
-            if not sealed:
-                raise
+        if (folder / journal.FILE_NAME).exists():
+            try:
+                stack.enter_context(place.lock(folder, shared=True, patience=0.2))
+                log = stack.enter_context(place.reading_journal(folder))
+            except InUseError:
+                if not sealed:
+                    raise
+        # There is a journal without a plan where the run was killed before it had planned anything.
         if log is None and not sealed:
-            # The run was killed before it had planned anything.
-            raise place.no_results(folder)
+            raise UsageError(f"there are no results in {folder}; 'ctid run' writes them")
         yield log
 
 
@@ -229,15 +228,10 @@ def load_estimates(folder: Path) -> pd.DataFrame:
     rows = stored.rows()
     # Where there is no system, the columns of one would be empty.
     left_out = "systems" if is_of_signal(stored.manifest) else ""
-    own = [column.name for column in row_columns(stored.manifest) if column.of != left_out]
-    compared = [column.name for column in columns.COLUMNS if column.source == "truth" and column.of != left_out]
-    types = {column.name: column.dtype for column in columns.COLUMNS}
-    frame = pd.DataFrame(
-        {
-            name: pd.Series([row.get(name) for row in rows], dtype=types.get(name))
-            for name in (*own, *swept_names(stored.manifest), *compared)
-        }
-    )
+    own = {column.name: column.dtype for column in row_columns(stored.manifest) if column.of != left_out}
+    compared = {c.name: c.dtype for c in columns.COLUMNS if c.source == "truth" and c.of != left_out}
+    types = own | dict.fromkeys(swept_names(stored.manifest)) | compared
+    frame = pd.DataFrame({name: pd.Series([row.get(name) for row in rows], dtype=of) for name, of in types.items()})
     frame.attrs["mixed"] = stored.mixed
     return frame
 
@@ -254,18 +248,9 @@ def find_estimate(results: Path, prefix: str) -> FoundEstimate:
             continue
         for slot in stored.slots():
             if slot.key.id.startswith(prefix) and slot.key.id not in matches:
-                matches[slot.key.id] = FoundEstimate(
-                    folder,
-                    stored.row(slot),
-                    dict(slot.cell["content"]),
-                    dict(slot.estimator["content"]),
-                    stored.manifest["seed"],
-                    stored.origins,
-                )
+                matches[slot.key.id] = FoundEstimate(folder, stored, slot)
     if not matches:
-        raise UsageError(
-            f"no estimate in {results} has an id that begins with {prefix!r}{in_use}; 'ctid export' lists all ids"
-        )
+        raise UsageError(f"no id in {results} begins with {prefix!r}{in_use}; 'ctid export' lists all ids")
     if len(matches) > 1:
         some = ", ".join(sorted(matches)[:5])
         raise UsageError(f"{len(matches)} estimates have an id that begins with {prefix!r}: {some}…; give more of it")
@@ -310,14 +295,12 @@ def _status(
     running: dict[str, Any] | None,
 ) -> ExperimentStatus:
     groups = []
-    for (name, _, cell), members in groupby(
-        slots(manifest), lambda slot: (slot.estimator["name"], slot.key.estimator_hash, slot.key.data_hash)
-    ):
+    for _, members in groupby(slots(manifest), lambda slot: (id(slot.estimator), slot.key.data_hash)):
         wanted = list(members)
         found = [statuses[slot.key] for slot in wanted if slot.key in statuses]
         failed = sum(status in columns.FAILURES for status in found)
-        groups.append(GroupStatus(len(wanted), len(found), failed, name, cell, wanted[0].swept))
-    planned, done, failed = (sum(getattr(group, name) for group in groups) for name in ("planned", "done", "failed"))
-    return ExperimentStatus(
-        planned, done, failed, manifest["experiment"], folder, left_aside, mixed, running, tuple(groups)
-    )
+        slot = wanted[0]
+        counts = (len(wanted), len(found), failed)
+        groups.append(GroupStatus(*counts, slot.estimator["name"], slot.key.data_hash, slot.swept))
+    counts = tuple(sum(getattr(group, name) for group in groups) for name in ("planned", "done", "failed"))
+    return ExperimentStatus(*counts, manifest["experiment"], folder, left_aside, mixed, running, tuple(groups))

@@ -120,6 +120,17 @@ def test_another_estimator_does_not_matter(tree: Path) -> None:
     ] * 2
 
 
+def test_one_more_kind_does_not_matter(tree: Path) -> None:
+    before = {name: versions(plan, tree) for name, plan in PLANS.items()}
+    file, line = path_of("ctid_cli.kinds", tree), '        "svf": "ctid_cli.estimators.svf:Svf",\n'
+    text = file.read_text(encoding="utf-8")
+    assert line in text
+    more = line.replace("svf", "another").replace("Svf", "Another")
+    file.write_text(text.replace(line, line + more), encoding="utf-8")
+    path_of("ctid_cli.estimators.another", tree).write_text("class Another: ...\n", encoding="utf-8")
+    assert {name: versions(plan, tree) for name, plan in PLANS.items()} == before
+
+
 def test_words_do_not_matter(tree: Path) -> None:
     before = {name: versions(plan, tree) for name, plan in PLANS.items()}
     for file in tree.rglob("*.py"):

@@ -218,12 +218,12 @@ def test_find_an_estimate_by_the_beginning_of_its_id(place: Path) -> None:
     assert found.folder == place
     assert found.row["id"] == wanted["id"]
     assert found.row["delay"] == wanted["delay"]
-    assert found.data == {"system": PLAN.data_cells[0].content["system"], "level": 5, "seed": 7}
-    assert found.estimator["kind"] == "toy"
-    assert found.seed == 7
+    assert found.slot.cell["content"] == {"system": PLAN.data_cells[0].content["system"], "level": 5, "seed": 7}
+    assert found.slot.estimator["kind"] == "toy"
+    assert found.stored.manifest["seed"] == 7
     with pytest.raises(UsageError, match="36 estimates"):
         find_estimate(place.parent, "")
-    with pytest.raises(UsageError, match="no estimate"):
+    with pytest.raises(UsageError, match="no id in .* begins with 'xyz'"):
         find_estimate(place.parent, "xyz")
 
 
