@@ -147,7 +147,7 @@ def check_free(folder: Path, manifest: Manifest, origins: Mapping[str, Origin], 
 
 def _other_origin(folder: Path, other: Origin, origin: Origin) -> str:
     then, now = dict(other.packages), dict(origin.packages)
-    pairs = [("code version", other.code_version, origin.code_version)]
+    pairs: list[tuple[str, str | None, str | None]] = [("code version", other.code_version, origin.code_version)]
     pairs += [(name, then.get(name), now.get(name)) for name in then | now]
     pairs += [("numeric platform", other.platform, origin.platform)]
     differences = "; ".join(f"{name} {old} then, {new} now" for name, old, new in pairs if old != new)

@@ -223,7 +223,7 @@ def test_find_an_estimate_by_the_beginning_of_its_id(place: Path) -> None:
     assert found.stored.manifest["seed"] == 7
     with pytest.raises(UsageError, match="36 estimates"):
         find_estimate(place.parent, "")
-    with pytest.raises(UsageError, match="no id in .* begins with 'xyz'"):
+    with pytest.raises(UsageError, match=r"no id in .* begins with 'xyz'"):
         find_estimate(place.parent, "xyz")
 
 
