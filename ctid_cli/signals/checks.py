@@ -8,7 +8,10 @@ from __future__ import annotations
 import math
 from numbers import Integral, Real
 
-from ctid_cli.errors import OptionError
+import numpy as np
+
+from ctid_cli.arrays import Array
+from ctid_cli.errors import DataError, OptionError
 
 
 def require_positive(name: str, value: float, unit: str, label: str = "") -> None:
@@ -41,6 +44,21 @@ def require_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
     """Refuse anything but one of some words."""
     if value not in allowed:
         raise OptionError(name, f"{name} must be {' or '.join(map(repr, allowed))}, not {value!r}.")
+
+
+def require_increasing(name: str, t: Array) -> None:
+    """Refuse instants that do not increase strictly."""
+    late = np.diff(t) <= 0
+    if late.any():
+        k = int(np.argmax(late))
+        raise DataError(f"{name} must increase strictly; samples {k} and {k + 1} are at {t[k]:g} and {t[k + 1]:g} s")
+
+
+def freeze(owner: object, **arrays: Array) -> None:
+    """Give a frozen dataclass arrays that nobody can change."""
+    for name, array in arrays.items():
+        array.setflags(write=False)
+        object.__setattr__(owner, name, array)
 
 
 def _is_number(value: object) -> bool:

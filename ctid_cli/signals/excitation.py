@@ -12,13 +12,7 @@ from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.signals.checks import (
-    require_choice,
-    require_finite,
-    require_integer,
-    require_not_negative,
-    require_positive,
-)
+from ctid_cli.signals import checks
 from ctid_cli.signals.csv_file import read_held_signal
 from ctid_cli.signals.held import COINCIDENCE, HeldSignal, Hold
 
@@ -133,9 +127,9 @@ class Prbs(Excitation):
     amplitude: float = 1.0
 
     def __post_init__(self) -> None:
-        require_integer("stages", self.stages, min(TAPS), max(TAPS))
-        require_positive("clock_period", self.clock_period, "s")
-        require_positive("amplitude", self.amplitude, "input unit")
+        checks.require_integer("stages", self.stages, min(TAPS), max(TAPS))
+        checks.require_positive("clock_period", self.clock_period, "s")
+        checks.require_positive("amplitude", self.amplitude, "input unit")
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """The sequence on its clock, the first edge at the first instant; the register's first state is drawn."""
@@ -176,10 +170,10 @@ class Multisine(Excitation):
     clock_period: float | None = None
 
     def __post_init__(self) -> None:
-        require_positive("lowest_frequency", self.lowest_frequency, "rad/s")
-        require_positive("highest_frequency", self.highest_frequency, "rad/s")
-        require_integer("tones", self.tones, 1)
-        require_positive("amplitude", self.amplitude, "input unit")
+        checks.require_positive("lowest_frequency", self.lowest_frequency, "rad/s")
+        checks.require_positive("highest_frequency", self.highest_frequency, "rad/s")
+        checks.require_integer("tones", self.tones, 1)
+        checks.require_positive("amplitude", self.amplitude, "input unit")
         _check_clock(self.clock_period)
         band = f"{self.lowest_frequency:g} and {self.highest_frequency:g} rad/s"
         if self.lowest_frequency > self.highest_frequency:
@@ -187,9 +181,7 @@ class Multisine(Excitation):
                 "lowest_frequency", f"lowest_frequency must not exceed highest_frequency; they are {band}."
             )
         if self.tones > 1 and self.lowest_frequency == self.highest_frequency:
-            raise OptionError(
-                "tones", f"{self.tones} tones need a band, but both ends are at {self.lowest_frequency:g} rad/s."
-            )
+            raise OptionError("tones", f"{self.tones} tones need a band, but its ends are {band}.")
 
     @property
     def frequencies(self) -> Array:
@@ -202,10 +194,8 @@ class Multisine(Excitation):
         mean_period = (clock[-1] - clock[0]) / (clock.size - 1) if clock.size > 1 else math.inf
         limit = math.pi / mean_period
         if self.frequencies[-1] >= limit:
-            raise DataError(
-                f"the multisine's highest tone, {self.frequencies[-1]:g} rad/s, is not below {limit:g} rad/s "
-                f"= pi / {mean_period:g} s, the most its clock can carry; lower one or the other"
-            )
+            most = f"{limit:g} rad/s = pi / {mean_period:g} s, the most its clock can carry; lower one or the other"
+            raise DataError(f"the multisine's highest tone, {self.frequencies[-1]:g} rad/s, is not below {most}")
         phases = rng.uniform(0.0, 2 * math.pi, self.tones)
         elapsed = clock - clock[0]
         total = np.zeros(clock.size)
@@ -233,7 +223,7 @@ class Gaussian(Excitation):
     clock_period: float | None = None
 
     def __post_init__(self) -> None:
-        require_positive("standard_deviation", self.standard_deviation, "input unit")
+        checks.require_positive("standard_deviation", self.standard_deviation, "input unit")
         _check_clock(self.clock_period)
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
@@ -262,12 +252,10 @@ class Step(Excitation):
     time: float = 0.0
 
     def __post_init__(self) -> None:
-        require_finite("amplitude", self.amplitude, "input unit")
+        checks.require_finite("amplitude", self.amplitude, "input unit")
         if self.amplitude == 0:
-            raise OptionError(
-                "amplitude", "amplitude must not be zero [input unit]: a step of height zero excites nothing."
-            )
-        require_not_negative("time", self.time, "s")
+            raise OptionError("amplitude", "amplitude must not be zero [input unit]: such a step excites nothing.")
+        checks.require_not_negative("time", self.time, "s")
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """The step, which must come before the last instant; nothing is drawn."""
@@ -313,7 +301,7 @@ class InputFile(Excitation):
     sha256: str | None = None
 
     def __post_init__(self) -> None:
-        require_choice("hold", self.hold, get_args(Hold))
+        checks.require_choice("hold", self.hold, get_args(Hold))
         if self.time == self.input:
             raise OptionError("input", f"time and input must be two columns; both are {self.time!r}.")
 
@@ -322,16 +310,13 @@ class InputFile(Excitation):
         whole = read_held_signal(self.file, time=self.time, input=self.input, hold=self.hold)
         start, end = float(sample_times[0]), float(sample_times[-1])
         if whole.t[0] >= end:
-            raise DataError(
-                f"{self.file}: the input begins at {whole.t[0]:g} s, and the record ends at {end:g} s; "
-                "shift the file's times or take more samples"
-            )
+            begins = f"the input begins at {whole.t[0]:g} s, and the record ends at {end:g} s"
+            raise DataError(f"{self.file}: {begins}; shift the file's times or take more samples")
         # One break beyond the end stays: straight lines need it.
         stop = int(np.searchsorted(whole.t, end)) + 1
         times, values = whole.t[:stop], whole.values[:stop]
         if times[0] < start:
-            slack = COINCIDENCE * float(np.diff(whole.t).min()) if whole.t.size > 1 else 0.0
-            inside = times > start + slack
+            inside = times > start + whole.slack
             times = np.concatenate(([start], times[inside]))
             values = np.concatenate((whole.at([start]), values[inside]))
         return HeldSignal(times, values, self.hold)
@@ -349,4 +334,4 @@ def _clock(sample_times: Array, period: float | None) -> Array:
 
 def _check_clock(period: float | None) -> None:
     if period is not None:
-        require_positive("clock_period", period, "s")
+        checks.require_positive("clock_period", period, "s")

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
+from ctid_cli.signals.checks import freeze, require_increasing
 from ctid_cli.signals.treatment import Hold as Hold
 
 #: Instants closer than this fraction of the shortest break interval count as the same instant.
@@ -44,25 +45,22 @@ class HeldSignal:
         t = np.array(self.t, dtype=float)
         values = np.array(self.values, dtype=float)
         if t.ndim != 1 or t.shape != values.shape or t.size == 0:
-            raise DataError(
-                f"a held signal needs times and values of one equal, non-zero length; got {t.shape} and {values.shape}"
-            )
+            shapes = f"{t.shape} and {values.shape}"
+            raise DataError(f"a held signal needs times and values of one equal, non-zero length; got {shapes}")
         if self.hold not in ("zoh", "foh"):
             raise DataError(f"hold must be 'zoh' or 'foh', not {self.hold!r}")
         if not (np.isfinite(t).all() and np.isfinite(values).all()):
             raise DataError("the input holds a value or a time that is not a finite number")
-        if not (np.diff(t) > 0).all():
-            k = int(np.argmin(np.diff(t) > 0))
-            raise DataError(
-                f"input times must increase strictly; samples {k} and {k + 1} are {t[k]:g} and {t[k + 1]:g}"
-            )
-        t.setflags(write=False)
-        values.setflags(write=False)
-        object.__setattr__(self, "t", t)
-        object.__setattr__(self, "values", values)
+        require_increasing("input times", t)
+        freeze(self, t=t, values=values)
 
     def __repr__(self) -> str:
         return f"HeldSignal({self.t.size} values from {self.t[0]:g} to {self.t[-1]:g} s, {self.hold})"
+
+    @property
+    def slack(self) -> float:
+        """Instants closer than this count as the same [s]."""
+        return COINCIDENCE * float(np.diff(self.t).min()) if self.t.size > 1 else 0.0
 
     def at(self, times: ArrayLike) -> Array:
         """Value of the signal at given instants, from the right at a jump.
@@ -78,8 +76,7 @@ class HeldSignal:
             Values [input unit]; zero before the first break.
         """
         instants = np.asarray(times, dtype=float)
-        slack = COINCIDENCE * float(np.diff(self.t).min()) if self.t.size > 1 else 0.0
-        index = np.searchsorted(self.t, instants + slack, side="right") - 1
+        index = np.searchsorted(self.t, instants + self.slack, side="right") - 1
         if self.hold == "zoh":
             held = self.values[np.maximum(index, 0)]
         else:

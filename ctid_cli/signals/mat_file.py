@@ -108,18 +108,15 @@ def _read_hdf5(path: str | os.PathLike[str], file: str) -> tuple[dict[str, Any],
 
 
 def _vector(file: str, name: str, value: Any) -> Array:
-    array = np.asarray(value)
-    if hasattr(value, "toarray"):
-        array = value.toarray()  # a sparse matrix
+    array = value.toarray() if hasattr(value, "toarray") else np.asarray(value)  # a matrix may be sparse
     if array.dtype.kind not in "biufc":
-        raise DataError(f"{file}: variable {name!r} does not hold numbers; time, input and output must be vectors")
+        raise DataError(f"{file}: variable {name!r} does not hold numbers")
     if array.size == 0:
         raise DataError(f"{file}: variable {name!r} is empty")
     if array.size != max(array.shape, default=1):
         shape = "x".join(str(n) for n in array.shape)
         raise DataError(
-            f"{file}: variable {name!r} is a {shape} array; time, input and output must each be one vector, "
-            "so save the columns you mean as vectors of their own"
+            f"{file}: variable {name!r} is a {shape} array; save the columns you mean as vectors of their own"
         )
     if array.dtype.kind == "c":
         if np.any(array.imag != 0):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -68,53 +69,29 @@ def read_measurement(
     left behind is estimated with the model where that is asked for.
     """
     require_choice("hold", hold, get_args(Hold))
-    table = read_table(
-        path,
-        "export the record as comma-separated text (.csv) whose first line names the columns, or from MATLAB as "
-        "vectors (.mat)",
-    )
-    asked: dict[Role, str | None] = {"time": time, "input": input, "output": output}
-    columns, notes = _choose(table, asked)
+    table = read_table(path, "export the record as comma-separated text (.csv), or from MATLAB as vectors (.mat)")
+    columns, notes = _choose(table, {"time": time, "input": input, "output": output})
     unit = {role: (units or {}).get(role) or split_header(name)[1] for role, name in columns.items()}
-
-    y = table.numbers(columns["output"])
-    u = table.numbers(columns["input"])
-    t = table.numbers(columns["time"])
+    t, u, y = (table.numbers(columns[role]) for role in ROLES)
     label = unit["time"] or "s"
     if t.size == 1 and y.size > 1:
         interval = table.lone_interval(columns["time"], float(t[0]))
         t = interval * np.arange(y.size, dtype=float)
         note = f"{columns['time']!r} is one number: it was taken as the sampling interval"
         notes.append(f"{note}, {interval:g} {label}, from 0 {label} on.")
-    for role, values in (("time", t), ("input", u)):
-        if values.size != y.size:
-            raise DataError(
-                f"{table.file}: {role} {columns[_role(role)]!r} has {values.size} values and "
-                f"output {columns['output']!r} has {y.size}; they must be equally many"
-            )
+    for name, values in ((columns["time"], t), (columns["input"], u)):
+        table.require_as_many(name, values, columns["output"], y)
     table.check_times(columns["time"], t, label)
     first, last = _window(table, t, start, stop, label)
     if last - first < t.size:
-        notes.append(
-            f"Only the {last - first} of {t.size} samples from {t[first]:.6g} to {t[last - 1]:.6g} {label} are used; "
-            "the input before them is not."
-        )
+        part = f"Only the {last - first} of {t.size} samples from {t[first]:.6g} to {t[last - 1]:.6g} {label} are used"
+        notes.append(f"{part}; the input before them is not.")
     t = t[first:last]
     u = table.check_input(columns["input"], u[first:last], first)
     y = table.check_output(columns["output"], y[first:last], first)
     record = Record(t, y, HeldSignal(t, u, hold), name=table.file)
-    return Measurement(
-        record,
-        unit["time"],
-        unit["input"],
-        unit["output"],
-        columns["time"],
-        columns["input"],
-        columns["output"],
-        start,
-        stop,
-        tuple(notes),
-    )
+    named = (columns["time"], columns["input"], columns["output"])
+    return Measurement(record, unit["time"], unit["input"], unit["output"], *named, start, stop, tuple(notes))
 
 
 def read_table(path: str | os.PathLike[str], otherwise: str) -> Table:
@@ -129,43 +106,35 @@ def read_table(path: str | os.PathLike[str], otherwise: str) -> Table:
 
 def _choose(table: Table, asked: Mapping[Role, str | None]) -> tuple[dict[Role, str], list[str]]:
     """The column of each role, and what was assumed."""
-    chosen: dict[Role, str] = {}
-    for role in ROLES:
-        if (wanted := asked[role]) is not None:
-            chosen[role] = table.named(wanted)
+    chosen = {role: table.named(wanted) for role in ROLES if (wanted := asked[role]) is not None}
     refuse_nameless(table)
-    by_position: list[Role] = []
     for role in ROLES:
-        if role not in chosen:
-            found = _recognised(table, role, chosen)
-            if found is None:
-                by_position.append(role)
-            else:
-                chosen[role] = found
-    notes = []
-    if by_position:
-        left = [name for name in table.names if name not in chosen.values()]
-        # A column with a usual name is not put in another place than its name says.
-        named = any(table.leaf(name).lower() in names for name in left for names in USUAL_NAMES.values())
-        if table.lines is None or len(table.names) != 3 or len(left) != len(by_position) or named:
-            _refuse_unrecognised(table, by_position[0], chosen)
-        chosen.update(zip(by_position, left, strict=True))
-        taken = [f"{chosen[role]!r} as the {role}" for role in by_position]
-        notes.append(f"Columns were taken by their position: {listed(taken)}.")
-    for one, other in (("time", "input"), ("time", "output"), ("input", "output")):
-        if chosen[_role(one)] == chosen[_role(other)]:
-            raise DataError(f"{table.head}: {chosen[_role(one)]!r} cannot be both the {one} and the {other}")
-    unused = [name for name in table.names if name not in chosen.values()]
+        if role not in chosen and (found := _recognised(table, role, chosen)) is not None:
+            chosen[role] = found
+    notes = _take_by_position(table, chosen)
+    for one, other in itertools.combinations(ROLES, 2):
+        if chosen[one] == chosen[other]:
+            raise DataError(f"{table.head}: {chosen[one]!r} cannot be both the {one} and the {other}")
+    unused = [repr(name) for name in table.names if name not in chosen.values()]
     if unused and table.lines is not None:
-        verb = "is" if len(unused) == 1 else "are"
-        notes.append(
-            f"Column{'s' if len(unused) > 1 else ''} {listed([repr(name) for name in unused])} {verb} not used."
-        )
+        words = ("Column", "is") if len(unused) == 1 else ("Columns", "are")
+        notes.append(f"{words[0]} {listed(unused)} {words[1]} not used.")
     return chosen, notes
 
 
-def _role(name: str) -> Role:
-    return next(role for role in ROLES if role == name)
+def _take_by_position(table: Table, chosen: dict[Role, str]) -> list[str]:
+    """Take the columns of the roles that are still open in their order, where no name contradicts; say so."""
+    missing = [role for role in ROLES if role not in chosen]
+    if not missing:
+        return []
+    left = [name for name in table.names if name not in chosen.values()]
+    # A column with a usual name is not put in another place than its name says.
+    named = any(table.leaf(name).lower() in names for name in left for names in USUAL_NAMES.values())
+    if table.lines is None or len(table.names) != 3 or len(left) != len(missing) or named:
+        _refuse_unrecognised(table, missing[0], chosen)
+    chosen.update(zip(missing, left, strict=True))
+    taken = [f"{chosen[role]!r} as the {role}" for role in missing]
+    return [f"Columns were taken by their position: {listed(taken)}."]
 
 
 def _recognised(table: Table, role: Role, chosen: Mapping[Role, str]) -> str | None:
@@ -178,10 +147,8 @@ def _recognised(table: Table, role: Role, chosen: Mapping[Role, str]) -> str | N
         close = [name for name in matching if table.lines is None and name.rpartition(".")[0] in homes]
         matching = close or matching
         if len(matching) > 1:
-            raise DataError(
-                f"{table.head}: {listed([repr(name) for name in matching])} may all be the {role}; "
-                f"say which one (option {role})"
-            )
+            several = listed([repr(name) for name in matching])
+            raise DataError(f"{table.head}: {several} may all be the {role}; say which one (option {role})")
         if matching:
             return matching[0]
     return None
@@ -195,15 +162,11 @@ def _refuse_unrecognised(table: Table, role: Role, chosen: Mapping[Role, str]) -
         )
     usual = " or ".join(map(repr, USUAL_NAMES[role][:2]))
     other = "other " if any(table.leaf(name).lower() in USUAL_NAMES[role] for name in chosen.values()) else ""
-    message = (
-        f"{table.head}: no {other}{table.noun} is called {usual}; {listing(table)}. "
-        f"Say which one is the {role} (option {role})"
-    )
-    if close := next((match for name in USUAL_NAMES[role][1:] if (match := closest(name, table.names))), None):
-        message += f"; did you mean {close!r}?"
-    if table.hint:
-        message += f". {table.hint}"
-    raise DataError(message)
+    message = f"{table.head}: no {other}{table.noun} is called {usual}; {listing(table)}"
+    close = next((match for name in USUAL_NAMES[role][1:] if (match := closest(name, table.names))), None)
+    meant = f"; did you mean {close!r}?" if close else ""
+    parts = [message, f"Say which one is the {role} (option {role}){meant}", table.hint]
+    raise DataError(". ".join(filter(None, parts)))
 
 
 def _window(table: Table, t: Array, start: float | None, stop: float | None, unit: str) -> tuple[int, int]:
@@ -215,14 +178,11 @@ def _window(table: Table, t: Array, start: float | None, stop: float | None, uni
     first = int(np.searchsorted(t, low, side="left"))
     last = int(np.searchsorted(t, high, side="right"))
     if first >= last:
-        raise DataError(
-            f"{table.file}: no sample lies {_span(start, stop, unit)}; "
-            f"the record runs from {t[0]:.9g} to {t[-1]:.9g} {unit}"
-        )
+        raise no_sample(table, low, high, float(t[0]), float(t[-1]), unit)
     return first, last
 
 
-def _span(start: float | None, stop: float | None, unit: str) -> str:
-    if stop is None:
-        return f"at {start:g} {unit} or later"
-    return f"at {stop:g} {unit} or earlier" if start is None else f"between {start:g} and {stop:g} {unit}"
+def no_sample(table: Table, low: float, high: float, begin: float, end: float, unit: str) -> DataError:
+    """The error for a window without a sample."""
+    runs = f"the record runs from {begin:.9g} to {end:.9g} {unit}"
+    return DataError(f"{table.file}: no sample lies between {low:g} and {high:g} {unit}; {runs}")

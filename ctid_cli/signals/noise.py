@@ -299,11 +299,8 @@ class ArmaNoise(Noise):
             object.__setattr__(self, name, tuple(float(value) for value in coefficients))
         largest = float(np.abs(np.roots(self.denominator)).max(initial=0.0))
         if largest >= 1.0:
-            raise OptionError(
-                "denominator",
-                f"denominator has a zero of magnitude {largest:.6g}: the noise would grow without bound; "
-                "all must lie inside the unit circle.",
-            )
+            why = f"denominator has a zero of magnitude {largest:.6g}: the noise would grow without bound"
+            raise OptionError("denominator", f"{why}; all must lie inside the unit circle.")
         self._require_one_level()
 
     @property

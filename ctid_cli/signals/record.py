@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
-from ctid_cli.signals.checks import require_choice
+from ctid_cli.signals.checks import freeze, require_choice, require_increasing
 from ctid_cli.signals.held import HeldSignal, Hold
 
 #: A clock counts as regular when no instant is further than this fraction of the interval from its place.
@@ -64,8 +64,7 @@ class Loop:
         reference = np.array(self.reference, dtype=float)
         if reference.ndim != 1 or not np.isfinite(reference).all():
             raise DataError("the reference of a loop must be one finite number for each sample")
-        reference.setflags(write=False)
-        object.__setattr__(self, "reference", reference)
+        freeze(self, reference=reference)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,27 +109,19 @@ class Record:
         y = np.array(self.y, dtype=float)
         where = f"{self.name}: " if self.name else ""
         if t.ndim != 1 or t.shape != y.shape:
-            raise DataError(
-                f"{where}times and outputs must be one-dimensional and of equal length; got {t.shape} and {y.shape}"
-            )
+            shapes = f"{t.shape} and {y.shape}"
+            raise DataError(f"{where}times and outputs must be one-dimensional and of equal length; got {shapes}")
         if t.size == 0:
             raise DataError(f"{where}the record is empty")
         if not np.isfinite(t).all():
             raise DataError(f"{where}time of sample {int(np.argmin(np.isfinite(t)))} is not a finite number")
-        if not (np.diff(t) > 0).all():
-            k = int(np.argmin(np.diff(t) > 0))
-            raise DataError(
-                f"{where}times must increase strictly; samples {k} and {k + 1} are at {t[k]:g} s and {t[k + 1]:g} s"
-            )
+        require_increasing(f"{where}times", t)
         if np.isinf(y).any():
             k = int(np.argmax(np.isinf(y)))
             raise DataError(f"{where}output of sample {k} is infinite; mark missing samples as NaN")
         if not np.isfinite(y).any():
             raise DataError(f"{where}no output sample is a finite number")
-        t.setflags(write=False)
-        y.setflags(write=False)
-        object.__setattr__(self, "t", t)
-        object.__setattr__(self, "y", y)
+        freeze(self, t=t, y=y)
         if self.loop is not None:
             self._require_loop(self.loop, where)
 
@@ -145,15 +136,11 @@ class Record:
         if loop.reference.size != self.t.size:
             raise DataError(f"{where}the reference has {loop.reference.size} values for {self.t.size} samples")
         if self.interval is None:
-            raise DataError(
-                f"{where}a closed loop needs a regular clock: its controller is discrete and acts at every sample, "
-                "and these are not equidistant"
-            )
+            why = "its controller is discrete and acts at every sample, and these are not equidistant"
+            raise DataError(f"{where}a closed loop needs a regular clock: {why}")
         if self.input.hold != "zoh" or not self.input_on_grid:
-            raise DataError(
-                f"{where}in a closed loop the input is held (zoh) from one sample to the next, because a discrete "
-                "controller makes it; give its values at the samples"
-            )
+            what = "the input is held (zoh) from one sample to the next"
+            raise DataError(f"{where}in a closed loop {what}; give its values at the samples")
 
     @classmethod
     def from_arrays(cls, t: ArrayLike, u: ArrayLike, y: ArrayLike, hold: Hold = "zoh", name: str = "") -> Record:

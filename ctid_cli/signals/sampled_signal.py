@@ -13,7 +13,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import require_positive
 from ctid_cli.signals.csv_file import require_file
-from ctid_cli.signals.measurement import USUAL_NAMES, read_table
+from ctid_cli.signals.measurement import USUAL_NAMES, no_sample, read_table
 from ctid_cli.signals.table import Table, listing, refuse_nameless, refuse_one_column, split_header
 
 #: Names by which the signal is recognised when nobody says which column it is, the most telling first.
@@ -89,11 +89,7 @@ def read_sampled_signal(
             interval, first, time_unit = table.lone_interval(times, float(clock[0])), 0.0, time_unit or "s"
             notes.append(f"{times!r} is one number and was taken as the sampling interval.")
         else:
-            if clock.size != values.size:
-                raise DataError(
-                    f"{table.file}: {times!r} has {clock.size} values and {column!r} has {values.size}; they must be "
-                    "equally many"
-                )
+            table.require_as_many(times, clock, column, values)
             values, interval, note = _on_grid(table, times, clock, values, time_unit or "s")
             first = float(clock[0])
             notes += [note] if note else []
@@ -107,9 +103,8 @@ def read_sampled_signal(
     values = values[low:high]
     if not np.isfinite(values).any():
         raise DataError(f"{table.file}: no sample of {column!r} is a finite number")
-    return SampledSignal(
-        values, interval, first + low * interval, table.file, name, times, time_unit, unit, tuple(notes)
-    )
+    begin = first + low * interval
+    return SampledSignal(values, interval, begin, table.file, name, times, time_unit, unit, tuple(notes))
 
 
 def _columns(table: Table, time: str | None, signal: str | None, clocked: bool) -> tuple[str | None, str, list[str]]:
@@ -118,19 +113,15 @@ def _columns(table: Table, time: str | None, signal: str | None, clocked: bool) 
     refuse_one_column(table)
     times = table.named(time) if time is not None else _usual(table, USUAL_NAMES["time"], signal)
     if times is None and not clocked:
-        raise DataError(
-            f"{table.head}: no {table.noun} is called 't' or 'time'; {listing(table)}. Say which one holds the times "
-            "(--time), or give the clock (--interval SECONDS or --rate HERTZ)"
-        )
+        ways = "Say which one holds the times (--time), or give the clock (--interval SECONDS or --rate HERTZ)"
+        raise DataError(f"{table.head}: no {table.noun} is called 't' or 'time'; {listing(table)}. {ways}")
     column = table.named(signal) if signal is not None else _usual(table, SIGNAL_NAMES, times)
     left = [name for name in table.names if name != times]
     notes = []
     if column is None:
         if len(left) != 1 and table.noun != "channel":
-            raise DataError(
-                f"{table.head}: no {table.noun} is called 'y' or 'signal'; {listing(table)}. Say which one is the "
-                "signal (--signal)"
-            )
+            which = f"{listing(table)}. Say which one is the signal (--signal)"
+            raise DataError(f"{table.head}: no {table.noun} is called 'y' or 'signal'; {which}")
         column = left[0]
     if column == times:
         raise DataError(f"{table.head}: {column!r} cannot be both the time and the signal")
@@ -156,20 +147,18 @@ def _on_grid(table: Table, name: str, t: Array, values: Array, unit: str) -> tup
     worst = int(np.argmax(stray))
     if stray[worst] > CLOCK_TOLERANCE * interval + tolerance:
         # Where most neighbours of a sample are missing, the median is a multiple of the interval.
+        beside = f"{t[worst]:.9g} {unit} lies {stray[worst]:.3g} {unit} beside a grid of {interval:.6g} {unit}"
         complaint = (
-            f"{table.place(worst)}: the clock is not regular: the intervals run from {steps.min():.6g} to "
-            f"{steps.max():.6g} {unit}, and {t[worst]:.9g} {unit} lies {stray[worst]:.3g} {unit} beside a grid of "
-            f"{interval:.6g} {unit}; the estimators compare samples at fixed delays, so they need a regular clock. "
-            "Resample the record, or give its clock (--interval or --rate) if the times in the file are only rounded"
+            f"{table.place(worst)}: the clock is not regular: {beside}, at intervals from {steps.min():.6g} to "
+            f"{steps.max():.6g} {unit}. Resample the record, or give its clock (--interval or --rate) if the times in "
+            "the file are only rounded"
         )
         places, interval, stray = _nearest_grid(t, float(steps.min()))
         if not stray.max() <= CLOCK_TOLERANCE * interval + tolerance:
             raise DataError(complaint)
     if places[-1] > MOST_FILLED * t.size:
-        raise DataError(
-            f"{table.file}: of {places[-1] + 1:.6g} instants of a clock of {interval:.6g} {unit} the file has only "
-            f"{t.size}; use a part of the record with fewer gaps (--from, --to), or resample it"
-        )
+        some = f"of {places[-1] + 1:.6g} instants of a clock of {interval:.6g} {unit} the file has only {t.size}"
+        raise DataError(f"{table.file}: {some}; use a part with fewer gaps (--from, --to), or resample the record")
     if places[-1] + 1 == t.size:
         return values, interval, ""
     filled = np.full(int(places[-1]) + 1, np.nan)
@@ -191,11 +180,8 @@ def _window(
     low = 0 if start is None else int(np.ceil(np.clip((start - first) / interval - 1e-6, 0.0, count)))
     high = count if stop is None else int(np.floor(np.clip((stop - first) / interval + 1e-6, -1.0, count - 1))) + 1
     if low >= high:
-        last = first + (count - 1) * interval
-        raise DataError(
-            f"{table.file}: no sample lies in the window that was asked for; the record runs from {first:.9g} to "
-            f"{last:.9g} {unit}"
-        )
+        window = (-np.inf if start is None else start, np.inf if stop is None else stop)
+        raise no_sample(table, *window, first, first + (count - 1) * interval, unit)
     return low, high
 
 

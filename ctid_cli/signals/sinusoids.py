@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -108,11 +107,7 @@ class SumOfSinusoids:
         instants = [0.0, *self.frequency_steps]
         for instant, row in zip(instants, self.frequencies_at(instants), strict=True):
             if (np.diff(row) == 0.0).any():
-                raise OptionError(
-                    "tones",
-                    f"two tones have the same frequency from {instant:g} s on; they are one sinusoid, so leave one "
-                    "out.",
-                )
+                raise OptionError("tones", f"two tones have the same frequency from {instant:g} s on; leave one out.")
 
     @property
     def frequency_steps(self) -> tuple[float, ...]:
@@ -255,12 +250,12 @@ def _check_course(name: str, course: float | tuple[Piece, ...], unit: str) -> No
         raise OptionError(name, f"{name} must hold at least one piece.")
     for piece in course:
         require_positive(name, piece.value, unit, label=f"the value of a piece of {name}")
-    if course[-1].until is not None or any(piece.until is None for piece in course[:-1]):
+    *ends, last = (piece.until for piece in course)
+    if last is not None or None in ends:
         raise OptionError(name, f"every piece of {name} but the last needs 'until' [s], and the last has none.")
-    ends = [piece.until for piece in course[:-1] if piece.until is not None]
     for end in ends:
-        require_positive(name, end, "s", label=f"'until' of a piece of {name}")
-    if any(later <= earlier for earlier, later in itertools.pairwise(ends)):
+        require_positive(name, cast(float, end), "s", label=f"'until' of a piece of {name}")
+    if (np.diff(_ends(course)) <= 0).any():
         raise OptionError(name, f"the pieces of {name} must follow one another; their ends are {ends} s.")
 
 

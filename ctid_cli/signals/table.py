@@ -9,7 +9,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from ctid_cli.arrays import Array, IntArray
+from ctid_cli.arrays import Array, BoolArray, IntArray
 from ctid_cli.errors import DataError
 from ctid_cli.text import closest
 
@@ -40,13 +40,9 @@ class Table:
 
     def numbers(self, name: str) -> Array:
         """One column."""
-        self.require(name)
-        return self.convert(name)
-
-    def require(self, name: str) -> None:
-        """Refuse a name that the file does not have."""
         if name not in self.names:
             refuse_missing(self, name)
+        return self.convert(name)
 
     def named(self, wanted: str) -> str:
         """The column whose header is ``wanted``, with or without its unit."""
@@ -67,48 +63,47 @@ class Table:
             raise DataError(f"{self.file}: {name!r} is {value:g}; a sampling interval must be a positive number")
         return value
 
+    def require_as_many(self, name: str, values: Array, other: str, others: Array) -> None:
+        """Refuse two columns of different lengths."""
+        if values.size != others.size:
+            sizes = f"{name!r} has {values.size} values and {other!r} has {others.size}"
+            raise DataError(f"{self.file}: {sizes}; they must be equally many")
+
     def times(self, name: str, unit: str = "s") -> Array:
         """The column of the instants."""
         return self.check_times(name, self.numbers(name), unit)
 
     def check_times(self, name: str, t: Array, unit: str = "s") -> Array:
         """Refuse instants that are missing or do not increase."""
-        if not np.isfinite(t).all():
-            k = int(np.argmin(np.isfinite(t)))
-            every = "sample" if self.lines is None else "line"
-            raise DataError(
-                f"{self.place(k)}: time {name!r} is missing or not finite; every {every} needs its instant [{unit}]"
-            )
-        steps = np.diff(t)
-        if not (steps > 0).all():
-            k = int(np.argmin(steps > 0))
-            how = "repeats" if steps[k] == 0 else "goes back to"
-            raise DataError(
-                f"{self.place(k + 1)}: time {name!r} {how} {t[k + 1]:.12g} {unit} after {t[k]:.12g} {unit} "
-                f"on {self.row(k)}; times must increase strictly"
-            )
+        every = "sample" if self.lines is None else "line"
+        self._refuse(
+            ~np.isfinite(t), f"time {name!r} is missing or not finite; every {every} needs its instant [{unit}]"
+        )
+        steps = np.diff(t, prepend=-np.inf)
+        k = int(np.argmax(steps <= 0))
+        how = "repeats" if steps[k] == 0 else "goes back to"
+        found = f"{t[k]:.12g} {unit} after {t[k - 1]:.12g} {unit} on {self.row(k - 1)}"
+        self._refuse(steps <= 0, f"time {name!r} {how} {found}; times must increase strictly")
         return t
 
     def check_input(self, name: str, u: Array, first: int = 0) -> Array:
-        """Refuse an input with gaps."""
-        if not np.isfinite(u).all():
-            k = first + int(np.argmin(np.isfinite(u)))
-            raise DataError(
-                f"{self.place(k)}: input {name!r} is missing or not finite; only the output may have gaps, "
-                "since the system answers to its input whether or not that was recorded"
-            )
+        """Refuse an input with gaps: the system answers to its input whether or not that was recorded."""
+        self._refuse(~np.isfinite(u), f"input {name!r} is missing or not finite; only the output may have gaps", first)
         return u
 
     def check_output(self, name: str, y: Array, first: int = 0) -> Array:
         """Refuse an output that is infinite somewhere or missing everywhere."""
-        if np.isinf(y).any():
-            k = first + int(np.argmax(np.isinf(y)))
-            raise DataError(
-                f"{self.place(k)}: output {name!r} is infinite; leave the field empty where a sample is missing"
-            )
+        self._refuse(
+            np.isinf(y), f"output {name!r} is infinite; leave the field empty where a sample is missing", first
+        )
         if not np.isfinite(y).any():
             raise DataError(f"{self.place(first)}: no sample of the output {name!r} is a finite number")
         return y
+
+    def _refuse(self, wrong: BoolArray, message: str, first: int = 0) -> None:
+        """Refuse a column that is wrong somewhere, and name the first row where it is."""
+        if wrong.any():
+            raise DataError(f"{self.place(first + int(np.argmax(wrong)))}: {message}")
 
 
 def split_header(header: str) -> tuple[str, str | None]:
@@ -123,14 +118,10 @@ def split_header(header: str) -> tuple[str, str | None]:
 def refuse_missing(table: Table, wanted: str) -> NoReturn:
     """Say which columns there are in place of one that there is not."""
     refuse_nameless(table)
-    message = f"{table.head}: there is no {table.noun} {wanted!r}; {listing(table)}"
-    if separated := wrong_separator(table):
-        message += f". {separated}"
-    elif close := closest(wanted, table.names):
-        message += f". Did you mean {close!r}?"
-    if table.hint:
-        message += f". {table.hint}"
-    raise DataError(message)
+    parts = [f"{table.head}: there is no {table.noun} {wanted!r}; {listing(table)}", wrong_separator(table)]
+    if not parts[1] and (close := closest(wanted, table.names)):
+        parts.append(f"Did you mean {close!r}?")
+    raise DataError(". ".join(filter(None, [*parts, table.hint])))
 
 
 def refuse_nameless(table: Table) -> None:

@@ -162,13 +162,13 @@ def test_other_objects_are_named(tmp_path):
 @pytest.mark.parametrize(
     ("content", "options", "message"),
     [
-        ({"t": T, "u": np.ones((5, 2)), "y": Y}, {}, "variable 'u' is a 5x2 array; time, input and output must each"),
+        ({"t": T, "u": np.ones((5, 2)), "y": Y}, {}, "variable 'u' is a 5x2 array; save the columns you mean"),
         ({"t": T, "u": "held", "y": Y}, {}, "variable 'u' does not hold numbers"),
         ({"t": T, "u": np.array([U, Y], dtype=object), "y": Y}, {}, "variable 'u' does not hold numbers"),
         ({"t": T, "u": U * 1j, "y": Y}, {}, "variable 'u' holds complex numbers"),
         ({"t": T, "u": np.empty((0, 0)), "y": Y}, {}, "variable 'u' is empty"),
-        ({"t": T, "u": U[:4], "y": Y}, {}, "input 'u' has 4 values and output 'y' has 5; they must be equally many"),
-        ({"t": T[:4], "u": U, "y": Y}, {}, "time 't' has 4 values and output 'y' has 5"),
+        ({"t": T, "u": U[:4], "y": Y}, {}, "'u' has 4 values and 'y' has 5; they must be equally many"),
+        ({"t": T[:4], "u": U, "y": Y}, {}, "'t' has 4 values and 'y' has 5"),
         ({"t": T[::-1], "u": U, "y": Y}, {}, "sample 2: time 't' goes back to 0.3 s after 0.4 s on sample 1"),
         ({"t": T, "u": U, "y": Y * np.nan}, {}, "sample 1: no sample of the output 'y' is a finite number"),
         ({"t": T, "valve": U, "y": Y}, {}, "no variable is called 'u' or 'input'; the file has 't', 'valve', 'y'"),

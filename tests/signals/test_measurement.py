@@ -116,7 +116,7 @@ def test_other_text_files_are_read_alike(write):
         ("t,a,b,c\n0,1,2,3\n", {}, "no column is called 'u' or 'input'; the file has 't', 'a', 'b', 'c'. Say which"),
         ("t,inputs_1,b,c\n0,1,2,3\n", {}, "did you mean 'inputs_1'?"),
         ("t [s],t (h),u,y\n0,1,2,3\n", {}, "'t [s]' and 't (h)' may all be the time; say which one (option time)"),
-        ("t,u,y\n0,1,2\n1,1,2\n", {"start": 5}, ": no sample lies at 5 s or later; the record runs from 0 to 1 s"),
+        ("t,u,y\n0,1,2\n1,1,2\n", {"start": 5}, ": no sample lies between 5 and inf s; the record runs from 0 to 1 s"),
         ("t,u,y\n0,1,2\n1,1,2\n", {"start": 0.2, "stop": 0.8}, "no sample lies between 0.2 and 0.8 s"),
         ("t,u,y\n0,1,2\n1,1,2\n", {"start": 1, "stop": 0}, "the window from 1 to 0 s ends before it begins"),
         ("t,u,y\n0,1,2\n1,1,\n2,1,\n", {"start": 1}, ":3: no sample of the output 'y' is a finite number"),

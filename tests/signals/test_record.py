@@ -79,7 +79,7 @@ def test_record_never_changes():
         (
             [0.0, 1.0, 1.0],
             [1.0, 2.0, 3.0],
-            "pump: times must increase strictly; samples 1 and 2 are at 1 s and 1 s",
+            "pump: times must increase strictly; samples 1 and 2 are at 1 and 1 s",
         ),
         ([0.0, 1.0], [1.0, np.inf], "pump: output of sample 1 is infinite"),
         ([0.0, 1.0], [np.nan, np.nan], "pump: no output sample is a finite number"),
