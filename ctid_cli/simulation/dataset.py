@@ -65,13 +65,12 @@ class DataSet:
         }
 
     def _validation_fit_percent(self, model: Any) -> float | None:
-        from ctid_cli.filtering.simulate import simulate
         from ctid_cli.inference.diagnostics import fit_percent
 
         record = self.validation
         if record is None:
             return None
-        simulated = simulate(model, record.input, record.t)
+        simulated = _simulated(model, record.input, record.t)
         return float(fit_percent(record.y[record.valid], simulated[record.valid]))
 
 
@@ -96,20 +95,12 @@ class SimulatedSource:
         applied = generator.generate(times, stream(self.seed, "input", replicate))
         if self.loop is not None:
             return DataSet(self._record_in(self.loop, times, applied.at(times), replicate), true_model=self.system)
-        output = self._simulated(applied, times)
+        output = _simulated(self.system, applied, times)
         known = applied
         if self.sampling.input_record == "sampled":
             known = HeldSignal(times, applied.at(times), applied.hold)
         record = Record(times, output + self._drawn(output, replicate), known, noise_free=output)
         return DataSet(record, true_model=self.system)
-
-    def _simulated(self, applied: HeldSignal, times: Array) -> Array:
-        from ctid_cli.filtering.sampled import simulate_additive
-        from ctid_cli.filtering.simulate import simulate
-
-        if isinstance(self.system, AdditiveModel):
-            return simulate_additive(self.system, applied, times)
-        return simulate(self.system, applied, times)
 
     def _record_in(self, loop: LoopOptions, times: Array, reference: Array, replicate: int) -> Record:
         from ctid_cli.filtering.loop import simulate_loop
@@ -172,8 +163,7 @@ class MeasuredSource:
         if self.estimation_samples is not None:
             require_integer("estimation_samples", self.estimation_samples, 2)
         if self.reference is not None and self.hold != "zoh":
-            message = "must be zoh in a loop: a discrete controller holds the input between its samples"
-            raise OptionError("hold", message)
+            raise OptionError("hold", "must be zoh in a loop: a discrete controller holds the input")
 
     def dataset(self, replicate: int) -> DataSet:
         """The record."""
@@ -184,41 +174,44 @@ class MeasuredSource:
         whole = read_record(self.file, time=self.time, input=self.input, output=self.output, hold=self.hold)
         t, u, y = whole.t, whole.input.values, whole.y
         count = t.size if self.estimation_samples is None else self.estimation_samples
+        used = f"the {count} samples used for estimation"
         if count > t.size:
             raise DataError(f"{self.file}: {count} samples are asked for and the file has {t.size}")
         if not np.isfinite(y[:count]).any():
-            raise DataError(f"{self.file}: none of the {count} output samples used for estimation is a finite number")
+            raise DataError(f"{self.file}: the output is no finite number in any of {used}")
         if np.ptp(u[:count]) == 0.0:
-            raise DataError(
-                f"{self.file}: the input {self.input!r} is constant ({u[0]:g}) over the {count} samples used for "
-                "estimation; it excites nothing to identify"
-            )
-        r = self._reference()
+            constant = f"the input {self.input!r} is constant ({u[0]:g}) over {used}"
+            raise DataError(f"{self.file}: {constant}; it excites nothing to identify")
+        loop = None
+        if self.reference is not None:
+            r = read_held_signal(self.file, time=self.time, input=self.reference).values[:count]
+            if self.loop is not None:
+                mean = r.mean() if self.offset == "remove" else 0.0
+                loop = Loop(r - mean, self.loop.controller, self.loop.enters)
         if self.offset == "remove":
             # The remaining samples must not have a say in what the model is made of.
             u = u - u[:count].mean()
             y = y - np.nanmean(y[:count])
-            r = None if r is None else r - r[:count].mean()
         # Without its folder: what an estimator says about the record is part of the results.
         name = Path(self.file).name
-        loop = None
-        if r is not None and self.loop is not None:
-            loop = Loop(r[:count], self.loop.controller, self.loop.enters)
         record = Record(t[:count], y[:count], HeldSignal(t[:count], u[:count], self.hold), name=name, loop=loop)
-        if count == t.size:
-            return DataSet(record)
         rest = np.where(np.arange(t.size) < count, np.nan, y)
         if not np.isfinite(rest).any():
             return DataSet(record)
         return DataSet(record, validation=Record(t, rest, HeldSignal(t, u, self.hold), name=name))
 
-    def _reference(self) -> Array | None:
-        if self.reference is None:
-            return None
-        return read_held_signal(self.file, time=self.time, input=self.reference).values
-
 
 Source = SimulatedSource | MeasuredSource
+
+
+def _simulated(system: TransferFunction | AdditiveModel, applied: HeldSignal, times: Array) -> Array:
+    """Output of a model."""
+    from ctid_cli.filtering.sampled import simulate_additive
+    from ctid_cli.filtering.simulate import simulate
+
+    if isinstance(system, AdditiveModel):
+        return simulate_additive(system, applied, times)
+    return simulate(system, applied, times)
 
 
 def joined(folder: Path, file: str) -> str:
@@ -236,8 +229,7 @@ def file_sha256(path: str) -> str:
     try:
         return hashlib.sha256(Path(path).read_bytes()).hexdigest()
     except FileNotFoundError:
-        message = f"{path}: there is no such file; names are relative to the folder of the specification"
-        raise DataError(message) from None
+        raise DataError(f"{path}: there is no such file; names start at the folder of the specification") from None
     except OSError as error:
         raise DataError(f"{path}: the file cannot be read: {error.strerror or error}") from None
 
@@ -246,7 +238,6 @@ def require_content(path: str, sha256: str) -> None:
     """Refuse a file that is not the one that an experiment was planned with."""
     found = file_sha256(path)
     if found != sha256:
-        raise DataError(
-            f"{path}: the content (SHA-256 {found[:12]}…) is not that which the experiment was planned with "
-            f"({sha256[:12]}…); restore the file, or run the changed one as an experiment of its own"
-        )
+        planned = f"is not that which the experiment was planned with ({sha256[:12]}…)"
+        restore = "restore the file, or run the changed one as an experiment of its own"
+        raise DataError(f"{path}: the content (SHA-256 {found[:12]}…) {planned}; {restore}")

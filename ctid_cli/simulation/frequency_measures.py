@@ -81,7 +81,7 @@ def measure_track(
     """Measure the estimates of an online estimator."""
     t, errors, valid = track.t, track.omega - true, track.valid
     count = errors.shape[1]
-    found: dict[str, float | None] = _numbered("omega", track.omega[-1])
+    found = _numbered("omega", track.omega[-1])
     found["valid_from"] = float(t[np.argmax(valid)]) if valid.any() else None
     if measuring.band is not None:
         steps = [float(step) for step in signal.frequency_steps]
@@ -105,8 +105,7 @@ def measure_track(
 def measure_estimate(estimate: FrequencyEstimate, true: Array, window: tuple[float, float] | None, times: Array) -> Any:
     """Measure the estimate of a whole record."""
     error = estimate.omega - true[_in_window(times, window)].mean(axis=0)
-    found: dict[str, float | None] = _numbered("omega", estimate.omega)
-    found |= _numbered("rms", np.abs(error)) | _numbered("bias", error)
+    found = _numbered("omega", estimate.omega) | _numbered("rms", np.abs(error)) | _numbered("bias", error)
     return found | {"valid_share": 100.0 if estimate.valid else 0.0}
 
 
@@ -146,13 +145,11 @@ def thinned(track: FrequencyTrack, interval: float, sampling_interval: float) ->
 
 def pack_track(track: FrequencyTrack) -> dict[str, Any]:
     """A track as plain data."""
-    columns = {"t": track.t, "omega": track.omega, "flags": track.flags, "uncertainty": track.uncertainty}
-    kinds = {"t": "<f8", "omega": "<f8", "flags": "<u2", "uncertainty": "<f4"}
     packed = {}
-    for name, values in columns.items():
-        array = np.ascontiguousarray(values, dtype=kinds[name])
+    for name, kind in (("t", "<f8"), ("omega", "<f8"), ("flags", "<u2"), ("uncertainty", "<f4")):
+        array = np.ascontiguousarray(getattr(track, name), dtype=kind)
         data = base64.b64encode(zlib.compress(array.tobytes())).decode("ascii")
-        packed[name] = {"kind": kinds[name], "shape": list(array.shape), "data": data}
+        packed[name] = {"kind": kind, "shape": list(array.shape), "data": data}
     return packed
 
 
@@ -169,11 +166,7 @@ def _numbered(name: str, values: Array) -> dict[str, float | None]:
 
 
 def _settling(inside: BoolArray, t: Array, first: int, last: int, since: float) -> float | None:
-    outside = np.flatnonzero(~inside[first:last])
-    if not outside.size:
-        place = first
-    else:
-        place = first + int(outside[-1]) + 1
+    place = first + int(np.flatnonzero(~inside[first:last]).max(initial=-1)) + 1
     # A difference of instants, without the last digits of either.
     return None if place == last else max(0.0, round(float(t[place] - since), 9))
 
