@@ -95,13 +95,6 @@ class Plan:
 
     def manifest(self) -> Manifest:
         """The plan as plain data."""
-        replicates = [0] * len(self.data_cells)
-        starts: dict[str, list[str]] = {}
-        for task in self.tasks():
-            replicates[task.cell] += 1
-            if not starts:
-                for _, cell, start in self.keys(task):
-                    starts.setdefault(f"{cell.name}/{cell.hash}", []).append(start.label)
         canonical = self.spec.canonical()
         return {
             "experiment": self.experiment,
@@ -111,8 +104,8 @@ class Plan:
             "spec": canonical,
             "success": canonical.get("success"),
             "data_cells": [
-                {"hash": cell.hash, "replicates": count, "swept": dict(cell.swept), "content": cell.content}
-                for cell, count in zip(self.data_cells, replicates, strict=True)
+                {"hash": cell.hash, "replicates": self.runs, "swept": dict(cell.swept), "content": cell.content}
+                for cell in self.data_cells
             ],
             "estimators": [
                 {
@@ -121,7 +114,7 @@ class Plan:
                     "hash": cell.hash,
                     "swept": dict(cell.swept),
                     "content": cell.content,
-                    "starts": starts.get(f"{cell.name}/{cell.hash}", []),
+                    "starts": [start.label for start in starts_of(cell.estimator.start_from, self.starts)],
                 }
                 for cell in self.estimators
             ],

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ctid_cli.errors import DataError, RefusedError, StorageError
+from ctid_cli.errors import DataError, StorageError
 from ctid_cli.running import events
 from ctid_cli.running.job import Job
 from ctid_cli.running.stopping import StopRequest
@@ -90,7 +90,8 @@ def run_experiment(
             on_event(events.KernelsCompiled(warm() if warm else _compile_kernels(plan)))
             _check_first_records(todo)
         moved = place.move_aside(folder) if fresh else None
-        _make(folder)
+        with _writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
         stack.enter_context(place.lock(folder))
         # Another run may have come between.
         place.check_free(folder, plan.manifest(), origins, allow_mixed=allow_mixed)
@@ -303,13 +304,6 @@ def _compile_kernels(plan: Plan) -> float:
         if isinstance(cell.estimator, FrequencyEstimation):
             cell.estimator.compile(source.sampling.interval)
     return time.perf_counter() - begun
-
-
-def _make(folder: Path) -> None:
-    with _writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    if not folder.is_dir():
-        raise RefusedError(f"{folder} is a file, not a folder")
 
 
 def _write_if_new(path: Path, data: bytes) -> None:

@@ -6,14 +6,13 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import UsageError
 from ctid_cli.kinds import KINDS
 from ctid_cli.running.cells import DataCell, EstimatorCell, Plan, starts_of
-from ctid_cli.simulation.dataset import LoopOptions, SimulatedSource, Source, located
+from ctid_cli.simulation.dataset import SimulatedSource, Source, located
 from ctid_cli.simulation.frequency_measures import Measuring
 from ctid_cli.simulation.frequency_runs import FrequencyEstimation, SignalSource
 from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, replaced, variants
@@ -24,6 +23,8 @@ from ctid_cli.storage.columns import reserved_names
 
 #: Data sets that one experiment may ask for; beyond this its plan alone would fill the memory.
 MAX_DATA_SETS = 1_000_000
+#: Sections that data are simulated from.
+_SIMULATED = ("system", "excitation", "loop", "sampling", "noise", "signal", "disturbance")
 
 
 def build_plan(spec: Spec, runs: int | None = None) -> Plan:
@@ -34,50 +35,24 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
     if spec.data is None and spec.monte_carlo is not None:
         count = spec.monte_carlo.runs if runs is None else runs
         spec = replaced(spec, ("monte_carlo", "runs"), count)
-    parts = _data_variants(spec)
-    cells = math.prod(len(cases) for cases in parts.values())
-    if cells > MAX_COMBINATIONS:
-        raise UsageError(
-            f"{spec.experiment}: the swept fields combine to {cells} data cells; at most {MAX_COMBINATIONS} are allowed"
-        )
-    if cells * count > MAX_DATA_SETS:
-        raise UsageError(
-            f"{spec.experiment}: {cells} data cells of {count} data sets each are too many; "
-            f"at most {MAX_DATA_SETS} data sets are allowed"
-        )
-    estimators = {name: variants(section) for name, section in spec.estimators.items()}
+    # Of a measured record only those of its loop.
+    sections = {name: getattr(spec, name) for name in _SIMULATED if getattr(spec, name) is not None}
+    parts = {name: variants(section) for name, section in sections.items()}
+    cells = math.prod(map(len, parts.values()))
+    for number, most, what in ((cells, MAX_COMBINATIONS, "data cells"), (cells * count, MAX_DATA_SETS, "data sets")):
+        if number > most:
+            raise UsageError(f"{spec.experiment}: {number} {what} are too many; at most {most} are allowed")
+    cases = [(name, variant) for name, section in spec.estimators.items() for variant in variants(section)]
     names = _column_names(
-        [(name, *path) for name, cases in parts.items() for path in cases[0].swept]
-        + [("estimator", *path) for cases in estimators.values() for path in cases[0].swept]
+        [(name, *path) for name, several in parts.items() for path in several[0].swept]
+        + [("estimator", *path) for _, variant in cases for path in variant.swept]
     )
-    estimator_cells = tuple(
-        _estimator_cell(name, variant, names) for name, cases in estimators.items() for variant in cases
-    )
+    estimators = tuple(_estimator_cell(name, variant, names) for name, variant in cases)
     starts = start_points(spec.starts)
-    if any(NO_START in starts_of(cell.estimator.start_from, starts) for cell in estimator_cells):
+    if any(NO_START in starts_of(cell.estimator.start_from, starts) for cell in estimators):
         starts = (*starts, NO_START)
-    return Plan(
-        spec=spec,
-        data_cells=_data_cells(spec, parts, names),
-        estimators=estimator_cells,
-        starts=starts,
-        runs=count,
-        spec_hash=content_hash(_without_circumstances(spec.canonical())),
-    )
-
-
-def _data_variants(spec: Spec) -> dict[str, list[Variant]]:
-    """Variants of every section that data are simulated from; of a measured record only those of its loop."""
-    sections = {
-        "system": spec.system,
-        "excitation": spec.excitation,
-        "loop": spec.loop,
-        "sampling": spec.sampling,
-        "noise": spec.noise,
-        "signal": spec.signal,
-        "disturbance": spec.disturbance,
-    }
-    return {name: variants(section) for name, section in sections.items() if section is not None}
+    spec_hash = content_hash(_without_circumstances(spec.canonical()))
+    return Plan(spec, _data_cells(spec, parts, names), estimators, starts, count, spec_hash)
 
 
 def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[KeyPath, str]) -> tuple[DataCell, ...]:
@@ -87,42 +62,31 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
     cells = []
     for point in itertools.product(*parts.values()):
         chosen = dict(zip(parts, point, strict=True))
-        loop = chosen["loop"].options if "loop" in chosen else None
+        options = {name: variant.options for name, variant in chosen.items()}
         content: dict[str, Any] = {name: _without_place(variant.values) for name, variant in chosen.items()}
+        loop = options.get("loop")
         source: Source | SignalSource
         if spec.signal is not None:
             # What is measured of an estimate is stored with it, so that it belongs to its identity.
             measuring = _measuring(spec)
             content |= {"disturbance": content.get("disturbance"), "seed": seed}
             content["measuring"] = dataclasses.asdict(measuring)
-            source = _of_signal(chosen, spec, measuring)
+            disturbance = options.get("disturbance")
+            source = SignalSource(options["signal"], disturbance, options["sampling"], seed or 0, measuring)
         elif spec.data is not None:
             # The seed decides where random starts lie; the record itself is in the content as a hash.
             content = {"data": _without_place(spec.data.model_dump(mode="json")), **content, "seed": seed}
             source = dataclasses.replace(located(spec.data.options(), folder), loop=loop)
         else:
             content |= {"noise": content.get("noise"), "seed": seed}
-            source = _simulated(chosen, loop, folder, spec)
+            if loop is not None:
+                loop = dataclasses.replace(loop, reference=located(loop.reference, folder))
+            excitation, noise = located(options.get("excitation"), folder), options.get("noise")
+            # Any seed will do where nothing is random.
+            source = SimulatedSource(options["system"], excitation, options["sampling"], noise, seed or 0, loop)
         swept = {names[name, *path]: value for name, v in chosen.items() for path, value in v.swept.items()}
         cells.append(DataCell(content, content_hash(content), swept, source))
     return tuple(cells)
-
-
-def _simulated(chosen: Mapping[str, Variant], loop: LoopOptions | None, folder: Path, spec: Spec) -> SimulatedSource:
-    """Source of the data sets of one combination of the sections' variants."""
-    return SimulatedSource(
-        system=chosen["system"].options,
-        excitation=located(chosen["excitation"].options, folder) if loop is None else None,
-        sampling=chosen["sampling"].options,
-        noise=chosen["noise"].options if "noise" in chosen else None,
-        seed=_seed(spec),
-        loop=None if loop is None else dataclasses.replace(loop, reference=located(loop.reference, folder)),
-    )
-
-
-def _seed(spec: Spec) -> int:
-    """The seed; any one will do where nothing is random."""
-    return 0 if spec.monte_carlo is None else spec.monte_carlo.seed
 
 
 def _measuring(spec: Spec) -> Measuring:
@@ -130,15 +94,8 @@ def _measuring(spec: Spec) -> Measuring:
     band = None if spec.success is None else spec.success.band
     if spec.tracks is None:
         return Measuring(band)
-    low_high = spec.tracks.window
-    window = None if low_high is None else (low_high[0], low_high[1])
+    window = None if spec.tracks.window is None else (spec.tracks.window[0], spec.tracks.window[1])
     return Measuring(band, window, spec.tracks.interval, spec.tracks.runs)
-
-
-def _of_signal(chosen: Mapping[str, Variant], spec: Spec, measuring: Measuring) -> SignalSource:
-    """Source of the data sets of one combination of the sections' variants."""
-    disturbance = chosen["disturbance"].options if "disturbance" in chosen else None
-    return SignalSource(chosen["signal"].options, disturbance, chosen["sampling"].options, _seed(spec), measuring)
 
 
 def _estimator_cell(name: str, variant: Variant, names: Mapping[KeyPath, str]) -> EstimatorCell:
