@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ctid_cli.simulation.dataset import Source
     from ctid_cli.simulation.frequency_runs import SignalSource
     from ctid_cli.specification.spec import Spec
-    from ctid_cli.specification.start_points import AnyStart
+    from ctid_cli.specification.start_points import StartPoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Plan:
     spec: Spec
     data_cells: tuple[DataCell, ...]
     estimators: tuple[EstimatorCell, ...]
-    starts: tuple[AnyStart, ...]
+    starts: tuple[StartPoint, ...]
     runs: int
     spec_hash: str
 
@@ -69,7 +69,7 @@ class Plan:
         """The data sets."""
         return [Task(cell, replicate) for replicate in range(self.runs) for cell in range(len(self.data_cells))]
 
-    def keys(self, task: Task) -> list[tuple[Key, EstimatorCell, AnyStart]]:
+    def keys(self, task: Task) -> list[tuple[Key, EstimatorCell, StartPoint]]:
         """The estimates wanted of a data set."""
         data_hash = self.data_cells[task.cell].hash
         return [
@@ -122,9 +122,8 @@ class Plan:
         }
 
 
-def starts_of(kind: str | None, starts: tuple[AnyStart, ...]) -> tuple[AnyStart, ...]:
+def starts_of(kind: str | None, starts: tuple[StartPoint, ...]) -> tuple[StartPoint, ...]:
     """The starts that an estimator which takes one of a kind begins from."""
-    from ctid_cli.specification.start_points import NO_START, ParameterStart, StartPoint
+    from ctid_cli.specification.start_points import NO_START
 
-    wanted = {None: (), "delay": (StartPoint,), "parameters": (ParameterStart,)}[kind]
-    return tuple(start for start in starts if isinstance(start, wanted) and start != NO_START) or (NO_START,)
+    return tuple(start for start in starts if start.of == kind) or (NO_START,)

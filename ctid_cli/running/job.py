@@ -19,7 +19,7 @@ from ctid_cli.storage.manifest import Key, Outcome
 if TYPE_CHECKING:
     from ctid_cli.models.additive import Term
     from ctid_cli.running.cells import DataCell, EstimatorCell
-    from ctid_cli.specification.start_points import AnyStart
+    from ctid_cli.specification.start_points import StartPoint
 
 #: Frames of a traceback that are kept, the innermost ones.
 TRACEBACK_FRAMES = 6
@@ -32,7 +32,7 @@ class Job:
     cell: DataCell
     replicate: int
     seed: int | None
-    wanted: tuple[tuple[Key, EstimatorCell, AnyStart], ...]
+    wanted: tuple[tuple[Key, EstimatorCell, StartPoint], ...]
     terms: tuple[Term, ...] | None = None
 
 

@@ -36,17 +36,13 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
         count = spec.monte_carlo.runs if runs is None else runs
         spec = replaced(spec, ("monte_carlo", "runs"), count)
     # Of a measured record only those of its loop.
-    sections = {name: getattr(spec, name) for name in _SIMULATED if getattr(spec, name) is not None}
-    parts = {name: variants(section) for name, section in sections.items()}
+    parts = {name: found for name in _SIMULATED if (found := variants(getattr(spec, name)))}
     cells = math.prod(map(len, parts.values()))
     for number, most, what in ((cells, MAX_COMBINATIONS, "data cells"), (cells * count, MAX_DATA_SETS, "data sets")):
         if number > most:
             raise UsageError(f"{spec.experiment}: {number} {what} are too many; at most {most} are allowed")
     cases = [(name, variant) for name, section in spec.estimators.items() for variant in variants(section)]
-    names = _column_names(
-        [(name, *path) for name, several in parts.items() for path in several[0].swept]
-        + [("estimator", *path) for _, variant in cases for path in variant.swept]
-    )
+    names = _column_names(parts | {"estimator": [variant for _, variant in cases]})
     estimators = tuple(_estimator_cell(name, variant, names) for name, variant in cases)
     starts = start_points(spec.starts)
     if any(NO_START in starts_of(cell.estimator.start_from, starts) for cell in estimators):
@@ -106,9 +102,9 @@ def _estimator_cell(name: str, variant: Variant, names: Mapping[KeyPath, str]) -
     return EstimatorCell(name, content["kind"], estimator, content, content_hash(content), swept)
 
 
-def _column_names(paths: Iterable[KeyPath]) -> dict[KeyPath, str]:
+def _column_names(parts: Mapping[str, Iterable[Variant]]) -> dict[KeyPath, str]:
     """Name of the column of every swept field: its last word, or more of its path where that is taken."""
-    distinct = list(dict.fromkeys(paths))
+    distinct = list(dict.fromkeys((name, *path) for name, cases in parts.items() for v in cases for path in v.swept))
     last, reserved = [path[-1] for path in distinct], reserved_names()
     return {
         path: ".".join(map(str, path)) if path[-1] in reserved or last.count(path[-1]) > 1 else str(path[-1])

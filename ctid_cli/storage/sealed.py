@@ -164,12 +164,7 @@ def _write_column(group: h5py.Group, column: columns.Column, rows: Sequence[Any]
             if column.type == "Int64":
                 written.attrs["missing"] = _MISSING
         case "coefficients":
-            lengths = np.array([_MISSING if row is None else len(row) for row in rows], dtype=np.int64)
-            padded = np.full((len(rows), lengths.max(initial=1)), np.nan)
-            for k, row in enumerate(rows):
-                padded[k, : len(row or ())] = _floats(row or ())
-            _write(group, name, padded).attrs["padding"] = "NaN, behind the last coefficient; descending powers"
-            _write(group, f"{name}_length", lengths)
+            _write_lists(group, name, rows)
         case "by name":
             _write_named(group, name, column.names(rows), [row or {} for row in rows])
         case _:
@@ -177,6 +172,15 @@ def _write_column(group: h5py.Group, column: columns.Column, rows: Sequence[Any]
             written = _write(group, name, _floats([None if isinstance(row, str) else row for row in rows]))
             if column.unit:
                 written.attrs["unit"] = column.unit
+
+
+def _write_lists(group: h5py.Group, name: str, rows: Sequence[Any]) -> None:
+    lengths = np.array([_MISSING if row is None else len(row) for row in rows], dtype=np.int64)
+    padded = np.full((len(rows), lengths.max(initial=1)), np.nan)
+    for k, row in enumerate(rows):
+        padded[k, : len(row or ())] = _floats(row or ())
+    _write(group, name, padded).attrs["padding"] = "NaN, behind the last coefficient; descending powers"
+    _write(group, f"{name}_length", lengths)
 
 
 def _write_named(group: h5py.Group, name: str, parts: list[str], rows: Sequence[Mapping[str, Any]]) -> None:

@@ -238,7 +238,7 @@ def test_random_starts(plan_of):
     # Nor does a start depend on which others there are.
     more = plan_of("starts.initial_delay=[{uniform: [0, 5]},{uniform: [0, 9]}]")
     assert more.starts[1].draw(11, 3) == random.draw(11, 3)
-    assert StartPoint("3", 3.0).draw(None, 0).delay == 3.0
+    assert StartPoint("3", "delay", 3.0).draw(None, 0).delay == 3.0
     with pytest.raises(ValueError, match="seed"):
         random.draw(None, 0)
 

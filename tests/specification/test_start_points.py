@@ -8,7 +8,7 @@ from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.streams import ROLES, stream
-from ctid_cli.specification.start_points import ParameterStart, additive_form, start_points
+from ctid_cli.specification.start_points import StartPoint, additive_form, start_points
 from ctid_cli.specification.start_sections import StartsSection
 
 TRUE = AdditiveModel([Submodel([0.5], [1.0], 2), Submodel([1.0], [0.025, 0.01, 1.0])], 0.3)
@@ -69,7 +69,7 @@ def test_delays_come_before_parameters():
 
 def test_a_fraction_is_drawn_by_its_partial_fractions():
     fraction = unfactored(AdditiveModel([Submodel([1.0], [2.0, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])]))
-    model = ParameterStart("parameters(5%)", 0.05).draw(1, 0, fraction).model
+    model = StartPoint("parameters(5%)", "parameters", spread=0.05).draw(1, 0, fraction).model
     assert model.terms == (Term(1, 0), Term(2, 1))
     assert model.theta[:2] == pytest.approx([2.0, 1.0], rel=0.051)
     assert additive_form(TRUE) is TRUE
