@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import json
 import os
 import sys
 import tempfile
@@ -27,6 +28,10 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the file, e.g. noise.snr_db=15; repeatable."),
 ]
+Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Worker processes; all processors by default.")]
+Fresh = Annotated[bool, typer.Option("--fresh", help="Move older results aside and start anew.")]
+Config = Annotated[Path, typer.Argument(metavar="CONFIG", help="Experiment file (YAML).")]
+Configs = Annotated[list[Path], typer.Argument(metavar="CONFIG", help="Experiment files (YAML).")]
 TimeColumn = Annotated[str | None, typer.Option("--time", metavar="NAME", help="Column of the times.")]
 InputColumn = Annotated[str | None, typer.Option("--input", metavar="NAME", help="Column of the input.")]
 OutputColumn = Annotated[str | None, typer.Option("--output", metavar="NAME", help="Column of the output.")]
@@ -49,11 +54,9 @@ class Command(TyperCommand):
         return super().parse_args(ctx, args)
 
 
-def echo_json(content: object) -> None:
-    """Write one JSON object to stdout."""
-    import json
-
-    typer.echo(json.dumps(content, allow_nan=False))
+def answer(as_json: bool, content: Callable[[], object], text: Callable[[], str]) -> None:
+    """Write the answer of a command to stdout, as one JSON object or as text."""
+    typer.echo(json.dumps(content(), allow_nan=False) if as_json else text())
 
 
 def write_files(files: Mapping[Path, bytes]) -> None:
@@ -98,8 +101,8 @@ def _one_line(error: Exception) -> str:
 def _write_traceback(out: Path | None) -> Path:
     name = f"ctid-error-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.txt"
     text = f"arguments: {sys.argv}\n\n{traceback.format_exc()}"
-    folders = [Path(tempfile.gettempdir())] if out is None or not out.is_dir() else [out, Path(tempfile.gettempdir())]
-    for folder in folders:
+    results = [out] if out is not None and out.is_dir() else []
+    for folder in [*results, Path(tempfile.gettempdir())]:
         with contextlib.suppress(OSError):
             (folder / name).write_text(text, encoding="utf-8")
             return folder / name

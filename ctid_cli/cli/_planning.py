@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from ctid_cli.errors import Problem, SpecError, UsageError
+from ctid_cli.reporting.layout import count
 
 if TYPE_CHECKING:
     from ctid_cli.running.cells import Plan
@@ -31,10 +32,8 @@ def load_plans(configs: Sequence[Path], overrides: Sequence[str], runs: int | No
     seen: dict[str, Path] = {}
     for config, plan in plans:
         if plan.experiment in seen:
-            raise UsageError(
-                f"{seen[plan.experiment]} and {config} both describe the experiment {plan.experiment!r};"
-                " run them one at a time, or give one of them another name"
-            )
+            both = f"{seen[plan.experiment]} and {config} both describe the experiment {plan.experiment!r}"
+            raise UsageError(f"{both}; run them one at a time, or give one of them another name")
         seen[plan.experiment] = config
         for warning in plan.spec.warnings:
             typer.echo(f"warning: {warning}", err=True)
@@ -43,8 +42,6 @@ def load_plans(configs: Sequence[Path], overrides: Sequence[str], runs: int | No
 
 def workload(plan: Plan) -> str:
     """How much work a plan asks for."""
-    from ctid_cli.reporting.layout import count
-
     tasks = plan.tasks()
     estimates = sum(len(plan.keys(task)) for task in tasks)
     sets, cells = count(len(tasks), "data set"), count(len(plan.data_cells), "data cell")

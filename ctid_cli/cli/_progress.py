@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict
-from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import typer
@@ -41,9 +40,7 @@ class _Progress:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._bar is not None:
             self._bar.stop()
 
@@ -56,14 +53,17 @@ class _Progress:
         self._task = self._bar.add_task(self.name.rpartition("/")[2], total=total, **fields)
         self._bar.start()
 
-    def _update(self, done: int, **fields: Any) -> bool:
+    def _update(self, done: int, **fields: Any) -> None:
         """Move the bar, if there is one."""
-        if self._bar is None or self._task is None:
-            return False
-        self._bar.update(self._task, completed=done, **fields)
-        return True
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=done, **fields)
+
+    def _is_time(self) -> bool:
+        """Whether a line is due where no bar is drawn."""
+        return self._bar is None and self._clock() - self._last >= LINE_EVERY
 
     def _say(self, text: str) -> None:
+        self._last = self._clock()
         line = f"{self.name}: {text}"
         if self._bar is not None:
             self._bar.console.print(line, markup=False, highlight=False)
@@ -76,15 +76,13 @@ class RecordProgress(_Progress):
 
     def __call__(self, done: int, total: int) -> None:
         """Show that so many of all samples are done."""
-        now = self._clock()
         if sys.stderr.isatty():
-            if self._bar is None and now - self._began > BAR_AFTER:
+            if self._bar is None and self._clock() - self._began > BAR_AFTER:
                 from rich.progress import TaskProgressColumn
 
                 self._start(total, TaskProgressColumn())
             self._update(done)
-        elif now - self._last >= LINE_EVERY:
-            self._last = now
+        elif self._is_time():
             self._say(f"{100 * done / total:.0f} % of the record")
 
 
@@ -108,13 +106,10 @@ class Reporter(_Progress):
             case events.DataSetDone():
                 self._advance(event)
             case events.WorkerDied():
-                self._say(
-                    f"a worker process died ({event.reason}); repeating {count(event.data_sets, 'data set')} alone"
-                )
+                sets = count(event.data_sets, "data set")
+                self._say(f"a worker process died ({event.reason}); repeating {sets} alone")
             case events.Stopping():
                 self._say(f"stopping ({event.reason}): storing what is finished; once more to stop at once")
-            case events.Sealed():
-                pass
 
     def _plan(self, event: Any) -> None:
         parts = [f"{count(event.estimates, 'estimate')} of {count(event.data_sets, 'data set')} to compute"]
@@ -123,7 +118,7 @@ class Reporter(_Progress):
         if event.left_aside:
             parts.append(f"{event.left_aside} stored ones set aside")
         self._say(", ".join(parts))
-        self._began = self._last = self._clock()
+        self._began = self._last
         if event.data_sets and sys.stderr.isatty():
             from rich.progress import MofNCompleteColumn, TextColumn
 
@@ -134,13 +129,10 @@ class Reporter(_Progress):
         from ctid_cli.storage.columns import FAILURES
 
         self.failed += sum(row["status"] in FAILURES for row in event.rows)
-        now = self._clock()
-        speed = event.done / max(now - self._began, 1e-9)
+        speed = event.done / max(self._clock() - self._began, 1e-9)
         rate = f"{speed:.2g}/s" if speed >= 0.1 else f"{60 * speed:.2g}/min"
-        if not self._update(event.done, rate=rate, failed=self.failed) and (
-            now - self._last >= LINE_EVERY or event.done == event.total
-        ):
-            self._last = now
+        self._update(event.done, rate=rate, failed=self.failed)
+        if self._is_time() or (self._bar is None and event.done == event.total):
             left = f", ETA {seconds((event.total - event.done) / speed)}" if 0 < event.done < event.total else ""
             self._say(f"{event.done}/{event.total} data sets, {rate}, {self.failed} failed{left}")
 
@@ -151,15 +143,7 @@ def json_lines(event: Event) -> list[str]:
     from ctid_cli.running import events
 
     if isinstance(event, events.DataSetDone):
-        lines = [{"event": "estimate", **as_object(row)} for row in event.rows]
-        return [json.dumps(line, allow_nan=False) for line in lines]
-    names = {
-        events.PlanReady: "plan",
-        events.KernelsCompiling: "kernels_compiling",
-        events.KernelsCompiled: "kernels_compiled",
-        events.WorkerDied: "worker_died",
-        events.Stopping: "stopping",
-        events.Sealed: "sealed",
-    }
-    content = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(event).items()}
-    return [json.dumps({"event": names[type(event)], **content}, allow_nan=False)]
+        return [json.dumps({"event": "estimate", **as_object(row)}, allow_nan=False) for row in event.rows]
+    # PlanReady is "plan", KernelsCompiling "kernels_compiling".
+    name = re.sub("(?<=.)([A-Z])", r"_\1", type(event).__name__).lower().removesuffix("_ready")
+    return [json.dumps({"event": name, **asdict(event)}, default=str, allow_nan=False)]

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from ctid_cli.cli._common import From, InputColumn, InputHold, Json, OutputColumn, TimeColumn, To, guarded, write_files
+from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import InitialState, Offset
 
 
@@ -40,10 +44,6 @@ def fit(
     Prints the parameters with their standard errors and what tells whether to believe them, and writes fit.json and
     fit.svg. The delay is searched over its whole range: no start is needed.
     """
-    import json
-    from functools import partial
-
-    from ctid_cli.errors import UsageError
     from ctid_cli.estimators.delay_profile import DelayProfile
     from ctid_cli.estimators.identification import identify
     from ctid_cli.reporting.identification_plot import identification_svg
@@ -72,17 +72,10 @@ def fit(
 
 
 def _delay_bounds(text: str) -> tuple[float, float]:
-    from ctid_cli.errors import UsageError
-
     low, colon, high = text.partition(":")
-    allowed = (
-        "--delay must be LOW:HIGH, a range to search, or one known VALUE, in the record's unit of time and not "
-        "negative, for example 0:2 or 0.3"
-    )
-    try:
+    with contextlib.suppress(ValueError):
         bounds = float(low), float(high if colon else low)
-    except ValueError:
-        raise UsageError(f"{allowed}; got {text!r}") from None
-    if not 0 <= bounds[0] <= bounds[1] < float("inf"):
-        raise UsageError(f"{allowed}; got {text!r}")
-    return bounds
+        if 0 <= bounds[0] <= bounds[1] < float("inf"):
+            return bounds
+    allowed = "LOW:HIGH, a range to search, or one known VALUE, in the record's unit of time and not negative"
+    raise UsageError(f"--delay must be {allowed}, for example 0:2 or 0.3; got {text!r}")

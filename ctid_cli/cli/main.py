@@ -7,20 +7,13 @@ from typing import Annotated
 import typer
 
 import ctid_cli
-from ctid_cli.cli._checks import CheckCommand
 from ctid_cli.cli._common import Command
-from ctid_cli.cli.check_command import check
-from ctid_cli.cli.export_command import export
-from ctid_cli.cli.figure_command import figure
+from ctid_cli.cli.check_commands import CheckCommand, check
+from ctid_cli.cli.experiment_commands import run, schema, validate
 from ctid_cli.cli.fit_command import fit
-from ctid_cli.cli.run_command import run
-from ctid_cli.cli.schema_command import schema
-from ctid_cli.cli.show_command import show
-from ctid_cli.cli.status_command import status
+from ctid_cli.cli.result_commands import export, figure, show, status, table
 from ctid_cli.cli.study_command import study
-from ctid_cli.cli.table_command import table
 from ctid_cli.cli.track_command import track
-from ctid_cli.cli.validate_command import validate
 
 # Plain help and error texts: they read well in log files, and leave rich out of the start-up.
 app = typer.Typer(

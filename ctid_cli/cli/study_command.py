@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import tempfile
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ctid_cli.cli._common import Out, guarded
+from ctid_cli.cli._common import Fresh, Jobs, Out, guarded
+from ctid_cli.cli.experiment_commands import run
+from ctid_cli.errors import MismatchError
 
 if TYPE_CHECKING:
     from ctid_cli.studies.catalogue import StudyFolder
 
 Names = Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="Studies; all of them by default.")]
-Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Worker processes; all processors by default.")]
 
 study = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -48,15 +51,13 @@ def run_study(
     ] = None,
     jobs: Jobs = None,
     out: Out = Path("results"),
-    fresh: Annotated[bool, typer.Option("--fresh", help="Move older results aside and start anew.")] = False,
+    fresh: Fresh = False,
 ) -> None:
     """Run all experiments of a study; the same command again resumes."""
-    from ctid_cli.cli.run_command import run
     from ctid_cli.studies.catalogue import last_part
 
     for item in _chosen(names):
-        configs = [item.config(last_part(name)) for name in item.configs]
-        run(configs=configs, jobs=jobs, runs=runs, out=out, fresh=fresh)
+        run([item.config(last_part(name)) for name in item.configs], jobs=jobs, runs=runs, out=out, fresh=fresh)
 
 
 @study.command("check")
@@ -77,7 +78,6 @@ def check_study(
 
     Exit code 7 if one does not hold.
     """
-    from ctid_cli.errors import MismatchError
     from ctid_cli.studies.catalogue import read_study
     from ctid_cli.studies.claim import claims_table
     from ctid_cli.studies.publishing import against_published, evaluate, published_folder
@@ -98,10 +98,6 @@ def check_study(
 
 
 def _compute_first(studies: list[StudyFolder], update: bool, jobs: int | None) -> None:
-    import tempfile
-    import time
-
-    from ctid_cli.errors import MismatchError
     from ctid_cli.studies.first_estimates import compute_first, differences, read_first, write_first
 
     wrong = []
@@ -129,7 +125,6 @@ def publish_study(names: Names = None, out: Out = Path("results")) -> None:
     Refused unless one commit of this repository, without changes, computed all results. Exit code 7 if a claim does
     not hold, which is published nevertheless.
     """
-    from ctid_cli.errors import MismatchError
     from ctid_cli.studies.catalogue import read_study
     from ctid_cli.studies.publishing import evaluate, publish, published_folder
 

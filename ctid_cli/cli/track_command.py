@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from ctid_cli.cli._common import From, Json, TimeColumn, To, echo_json, guarded, write_files
+from ctid_cli.cli._common import From, Json, TimeColumn, To, answer, guarded, write_files
 from ctid_cli.cli._progress import RecordProgress
+from ctid_cli.errors import UsageError
 from ctid_cli.kinds import KINDS
 
 if TYPE_CHECKING:
@@ -54,7 +55,6 @@ def track(
     frequencies and amplitudes over time to track.csv (or track.h5) and track.svg. All the rest is chosen from the
     record, and said.
     """
-    from ctid_cli.errors import UsageError
     from ctid_cli.frequency.automatic import choose_settings
     from ctid_cli.frequency.record_track import track_record
     from ctid_cli.reporting.track_plot import track_svg
@@ -62,14 +62,14 @@ def track(
     from ctid_cli.signals.sampled_signal import read_sampled_signal
 
     data, figure = out / f"track.{style}", out / "track.svg"
-    if any(_same(file, written) for written in (data, figure)):
+    if any(file.exists() and written.exists() and file.samefile(written) for written in (data, figure)):
         raise UsageError(f"{file} would be overwritten by the track; write it elsewhere (--out DIR)")
     given = _interval(interval, rate)
     for name, value in (("--from", start), ("--to", stop)):
         if value is not None and not math.isfinite(value):
             raise UsageError(f"{name} must be an instant, not {value:g}")
     for name, value in (("--every", every), ("--window", window)):
-        if value is not None and not 0 < value < float("inf"):
+        if value is not None and not 0 < value < math.inf:
             raise UsageError(f"{name} must be a positive number of seconds, not {value:g}")
     record = _in_seconds(read_sampled_signal(file, time=time, signal=signal, interval=given, start=start, stop=stop))
     kind = None if method == "automatic" else method
@@ -79,27 +79,16 @@ def track(
             found = track_record(record.samples, record.interval, settings, every=every, on_progress=tell)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    title = f"{file.name}: {settings.estimator.kind}"
-    write_files(
-        {
-            data: track_bytes(track_table(found, record.start), style, record.unit),
-            figure: track_svg(found, record.start, record.unit, title),
-        }
+    drawn = track_svg(found, record.start, record.unit, f"{file.name}: {settings.estimator.kind}")
+    write_files({data: track_bytes(track_table(found, record.start), style, record.unit), figure: drawn})
+    answer(
+        as_json,
+        lambda: track_object(record, settings, found, [data, figure]),
+        lambda: f"{track_text(record, settings, found)}\n\nWritten: {data}, {figure}",
     )
-    if as_json:
-        echo_json(track_object(record, settings, found, [data, figure]))
-    else:
-        typer.echo(track_text(record, settings, found))
-        typer.echo(f"\nWritten: {data}, {figure}")
-
-
-def _same(one: Path, other: Path) -> bool:
-    return one.exists() and other.exists() and one.samefile(other)
 
 
 def _interval(interval: float | None, rate: float | None) -> float | None:
-    from ctid_cli.errors import UsageError
-
     if interval is not None and rate is not None:
         raise UsageError("--interval and --rate say the same; give one of them")
     for name, value in (("--interval", interval), ("--rate", rate)):
@@ -109,13 +98,10 @@ def _interval(interval: float | None, rate: float | None) -> float | None:
 
 
 def _in_seconds(record: SampledSignal) -> SampledSignal:
-    from ctid_cli.errors import UsageError
     from ctid_cli.reporting.estimate import SECONDS
 
     unit = record.time_unit or "s"
     if unit not in SECONDS:
-        raise UsageError(
-            f"{record.file}: the unit of time, {unit!r}, is not known, so there is no frequency in Hz; give the clock "
-            "with --interval SECONDS or --rate HERTZ"
-        )
+        unknown = f"{record.file}: the unit of time, {unit!r}, is not known, so there is no frequency in Hz"
+        raise UsageError(f"{unknown}; give the clock with --interval SECONDS or --rate HERTZ")
     return record.rescaled(SECONDS[unit], "s")

@@ -15,6 +15,12 @@ from ctid_cli.running.cells import DataCell, EstimatorCell, Plan
 from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.text import listed
 
+#: On what all of it rests.
+REMARK = (
+    "To first order in the noise: this holds where the estimator converges to the right solution, standard errors are "
+    "small against the parameters, and system and noise are as the experiment says, from rest. Initial states and "
+    "offsets that are estimated besides are not counted."
+)
 #: Different numbers of samples that are shown, of all that are swept.
 SIZES = 4
 #: Combinations of the other swept settings that are shown.
@@ -25,10 +31,8 @@ def accuracy_object(plan: Plan) -> dict[str, Any]:
     """Expected accuracy of every estimator of an experiment as JSON-able content."""
     cells = [(cell, cell.source) for cell in plan.data_cells if isinstance(cell.source, SimulatedSource)]
     if not cells:
-        raise UsageError(
-            f"{plan.experiment} is about a measured record, whose true system is not known; "
-            "its estimates carry their standard errors: ctid fit, or ctid run and ctid table"
-        )
+        text = f"{plan.experiment} is about a measured record, whose true system is not known; "
+        raise UsageError(f"{text}its estimates carry their standard errors: ctid fit, or ctid run and ctid table")
     shown = _shown(cells)
     estimates = [_entry(cell, source, estimator, plan) for cell, source in shown for estimator in plan.estimators]
     return {"experiment": plan.experiment, "left_out": len(cells) - len(shown), "estimates": estimates}
@@ -90,47 +94,30 @@ def accuracy_text(content: dict[str, Any]) -> str:
         entries.sort(key=lambda entry: int(entry["samples"]))
         if known := [entry for entry in entries if entry["parameters"]]:
             tables.setdefault((f" at {settings}" if settings else "", _table(known)), []).append(title)
-        for entry in entries:
-            if entry["parameters"]:
-                formulas.setdefault(entry["formula"], []).append(entry)
-            else:
-                unknown.setdefault(entry["reason"], []).append(title)
-    parts = [
-        [
-            f"{content['experiment']}: standard errors to expect by theory, before any data are taken. The half width "
-            "is that of an interval of 95 %, 1.96 standard errors."
-        ],
+        for entry in known:
+            formulas.setdefault(entry["formula"], []).append(entry)
+        for reason in (entry["reason"] for entry in entries if not entry["parameters"]):
+            unknown.setdefault(reason, []).append(title)
+    blocks = [
+        [f"{content['experiment']}: standard errors to expect by theory. The half width is 1.96 of them, for 95 %."],
         *([f"{listed(titles)}: standard errors{where}", table] for (where, table), titles in tables.items()),
         *([f"{listed(titles)}: no theory: {reason}."] for reason, titles in unknown.items()),
         *([_formula(formula, entries)] for formula, entries in formulas.items()),
     ]
     if content["left_out"]:
         more = count(content["left_out"], "further combination")
-        parts.append(
-            [f"Not shown: {more} of swept settings and numbers of samples; --set gives a swept key one value."]
-        )
-    parts.append(
-        [
-            "All this is to first order in the noise: it holds where the estimator converges to the right solution and "
-            "the standard errors are small against the parameters. It takes the noise to be as the experiment says and "
-            "the system to be at rest before the first sample; initial states and offsets that an estimator determines "
-            "besides are not counted."
-        ]
-    )
-    return Report(parts).draw()
+        blocks.append([f"Not shown: {more} of swept settings and numbers of samples; --set gives a key one value."])
+    return Report([*blocks, [REMARK]]).draw()
 
 
 def _table(entries: list[dict[str, Any]]) -> str:
     """Parameters down, numbers of samples across; the last columns are about the greatest number."""
     last = entries[-1]
-    rows = [
-        [
-            *(row["name"], number(row["value"])),
-            *(number(entry["parameters"][k]["standard_error"], 3) for entry in entries),
-            *(number(row["relative_percent"], 3), number(row["half_width_95"], 3)),
-        ]
-        for k, row in enumerate(last["parameters"])
-    ]
+    rows = []
+    for k, row in enumerate(last["parameters"]):
+        errors = (entry["parameters"][k]["standard_error"] for entry in entries)
+        numbers = (number(value, 3) for value in (*errors, row["relative_percent"], row["half_width_95"]))
+        rows.append([row["name"], number(row["value"]), *numbers])
     sizes = [f"N = {entry['samples']}" for entry in entries]
     header = ["parameter", "true value", *sizes, "relative [%]", "half width"]
     table = Table(header, rows, "l" + "r" * (len(header) - 1)).draw()

@@ -52,23 +52,23 @@ def read_tables(file: Path) -> list[Row]:
             if missing:
                 advice = "write such a file with: ctid table --format csv"
                 raise UsageError(f"{file} has no column {', '.join(missing)}; {advice}")
-            rows = []
-            for line in reader:
-                line.pop(None, None)
-                rows.append(row := plain_row(line))
-                n, converged = row["n"], row["converged"]
-                # An empty field is a cell without a success rule.
-                judged = line["converged"] not in (None, "")
-                if n is None or (judged and not (converged is not None and 0 <= converged <= n)):
-                    raise UsageError(
-                        f"{file}:{reader.line_num}: n and converged must be counts with 0 <= converged <= n, "
-                        f"not {line['n']!r} and {line['converged']!r}"
-                    )
-            return rows
+            return [_checked_row(line, f"{file}:{reader.line_num}") for line in reader]
     except OSError as error:
         raise UsageError(f"{file} cannot be read: {error.strerror or error}") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"{file} is not a comma-separated text file: {error}") from None
+
+
+def _checked_row(line: dict[str, str], place: str) -> Row:
+    line.pop(None, None)  # type: ignore[call-overload]  # fields beyond the last column
+    row = plain_row(line)
+    n, converged = row["n"], row["converged"]
+    # An empty field is a cell without a success rule.
+    judged = line["converged"] not in (None, "")
+    if n is None or (judged and not (converged is not None and 0 <= converged <= n)):
+        given = f"not {line['n']!r} and {line['converged']!r}"
+        raise UsageError(f"{place}: n and converged must be counts with 0 <= converged <= n, {given}")
+    return row
 
 
 def plain_row(row: Mapping[str, Any]) -> Row:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -76,9 +76,7 @@ class Comparison:
             "compared": len(self.decisive),
             "identical": self.identical,
             "mismatches": len(self.mismatches),
-            "not_run": self.not_run,
-            "not_in_reference": self.not_in_reference,
-            "cells": self.cells,
+            **{name: getattr(self, name) for name in ("not_run", "not_in_reference", "cells")},
             "notes": list(self.notes),
         }
 
@@ -99,13 +97,12 @@ def check_tables(names: Sequence[str], out: Path, reference: Path | None = None)
         return comparison
     if not any(row["n"] for row in rows):
         raise UsageError("\n".join(["nothing can be compared, because none of these cells was run.", *notes]))
-    asked = "".join(f" {name}" for name in names)
+    command = " ".join(["ctid table", *names])
     where = "there are no committed tables" if file is None else f"{comparison.reference} has none of their cells"
-    raise UsageError(
-        f"the results in {out} have nothing to be compared with: {where}, and of the paper's only those of "
-        f"{', '.join(study.must_reach)} decide. To keep these results as a reference for later: "
-        f"ctid table{asked}{out_option(out)} --format csv > FILE, then ctid table{asked} --check --reference FILE"
-    )
+    text = f"the results in {out} have nothing to be compared with: {where}, and of the paper's only those of "
+    text += f"{', '.join(study.must_reach)} decide. To keep these results as a reference for later: "
+    text += f"{command}{out_option(out)} --format csv > FILE, then {command} --check --reference FILE"
+    raise UsageError(text)
 
 
 def compare(
@@ -131,28 +128,36 @@ def compare(
         if _is_counted(row):
             known.setdefault(_identity(row), row)
 
-    # Fresh row, what it is compared with, whether that decides, converged and all data sets of the reference.
-    pairs: list[tuple[Row, str, bool, int, int]] = []
-    for identity, row in fresh.items():
-        if not _is_counted(row):
-            continue
-        if identity in known:
-            pairs.append((row, "committed", True, known[identity]["converged"], known[identity]["n"]))
-        if (published := row.get("published_percent")) is not None:
-            trials = study.published_data_sets
-            pairs.append((row, "paper", row["method"] in study.must_reach, round(published * trials / 100), trials))
-    lacking = sum(_is_counted(row) and key not in known for key, row in fresh.items()) if committed is not None else 0
-    tables = {str(row["table"]) for row in fresh.values()}
-    asked = {key for key, row in known.items() if not tables.isdisjoint((str(row["table"]), row["experiment"]))}
-    asked |= {key for key, row in fresh.items() if row.get("published_percent") is not None}
-    not_run = sum(not (key in fresh and fresh[key]["n"]) for key in asked)
+    pairs = list(_pairs(fresh, known, study))
     cells: dict[int, Cell] = {}
     for family in (True, False):
         members = [k for k, (_, _, decisive, *_) in enumerate(pairs) if decisive is family]
         p_values = [fisher(pairs[k][0]["converged"], pairs[k][0]["n"], *pairs[k][3:]) for k in members]
         for k, p_value, adjusted in zip(members, p_values, holm(p_values), strict=True):
             cells[k] = _compared(*pairs[k], p_value, adjusted, LEVEL / len(members))
+    lacking = sum(_is_counted(row) and key not in known for key, row in fresh.items()) if committed is not None else 0
+    not_run = _not_run(fresh, known)
     return Comparison([cells[k] for k in range(len(pairs))], reference, not_run, lacking, notes)
+
+
+def _pairs(
+    fresh: Mapping[Any, Row], known: Mapping[Any, Row], study: Study
+) -> Iterator[tuple[Row, str, bool, int, int]]:
+    """Fresh row, what it is compared with, whether that decides, converged and all data sets of the reference."""
+    trials = study.published_data_sets
+    for identity, row in fresh.items():
+        if _is_counted(row) and identity in known:
+            yield row, "committed", True, known[identity]["converged"], known[identity]["n"]
+        if _is_counted(row) and (published := row.get("published_percent")) is not None:
+            yield row, "paper", row["method"] in study.must_reach, round(published * trials / 100), trials
+
+
+def _not_run(fresh: Mapping[Any, Row], known: Mapping[Any, Row]) -> int:
+    """How many cells of the tables that were asked for have no estimates."""
+    tables = {str(row["table"]) for row in fresh.values()}
+    asked = {key for key, row in known.items() if not tables.isdisjoint((str(row["table"]), row["experiment"]))}
+    asked |= {key for key, row in fresh.items() if row.get("published_percent") is not None}
+    return sum(not (key in fresh and fresh[key]["n"]) for key in asked)
 
 
 def _compared(

@@ -57,20 +57,17 @@ def detail_text(found: FoundEstimate, again: Repeated | None, out: Path) -> str:
     ]
     if row.get("converged") is not None:
         head.append("It meets the success rule." if row["converged"] else "It does not meet the success rule.")
-    origin = [
-        f"Data (cell {row['cell']}, seed {found.stored.manifest['seed']}, data set {row['replicate']}):",
-        *_settings(found.slot.cell["content"]),
-        "Estimator:",
-        *_settings(found.slot.estimator["content"]),
-    ]
+    data, estimator = found.slot.cell["content"], found.slot.estimator["content"]
+    place = f"Data (cell {row['cell']}, seed {found.stored.manifest['seed']}, data set {row['replicate']}):"
+    origin = [place, *_settings(data), "Estimator:", *_settings(estimator)]
     of_signal = "measures" in row
-    what = "frequencies" if of_signal else "parameters"
+    blocks = [head, *(_measured(row) if of_signal else _fitted(found)), origin]
     if again is None:
         every = "" if of_signal else " and see every iteration"
-        last = [f"To make this data set and this estimate again{every}:\n  {_redo_command(found, out)}"]
+        blocks.append([f"To make this data set and this estimate again{every}:", f"  {_redo_command(found, out)}"])
     else:
-        last = [_verdict(again, what), *([_history(again)] if again.history else [])]
-    blocks = [head, *(_measured(row) if of_signal else _fitted(found)), origin, *([block] for block in last)]
+        blocks.append([_verdict(again, "frequencies" if of_signal else "parameters")])
+        blocks += [[_history(again)]] if again.history else []
     return "\n\n".join("\n".join(block) for block in blocks)
 
 
@@ -156,10 +153,8 @@ def _verdict(again: Repeated, what: str) -> str:
         return f"Computed once more: the same {what} to the last digit."
     if again.difference <= AGREEMENT:
         return f"Computed once more: the same {what}, up to {again.difference:.1e} of their size."
-    return (
-        f"Computed once more: {what} differ by up to {again.difference:.1e} of their size. "
-        "Another version of the code or another processor computed the stored ones."
-    )
+    text = f"Computed once more: {what} differ by up to {again.difference:.1e} of their size. "
+    return text + "Another version of the code or another processor computed the stored ones."
 
 
 def _history(again: Repeated) -> str:
@@ -178,12 +173,11 @@ def _settings(content: Mapping[str, Any]) -> list[str]:
 def _conventions(shown: list[UncertainValue]) -> list[str]:
     """What the names and columns of a table of parameters mean."""
     interval = "low and high are estimate -+ 1.96 errors."
-    if not any(item.name.startswith("g") for item in shown):
+    names = [item.name for item in shown]
+    if not any(name.startswith("g") for name in names):
         return [f"Monic denominator, descending powers; {interval}"]
-    lines = [
-        "g1: submodel of the least natural frequency; g1_a2: coefficient of p^2 in its denominator, which ends in 1."
-    ]
-    if any(item.name == "a1" for item in shown):
+    lines = ["g1: submodel of the least natural frequency; g1_a2: coefficient of p^2 in its denominator (ends in 1)."]
+    if "a1" in names:
         lines.append("a1, b0: all submodels as one fraction with a monic denominator, descending powers.")
     return [*lines, interval.capitalize()]
 

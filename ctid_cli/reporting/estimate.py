@@ -53,27 +53,24 @@ class Units:
             return self.time
         if name.startswith("offset"):
             return self.output
-        kind, k = name[0], int(name[1:].split("_")[0])
-        if kind == "a":
-            return self._over_time("1", k)
-        return self._over_time(self.gain, poles - zeros + k) if kind == "b" else self._over_time(self.output, k - 1)
+        k = int(name[1:].split("_")[0])
+        unit, power = {"a": ("1", k), "b": (self.gain, poles - zeros + k)}.get(name[0], (self.output, k - 1))
+        return self._over_time(unit, power)
 
     def of_submodel(self, name: str, integrators: int = 0) -> str:
         """Unit of a parameter of a submodel, whose denominator has the constant term 1."""
         coefficient = name.split("_")[1]
         power = int(coefficient[1:])
-        if coefficient[0] == "b":
-            power -= integrators
-            return f"{self.gain}*{self._power(power)}" if power > 0 else self._over_time(self.gain, -power)
-        return self._power(power)
+        if coefficient[0] == "a":
+            return self._power(power)
+        power -= integrators
+        return f"{self.gain}*{self._power(power)}" if power > 0 else self._over_time(self.gain, -power)
 
     def _power(self, power: int) -> str:
         return self.time if power == 1 else f"{self.time}^{power}"
 
     def _over_time(self, unit: str, power: int) -> str:
-        if power == 0:
-            return unit
-        return f"{unit}/{self.time}" if power == 1 else f"{unit}/{self.time}^{power}"
+        return f"{unit}/{self._power(power)}" if power else unit
 
 
 def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None = None) -> list[UncertainValue]:
@@ -81,41 +78,40 @@ def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None
     numerator, denominator = estimate.get("numerator"), estimate.get("denominator")
     if not numerator or not denominator:
         return []
-    errors = estimate.get("standard_errors") or {}
-    poles, zeros, units = len(denominator) - 1, len(numerator) - 1, Units()
-    found = []
-
-    def add(name: str, value: float | None, unit: str) -> None:
-        error = errors.get(name)
-        found.append(
-            UncertainValue.normal(name, nan if value is None else value, nan if error is None else error, unit)
-        )
-
+    errors, submodels, units = estimate.get("standard_errors") or {}, estimate.get("parameters") or {}, Units()
     values = {f"b{k}": value for k, value in enumerate(numerator)}
     values |= {f"a{k}": value for k, value in enumerate(denominator[1:], start=1)}
-    submodels = estimate.get("parameters") or {}
-    if not submodels or values.keys() & errors.keys():
-        for name, value in values.items():
-            add(name, value, units.of(name, poles, zeros))
+    if submodels and not values.keys() & errors.keys():
+        values = {}
+    named = {name: units.of(name, len(denominator) - 1, len(numerator) - 1) for name in values}
     # Integrators have the least natural frequency of all, so that they are those of the first submodel.
     integrators = next(k for k, value in enumerate(reversed(denominator)) if value != 0)
-    for name, value in submodels.items():
-        add(name, value, units.of_submodel(name, integrators if name.startswith("g1_") else 0))
+    named |= {name: units.of_submodel(name, integrators if name.startswith("g1_") else 0) for name in submodels}
     delay = estimate.get("delay")
-    add("delay", delay, units.time)
-    status = "fixed"
-    if delay_bounds is not None:
-        low, high = delay_bounds
-        at_bound = delay is not None and min(abs(delay - low), abs(high - delay)) <= 1e-9 * (high - low)
-        status = "at bound" if at_bound else "free"
-    return [*found[:-1], replace(found[-1], status=status)]
+    values |= {**submodels, "delay": delay}
+    found = [
+        UncertainValue.normal(name, _or_nan(values[name]), _or_nan(errors.get(name)), unit)
+        for name, unit in {**named, "delay": units.time}.items()
+    ]
+    return [*found[:-1], replace(found[-1], status=_delay_status(delay, delay_bounds))]
+
+
+def _or_nan(value: float | None) -> float:
+    return nan if value is None else value
+
+
+def _delay_status(delay: float | None, bounds: Sequence[float] | None) -> str:
+    if bounds is None:
+        return "fixed"
+    low, high = bounds
+    at_bound = delay is not None and min(abs(delay - low), abs(high - delay)) <= 1e-9 * (high - low)
+    return "at bound" if at_bound else "free"
 
 
 def parameter_object(item: UncertainValue) -> dict[str, Any]:
     """A parameter for JSON."""
     names = ("name", "estimate", "standard_error", "relative_percent", "low", "high", "unit", "status")
-    cleaned: dict[str, Any] = plain({name: getattr(item, name) for name in names})
-    return cleaned
+    return dict(plain({name: getattr(item, name) for name in names}))
 
 
 def parameter_table(found: Iterable[UncertainValue]) -> str:

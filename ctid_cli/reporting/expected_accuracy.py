@@ -115,10 +115,8 @@ def _in_terms(system: AdditiveModel | TransferFunction, terms: tuple[Term, ...])
         found = _matched(submodels, order)
         if found is not None:
             return AdditiveModel(found, system.delay).sorted()
-    raise DataError(
-        f"the estimator's terms ({len(terms)}) do not match the submodels of the system ({len(submodels)}): they "
-        "cannot hold it, or no data determine what they have in excess"
-    )
+    numbers = f"the estimator's terms ({len(terms)}) do not match the submodels of the system ({len(submodels)})"
+    raise DataError(f"{numbers}: they cannot hold it, or no data determine what they have in excess")
 
 
 def _matched(submodels: list[Submodel], terms: Sequence[Term]) -> list[Submodel] | None:
@@ -145,13 +143,12 @@ def _without_rounding(submodel: Submodel) -> Submodel:
 
 def _why_no_limit(source: SimulatedSource, estimated: _Estimated) -> str:
     """Why the limit for long records is not taken, in a clause; empty where it is."""
-    sampling, signal = source.sampling, source.excitation if source.loop is None else source.loop.reference
+    sampling, (name, signal) = source.sampling, _driving(source)
     if estimated.delay_from is not None:
         return "the delay is estimated too"
     if not isinstance(sampling, RegularSampling):
         return "the clock is irregular"
     if not isinstance(signal, Gaussian) or signal.clock_period not in (None, sampling.interval):
-        name = "input" if source.loop is None else "reference"
         return f"the {name} is not white Gaussian noise held from sample to sample"
     if sampling.samples < LONG:
         return f"there are fewer than {LONG} samples"
@@ -160,12 +157,15 @@ def _why_no_limit(source: SimulatedSource, estimated: _Estimated) -> str:
     return ""
 
 
+def _driving(source: SimulatedSource) -> tuple[str, Any]:
+    """The signal that drives the system, and what it is called."""
+    return ("input", source.excitation) if source.loop is None else ("reference", source.loop.reference)
+
+
 def _of_long_records(source: SimulatedSource, estimated: _Estimated) -> ExpectedAccuracy:
-    sampling, noise, loop = source.sampling, source.noise, source.loop
+    sampling, noise, loop, (name, signal) = source.sampling, source.noise, source.loop, _driving(source)
     assert isinstance(sampling, RegularSampling)
     assert noise is not None
-    signal = source.excitation if loop is None else loop.reference
-    assert isinstance(signal, Gaussian)
     options: dict[str, Any] = {}
     if loop is None:
         # A level relative to the output counts from its mean square.
@@ -188,10 +188,8 @@ def _of_long_records(source: SimulatedSource, estimated: _Estimated) -> Expected
     if noise.coloured:
         product = "M^-1 Sigma M^-1"
         matrices += ", Sigma = sigma_e^2 cov(H psi), H the filter and sigma_e^2 the innovation variance of the noise"
-    formula = (
-        f"the limit for long records, {product} / N with {matrices}, psi {_sensitivities(source, estimated)}; by "
-        f"discrete Lyapunov equations, as the {'input' if loop is None else 'reference'} is white Gaussian noise"
-    )
+    formula = f"the limit for long records, {product} / N with {matrices}, psi {_sensitivities(source, estimated)}; "
+    formula += f"by discrete Lyapunov equations, as the {name} is white Gaussian noise"
     return ExpectedAccuracy(parameters, sampling.samples, True, formula)
 
 
@@ -204,12 +202,10 @@ def _of_records(source: SimulatedSource, estimated: _Estimated, why: str) -> Exp
         raise DataError("the data would not determine the parameters, even without noise")
     sought = estimated.delay_from is not None
     parameters = ParameterAccuracy.of(estimated.model, covariance, estimated.zeros, sought)
+    # Instruments other than the input itself are not the best there are.
+    start = f"{'the Cramér-Rao bound ' if estimated.instruments == 'open_loop' else ''}sigma^2 (psi' psi)^-1"
     if source.noise.coloured:
         start = "(psi' psi)^-1 psi' R psi (psi' psi)^-1, R the covariance matrix of the noise"
-    else:
-        # Instruments other than the input itself are not the best there are.
-        best = estimated.instruments == "open_loop"
-        start = f"{'the Cramér-Rao bound ' if best else ''}sigma^2 (psi' psi)^-1"
     where = "in the first data set" if sets == 1 else f"averaged over the first {sets} data sets"
     formula = f"{start}, psi {_sensitivities(source, estimated)}, {where}, as {why}"
     return ExpectedAccuracy(parameters, samples, False, formula)

@@ -11,20 +11,14 @@ from ctid_cli.reporting.layout import Report, Table, count, number
 
 def filter_object(filters: FilterSet, check: FilterCheck) -> dict[str, Any]:
     """A check of a filter set as JSON-able content."""
+    regions = (convergence_region(float(cutoff), exact=check.exact) for cutoff in filters.cutoffs)
+    rows = zip(range(1, filters.count + 1), filters.periods.tolist(), filters.cutoffs.tolist(), regions, strict=True)
     return {
         "passes": check.passes,
         "bandwidth": filters.bandwidth,
         "beta": filters.beta,
         "largest_error": check.largest_error,
-        "filters": [
-            {
-                "filter": k,
-                "period": float(period),
-                "cutoff": float(cutoff),
-                "convergence_region": convergence_region(float(cutoff), exact=check.exact),
-            }
-            for k, (period, cutoff) in enumerate(zip(filters.periods, filters.cutoffs, strict=True), start=1)
-        ],
+        "filters": [dict(zip(("filter", "period", "cutoff", "convergence_region"), row, strict=True)) for row in rows],
         "intervals": _best(check),
         "gaps": [{"low": low, "high": high} for low, high in check.gaps],
         "path": [{"filter": k + 1, "error": error} for k, error in check.path(check.largest_error)],
@@ -51,20 +45,17 @@ def filter_text(filters: FilterSet, check: FilterCheck) -> str:
     top = _time(check.largest_error)
     keys = ("period", "cutoff", "convergence_region")
     filter_rows = [[str(row["filter"]), *(number(row[key], 4) for key in keys)] for row in content["filters"]]
-    error_rows = [
-        [
-            f"{number(row['low'], 5)} to {number(row['high'], 5)}",
-            str(row.get("filter", "none")),
-            number(row["minimum"], 5) if "minimum" in row else "nothing closer",
-        ]
-        for row in sorted([*content["intervals"], *content["gaps"]], key=lambda row: float(row["low"]))
-    ]
+    error_rows = []
+    for row in sorted([*content["intervals"], *content["gaps"]], key=lambda row: float(row["low"])):
+        leads = number(row["minimum"], 5) if "minimum" in row else "nothing closer"
+        error_rows.append(
+            [f"{number(row['low'], 5)} to {number(row['high'], 5)}", str(row.get("filter", "none")), leads]
+        )
+    longest = f"periods from {number(filters.beta, 4)} to 1 times {_time(float(filters.periods[-1]))}"
+    text = f"{count(filters.count, 'filter')}, {longest}, that of the bandwidth {number(filters.bandwidth, 4)} rad/s."
     blocks: list[list[str | Table]] = [
         [_verdict(content, top)],
-        [
-            f"{count(filters.count, 'filter')}, periods from {number(filters.beta, 4)} to 1 times "
-            f"{_time(float(filters.periods[-1]))}, that of the bandwidth {number(filters.bandwidth, 4)} rad/s."
-        ],
+        [text],
         [
             Table(["filter", "period [s]", "cut-off [rad/s]", "alone from [s]"], filter_rows, "rrrr"),
             "alone from: delay errors up to this one lead to zero with this filter alone.",
@@ -75,10 +66,7 @@ def filter_text(filters: FilterSet, check: FilterCheck) -> str:
         ],
         [_path(content)],
         [_sufficient(content, top)],
-        [
-            "Checked is the necessary condition, with the exact extrema of the cost of an ideal low-pass filter: white "
-            "input, rational part known. Real filters, noise and an estimated rational part move the minima."
-        ],
+        ["Checked is the necessary condition for ideal filters, white input and a known rational part, without noise."],
     ]
     return Report(blocks).draw()
 
@@ -93,10 +81,8 @@ def _verdict(content: dict[str, Any], top: str) -> str:
         return f"PASS: from every delay error up to {top} some filter leads closer to zero, and so on down to zero."
     where = ", ".join(f"{number(gap['low'], 5)} to {_time(gap['high'])}" for gap in gaps[:3])
     more = f" and {count(len(gaps) - 3, 'more gap')}" if len(gaps) > 3 else ""
-    return (
-        f"NOT PASSED: from some delay errors up to {top} no filter leads closer to zero: {where}{more}. "
-        f"Up to {_time(gaps[0]['low'])} there is no gap."
-    )
+    text = f"NOT PASSED: from some delay errors up to {top} no filter leads closer to zero: {where}{more}."
+    return f"{text} Up to {_time(gaps[0]['low'])} there is no gap."
 
 
 def _path(content: dict[str, Any]) -> str:
@@ -112,11 +98,7 @@ def _sufficient(content: dict[str, Any], top: str) -> str:
     if filters[0]["convergence_region"] >= content["largest_error"]:
         return f"One filter suffices: that of the longest period leads from {top} to zero by itself."
     if enough == 1 or (len(filters) >= enough and not content["passes"]):
-        return (
-            f"Equation (56) asks for {count(enough, 'filter')}, but rests on extrema that are up to 0.15 % off, which "
-            "is too much here: a larger beta helps."
-        )
-    return (
-        f"Sufficient by (56) for delay errors up to {top}: {count(enough, 'filter')}. Fewer may do, and more of them "
-        "may fail: below that number check each set."
-    )
+        asks = f"Equation (56) asks for {count(enough, 'filter')}"
+        return f"{asks}, but rests on extrema that are up to 0.15 % off, too much here: a larger beta helps."
+    text = f"Sufficient by (56) for delay errors up to {top}: {count(enough, 'filter')}."
+    return f"{text} Fewer may do, and more of them may fail: below that number check each set."

@@ -10,10 +10,10 @@ import numpy as np
 
 from ctid_cli.canonical import plain
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.identification import Identification
+from ctid_cli.estimators.identification import Identification, Validation
 from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
-from ctid_cli.reporting.layout import Table, count, number
+from ctid_cli.reporting.layout import Table, count, number, picked
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import warning_lines, wrapped
 
@@ -40,10 +40,8 @@ def common_units(measurements: Sequence[Measurement]) -> Units:
         for measurement in measurements:
             unit = getattr(measurement, f"{role}_unit")
             if unit is not None and found.setdefault(role, unit) != unit:
-                raise DataError(
-                    f"{measurement.record.name}: the {role} is in {unit}, that of another file in {found[role]}; "
-                    "files of one command must have the same units"
-                )
+                where = f"{measurement.record.name}: the {role} is in {unit}, that of another file in {found[role]}"
+                raise DataError(f"{where}; files of one command must have the same units")
     return Units(**found)
 
 
@@ -72,16 +70,12 @@ def identification_object(
     """A fit for ``fit.json`` and ``ctid fit --json``."""
     fit, options, criteria = result.fit, result.options, result.criteria
     interval, profile, judged = result.delay_interval, fit.profile, result.validation
+    numerator = [item.estimate for item in result.estimates if item.name.startswith("b")]
+    kind = "robust" if result.robust else "white"
     content = {
-        "model": {
-            "numerator": [item.estimate for item in result.estimates if item.name.startswith("b")],
-            "denominator": fit.model.denominator,
-            "delay": fit.model.delay,
-        },
+        "model": {"numerator": numerator, "denominator": fit.model.denominator, "delay": fit.model.delay},
         "parameters": [parameter_object(item) for item in parameters_of(result, units)],
-        "fit_percent": fit.fit_percent,
-        "r2": fit.r2,
-        "cost": fit.cost,
+        **picked(fit, ("fit_percent", "r2", "cost")),
         "status": fit.status.name,
         "message": fit.status.value,
         "initial_state": {"treatment": options.initial_state, "values": fit.initial_states},
@@ -89,15 +83,11 @@ def identification_object(
         "modes": _modes(result, units),
         "warnings": result.warnings,
         "notes": [note for measurement in measurements for note in measurement.notes],
-        "derived": [{name: getattr(row, name) for name in DERIVED_KEYS} for row in derived_of(result, units)],
-        "covariance": {
-            "kind": "robust" if result.robust else "white",
-            "names": fit.parameter_names,
-            "values": result.covariance,
-        },
+        "derived": [picked(row, DERIVED_KEYS) for row in derived_of(result, units)],
+        "covariance": {"kind": kind, "names": fit.parameter_names, "values": result.covariance},
         "delay_interval": "profile likelihood" if interval is not None else "quadratic",
         "criteria": {
-            **{name: getattr(criteria, name) for name in ("aic", "aicc", "bic", "fpe")},
+            **picked(criteria, ("aic", "aicc", "bic", "fpe")),
             "yic": result.yic,
             "r_t_squared": result.r_t_squared,
             "samples": criteria.count,
@@ -105,24 +95,14 @@ def identification_object(
         },
         "condition_number": fit.condition_number,
         "iterations": fit.iterations,
-        "residual_tests": [{name: getattr(test, name) for name in TEST_KEYS} for test in result.tests],
+        "residual_tests": [picked(test, TEST_KEYS) for test in result.tests],
         "profile": None if profile is None else {"delays": profile.delays, "costs": profile.costs},
-        "validation": judged
-        and {
-            "file": judged.name,
-            "fit_percent": judged.fit_percent,
-            "r2": judged.r2,
-            "samples": judged.count,
-            "initial_state": judged.applied.initial_states[0],
-            "offset": judged.applied.offsets[0],
-            "notes": () if validation is None else validation.notes,
-        },
+        "validation": judged and _validation_object(judged, validation),
         "records": [_record_object(item, use) for item, use in zip(measurements, fit.used, strict=True)],
         "units": asdict(units),
         "settings": asdict(options) | {"hold": measurements[0].record.input.hold},
     }
-    cleaned: dict[str, Any] = plain(content)
-    return cleaned
+    return dict(plain(content))
 
 
 def identification_text(result: Identification, measurements: Sequence[Measurement], units: Units) -> str:
@@ -150,11 +130,8 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
     row("R2", f"{number(fit.r2, 6)} = {R2_DEFINITION}")
     row("", "y measured, x simulated, over the samples used")
     if judged is not None:
-        row(
-            "validation",
-            f"fit {number(judged.fit_percent, 5)} %, R2 {number(judged.r2, 6)} on {judged.name}, "
-            f"{count(judged.count, 'sample')}; initial state and offset treated in the same way",
-        )
+        text = f"fit {number(judged.fit_percent, 5)} %, R2 {number(judged.r2, 6)} on {judged.name}, "
+        row("validation", f"{text}{count(judged.count, 'sample')}; initial state and offset treated in the same way")
     row("cost", f"{number(fit.cost)} ({units.output})^2, mean squared output error")
     sizes = f"N = {criteria.count} samples and p = {criteria.parameters} parameters"
     row("AIC", f"{number(criteria.aic)} = N ln cost + 2 p with {sizes}")
@@ -172,13 +149,11 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
 
 def _record_line(measurement: Measurement, used: int, units: Units) -> str:
     record = measurement.record
-    some = "" if used == record.n_samples else f" ({used} used)"
-    clock = "regular clock" if record.interval is not None else "irregular clock"
-    return (
-        f"{record.name}: {count(record.n_samples, 'sample')}{some} from {record.t[0]:.6g} to {record.t[-1]:.6g} "
-        f"{units.time}, {clock}; input {measurement.input} [{units.input}], output {measurement.output} "
-        f"[{units.output}]"
-    )
+    text = f"{record.name}: {count(record.n_samples, 'sample')}"
+    text += "" if used == record.n_samples else f" ({used} used)"
+    text += f" from {record.t[0]:.6g} to {record.t[-1]:.6g} {units.time}, "
+    text += "regular clock" if record.interval is not None else "irregular clock"
+    return f"{text}; input {measurement.input} [{units.input}], output {measurement.output} [{units.output}]"
 
 
 def _offset(result: Identification, units: Units) -> str:
@@ -191,12 +166,11 @@ def _offset(result: Identification, units: Units) -> str:
 
 
 def _covariance_line(result: Identification) -> str:
+    text = "Standard errors are those for white residuals"
     if result.robust:
         text = "Standard errors are robust (sandwich), because the residuals are not white"
     elif result.tests:
-        text = "Standard errors are those for white residuals, as the residuals pass the test"
-    else:
-        text = "Standard errors are those for white residuals"
+        text += ", as the residuals pass the test"
     text += "; intervals are estimate -+ 1.96 of them"
     if result.delay_interval is not None:
         text += ", that of the delay from the profile of the cost, which is not quadratic there"
@@ -227,6 +201,17 @@ def _modes(result: Identification, units: Units) -> list[dict[str, float | None]
         hertz = None if units.seconds is None else frequency / (2 * np.pi * units.seconds)
         modes.append({"frequency_hz": hertz, "damping": damping})
     return modes
+
+
+def _validation_object(judged: Validation, validation: Measurement | None) -> dict[str, Any]:
+    return {
+        "file": judged.name,
+        **picked(judged, ("fit_percent", "r2")),
+        "samples": judged.count,
+        "initial_state": judged.applied.initial_states[0],
+        "offset": judged.applied.offsets[0],
+        "notes": () if validation is None else validation.notes,
+    }
 
 
 def _record_object(measurement: Measurement, use: Any) -> dict[str, Any]:

@@ -96,6 +96,11 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]], align: 
     return Table(header, rows, align).draw("md")
 
 
+def picked(item: object, names: Iterable[str]) -> dict[str, Any]:
+    """Some attributes of an object, as data."""
+    return {name: getattr(item, name) for name in names}
+
+
 def number(value: object, digits: int = 6) -> str:
     """A number for people; a dash where there is none."""
     if value is None:

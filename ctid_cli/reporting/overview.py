@@ -18,7 +18,7 @@ from ctid_cli.storage.store import ExperimentStatus
 LISTED = 10
 
 
-def status_object(status: ExperimentStatus, estimates: Sequence[Mapping[str, Any]] | None) -> dict[str, Any]:
+def status_object(status: ExperimentStatus, estimates: Sequence[Mapping[str, Any]] | None = None) -> dict[str, Any]:
     """Progress of an experiment for ``ctid status --json``."""
     content = asdict(status) | {"folder": str(status.folder), "todo": status.todo}
     content["groups"] = [
@@ -43,39 +43,35 @@ def status_text(status: ExperimentStatus, estimates: Sequence[Mapping[str, Any]]
     remark = _remark(status)
     blocks = [f"{status.experiment} in {status.folder}: {status.done} of {status.planned} estimates done"]
     blocks[0] += f" ({remark})" if remark else ""
-    swept = list(dict.fromkeys(name for group in status.groups for name in group.swept))
     if status.groups:
-        header = ["estimator", *swept, "done", "planned", "failed"]
+        swept = list(dict.fromkeys(name for group in status.groups for name in group.swept))
         rows = [
             [group.estimator, *map(number, (*map(group.swept.get, swept), group.done, group.planned, group.failed))]
             for group in status.groups
         ]
+        header = ["estimator", *swept, "done", "planned", "failed"]
         blocks.append(Table(header, rows, "l" * (1 + len(swept)) + "rrr").draw())
-    outcomes = Counter((str(row["status"]), _sentence(row)) for row in estimates)
-    lines = [
-        f"{count} {name}" + ("" if name in FAILURES else f": {sentence}")
-        for (name, sentence), count in outcomes.most_common()
-    ]
-    failures = [
-        f"  {row['id']}  {row['estimator']}, replicate {row['replicate']}, start {row['start']}: {_sentence(row)}"
-        for row in estimates
-        if row["status"] in FAILURES
-    ]
-    lines += failures[:LISTED]
-    if len(failures) > LISTED:
-        lines.append(f"  and {len(failures) - LISTED} more")
-    blocks += ["\n".join(lines)] if lines else []
+    if estimates:
+        blocks.append("\n".join(_outcomes(estimates)))
     if status.left_aside:
-        blocks.append(
-            f"{status.left_aside} stored estimates are set aside: the latest run asked for other settings or fewer "
-            "data sets."
-        )
+        blocks.append(f"{status.left_aside} stored estimates are set aside, as the latest run asked for others.")
     command = f"ctid table {status.experiment}{out_option(out)}"
     if status.todo and not status.running:
         blocks.append(f"To continue, run the same `ctid run` command again; so far: {command}")
     elif status.done:
         blocks.append(f"Next: {command}")
     return "\n\n".join(blocks)
+
+
+def _outcomes(estimates: Sequence[Mapping[str, Any]]) -> list[str]:
+    """How often each status came, and the first failures."""
+    outcomes = Counter((str(row["status"]), _sentence(row)) for row in estimates).most_common()
+    lines = [f"{n} {name}" + ("" if name in FAILURES else f": {text}") for (name, text), n in outcomes]
+    failures = [row for row in estimates if row["status"] in FAILURES]
+    for row in failures[:LISTED]:
+        place = f"{row['estimator']}, replicate {row['replicate']}, start {row['start']}"
+        lines.append(f"  {row['id']}  {place}: {_sentence(row)}")
+    return [*lines, f"  and {len(failures) - LISTED} more"] if len(failures) > LISTED else lines
 
 
 def _sentence(row: Mapping[str, Any]) -> str:

@@ -15,14 +15,16 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ctid_cli.reporting.results import Results, lookup
-from ctid_cli.reporting.study import Study, StudyTable
+from ctid_cli.reporting.study import Place, Study, StudyTable
 from ctid_cli.simulation.frequency_measures import base_name, measure_names
 from ctid_cli.storage.columns import reserved_names
 from ctid_cli.storage.manifest import is_of_signal
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Row = dict[str, Any]
 
@@ -31,14 +33,8 @@ ALWAYS = {"snr_db": "noise.snr_db"}
 
 #: What stands in a cell that was not run.
 NOTHING = {
-    "n": 0,
-    "failed": 0,
-    "converged": 0,
-    "percent": None,
-    "low": None,
-    "high": None,
-    "published_percent": None,
-    "median_seconds": None,
+    **dict.fromkeys(("n", "failed", "converged"), 0),
+    **dict.fromkeys(("percent", "low", "high", "published_percent", "median_seconds")),
 }
 
 
@@ -61,8 +57,8 @@ def experiment_rows(
     """Cells of one experiment: every combination of swept fields, estimator and start that was planned."""
     manifest = results.manifest
     down, across = results.swept("data_cells"), results.swept("estimators")
-    always = {} if is_of_signal(manifest) else ALWAYS
-    constant = {name: lookup(results.settings, path) for name, path in (fields or always).items()}
+    fields = fields or ({} if is_of_signal(manifest) else ALWAYS)
+    constant = {name: lookup(results.settings, path) for name, path in fields.items()}
     # Several sets of initial parameters are told apart by their names, as initial delays are by their values.
     given = {label for label, delay in manifest["starts"].items() if delay is None and label != "none"}
     by = ["cell", "estimator", *across, "start"]
@@ -87,50 +83,36 @@ def experiment_rows(
     return rows
 
 
-def study_rows(study: Study, table: StudyTable, found: Mapping[str, Results | None]) -> list[Row]:
-    """Cells of one published table, published or run."""
-    rows: list[Row] = []
-    fields, random = list(study.fields), table.initial_delays == ("random",)
-    for name, experiment in study.experiments.items():
-        published = {
-            (method, *line.settings.values(), delay): value
-            for line in table.rows
-            if line.experiment == name
-            for method, values in line.published.items()
-            for delay, value in zip(table.initial_delays, values, strict=True)
-        }
-        results = found.get(name) if published else None
-        ours: dict[tuple[Any, ...], list[Row]] = {}
-        for row in experiment_rows(results, table.number, study.fields) if results else []:
+def study_rows(study: Study, table: StudyTable, found: Mapping[str, Results]) -> list[Row]:
+    """Cells of one published table, published or run: by experiment, settings and method in the order of the study."""
+    random = table.initial_delays == ("random",)
+    ours: dict[Place, list[Row]] = {}
+    for name in table.experiments:
+        for row in experiment_rows(found[name], table.number, study.fields) if name in found else ():
             if row["initial_delay"] is None or (row["initial_delay"] == "random") == random:
-                place = (row["method"], *(row[field] for field in fields), row["initial_delay"])
-                ours.setdefault(place, []).append(row | {"published_percent": published.get(place)})
-        for place, value in published.items():
-            method, *settings, delay = place
-            empty = {"table": table.number, "experiment": name, "sampling": experiment.sampling}
-            empty |= dict(zip(fields, settings, strict=True))
-            empty |= {"initial_delay": delay, "method": method, **NOTHING, "published_percent": value}
-            rows += ours.pop(place, [empty])
-        rows += itertools.chain(*ours.values())
+                ours.setdefault(_place(study, row), []).append(row)
+    rows: list[Row] = []
+    places = list(dict.fromkeys([*table.published, *ours]))
+    for place in places:
+        experiment, settings, method, delay = place
+        empty = {"table": table.number, "experiment": experiment, "sampling": study.experiments[experiment]["sampling"]}
+        empty |= dict(zip(study.fields, settings, strict=True))
+        empty |= {"initial_delay": delay, "method": method, **NOTHING}
+        rows += (row | {"published_percent": table.published.get(place)} for row in ours.get(place, [empty]))
+    experiments, settings_order, methods = ([*dict.fromkeys(column)] for column in [*zip(*places, strict=True)][:3])
+    order = experiments, settings_order, [*dict.fromkeys([*study.methods, *methods])]
+
+    def position(row: Row) -> list[int]:
+        return [known.index(own) for known, own in zip(order, _place(study, row)[:3], strict=True)]
+
     # Every row of a table carries the same keys, in the same order.
     blank = dict.fromkeys(["table", "experiment", "sampling", *settings_of(rows)])
-    return _ordered(study, table, [blank | row for row in rows])
+    return [blank | row for row in sorted(rows, key=position)]
 
 
-def _ordered(study: Study, table: StudyTable, rows: list[Row]) -> list[Row]:
-    """Rows by experiment, published settings and method, each in the order of the study."""
-
-    def settings(row: Row) -> tuple[Any, ...]:
-        return tuple(row[field] for field in study.fields)
-
-    experiments = list(dict.fromkeys(row.experiment for row in table.rows))
-    known = list(dict.fromkeys([*(tuple(r.settings.values()) for r in table.rows), *map(settings, rows)]))
-    methods = list(dict.fromkeys([*study.methods, *(row["method"] for row in rows)]))
-
-    def place(row: Row) -> tuple[int, int, int]:
-        return experiments.index(row["experiment"]), known.index(settings(row)), methods.index(row["method"])
-
-    return sorted(rows, key=place)
+def _place(study: Study, row: Row) -> Place:
+    settings = tuple(row[field] for field in study.fields)
+    return Place(row["experiment"], settings, row["method"], row["initial_delay"])
 
 
 def pooled_rows(study: Study, table: StudyTable, rows: Sequence[Row], options: Sequence[str] = ()) -> list[Row]:
@@ -142,15 +124,10 @@ def pooled_rows(study: Study, table: StudyTable, rows: Sequence[Row], options: S
     import numpy as np
     import pandas as pd
 
-    places = {(row.experiment, *row.settings.values()) for row in table.rows}
-    frame = pd.DataFrame(
-        [
-            row | {"startless": row["initial_delay"] is None}
-            for row in rows
-            if (row["experiment"], *(row[field] for field in study.fields)) in places
-            and row["initial_delay"] in (None, *table.initial_delays)
-        ]
-    )
+    places = {place[:2] for place in table.published}
+    shown = [row for row in rows if _place(study, row)[:2] in places]
+    shown = [row for row in shown if row["initial_delay"] in (None, *table.initial_delays)]
+    frame = pd.DataFrame([row | {"startless": row["initial_delay"] is None} for row in shown])
     known = {name: {row[name] for row in rows} - {None} for name in options}
     pooled = []
     for key, group in frame.groupby(["method", "startless", *options], sort=False, dropna=False):
@@ -176,35 +153,29 @@ def pooled_rows(study: Study, table: StudyTable, rows: Sequence[Row], options: S
 
 def _measured(results: Results, by: Sequence[str]) -> dict[tuple[Any, ...], dict[str, float | None]]:
     """What the estimates of a group measured together, where they are frequencies of a signal."""
+    import pandas as pd
+
     groups: dict[tuple[Any, ...], list[Mapping[str, float | None]]] = {}
     for row in results.rows:
         if "measures" in row:
             groups.setdefault(tuple(row.get(name) for name in by), []).append(row["measures"] or {})
     names = measure_names(one for group in groups.values() for one in group)
-    return {place: _together(group, names) for place, group in groups.items()}
+    return {place: _together(pd.DataFrame(group, columns=names).astype(float)) for place, group in groups.items()}
 
 
-def _together(group: Sequence[Mapping[str, float | None]], names: Sequence[str]) -> dict[str, float | None]:
+def _together(group: pd.DataFrame) -> dict[str, float | None]:
     """Medians over data sets, where what does not exist counts as later or larger than all else."""
-    found: dict[str, float | None] = {}
+    names, late = list(map(str, group)), group.fillna(math.inf)
+    medians: dict[str, float] = {}
     for base in ("settling_time", "settling_after_step"):
         own = [name for name in names if base_name(name)[0] == base]
         if own:
-            found[f"median_{base}"] = _median(max(_or_infinite(one, name) for name in own) for one in group)
-    for name in names:
-        if base_name(name)[0] == "rms":
-            found[f"median_{name}"] = _median(_or_infinite(one, name) for one in group)
-    if "false_alarms" in names:
-        alarms = [alarm for one in group if (alarm := one.get("false_alarms")) is not None]
-        found["false_alarms"] = sum(alarms) if alarms else None
+            medians[f"median_{base}"] = late[own].max(axis=1).median()
+    medians |= {f"median_{name}": late[name].median() for name in names if base_name(name)[0] == "rms"}
+    found: dict[str, float | None] = {
+        name: float(middle) if math.isfinite(middle) else None for name, middle in medians.items()
+    }
+    if "false_alarms" in group:
+        alarms = group["false_alarms"]
+        found["false_alarms"] = float(alarms.sum()) if alarms.notna().any() else None
     return found
-
-
-def _or_infinite(measures: Mapping[str, float | None], name: str) -> float:
-    value = measures.get(name)
-    return math.inf if value is None else value
-
-
-def _median(values: Iterable[float]) -> float | None:
-    middle = median(values)
-    return middle if math.isfinite(middle) else None

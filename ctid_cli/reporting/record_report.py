@@ -26,8 +26,7 @@ def record_object(measurement: Measurement, report: RecordReport) -> dict[str, A
         role: {"column": getattr(measurement, role), "unit": getattr(measurement, f"{role}_unit")} for role in ROLES
     }
     head = {"file": content.pop("name"), "columns": columns, "notes": measurement.notes, "worst": report.worst}
-    found: dict[str, Any] = plain({**head, **content})
-    return found
+    return dict(plain({**head, **content}))
 
 
 def record_text(measurement: Measurement, report: RecordReport) -> str:
@@ -48,13 +47,10 @@ def record_text(measurement: Measurement, report: RecordReport) -> str:
 
 
 def _verdict(report: RecordReport) -> str:
-    problems = sum(finding.level == "problem" for finding in report.findings)
-    warnings = sum(finding.level == "warning" for finding in report.findings)
-    if problems:
-        return f"No model can be identified from this record as it is: {count(problems, 'problem')}."
-    if warnings:
-        return f"Usable, with {count(warnings, 'warning')}."
-    return "Nothing is wrong with this record."
+    n = sum(finding.level == report.worst for finding in report.findings)
+    if report.worst == "problem":
+        return f"No model can be identified from this record as it is: {count(n, 'problem')}."
+    return f"Usable, with {count(n, 'warning')}." if report.worst == "warning" else "Nothing is wrong with this record."
 
 
 def _numbers(measurement: Measurement, r: RecordReport) -> list[str]:
@@ -69,9 +65,6 @@ def _numbers(measurement: Measurement, r: RecordReport) -> list[str]:
     def span(low: float, high: float, unit: str) -> str:
         return f"from {number(low, 4)} to {number(high, 4)} {unit}"
 
-    def plain_digits(x: float) -> str:
-        return f"{float(f'{x:.3g}'):.12g}"
-
     clock = "regular" if r.regular else span(r.interval_min, r.interval_max, time)
     row("sampling interval", f"{number(r.interval, 4)} {time}", clock)
     for signal, unit in (("input", measurement.input_unit or ""), ("output", measurement.output_unit or "")):
@@ -82,12 +75,9 @@ def _numbers(measurement: Measurement, r: RecordReport) -> list[str]:
         row(f"{signal}, range", "", span(low, high, unit))
     remark = "of the part that follows the input linearly, at least"
     row("signal-to-noise ratio", f"{number(r.snr_db, 3)} dB", remark, r.snr_db)
-    row(
-        "bandwidth of the answer",
-        f"{plain_digits(r.output_bandwidth)} rad/{time}",
-        f"Nyquist frequency {plain_digits(r.nyquist)} rad/{time}",
-        r.explained if r.input_kind != "steps" else 1.0,
-    )
+    bandwidth, nyquist = (f"{float(f'{x:.3g}'):.12g} rad/{time}" for x in (r.output_bandwidth, r.nyquist))
+    known = r.explained if r.input_kind != "steps" else 1.0
+    row("bandwidth of the answer", bandwidth, f"Nyquist frequency {nyquist}", known)
     row("delay", "", span(r.delay_early, r.delay_late, time), r.delay_late)
     width, wide = (max(len(cells[k]) for cells in rows) for k in (0, 1))
     return [
@@ -109,10 +99,7 @@ def _next_command(measurement: Measurement, report: RecordReport) -> str:
     if measurement.record.input.hold != "zoh":
         words += ["--hold", measurement.record.input.hold]
     for option, instant in (("--from", measurement.start), ("--to", measurement.stop)):
-        if instant is not None:
-            words += [option, f"{instant:.12g}"]
-    if report.suggested_offset != "none":
-        words += ["--offset", report.suggested_offset]
-    if report.suggested_initial_state != "rest":
-        words += ["--initial-state", report.suggested_initial_state]
+        words += [] if instant is None else [option, f"{instant:.12g}"]
+    words += [] if report.suggested_offset == "none" else ["--offset", report.suggested_offset]
+    words += [] if report.suggested_initial_state == "rest" else ["--initial-state", report.suggested_initial_state]
     return shlex.join(words)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import yaml
-
-from ctid_cli.errors import UsageError
 
 InitialDelay = float | Literal["random"] | None
 
@@ -17,22 +16,14 @@ InitialDelay = float | Literal["random"] | None
 DEFAULT_STUDY = "useful-redundancy"
 
 
-@dataclass(frozen=True)
-class StudyExperiment:
-    """One experiment of a study."""
-
-    config: str
-    sampling: str
-
-
-@dataclass(frozen=True)
-class StudyRow:
-    """One row of a published table."""
+class Place(NamedTuple):
+    """A cell of a published table."""
 
     experiment: str
-    settings: Mapping[str, float]
-    #: Published percentages of each method, one per initial delay of the table [%].
-    published: Mapping[str, tuple[float, ...]]
+    #: Values of the fields of the study.
+    settings: tuple[float, ...]
+    method: str
+    initial_delay: InitialDelay
 
 
 @dataclass(frozen=True)
@@ -43,7 +34,13 @@ class StudyTable:
     title: str
     #: Initial delays [s] of its columns, or ``("random",)``.
     initial_delays: tuple[InitialDelay, ...]
-    rows: tuple[StudyRow, ...]
+    #: Published percentages [%].
+    published: Mapping[Place, float]
+
+    @property
+    def experiments(self) -> list[str]:
+        """Names of the experiments that fill it."""
+        return list(dict.fromkeys(place.experiment for place in self.published))
 
 
 @dataclass(frozen=True)
@@ -57,7 +54,8 @@ class Study:
     methods: Mapping[str, str]
     must_reach: tuple[str, ...]
     fields: Mapping[str, str]
-    experiments: Mapping[str, StudyExperiment]
+    #: ``config`` and ``sampling`` of every experiment.
+    experiments: Mapping[str, Mapping[str, str]]
     tables: Mapping[int, StudyTable]
 
 
@@ -68,37 +66,38 @@ def data_folder(name: str) -> Path:
     return packaged if packaged.is_dir() else package.parent / name
 
 
-def load_study(name: str = DEFAULT_STUDY) -> Study:
-    """Read a study that is shipped with the program."""
-    for file in sorted(data_folder("experiments").glob("*/study.yaml")):
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-        if content["study"] == name:
-            source, fields = content["source"], content["fields"]
-            return Study(
-                name=name,
-                source=f"{source['authors']}: {source['title']} ({source['identifier']})",
-                success=content["success"],
-                published_data_sets=content["published_data_sets"],
-                methods=content["methods"],
-                must_reach=tuple(content["must_reach"]),
-                fields=fields,
-                experiments={key: StudyExperiment(**item) for key, item in content["experiments"].items()},
-                tables={number: _table(number, table, fields) for number, table in content["tables"].items()},
-            )
-    raise UsageError(f"there is no study named {name!r}")
+@cache
+def study_contents() -> dict[str, dict[str, Any]]:
+    """What ``study.yaml`` says of every study that is shipped with the program, by its name."""
+    files = sorted(data_folder("experiments").glob("*/study.yaml"))
+    contents = [yaml.safe_load(file.read_text(encoding="utf-8")) for file in files]
+    return {content["study"]: content for content in contents}
+
+
+def load_study() -> Study:
+    """The study whose tables are published."""
+    content = study_contents()[DEFAULT_STUDY]
+    source = content["source"]
+    return Study(
+        name=DEFAULT_STUDY,
+        source=f"{source['authors']}: {source['title']} ({source['identifier']})",
+        must_reach=tuple(content["must_reach"]),
+        tables={number: _table(number, table, content["fields"]) for number, table in content["tables"].items()},
+        **{name: content[name] for name in ("success", "published_data_sets", "methods", "fields", "experiments")},
+    )
 
 
 def tables_of(experiment: str) -> list[int]:
     """Numbers of the default study's tables that an experiment fills."""
-    return [n for n, table in load_study().tables.items() if experiment in (row.experiment for row in table.rows)]
+    return [number for number, table in load_study().tables.items() if experiment in table.experiments]
 
 
 def _table(number: int, content: dict[str, Any], fields: Mapping[str, str]) -> StudyTable:
     delays = tuple(delay if delay == "random" else float(delay) for delay in content["initial_delays"])
-    rows = []
-    for row in content["rows"]:
-        published = {method: tuple(map(float, values)) for method, values in row["published"].items()}
-        if any(len(values) != len(delays) for values in published.values()):
-            raise ValueError(f"table {number}: every published row needs {len(delays)} values")
-        rows.append(StudyRow(row["experiment"], {field: float(row[field]) for field in fields}, published))
-    return StudyTable(number, content["title"], delays, tuple(rows))
+    published = {
+        Place(row["experiment"], tuple(float(row[field]) for field in fields), method, delay): float(value)
+        for row in content["rows"]
+        for method, values in row["published"].items()
+        for delay, value in zip(delays, values, strict=True)
+    }
+    return StudyTable(number, content["title"], delays, published)

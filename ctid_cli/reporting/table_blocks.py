@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ctid_cli.inference.uncertain_value import UncertainValue
@@ -81,9 +81,8 @@ def study_blocks(
     foot = f"{RULE} {TIME}; of several cells, the least to the greatest."
     foot += f" Published: {study.published_data_sets} data sets, {study.source}."
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    startless = [
-        name for name in methods if any(row["method"] == name and row["initial_delay"] is None for row in rows)
-    ]
+    without = {row["method"] for row in rows if row["initial_delay"] is None}
+    startless = [name for name in methods if name in without]
     if startless:
         foot += f" {listed(startless)} {'was' if len(startless) == 1 else 'were'} given no initial delay: one estimate "
         foot += "per data set, shown under every initial delay."
@@ -107,17 +106,19 @@ def _stacked(header: list[str], groups: list[list[Row]], delays: list[Any], labe
         shown = [name if last[: k + 1] != names[: k + 1] else "" for k, name in enumerate(names)]
         if last and last[:-1] != names[:-1]:
             body.append([""] * len(header))
-        last, blank = names, [""] * len(names)
-        ours, run = _across(group, delays), any(row["n"] for row in group)
-        percents = ["" if row is None else percent_text(row) if row["n"] else "-" for row in ours]
-        body.append([*shown, f"n = {_sizes(group)}" if run else NOT_RUN, *percents])
-        if run:
-            body.append([*blank, "95 %", *("" if row is None else _whole_interval(row) for row in ours)])
-        if any(row["published_percent"] is not None for row in group):
-            body.append([*blank, "published", *map(_published, ours)])
-        if run:
-            body.append([*blank, "time", *("" if row is None else time_text(row) for row in ours)])
+        last, run, ours = names, any(row["n"] for row in group), _across(group, delays)
+        lines: dict[str, Callable[[Row], str]] = {f"n = {_sizes(group)}" if run else NOT_RUN: _percent_or_dash}
+        lines |= {"95 %": _whole_interval} if run else {}
+        lines |= {"published": _published} if any(row["published_percent"] is not None for row in group) else {}
+        lines |= {"time": time_text} if run else {}
+        for title, text in lines.items():
+            body.append([*shown, title, *("" if row is None else text(row) for row in ours)])
+            shown = [""] * len(names)
     return Table(header, body, "l" * (len(labels) + 3) + "r" * len(delays))
+
+
+def _percent_or_dash(row: Row) -> str:
+    return percent_text(row) if row["n"] else "-"
 
 
 def _flat(header: list[str], groups: list[list[Row]], delays: list[Any], labels: list[str]) -> Table:
@@ -127,13 +128,9 @@ def _flat(header: list[str], groups: list[list[Row]], delays: list[Any], labels:
     for group in groups:
         texts = [*_names(group[0], labels), _sizes(group)]
         for row in _across(group, delays):
-            if row is None:
-                texts += ["", "", ""] if single else ["-"]
-            elif single:
-                texts += [percent_text(row), interval_text(row), _published(row)]
-            else:
-                published = "" if row["published_percent"] is None else f" (pub {_published(row)})"
-                texts.append(f"{percent_text(row)} {interval_text(row)}".rstrip() + published)
+            cells = ["", "", ""] if row is None else [percent_text(row), interval_text(row), _published(row)]
+            one = " ".join(cells[:2]).rstrip() + (f" (pub {cells[2]})" if cells[2] else "")
+            texts += cells if single else [one or "-"]
         body.append([*texts, _span([row["median_seconds"] for row in group if row["n"]])])
     columns = ["percent", "95 %", "published"] if single else list(map(delay_label, delays))
     return Table([*header, "n", *columns, "time"], body, "l" * len(header) + "r" * (len(columns) + 2))
@@ -175,8 +172,8 @@ def _whole_interval(row: Row) -> str:
     return f"{row['low']:.0f}-{row['high']:.0f}" if row["n"] and row["low"] is not None else ""
 
 
-def _published(row: Row | None) -> str:
-    return "" if row is None or row["published_percent"] is None else number(row["published_percent"])
+def _published(row: Row) -> str:
+    return "" if row["published_percent"] is None else number(row["published_percent"])
 
 
 def _span(times: Sequence[float | None]) -> str:
@@ -215,23 +212,27 @@ def percentage_blocks(results: Results, rows: Sequence[Row]) -> Blocks:
         place = (*(row[key] for key in down), row["initial_delay"])
         cells.setdefault(place, {})[", ".join([row["method"], *own])] = row
     titles = list(dict.fromkeys(title for line in cells.values() for title in line))
-    tables: Blocks = []
-    for first in range(0, len(titles), GROUPS_PER_BLOCK):
-        block = titles[first : first + GROUPS_PER_BLOCK]
-        header = [*map(setting_title, down), "initial delay"]
-        header += [text for title in block for text in (f"{title}: %", "95 %", "n", "time")]
-        body = [
-            [*map(setting_text, down, place), delay_label(place[-1])]
-            + [text for title in block for text in _four(line.get(title))]
-            for place, line in cells.items()
-            if not line.keys().isdisjoint(block)
-        ]
-        tables.append([Table(header, body, "l" * (len(down) + 1) + "rrrr" * len(block))])
+    blocks = [titles[k : k + GROUPS_PER_BLOCK] for k in range(0, len(titles), GROUPS_PER_BLOCK)]
+    tables: Blocks = [[_percentage_table(down, block, cells)] for block in blocks]
     return [_heading(results), *tables, [f"{RULE} {TIME}."]]
 
 
-def _four(row: Row | None) -> list[str]:
-    return ["", "", "", ""] if row is None else [percent_text(row), interval_text(row), str(row["n"]), time_text(row)]
+def _percentage_table(
+    down: Sequence[str], titles: Sequence[str], cells: Mapping[tuple[Any, ...], Mapping[str, Row]]
+) -> Table:
+    header = [*map(setting_title, down), "initial delay"]
+    header += [text for title in titles for text in (f"{title}: %", "95 %", "n", "time")]
+    body = [
+        [*map(setting_text, down, place), delay_label(place[-1])]
+        + [text for title in titles for text in (_four(line[title]) if title in line else [""] * 4)]
+        for place, line in cells.items()
+        if not line.keys().isdisjoint(titles)
+    ]
+    return Table(header, body, "l" * (len(down) + 1) + "rrrr" * len(titles))
+
+
+def _four(row: Row) -> list[str]:
+    return [percent_text(row), interval_text(row), str(row["n"]), time_text(row)]
 
 
 def _heading(results: Results) -> list[str | Table]:
@@ -246,7 +247,7 @@ def frequency_blocks(results: Results, rows: Sequence[Row]) -> Blocks:
     body = [
         [
             *(setting_text(key, row[key]) for key in keys),
-            *(row["method"], percent_text(row), interval_text(row), str(row["n"])),
+            *(row["method"], *_four(row)[:3]),
             *(number(row[key], 3) for key in measures),
             time_text(row),
         ]
@@ -266,28 +267,29 @@ def record_blocks(results: Results) -> Blocks:
     fits = {"fit, estimation part": "fit_percent"}
     if any(item.get("validation_fit_percent") is not None for item in results.rows):
         fits["fit, validation part"] = "validation_fit_percent"
-    tables: Blocks = []
-    for first in range(0, len(results.rows), ESTIMATES_PER_BLOCK):
-        block = results.rows[first : first + ESTIMATES_PER_BLOCK]
-        found = [{item.name: item for item in parameters(row, bounds.get(row["estimator"]))} for row in block]
-        units = {name: item.unit for one in reversed(found) for name, item in one.items()}
-        names = dict.fromkeys(name for one in found for name in one)
-        body = [[key, "", *(str(row[key]) for row in block)] for key in ("id", "status")]
-        body += [[name, units[name], *(_with_error(one.get(name)) for one in found)] for name in names]
-        body += [[title, "%", *(number(row.get(key), 4) for row in block)] for title, key in fits.items()]
-        body.append(["time", "", *(seconds(row.get("seconds")) for row in block)])
-        header = ["", "unit", *(f"{row['estimator']}, start {_start(row['start'])}" for row in block)]
-        tables.append([Table(header, body, "ll" + "r" * len(block))])
+    blocks = [results.rows[k : k + ESTIMATES_PER_BLOCK] for k in range(0, len(results.rows), ESTIMATES_PER_BLOCK)]
+    tables: Blocks = [[_record_table(block, bounds, fits)] for block in blocks]
     foot = "± is one standard error. Fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x."
     return [[f"### {results.experiment}"], *tables, [foot]]
+
+
+def _record_table(block: Sequence[Row], bounds: Mapping[str, Any], fits: Mapping[str, str]) -> Table:
+    found = [{item.name: item for item in parameters(row, bounds.get(row["estimator"]))} for row in block]
+    units = {name: item.unit for one in reversed(found) for name, item in one.items()}
+    body = [[key, "", *(str(row[key]) for row in block)] for key in ("id", "status")]
+    for name in dict.fromkeys(name for one in found for name in one):
+        body.append([name, units[name], *(_with_error(one.get(name)) for one in found)])
+    body += [[title, "%", *(number(row.get(key), 4) for row in block)] for title, key in fits.items()]
+    body.append(["time", "", *(seconds(row.get("seconds")) for row in block)])
+    header = ["", "unit", *(f"{row['estimator']}, start {_start(row['start'])}" for row in block)]
+    return Table(header, body, "ll" + "r" * len(block))
 
 
 def _with_error(item: UncertainValue | None) -> str:
     if item is None:
         return "-"
-    if not math.isfinite(item.standard_error):
-        return f"{number(item.estimate)} ({item.status})"
-    return with_error(item.estimate, item.standard_error)
+    known = math.isfinite(item.standard_error)
+    return with_error(item.estimate, item.standard_error) if known else f"{number(item.estimate)} ({item.status})"
 
 
 def _start(label: str) -> str:

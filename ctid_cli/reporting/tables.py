@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.committed import committed_tables, made_by, read_tables
@@ -41,10 +42,8 @@ def build_tables(names: Sequence[str], out: Path, style: str = "text", *, commit
             if results is None:
                 known = [*map(str, study.tables), study.name, *experiments_in(out)]
                 hint = did_you_mean(name, known) or "."
-                raise UsageError(
-                    f"{name!r} is neither a table nor an experiment with results in {out}{hint} "
-                    f"Known: {', '.join(known)}"
-                )
+                wrong = f"{name!r} is neither a table nor an experiment with results in {out}{hint}"
+                raise UsageError(f"{wrong} Known: {', '.join(known)}")
             reports.append(experiment_report(results, _notes(results, out)))
     return reports
 
@@ -54,44 +53,55 @@ def _study_report(study: Study, number: int, out: Path, style: str, committed: b
     notes: list[str] = []
     known: set[str] = set()
     found: dict[str, Results] = {}
-    for name in dict.fromkeys(row.experiment for row in table.rows):
-        config = data_folder("configs") / study.experiments[name].config
-        command = f"ctid run {shown_path(config)}{out_option(out)}"
-        try:
-            results = find_results(out, name)
-        except InUseError as error:
-            notes.append(f"{name} has no stored results yet: {error}")
-            continue
-        if results is None:
-            # An installed package carries the tables, but not the specifications.
-            notes.append(f"{name} was not run." + (f" To fill its rows: {command}" if config.is_file() else ""))
-            continue
-        found[name] = results
-        known |= results.settings["estimators"].keys()
-        if config.is_file():
-            specification = load_spec(config).canonical()
-            known |= specification["estimators"].keys()
-            absent = [method for method in specification["estimators"] if method not in results.settings["estimators"]]
-            if absent:
-                which = ", ".join(absent)
-                notes.append(f"{name} was run without the estimator {which} of its specification; to add it: {command}")
-            changed = differences(results.settings, specification, set(study.fields.values()))
-            if changed:
-                notes.append(f"{name} was run with other settings than the published ones: {'; '.join(changed)}")
-        notes += _notes(results, out)
+    for name in table.experiments:
+        results, estimators, remarks = _results_of(study, name, out)
+        if results is not None:
+            found[name] = results
+        known |= estimators
+        notes += remarks
     rows = study_rows(study, table, found)
     file = committed_tables(study.name) if committed and not found else None
     if file is not None:
         rows = [row | {"table": number} for row in read_tables(file) if row["table"] == str(number)]
         remark = made_by(file)
         notes.insert(0, f"these are the committed results of {shown_path(file)}" + (f", {remark}" if remark else ""))
-    published = {method for row in table.rows for method in row.published}
+    published = {place.method for place in table.published}
     missing = [method for method in study.methods if known and method in published - known]
     if missing:
         which = ", ".join(missing)
         notes.append(f"no experiment has the estimator {which} yet; its rows show the published values only")
     options = dict.fromkeys(name for results in found.values() for name in results.swept("estimators"))
     return Report(study_blocks(study, table, rows, style, list(options)), rows, notes)
+
+
+def _results_of(study: Study, name: str, out: Path) -> tuple[Results | None, set[str], list[str]]:
+    """Results of one experiment, the estimators that it has or should have, and remarks."""
+    config = data_folder("configs") / study.experiments[name]["config"]
+    # An installed package carries the tables, but not the specifications.
+    specification = load_spec(config).canonical() if config.is_file() else None
+    command = f"ctid run {shown_path(config)}{out_option(out)}"
+    try:
+        results = find_results(out, name)
+    except InUseError as error:
+        return None, set(), [f"{name} has no stored results yet: {error}"]
+    if results is None:
+        return None, set(), [f"{name} was not run." + (f" To fill its rows: {command}" if specification else "")]
+    estimators, remarks = set(results.settings["estimators"]), _notes(results, out)
+    if specification is not None:
+        estimators |= specification["estimators"].keys()
+        remarks = [*_departures(results, specification, set(study.fields.values()), command), *remarks]
+    return results, estimators, remarks
+
+
+def _departures(results: Results, specification: Mapping[str, Any], shown: set[str], command: str) -> Iterator[str]:
+    """In what results are not those of the published specification."""
+    absent = [method for method in specification["estimators"] if method not in results.settings["estimators"]]
+    if absent:
+        which = f"the estimator {', '.join(absent)} of its specification"
+        yield f"{results.experiment} was run without {which}; to add it: {command}"
+    changed = differences(results.settings, specification, shown)
+    if changed:
+        yield f"{results.experiment} was run with other settings than the published ones: {'; '.join(changed)}"
 
 
 def experiment_report(results: Results, notes: Sequence[str] = ()) -> Report:
@@ -105,12 +115,11 @@ def experiment_report(results: Results, notes: Sequence[str] = ()) -> Report:
 
 def _record_rows(results: Results, rows: Sequence[Row]) -> list[Row]:
     """Rows of a measured record with its estimates."""
-    keys = settings_of(rows)
+    keys = ["estimator", "initial_delay", *settings_of(rows)]
+    estimates = {tuple(item.get(key) for key in keys): item for item in reversed(results.rows)}
     found = []
     for row in rows:
-        same = {"estimator": row["method"], "initial_delay": row["initial_delay"]} | {key: row[key] for key in keys}
-        matching = (item for item in results.rows if all(item.get(key) == value for key, value in same.items()))
-        estimate = next(matching, {})
+        estimate = estimates.get(tuple({**row, "estimator": row["method"]}[key] for key in keys), {})
         found.append(row | {key: estimate.get(key) for key in RECORD_KEYS})
     return found
 

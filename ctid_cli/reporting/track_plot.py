@@ -36,9 +36,7 @@ def track_svg(track: RecordTrack, start: float, unit: str | None, title: str) ->
 
 
 def _draw(figure: Figure, track: RecordTrack, start: float, unit: str | None, title: str, panels: int) -> None:
-    tones = track.omega.shape[1]
-    t, valid = start + track.t, track.valid
-    frequencies = track.omega / (2.0 * np.pi)
+    tones, t = track.omega.shape[1], start + track.t
     ratios = [1.0] * panels + [1.5] if panels > 1 else [2.2, 1.4]
     grid = figure.add_gridspec(panels + 1, 1, height_ratios=ratios)
     styles = ramp(tones)
@@ -48,46 +46,49 @@ def _draw(figure: Figure, track: RecordTrack, start: float, unit: str | None, ti
         mine = [tones - 1 - row] if panels > 1 or tones == 1 else list(range(tones))
         axes = figure.add_subplot(grid[row], sharex=first)
         first = first or axes
-        for k in mine:
-            shown = np.where(valid, frequencies[:, k], np.nan)
-            axes.plot(t, np.where(valid, np.nan, frequencies[:, k]), color=styles[k]["color"], linewidth=0.4, alpha=0.6)
-            _line(axes, t, shown, {**styles[k], "linestyle": "-"})
-        _limit(axes, frequencies[:, mine], valid)
-        axes.tick_params(labelbottom=False)
-        axes.ticklabel_format(axis="y", useOffset=False)
+        _draw_frequencies(axes, track, t, [(k, styles[k]) for k in mine])
         if panels > 1:
-            axes.annotate(
-                f"tone {tones - row}", (0.995, 0.92), xycoords="axes fraction", ha="right", va="top", fontsize=8
-            )
-        _shade(axes, t, valid)
-        if row == 0:
-            axes.set_title(title, loc="left")
-        axes.set_ylabel("[Hz]" if panels > 1 else "frequency [Hz]")
+            place: dict[str, Any] = {"xycoords": "axes fraction", "ha": "right", "va": "top", "fontsize": 8}
+            axes.annotate(f"tone {tones - row}", (0.995, 0.92), **place)
+        _shade(axes, t, track.valid)
+    figure.axes[0].set_title(title, loc="left")
     if panels > 1:
         figure.supylabel("frequency [Hz]", fontsize=9)
-        for axes in figure.axes:
-            axes.set_ylabel("")
-    below = figure.add_subplot(grid[-1], sharex=first)
+    else:
+        first.set_ylabel("frequency [Hz]")
+    _draw_amplitudes(figure.add_subplot(grid[-1], sharex=first), track, t, unit, styles)
+
+
+def _draw_frequencies(axes: Any, track: RecordTrack, t: Array, lines: list[tuple[int, dict[str, Any]]]) -> None:
+    frequencies, valid = track.omega / (2.0 * np.pi), track.valid
+    for k, style in lines:
+        axes.plot(t, np.where(valid, np.nan, frequencies[:, k]), color=style["color"], linewidth=0.4, alpha=0.6)
+        _line(axes, t, np.where(valid, frequencies[:, k], np.nan), {**style, "linestyle": "-"})
+    _limit(axes, frequencies[:, [k for k, _ in lines]], valid)
+    axes.tick_params(labelbottom=False)
+    axes.ticklabel_format(axis="y", useOffset=False)
+
+
+def _draw_amplitudes(axes: Any, track: RecordTrack, t: Array, unit: str | None, styles: list[dict[str, Any]]) -> None:
     ends = []
-    for k in range(tones):
-        values = np.where(valid, track.amplitudes[:, k], np.nan)
-        _line(below, t, values, styles[k])
+    for k, style in enumerate(styles):
+        values = np.where(track.valid, track.amplitudes[:, k], np.nan)
+        _line(axes, t, values, style)
         finite = values[np.isfinite(values)]
         ends.append(float(finite[-1]) if finite.size else np.nan)
-    seen = track.amplitudes[valid]
+    seen = track.amplitudes[track.valid]
     seen = seen[np.isfinite(seen) & (seen > 0)]
     if seen.size and np.percentile(seen, 95) > LOGARITHMIC * np.percentile(seen, 5):
-        below.set_yscale("log")
+        axes.set_yscale("log")
     elif seen.size:
-        below.set_ylim(bottom=0.0)
-    below.set_ylabel(f"amplitude [{unit}]" if unit else "amplitude")
-    below.set_xlabel("t [s]")
-    below.margins(x=0.0)
+        axes.set_ylim(bottom=0.0)
+    axes.set(xlabel="t [s]", ylabel=f"amplitude [{unit}]" if unit else "amplitude")
+    axes.margins(x=0.0)
     if t.size > 1:
-        below.set_xlim(t[0], t[-1])
-    _shade(below, t, valid)
-    if tones > 1:
-        _label_ends(below, np.array(ends))
+        axes.set_xlim(t[0], t[-1])
+    _shade(axes, t, track.valid)
+    if len(ends) > 1:
+        _label_ends(axes, np.array(ends))
 
 
 def _line(axes: Any, t: Array, values: Array, style: dict[str, Any]) -> None:

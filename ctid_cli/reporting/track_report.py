@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -26,70 +26,58 @@ MOSTLY_VALID = 0.9
 MOST_REASONS = 3
 
 
-@dataclass(frozen=True)
-class ToneSummary:
-    """One tone over the valid rows of a track; None where there are none."""
+def summarise(track: RecordTrack) -> list[dict[str, Any]]:
+    """Each tone over the valid rows of a track; None where there are none.
 
-    tone: int
-    #: Median frequency [Hz], [rad/s].
-    frequency_hz: float | None
-    omega: float | None
-    #: Half the width of the central 68 % [Hz].
-    spread_hz: float | None
-    #: Median amplitude [signal unit].
-    amplitude: float | None
-    #: Share of the rows that are valid [%].
-    valid_percent: float
-
-
-def summarise(track: RecordTrack) -> list[ToneSummary]:
-    """One line for each tone."""
-    share = 100.0 * float(track.valid.mean()) if track.valid.size else 0.0
+    ``frequency_hz`` [Hz] and ``omega`` [rad/s] are medians, ``spread_hz`` is half the width of the central 68 %,
+    ``amplitude`` a median [signal unit], ``valid_percent`` the share of the rows that are valid.
+    """
     found = []
-    for k in range(track.omega.shape[1]):
-        omega, amplitudes = track.omega[track.valid, k], track.amplitudes[track.valid, k]
+    for k, (omega, amplitudes) in enumerate(
+        zip(track.omega[track.valid].T, track.amplitudes[track.valid].T, strict=True)
+    ):
         amplitudes = amplitudes[np.isfinite(amplitudes)]
-        amplitude = float(np.median(amplitudes)) if amplitudes.size else None
-        if not omega.size:
-            found.append(ToneSummary(k + 1, None, None, None, None, share))
-            continue
-        middle = float(np.median(omega))
-        low, high = np.percentile(omega, [16.0, 84.0]) / (2.0 * np.pi)
-        found.append(ToneSummary(k + 1, middle / (2.0 * np.pi), middle, float(high - low) / 2.0, amplitude, share))
+        tone: dict[str, Any] = {"tone": k + 1, **dict.fromkeys(("frequency_hz", "omega", "spread_hz", "amplitude"))}
+        if omega.size:
+            middle = float(np.median(omega))
+            low, high = np.percentile(omega, [16.0, 84.0]) / (2.0 * np.pi)
+            tone |= {"frequency_hz": middle / (2.0 * np.pi), "omega": middle, "spread_hz": float(high - low) / 2.0}
+        if omega.size and amplitudes.size:
+            tone["amplitude"] = float(np.median(amplitudes))
+        found.append(tone | {"valid_percent": 100.0 * _valid_share(track)})
     return found
+
+
+def _valid_share(track: RecordTrack) -> float:
+    return float(track.valid.mean()) if track.valid.size else 0.0
 
 
 def track_warnings(track: RecordTrack, settings: Settings) -> list[str]:
     """What a reader must know before believing the numbers."""
-    found = list(settings.warnings)
-    share = float(track.valid.mean()) if track.valid.size else 0.0
-    if share < MOSTLY_VALID:
-        found.append(
-            f"{100 * (1 - share):.3g} % of the rows are not valid."
-            if share > 0
-            else "No row is valid: there are no frequencies to report."
-        )
-        if share == 0 and settings.estimator.online:
-            found.append("A record is easier for the methods that take it window by window: try --method automatic.")
-        shares = {flag: float(np.mean((track.flags & int(flag)) != 0)) for flag in Flag}
-        reasons = sorted((flag for flag in Flag if shares[flag] > 0), key=lambda flag: -shares[flag])
-        found += [f"{100 * shares[flag]:.3g} %: {MEANINGS[flag]}" for flag in reasons[:MOST_REASONS]]
-    return found
+    found, share = list(settings.warnings), _valid_share(track)
+    if share >= MOSTLY_VALID:
+        return found
+    if share > 0:
+        found.append(f"{100 * (1 - share):.3g} % of the rows are not valid.")
+    else:
+        found.append("No row is valid: there are no frequencies to report.")
+    if share == 0 and settings.estimator.online:
+        found.append("A record is easier for the methods that take it window by window: try --method automatic.")
+    shares = {flag: float(np.mean((track.flags & int(flag)) != 0)) for flag in Flag}
+    reasons = sorted((flag for flag in Flag if shares[flag] > 0), key=lambda flag: -shares[flag])
+    return [*found, *(f"{100 * shares[flag]:.3g} %: {MEANINGS[flag]}" for flag in reasons[:MOST_REASONS])]
 
 
 def track_object(signal: SampledSignal, settings: Settings, track: RecordTrack, files: list[Path]) -> dict[str, Any]:
     """A track for ``ctid track --json``."""
-    kind = settings.estimator.kind
     content = {
         "file": signal.file,
         "signal": signal.column,
         "unit": signal.unit,
         "samples": int(signal.samples.size),
-        "missing": signal.missing,
-        "interval": signal.interval,
-        "start": signal.start,
-        "method": kind,
-        "tones": [asdict(tone) for tone in summarise(track)],
+        **{name: getattr(signal, name) for name in ("missing", "interval", "start")},
+        "method": settings.estimator.kind,
+        "tones": summarise(track),
         "rows": int(track.t.size),
         "every": track.every,
         "warnings": track_warnings(track, settings),
@@ -106,29 +94,23 @@ def track_object(signal: SampledSignal, settings: Settings, track: RecordTrack, 
         },
         "written": [str(file) for file in files],
     }
-    cleaned: dict[str, Any] = plain(content)
-    return cleaned
+    return dict(plain(content))
 
 
 def track_text(signal: SampledSignal, settings: Settings, track: RecordTrack) -> str:
     """A track for people, within 100 columns."""
     end = signal.start + (signal.samples.size - 1) * signal.interval
     gaps = f", {count(signal.missing, 'sample')} missing" if signal.missing else ""
-    head = (
-        f"{signal.file}: {count(signal.samples.size, 'sample')} of {signal.column!r} from {signal.start:.6g} to "
-        f"{end:.6g} s, every {signal.interval:.6g} s ({1.0 / signal.interval:.6g} Hz){gaps}"
-    )
+    head = f"{signal.file}: {count(signal.samples.size, 'sample')} of {signal.column!r} from {signal.start:.6g} to "
+    head += f"{end:.6g} s, every {signal.interval:.6g} s ({1.0 / signal.interval:.6g} Hz){gaps}"
     lines = [wrapped(head), *(wrapped(note, "  ") for note in signal.notes)]
     lines += [wrapped(f"- {reason}", hanging="  ") for reason in settings.reasons]
     unit = f"amplitude [{signal.unit}]" if signal.unit else "amplitude"
     cells = [
         [
-            str(tone.tone),
-            _to_spread(tone.frequency_hz, tone.spread_hz),
-            number(tone.spread_hz, 2),
-            number(tone.omega, 8),
-            number(tone.amplitude, 4),
-            f"{tone.valid_percent:.4g} %",
+            *(str(tone["tone"]), _to_spread(tone["frequency_hz"], tone["spread_hz"])),
+            *(number(tone["spread_hz"], 2), number(tone["omega"], 8), number(tone["amplitude"], 4)),
+            f"{tone['valid_percent']:.4g} %",
         ]
         for tone in summarise(track)
     ]
@@ -183,7 +165,5 @@ def _to_spread(value: float | None, spread: float | None) -> str:
     """A frequency with two digits of its spread, at least six in all and no more than rounding allows."""
     if value is None or spread is None:
         return "-"
-    digits = 6
-    if 0.0 < spread < value:
-        digits = max(6, 2 + math.floor(math.log10(value)) - math.floor(math.log10(spread)))
-    return f"{value:#.{min(digits, 10)}g}"
+    known = 2 + math.floor(math.log10(value)) - math.floor(math.log10(spread)) if 0.0 < spread < value else 0
+    return f"{value:#.{min(max(6, known), 10)}g}"

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import yaml
-
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.results import Results, find_results
-from ctid_cli.reporting.study import data_folder
+from ctid_cli.reporting.study import data_folder, study_contents
 from ctid_cli.running.cells import Plan
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
@@ -53,12 +51,7 @@ class StudyFolder:
         """An experiment by the last part of its name."""
         return f"{self.name}/{short}"
 
-    def function(self, module: str, name: str) -> Callable[..., Any]:
-        """A function of one of its modules."""
-        found: Callable[..., Any] = getattr(self.module(module), name)
-        return found
-
-    def module(self, name: str) -> ModuleType:
+    def module(self, name: str) -> Any:
         """One of its modules, always from the folder that is shipped with the program."""
         if _PACKAGE not in sys.modules:
             package = ModuleType(_PACKAGE)
@@ -74,10 +67,8 @@ class StudyFolder:
         """Specification of one of its experiments."""
         file = data_folder("configs") / self.configs[self.experiment(short)]
         if not file.is_file():
-            raise UsageError(
-                f"this is computed from the specification {file.parent.name}/{file.name}, which an installed "
-                "package does not carry; run the command in a checkout of the repository"
-            )
+            missing = f"the specification {file.parent.name}/{file.name} is not in an installed package"
+            raise UsageError(f"{missing}; run the command in a checkout of the repository")
         return file
 
 
@@ -110,9 +101,7 @@ def read_study(study: StudyFolder, out: Path) -> StudyResults:
 @cache
 def all_studies() -> dict[str, StudyFolder]:
     """Every study by its name."""
-    files = sorted(data_folder("experiments").glob("*/study.yaml"))
-    studies = [_study(yaml.safe_load(file.read_text(encoding="utf-8"))) for file in files]
-    return {study.name: study for study in studies}
+    return {name: _study(content) for name, content in study_contents().items()}
 
 
 def find_study(name: str) -> StudyFolder:
@@ -129,8 +118,5 @@ def _study(content: Mapping[str, Any]) -> StudyFolder:
         title=content["title"],
         configs={name: item["config"] for name, item in content["experiments"].items()},
         figures={str(name): parts for name, parts in content["figures"].items()},
-        texts=content["texts"],
-        numbers=content["numbers"],
-        claims=content["claims"],
-        first=content["first"],
+        **{name: content[name] for name in ("texts", "numbers", "claims", "first")},
     )

@@ -33,10 +33,8 @@ class StudyFigure:
     def svg(self, out: Path) -> bytes:
         """Draw it."""
         require_results([self], out)
-        found: bytes = self.study.function("figures", f"figure_{self.number}")(
-            *(read_results(out, name) for name in self.experiments)
-        )
-        return found
+        draw = getattr(self.study.module("figures"), f"figure_{self.number}")
+        return bytes(draw(*(read_results(out, name) for name in self.experiments)))
 
 
 def find_figures(names: Sequence[str]) -> list[StudyFigure]:

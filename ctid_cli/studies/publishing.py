@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,15 +21,8 @@ from ctid_cli.studies.drawing import StudyFigure
 
 #: What is kept of a session: nothing that names a machine, a user or a folder.
 KEPT = (
-    "started",
-    "stopped",
-    "computed",
-    "failed",
-    "jobs",
-    "processors",
-    "code_version",
-    "numeric_platform",
-    "packages",
+    *("started", "stopped", "computed", "failed", "jobs", "processors"),
+    *("code_version", "numeric_platform", "packages"),
 )
 
 
@@ -40,19 +33,15 @@ def published_folder(study: StudyFolder) -> Path:
 
 def evaluate(found: StudyResults) -> list[Claim]:
     """All claims of a study; one that fails for every experiment that was not run."""
-    return list(_evaluated(found))
-
-
-def _evaluated(found: StudyResults) -> Iterator[Claim]:
-    for short in map(last_part, found.study.configs):
-        if short not in found:
-            yield Claim("was run", "no", "yes", False, short)
+    missing = [short for short in map(last_part, found.study.configs) if short not in found]
+    claims = [Claim("was run", "no", "yes", False, short) for short in missing]
     for function, calls in found.study.claims.items():
-        state = found.study.function("claims", function)
+        state = getattr(found.study.module("claims"), function)
         for shorts in calls:
-            if all(short in found for short in shorts):
-                for claim in state(*(found[short] for short in shorts)):
-                    yield replace(claim, experiment=" and ".join(shorts))
+            if not set(shorts) & set(missing):
+                made = state(*(found[short] for short in shorts))
+                claims += (replace(claim, experiment=" and ".join(shorts)) for claim in made)
+    return claims
 
 
 def commit_of(found: StudyResults) -> str:
@@ -65,10 +54,8 @@ def commit_of(found: StudyResults) -> str:
         if results.mixed:
             raise RefusedError(f"{results.experiment} mixes results of different code versions or processors")
         if not {origin.code_version for origin in results.stored.origins} <= present:
-            raise RefusedError(
-                f"{results.experiment} was not computed by the code that is checked out, so that no commit can be "
-                "named for it; check out the commit that computed it, or run it again with --fresh"
-            )
+            other = f"{results.experiment} was not computed by the code that is checked out"
+            raise RefusedError(f"{other}; check out the commit that computed it, or run it again with --fresh")
     origins = [origin for results in found.experiments.values() for origin in results.stored.origins]
     if len({(origin.platform, origin.packages) for origin in origins}) > 1:
         raise RefusedError(f"the experiments of {found.study.name} were computed on different platforms")
@@ -89,10 +76,10 @@ def _git(*arguments: str) -> str:
 
 def published_texts(found: StudyResults) -> dict[str, str]:
     """Published tables and numbers of a study by file name."""
-    texts = {file: found.study.function("tables", name)(found) for file, name in found.study.texts.items()}
+    texts = {file: getattr(found.study.module("tables"), name)(found) for file, name in found.study.texts.items()}
     for file, item in found.study.numbers.items():
         shorts = [short for short in item.get("experiments", found.experiments) if short in found]
-        rows = [row for short in shorts for row in found.study.function("tables", item["rows"])(found[short])]
+        rows = [row for short in shorts for row in getattr(found.study.module("tables"), item["rows"])(found[short])]
         # To 6 digits: a published file must not change with the last bit of a sum.
         rounded = [{k: float(f"{x:.6g}") if isinstance(x, float) else x for k, x in row.items()} for row in rows]
         texts[file] = csv_text(rounded, item.get("columns"))

@@ -13,10 +13,12 @@ from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.figures.frequency_plot import Response, dense_frequencies, response_svg
 from ctid_cli.reporting.figures.parameter_plot import bias_svg, coverage_svg, mse_svg
 from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, ramp
-from ctid_cli.reporting.parameter_errors import ParameterErrors, parameter_errors, parameter_estimates
+from ctid_cli.reporting.parameter_errors import ParameterErrors
 from ctid_cli.reporting.results import Results
 from ctid_cli.signals.record import Record
 from ctid_cli.studies.catalogue import find_study
+
+from .measures import errors_of, parameters
 
 #: Estimators of each experiment, and what they are called: those in open loop,
 OPEN_LOOP = {"additive": "sum of four submodels", "srivc": "SRIVC, 8 poles and 6 zeros, factored"}
@@ -53,14 +55,13 @@ def figure_3(results: Results) -> bytes:
     """Mean-square errors of the static gains in open loop."""
     gains = [f"g{k}_b0" for k in range(1, 5)]
     title = "Section 6.1, open loop, coloured noise: mean-square errors of the static gains"
-    return mse_svg(_errors(results), OPEN_LOOP, gains, 2, title)
+    return mse_svg(errors_of(results), OPEN_LOOP, gains, 2, title)
 
 
 def figure_4(results: Results) -> bytes:
     """Mean-square errors of all parameters in closed loop."""
-    rows = _errors(results)
     title = "Section 6.2, closed loop, white noise: mean-square errors of the parameters"
-    return mse_svg(rows, CLOSED_LOOP, _parameters(rows), 3, title)
+    return mse_svg(errors_of(results), CLOSED_LOOP, parameters(results), 3, title)
 
 
 def figure_6() -> bytes:
@@ -99,17 +100,17 @@ def figure_6() -> bytes:
 
 def figure_coloured(results: Results) -> bytes:
     """Biases under coloured noise in closed loop."""
-    rows = _errors(results)
+    rows = errors_of(results)
     title = (
         r"Biases in the loop of section 6.2 with noise $v = e/(1 - 0.9 q^{-1})$ of variance 0.01, "
         f"N = {_samples(rows)}"
     )
-    return bias_svg(rows, COLOURED, _parameters(rows), title)
+    return bias_svg(rows, COLOURED, parameters(results), title)
 
 
 def figure_coverage(open_loop: Results, closed_loop: Results) -> bytes:
     """How often 95 % intervals contain the true parameters."""
-    ours, theirs = _errors(open_loop), _errors(closed_loop)
+    ours, theirs = errors_of(open_loop), errors_of(closed_loop)
     return coverage_svg(
         [
             (f"open loop, coloured noise, N = {_samples(ours)}", ours, COVERAGE_OPEN_LOOP),
@@ -133,14 +134,6 @@ def empirical_response(record: Record, lowest: float, highest: float) -> tuple[A
     outputs, inputs = (np.fft.rfft(window * signal)[inside] for signal in (record.y, record.input.at(record.t)))
     hold = (1 - np.exp(-1j * frequencies * h)) / (1j * frequencies * h)
     return frequencies, np.asarray(outputs / (inputs * hold))
-
-
-def _errors(results: Results) -> list[ParameterErrors]:
-    return parameter_errors(parameter_estimates(results))
-
-
-def _parameters(rows: list[ParameterErrors]) -> list[str]:
-    return list(dict.fromkeys(row.parameter for row in rows))
 
 
 def _samples(rows: list[ParameterErrors]) -> str:

@@ -29,6 +29,11 @@ def errors_of(results: Results) -> list[ParameterErrors]:
     return parameter_errors(estimates_of(results))
 
 
+def parameters(results: Results) -> list[str]:
+    """Names of the parameters."""
+    return list(dict.fromkeys(row.parameter for row in errors_of(results)))
+
+
 def by_estimator(results: Results, least: int = 0) -> dict[str, list[ParameterEstimates]]:
     """Estimates of each estimator by rising number of samples."""
     groups: dict[str, list[ParameterEstimates]] = {}

@@ -12,7 +12,7 @@ from ctid_cli.reporting.parameter_errors import ParameterErrors
 from ctid_cli.reporting.results import Results
 from ctid_cli.studies.catalogue import StudyResults, last_part
 
-from .measures import by_estimator, errors_of, is_misused, ratios
+from .measures import by_estimator, errors_of, is_misused, parameters, ratios
 
 #: Numbers of samples that the text shows, of all that were run.
 SIZES = 6
@@ -28,13 +28,13 @@ TITLES = {
 
 def errors(results: Results) -> Iterator[dict[str, Any]]:
     """Errors of every parameter."""
-    return (row.as_dict() for row in errors_of(results))
+    return (vars(row) for row in errors_of(results))
 
 
 def coverage(results: Results) -> Iterator[dict[str, Any]]:
     """How often 95 % intervals contain the truth."""
     for row in errors_of(results):
-        yield row.as_dict() | {"misused": "yes" if is_misused(results, row.estimator) else "no"}
+        yield vars(row) | {"misused": "yes" if is_misused(results, row.estimator) else "no"}
 
 
 def unfinished(results: Results) -> Iterator[dict[str, Any]]:
@@ -102,11 +102,6 @@ def error_table(results: Results) -> str:
 def with_ratio(row: ParameterErrors | None) -> str:
     """One cell of the table of errors."""
     return "-" if row is None or row.n_mse is None else f"{number(row.n_mse, 3)} ({number(row.ratio, 3)})"
-
-
-def parameters(results: Results) -> list[str]:
-    """Names of the parameters."""
-    return list(dict.fromkeys(row.parameter for row in errors_of(results)))
 
 
 def ratio_tables(results: Results) -> list[str]:

@@ -10,11 +10,10 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.inference.robust import sandwich_covariance
 from ctid_cli.reporting.layout import markdown_table
-from ctid_cli.reporting.parameter_errors import QUANTILE
+from ctid_cli.reporting.parameter_errors import error_statistics
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import spec_from_canonical
-from ctid_cli.storage.summary import wilson_interval
 from ctid_cli.studies.catalogue import StudyResults, last_part
 
 #: Rows of the table by experiment: letter, and what the data are.
@@ -50,27 +49,21 @@ def coverage(results: Results) -> list[dict[str, Any]]:
     lines = []
     for formula, widths in formulas.items():
         for (name, true), found, width in zip(truth.items(), estimates.T, widths.T, strict=True):
-            error, deviation, runs = found - true, float(np.std(found, ddof=1)), found.size
-            # A standard error that could not be computed covers nothing.
-            covered = int((np.abs(error) <= QUANTILE * width).sum())
-            low, high = wilson_interval(covered, runs)
+            statistics, mean_error = error_statistics(found - true, width), float(np.nanmean(width))
             lines.append(
                 {
                     "row": letter,
                     "formula": formula,
                     "parameter": name,
                     "true": float(true),
-                    "runs": runs,
+                    "runs": found.size,
                     "not_converged": sum(row["status"] != "CONVERGED" for row in rows),
-                    "covered": covered,
-                    "percent": 100.0 * covered / runs,
-                    "low": 100.0 * low,
-                    "high": 100.0 * high,
-                    "standard_deviation": deviation,
-                    "mean_standard_error": float(np.nanmean(width)),
-                    "standard_error_ratio": float(np.nanmean(width)) / deviation,
-                    "bias": float(error.mean()),
-                    "bias_in_monte_carlo_errors": float(error.mean()) / (deviation / np.sqrt(runs)),
+                    **{name: statistics[name] for name in ("covered", "low", "high", "bias")},
+                    "percent": statistics["coverage"],
+                    "standard_deviation": statistics["deviation"],
+                    "mean_standard_error": mean_error,
+                    "standard_error_ratio": mean_error / statistics["deviation"],
+                    "bias_in_monte_carlo_errors": statistics["bias_per_error"],
                     "misused": formula != next(iter(formulas)),
                 }
             )

@@ -56,7 +56,7 @@ def test_an_installed_package_without_specifications_says_so(ctid, tmp_path, mon
     place = catalogue.data_folder
     monkeypatch.setattr(catalogue, "data_folder", lambda name: place(name) if name == "experiments" else tmp_path)
     done = ctid("figure", "3", "--out", tmp_path, code=2)
-    assert "an installed package does not carry" in done.stderr
+    assert "is not in an installed package" in done.stderr
     assert len(done.stderr.splitlines()) == 1
 
 

@@ -51,14 +51,14 @@ def test_every_study_is_complete(study):
         assert study.plan(short).experiment == study.experiment(short)
         assert study.plan(short).spec.warnings == ()
     for number, parts in study.figures.items():
-        assert callable(study.function("figures", f"figure_{number}"))
+        assert callable(getattr(study.module("figures"), f"figure_{number}"))
         assert set(parts) <= set(shorts)
     for name in [*study.texts.values(), *(item["rows"] for item in study.numbers.values())]:
-        assert callable(study.function("tables", name))
+        assert callable(getattr(study.module("tables"), name))
     for item in study.numbers.values():
         assert set(item.get("experiments", ())) <= set(shorts)
     for name, calls in study.claims.items():
-        assert callable(study.function("claims", name))
+        assert callable(getattr(study.module("claims"), name))
         assert {part for parts in calls for part in parts} <= set(shorts)
     assert set(study.first) == set(shorts)
     assert (study.folder / "README.md").is_file()
@@ -85,10 +85,10 @@ def test_what_was_not_run_does_not_hold(ctid, tmp_path):
 
 
 def test_run_runs_every_specification(ctid, tmp_path, monkeypatch):
-    from ctid_cli.cli import run_command
+    from ctid_cli.cli import study_command
 
     calls = []
-    monkeypatch.setattr(run_command, "run", lambda **options: calls.append(options))
+    monkeypatch.setattr(study_command, "run", lambda configs, **options: calls.append(options | {"configs": configs}))
     ctid("study", "run", "coverage", "--runs", 3, "--jobs", 1, "--out", tmp_path)
     (call,) = calls
     assert [file.name for file in call["configs"]] == [

@@ -1,6 +1,5 @@
 """Figures of the study of additive models: what is drawn is what was computed or found."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -208,7 +207,7 @@ def test_coverage_is_drawn_with_its_interval(drawn, tmp_path):
 
 def test_labels_count_what_is_not_as_it_should_be(rows):
     assert labelled("additive", "the sum", rows) == "the sum"
-    wrong = [replace(row, not_converged=2, failed=1, counted=row.runs - 1) for row in rows]
+    wrong = [type(row)(**vars(row) | {"not_converged": 2, "failed": 1, "counted": row.runs - 1}) for row in rows]
     assert labelled("srivc", "the fraction", wrong) == "the fraction (6 of 80 not converged, 2 without a value)"
 
 

@@ -214,7 +214,7 @@ def test_settings_are_the_published_ones(case, poles, zeros, bandwidth, filters,
 
 def test_without_specifications_the_message_says_so(monkeypatch, tmp_path):
     monkeypatch.setattr(catalogue, "data_folder", lambda name: tmp_path)
-    with pytest.raises(UsageError, match=r"case1_regular\.yaml, which an installed package does not carry; run"):
+    with pytest.raises(UsageError, match=r"case1_regular\.yaml is not in an installed package; run"):
         useful_redundancy.published_search(CASE_1, True)
 
 

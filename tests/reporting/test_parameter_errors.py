@@ -133,11 +133,11 @@ def test_settings_of_an_estimator_keep_their_estimates_apart(tmp_path):
         *(("srivc", most, n) for most in (5, 50) for n in (1000, 4000)),
     ]
     assert all(group.runs == 40 for group in groups)
-    assert parameter_errors(groups)[-1].as_dict()["max_iterations"] == 50
+    assert parameter_errors(groups)[-1].settings["max_iterations"] == 50
 
 
 def test_data_without_true_parameters_are_refused(tmp_path, make_results, estimate):
-    with pytest.raises(UsageError, match=r"case1-regular: errors of parameters need their true values.*additive"):
+    with pytest.raises(UsageError, match=r"case1-regular: errors of parameters need data that are simulated.*additive"):
         parameter_estimates(make_results({(5.0, "0.0"): [estimate(8.0)]}))
 
 

@@ -51,18 +51,18 @@ def some_invalid():
 
 def test_summary_is_over_valid_rows():
     first, second = summarise(make_track(some_invalid()))
-    assert first.frequency_hz == pytest.approx(np.median(HERTZ[12:, 0]))
-    assert first.omega == pytest.approx(2 * np.pi * first.frequency_hz)
+    assert first["frequency_hz"] == pytest.approx(np.median(HERTZ[12:, 0]))
+    assert first["omega"] == pytest.approx(2 * np.pi * first["frequency_hz"])
     low, high = np.percentile(HERTZ[12:, 0], [16, 84])
-    assert first.spread_hz == pytest.approx((high - low) / 2)
-    assert (second.frequency_hz, second.spread_hz, second.amplitude) == (pytest.approx(30.0), 0.0, 0.5)
-    assert first.valid_percent == pytest.approx(70.0)
+    assert first["spread_hz"] == pytest.approx((high - low) / 2)
+    assert (second["frequency_hz"], second["spread_hz"], second["amplitude"]) == (pytest.approx(30.0), 0.0, 0.5)
+    assert first["valid_percent"] == pytest.approx(70.0)
 
 
 def test_without_valid_rows_there_are_no_numbers(chosen):
     signal, settings = chosen
     track = make_track(np.full(ROWS, int(Flag.UNCERTAIN), np.uint16))
-    assert summarise(track)[0].frequency_hz is None
+    assert summarise(track)[0]["frequency_hz"] is None
     assert "No row is valid" in track_warnings(track, settings)[0]
     assert "  -  " in track_text(signal, settings, track)
     json.dumps(track_object(signal, settings, track, []), allow_nan=False)

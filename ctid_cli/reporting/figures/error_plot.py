@@ -13,8 +13,6 @@ from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, sv
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
 
 
 #: Looks of up to three estimators of a group, told apart by colour, lightness and dashes.
@@ -81,9 +79,8 @@ def errors_svg(rows: Sequence[Row], frequencies: tuple[float, float], errors: tu
         from matplotlib.ticker import MaxNLocator
 
         columns = len(rows[0].groups)
-        panels = figure.subplots(
-            2 * len(rows), columns, sharex=True, sharey="row", squeeze=False, height_ratios=[1.0, 1.15] * len(rows)
-        )
+        shape: dict[str, Any] = {"squeeze": False, "height_ratios": [1.0, 1.15] * len(rows)}
+        panels = figure.subplots(2 * len(rows), columns, sharex=True, sharey="row", **shape)
         for k, row in enumerate(rows):
             for above, below, group in zip(panels[2 * k], panels[2 * k + 1], row.groups, strict=True):
                 _draw_frequencies(above, group.curves)
@@ -97,10 +94,8 @@ def errors_svg(rows: Sequence[Row], frequencies: tuple[float, float], errors: tu
         for axes, group in zip(panels[-1], rows[0].groups, strict=True):
             axes.set(xlabel="time [s]", xlim=(0.0, rows[0].duration))
             axes.xaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 1.5, 2, 3, 5, 10]))
-            axes.legend(
-                handles=_handles(group.curves), loc="upper left", bbox_to_anchor=(-0.03, -0.27), frameon=False,
-                handlelength=2.8, borderpad=0.0, labelspacing=0.35,
-            )  # fmt: skip
+            place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (-0.03, -0.27), "frameon": False}
+            axes.legend(handles=_handles(group.curves), handlelength=2.8, borderpad=0.0, labelspacing=0.35, **place)
         figure.legend(handles=_common_handles(rows), loc="outside lower center", ncols=2, frameon=False)
         figure.suptitle(title)
 
@@ -128,21 +123,20 @@ def _draw_line(axes: Any, curve: Curve, values: Array, look: dict[str, Any]) -> 
     axes.plot(curve.t, np.where(curve.valid, values, np.nan), **look | FIRM)
 
 
-def _handles(curves: Sequence[Curve]) -> list[Line2D]:
+def _handles(curves: Sequence[Curve]) -> list[Any]:
     from matplotlib.lines import Line2D
 
     return [Line2D([], [], **look | FIRM, label=curve.label) for curve, look in zip(curves, LOOKS, strict=False)]
 
 
-def _common_handles(rows: Sequence[Row]) -> list[Line2D | Patch]:
+def _common_handles(rows: Sequence[Row]) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles: list[Line2D | Patch] = [
+    handles = [
         Line2D([], [], **TRUTH, label="true frequencies"),
         Line2D([], [], color=DARK, **FAINT, label="thin: called invalid by the estimator itself"),
         Patch(color=BAND, label="before the first instant at which finite time is exact, $n(2h + d)$"),
     ]
-    if any(row.reference is not None for row in rows):
-        handles.append(Line2D([], [], **WHOLE, label="nonlinear least squares, whole record"))
-    return handles
+    known = any(row.reference is not None for row in rows)
+    return [*handles, Line2D([], [], **WHOLE, label="nonlinear least squares, whole record")] if known else handles

@@ -21,6 +21,7 @@ LOOKS: tuple[dict[str, Any], ...] = (
     {"color": MIDDLE, "marker": "^", "markerfacecolor": "none", "linestyle": "-."},
     {"color": "#3a7d34", "marker": "x", "linestyle": ":"},
 )
+MARKERS = {"linestyle": "none"}
 #: Bias [standard errors of the mean] within which a parameter counts as unbiased: 1 in 1000, two-sided.
 UNBIASED = 3.3
 
@@ -50,11 +51,9 @@ def mse_svg(
                 theory = [(row.samples, row.theory / row.samples) for row in found if row.theory is not None]
                 if theory:
                     axes.plot(*np.transpose(theory), color=look["color"], linestyle=look["linestyle"], linewidth=0.9)
-                points = [(row.samples, row.mse) for row in found if row.mse is not None]
+                points, style = [(row.samples, row.mse) for row in found if row.mse is not None], look | MARKERS
                 if points:
-                    axes.plot(
-                        *np.transpose(points), **look | {"linestyle": "none"}, markersize=3.2, markeredgewidth=0.8
-                    )
+                    axes.plot(*np.transpose(points), **style, markersize=3.2, markeredgewidth=0.8)
             axes.set(xscale="log", yscale="log")
             for axis in (axes.xaxis, axes.yaxis):
                 axis.set_minor_formatter(NullFormatter())
@@ -87,7 +86,7 @@ def bias_svg(rows: Sequence[ParameterErrors], methods: Methods, parameters: Sequ
                     if (row.estimator, row.parameter) != (method, parameter) or row.bias_per_deviation is None:
                         continue
                     axes.plot([0.0, row.bias_per_deviation], [height] * 2, color=look["color"], linewidth=0.8)
-                    axes.plot([row.bias_per_deviation], [height], **look | {"linestyle": "none"}, markersize=5)
+                    axes.plot([row.bias_per_deviation], [height], **look | MARKERS, markersize=5)
         axes.set_yticks([-place for place in range(len(parameters))], [symbol(name) for name in parameters])
         axes.set_xlabel("bias / standard deviation of one estimate [-]")
         axes.grid(False, axis="y")
@@ -111,11 +110,10 @@ def coverage_svg(panels: Sequence[tuple[str, Sequence[ParameterErrors], Methods]
             axes.axhline(95, color=MIDDLE, linewidth=0.8)
             for k, (method, look) in enumerate(zip(methods, LOOKS, strict=False)):
                 found = [row for row in rows if row.estimator == method and row.coverage is not None]
-                at = np.array([parameters.index(row.parameter) for row in found]) + 0.16 * (
-                    k - 0.5 * (len(methods) - 1)
-                )
+                shift = 0.16 * (k - 0.5 * (len(methods) - 1))
+                at = np.array([parameters.index(row.parameter) for row in found]) + shift
                 places = np.array([(row.coverage, row.low, row.high) for row in found], dtype=float).reshape(-1, 3).T
-                style = look | {"linestyle": "none", "markersize": 4, "elinewidth": 0.8}
+                style = look | MARKERS | {"markersize": 4, "elinewidth": 0.8}
                 label = labelled(method, methods[method], rows)
                 axes.errorbar(at, places[0], np.abs(places[1:] - places[0]), **style, label=label)
             axes.set_xticks(range(len(parameters)), [symbol(parameter) for parameter in parameters], fontsize=8)
@@ -148,12 +146,11 @@ def _data_sets(rows: Sequence[ParameterErrors]) -> str:
 def _legend(figure: Figure, methods: Methods, rows: Sequence[ParameterErrors], note: str, *, line: bool = True) -> None:
     from matplotlib.lines import Line2D
 
-    off = {} if line else {"linestyle": "none"}
+    off = {} if line else MARKERS
     handles = [
         Line2D([], [], **look | off, markersize=4, linewidth=0.9, label=labelled(method, methods[method], rows))
         for method, look in zip(methods, LOOKS, strict=False)
     ]
     wide = max(len(str(handle.get_label())) for handle in handles) > 40 or len(handles) > 3
-    figure.legend(
-        handles=handles, loc="outside lower center", ncols=2 if wide else 3, frameon=False, title=note, title_fontsize=8
-    )
+    place: dict[str, Any] = {"loc": "outside lower center", "ncols": 2 if wide else 3, "frameon": False}
+    figure.legend(handles=handles, title=note, title_fontsize=8, **place)

@@ -83,44 +83,40 @@ def landscape(
 
 
 def _least_costs(costs: Sequence[FilteredCost], delays: Array, sweeps: int) -> Array:
-    count = len(costs)
-    best: list[list[Minimum | None]] = [[None] * count for _ in delays]
+    best: list[list[Minimum | None]] = [[None] * len(costs) for _ in delays]
     for sweep in range(sweeps):
-        places = range(delays.size) if sweep % 2 == 0 else range(delays.size - 1, -1, -1)
-        before: list[Minimum | None] = [None] * count
-        for i in places:
-            here = best[i]
-            for k in reversed(range(count)):
-                known = [before[k], *here[k + 1 : k + 2], *here[max(k - 1, 0) : k]]
-                starts = [minimum.theta for minimum in known if minimum is not None]
-                # Least squares on a narrow band is hopeless in noise.
-                if sweep == 0 and (k == count - 1 or not starts):
-                    starts += costs[k].starts(float(delays[i]))
-                found = costs[k].minimise_from(float(delays[i]), starts)
-                old = here[k]
-                if found is not None and (old is None or found.squared_error < old.squared_error):
-                    here[k] = found
-            before = here
-    return np.array(
-        [
-            [
-                NOTHING if minimum is None else 100.0 * float(np.sqrt(minimum.squared_error / cost.spread))
-                for minimum, cost in zip(row, costs, strict=True)
-            ]
-            for row in best
-        ]
-    )
+        before: list[Minimum | None] = [None] * len(costs)
+        for i in range(delays.size) if sweep % 2 == 0 else reversed(range(delays.size)):
+            _improve(best[i], before, costs, float(delays[i]), first=sweep == 0)
+            before = best[i]
+    least = np.full((delays.size, len(costs)), float(NOTHING))
+    for (i, k), minimum in np.ndenumerate(np.array(best, dtype=object)):
+        if minimum is not None:
+            least[i, k] = 100.0 * float(np.sqrt(minimum.squared_error / costs[k].spread))
+    return least
+
+
+def _improve(
+    here: list[Minimum | None], before: list[Minimum | None], costs: Sequence[FilteredCost], delay: float, first: bool
+) -> None:
+    """Try at one delay what was found at the delay before and for the neighbouring filters, the widest band last."""
+    for k in reversed(range(len(costs))):
+        known = [before[k], *here[k + 1 : k + 2], *here[max(k - 1, 0) : k]]
+        starts = [minimum.theta for minimum in known if minimum is not None]
+        # Least squares on a narrow band is hopeless in noise.
+        if first and (k == len(costs) - 1 or not starts):
+            starts += costs[k].starts(delay)
+        found, old = costs[k].minimise_from(delay, starts), here[k]
+        if found is not None and (old is None or found.squared_error < old.squared_error):
+            here[k] = found
 
 
 def _legs(search: FilterSearch, fit: RedundantFit) -> tuple[Leg, ...]:
     assert fit.search is not None
     legs = []
     for visit in fit.search.trajectory[1:]:
-        path = next(
-            path
-            for path in fit.paths
-            if (path.round, path.filter, float(path.delays[-1])) == (visit.round, visit.path, visit.point)
-        )
+        place = visit.round, visit.path, visit.point
+        path = next(path for path in fit.paths if (path.round, path.filter, float(path.delays[-1])) == place)
         costs = np.array([search.reference_cost(float(delay)) for delay in path.delays])
         legs.append(Leg(path.filter, path.delays, costs, visit in fit.switches))
     return tuple(legs)

@@ -59,13 +59,10 @@ def trajectory_svg(result: Landscape, title: str, detail: tuple[float, float]) -
         _name_filters(panels[1, 0], result)
         count = sum(leg.switched for leg in result.legs)
         switches = {0: "no switch", 1: "one switch"}.get(count, f"{count} switches")
-        figure.suptitle(
-            f"{title}\nsearch from {result.legs[0].delays[0]:g} s: {switches}, ends at "
-            f"{result.legs[-1].delays[-1]:.4f} s; refined on unfiltered data: {result.fit.model.delay:.4f} s"
-        )
-        handles, labels = (
-            a + b for a, b in zip(*(axes.get_legend_handles_labels() for axes in panels[:, 0]), strict=True)
-        )
+        way = f"search from {result.legs[0].delays[0]:g} s: {switches}, ends at {result.legs[-1].delays[-1]:.4f} s"
+        figure.suptitle(f"{title}\n{way}; refined on unfiltered data: {result.fit.model.delay:.4f} s")
+        above, below = (axes.get_legend_handles_labels() for axes in panels[:, 0])
+        handles, labels = (a + b for a, b in zip(above, below, strict=True))
         figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
 
     return svg(7.5, 5.6, draw)
@@ -84,11 +81,9 @@ def _draw_reference(axes: Any, result: Landscape, low: float, high: float) -> No
         label = None if k else "Gauss-Newton steps"
         axes.plot(leg.delays, leg.costs, "o:", color=MARK, markersize=3.5, linewidth=0.8, label=label)
     _draw_marks(axes, result, [leg.costs for leg in result.legs])
-    if low <= delays[0] and delays[-1] <= high:
-        axes.set_ylim(0.0, 1.05 * max(least.max(), result.evaluated.max()))
-        return
     inside = (low <= delays) & (delays <= high)
-    axes.set_ylim(0.0, 1.25 * least[inside].max())
+    top = 1.05 * max(least.max(), result.evaluated.max()) if inside.all() else 1.25 * least[inside].max()
+    axes.set_ylim(0.0, top)
 
 
 def _draw_filters(axes: Any, result: Landscape) -> None:

@@ -1,0 +1,125 @@
+"""``ctid check``: a command of its own for a FILE, and a group of further checks beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ctid_cli.cli._common import (
+    Command,
+    Config,
+    From,
+    InputColumn,
+    InputHold,
+    Json,
+    OutputColumn,
+    Overrides,
+    TimeColumn,
+    To,
+    answer,
+    guarded,
+)
+from ctid_cli.errors import MismatchError, UsageError
+
+further = typer.Typer(rich_markup_mode=None, context_settings={"help_option_names": ["-h", "--help"]})
+
+
+@guarded
+def check(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Measured record (.csv, .mat).")],
+    time: TimeColumn = None,
+    input: InputColumn = None,
+    output: OutputColumn = None,
+    hold: InputHold = "zoh",
+    start: From = None,
+    stop: To = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit code 7 if there is a PROBLEM.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Say what a measured record is worth, before any model.
+
+    Sampling, gaps, excitation, offsets, trends, bandwidth against the clock, and a hint of the delay: what is wrong
+    with these data, in words, the worst first. Columns are found by their usual names (t, u, y) unless named.
+    """
+    from ctid_cli.reporting.record_findings import check_record_quality
+    from ctid_cli.reporting.record_report import record_object, record_text
+    from ctid_cli.signals.measurement import read_measurement
+
+    found = read_measurement(file, time=time, input=input, output=output, hold=hold, start=start, stop=stop)
+    units = found.time_unit or "s", found.input_unit or "", found.output_unit or ""
+    report = check_record_quality(found.record, *units)
+    answer(as_json, lambda: record_object(found, report), lambda: record_text(found, report))
+    if strict and report.worst == "problem":
+        raise MismatchError(f"{file}: no model can be identified from this record as it is")
+
+
+@further.command("filters", cls=Command)
+@guarded
+def check_filters(
+    bandwidth: Annotated[
+        float, typer.Option("--bandwidth", metavar="RAD/S", help="Bandwidth of the system, its last -3 dB crossing.")
+    ],
+    largest_error: Annotated[
+        float, typer.Option("--largest-error", metavar="SECONDS", help="Largest error of an initial delay.")
+    ],
+    filters: Annotated[int, typer.Option("--filters", metavar="N", help="Number of filters, at least 2.")] = 10,
+    beta: Annotated[
+        float, typer.Option("--beta", metavar="RATIO", help="Longest over shortest period, 1.717 to 10.")
+    ] = 10.0,
+    as_json: Json = False,
+) -> None:
+    """Say whether a set of low-pass filters leads a delay estimate past local minima.
+
+    A search that switches between the filters must find, from every wrong delay, one filter whose cost falls to a
+    minimum closer to the true delay. The first line says PASS or NOT PASSED; then come the filters, which of them
+    serves which delay error, and how many are sure to suffice. The exit code is 0 either way.
+    """
+    from ctid_cli.filtering import filter_set
+    from ctid_cli.reporting.filter_report import filter_object, filter_text
+    from ctid_cli.signals.checks import require_integer, require_positive
+
+    try:
+        require_positive("--bandwidth", bandwidth, "rad/s")
+        require_positive("--largest-error", largest_error, "s")
+        require_integer("--filters", filters, 2)
+        chosen = filter_set.FilterSet(bandwidth, filters, beta)
+        found = filter_set.check_filters(chosen.cutoffs, largest_error)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    answer(as_json, lambda: filter_object(chosen, found), lambda: filter_text(chosen, found))
+
+
+@further.command("accuracy", cls=Command)
+@guarded
+def check_accuracy(config: Config, overrides: Overrides = None, as_json: Json = False) -> None:
+    """Say how accurate the estimates of an experiment can be, before any data are taken.
+
+    For every estimator and the swept numbers of samples: the standard error of each parameter by theory, with the
+    formula that it comes from. White Gaussian excitation on a regular clock has a limit for long records; otherwise
+    the sensitivities of the experiment's first data set count.
+    """
+    from ctid_cli.cli._planning import load_plans
+    from ctid_cli.reporting.accuracy_report import accuracy_object, accuracy_text
+
+    ((_, plan),) = load_plans([config], overrides or [])
+    content = accuracy_object(plan)
+    answer(as_json, lambda: content, lambda: accuracy_text(content))
+
+
+class CheckCommand(Command):
+    """``ctid check FILE``, which hands over if the first word names a further check: such a file is ``./filters``."""
+
+    further = typer.main.get_group(further).commands
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        """Parse the command line."""
+        if args and args[0] in self.further:
+            return self.further[args[0]].make_context(f"{info_name} {args[0]}", args[1:], parent, **extra)
+        return super().make_context(info_name, args, parent, **extra)
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Write the end of the help: the further checks."""
+        with formatter.section("Further checks"):
+            formatter.write_dl([(name, command.get_short_help_str(80)) for name, command in self.further.items()])
