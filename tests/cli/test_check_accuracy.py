@@ -153,7 +153,7 @@ def test_where_the_reference_enters(accuracy):
 def test_text(accuracy):
     text = accuracy(CLOSED, text=True)
     lines = text.splitlines()
-    assert lines[0].startswith("closed: standard errors to expect by theory, before any data are taken.")
+    assert lines[0].startswith("closed: standard errors to expect by theory.")
     assert max(map(len, lines)) <= 100
     assert re.search(r"^parameter +true value +N = 500 +N = 19650 +relative \[%\] +half width$", text, re.MULTILINE)
     assert re.search(r"^g2_b0 +1 +0\.1\d+ +0\.0186 +1\.86 +0\.0364$", text, re.MULTILINE)
