@@ -323,7 +323,7 @@ def test_without_noise_and_with_coloured_noise_in_a_loop(accuracy):
     assert "no noise" in accuracy(silent)["estimates"][0]["reason"]
     coloured = CLOSED.replace("kind: white", "kind: arma, numerator: [1], denominator: [1, -0.9]")
     content = accuracy(coloured)
-    assert "instruments from the input itself are biased" in entries(content, "direct")[0]["reason"]
+    assert "instruments from it are biased" in entries(content, "direct")[0]["reason"]
     assert entries(content, "clsrivc")[0]["parameters"]
     assert "M^-1 Sigma M^-1" in entries(content, "clsrivc")[1]["formula"]
 
