@@ -21,6 +21,7 @@ from ctid_cli.cli._common import (
     answer,
     guarded,
 )
+from ctid_cli.cli.experiment_commands import load_plans
 from ctid_cli.errors import MismatchError, UsageError
 
 further = typer.Typer(rich_markup_mode=None, context_settings={"help_option_names": ["-h", "--help"]})
@@ -100,7 +101,6 @@ def check_accuracy(config: Config, overrides: Overrides = None, as_json: Json = 
     formula that it comes from. White Gaussian excitation on a regular clock has a limit for long records; otherwise
     the sensitivities of the experiment's first data set count.
     """
-    from ctid_cli.cli._planning import load_plans
     from ctid_cli.reporting.accuracy_report import accuracy_object, accuracy_text
 
     ((_, plan),) = load_plans([config], overrides or [])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -12,12 +13,46 @@ import typer
 
 from ctid_cli.cli._common import Configs, Fresh, Jobs, Out, Overrides, guarded
 from ctid_cli.cli._progress import Reporter, json_lines
-from ctid_cli.errors import TooManyFailuresError
+from ctid_cli.errors import Problem, SpecError, TooManyFailuresError, UsageError
 from ctid_cli.reporting.layout import count, seconds
 
 if TYPE_CHECKING:
+    from ctid_cli.running.cells import Plan
     from ctid_cli.running.engine import RunSummary
     from ctid_cli.running.events import Event, PlanReady
+
+
+def load_plans(configs: Sequence[Path], overrides: Sequence[str], runs: int | None = None) -> list[tuple[Path, Plan]]:
+    """Read and check experiment files; warnings go to stderr."""
+    from ctid_cli.running.plan import build_plan
+    from ctid_cli.specification.load import load_spec
+
+    problems: list[Problem] = []
+    plans: list[tuple[Path, Plan]] = []
+    for config in configs:
+        try:
+            plans.append((config, build_plan(load_spec(config, overrides), runs)))
+        except SpecError as error:
+            problems += error.problems
+    if problems:
+        raise SpecError(problems)
+    seen: dict[str, Path] = {}
+    for config, plan in plans:
+        if plan.experiment in seen:
+            both = f"{seen[plan.experiment]} and {config} both describe the experiment {plan.experiment!r}"
+            raise UsageError(f"{both}; run them one at a time, or give one of them another name")
+        seen[plan.experiment] = config
+        for warning in plan.spec.warnings:
+            typer.echo(f"warning: {warning}", err=True)
+    return plans
+
+
+def _workload(plan: Plan) -> str:
+    """How much work a plan asks for."""
+    tasks = plan.tasks()
+    estimates = sum(len(plan.keys(task)) for task in tasks)
+    sets, cells = count(len(tasks), "data set"), count(len(plan.data_cells), "data cell")
+    return f"{sets} ({cells}), {count(estimates, 'estimate')}"
 
 
 @guarded
@@ -41,7 +76,6 @@ def run(
 
     Finished estimates are stored as they come, so nothing is lost when a run is stopped or killed.
     """
-    from ctid_cli.cli._planning import load_plans
     from ctid_cli.running.engine import preview, run_experiment
 
     plans = [plan for _, plan in load_plans(configs, overrides or [], runs)]
@@ -105,10 +139,8 @@ def validate(configs: Configs, overrides: Overrides = None) -> None:
 
     Prints every mistake with its place in the file, or how much work the experiment asks for.
     """
-    from ctid_cli.cli._planning import load_plans, workload
-
     for config, plan in load_plans(configs, overrides or []):
-        typer.echo(f"{config}: ok, {plan.experiment}: {workload(plan)}")
+        typer.echo(f"{config}: ok, {plan.experiment}: {_workload(plan)}")
 
 
 @guarded

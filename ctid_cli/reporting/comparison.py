@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -220,16 +221,15 @@ def smallest_detectable(
 
     drops = []
     for expected in (reference_converged, reference_n - reference_converged)[: 1 + rise]:
-        low, high = -1, n * expected // reference_n
-        while low < high:
-            middle = (low + high + 1) // 2
-            if fisher(middle, n, expected, reference_n) < level:
-                low = middle
-            else:
-                high = middle - 1
+        insignificant = partial(_agrees, n, expected, reference_n, level)
+        low = bisect_left(range(n * expected // reference_n + 1), True, key=insignificant) - 1
         if 0 <= low < n:
             drops.append(100 * (expected / reference_n - float(beta.ppf(1 - POWER, low + 1, n - low))))
     return min(drops, default=None)
+
+
+def _agrees(n: int, expected: int, reference_n: int, level: float, converged: int) -> bool:
+    return fisher(converged, n, expected, reference_n) >= level
 
 
 def write_comparison(comparison: Comparison, style: str = "text") -> str:
@@ -268,11 +268,10 @@ def _verdict(comparison: Comparison) -> str:
         parts.append(f"{count(len(paper), 'cell')} of {methods} with the paper")
     least, most = (extreme(cell["n"] for cell in cells) for extreme in (min, max))
     sizes = count(most, "data set") if least == most else f"{least} to {count(most, 'data set')}"
-    text = f"No difference beyond sampling error in {count(len(cells), 'comparison')}"
-    text = mismatch_sentence(comparison) if comparison.mismatches else text
-    text += f": {listed(parts)}, from {sizes} a cell."
-    text += f" Fisher's exact test, Holm's correction: a chance of at most {100 * LEVEL:g} % of any false alarm."
-    text += f" {_power(cells)}"
+    agrees = f"No difference beyond sampling error in {count(len(cells), 'comparison')}"
+    text = mismatch_sentence(comparison) if comparison.mismatches else agrees
+    text += f": {listed(parts)}, from {sizes} a cell. Fisher's exact test, Holm's correction: a chance of at most "
+    text += f"{100 * LEVEL:g} % of any false alarm. {_power(cells)}"
     if comparison.not_run:
         text += f" Not run, so not compared: {count(comparison.not_run, 'cell')}."
     if comparison.not_in_reference:

@@ -162,10 +162,8 @@ def _driving(source: SimulatedSource) -> tuple[str, Any]:
     return ("input", source.excitation) if source.loop is None else ("reference", source.loop.reference)
 
 
-def _of_long_records(source: SimulatedSource, estimated: _Estimated) -> ExpectedAccuracy:
+def _of_long_records(source: Any, estimated: _Estimated) -> ExpectedAccuracy:
     sampling, noise, loop, (name, signal) = source.sampling, source.noise, source.loop, _driving(source)
-    assert isinstance(sampling, RegularSampling)
-    assert noise is not None
     options: dict[str, Any] = {}
     if loop is None:
         # A level relative to the output counts from its mean square.
@@ -193,8 +191,7 @@ def _of_long_records(source: SimulatedSource, estimated: _Estimated) -> Expected
     return ExpectedAccuracy(parameters, sampling.samples, True, formula)
 
 
-def _of_records(source: SimulatedSource, estimated: _Estimated, why: str) -> ExpectedAccuracy:
-    assert source.noise is not None
+def _of_records(source: Any, estimated: _Estimated, why: str) -> ExpectedAccuracy:
     samples = source.sampling.samples
     sets = max(1, min(MOST_SETS, SET_SAMPLES // samples))
     covariance = np.mean([_record_covariance(source, estimated, replicate) for replicate in range(sets)], axis=0)
@@ -211,15 +208,11 @@ def _of_records(source: SimulatedSource, estimated: _Estimated, why: str) -> Exp
     return ExpectedAccuracy(parameters, samples, False, formula)
 
 
-def _record_covariance(source: SimulatedSource, estimated: _Estimated, replicate: int) -> Array:
+def _record_covariance(source: Any, estimated: _Estimated, replicate: int) -> Array:
     """Covariance of an estimate from one data set; NaN where it does not determine the parameters."""
-    assert source.noise is not None
     record = source.dataset(replicate).record
     signal = record.input
     if estimated.instruments == "closed_loop":
-        assert record.loop is not None
-        assert record.interval is not None
-        assert source.loop is not None
         reference, controller, enters = record.loop.reference, source.loop.controller, source.loop.enters
         loop = simulate_loop(source.system, controller, reference, 0.0, record.interval, enters)
         signal = HeldSignal(record.t, loop.u)
@@ -233,10 +226,8 @@ def _record_covariance(source: SimulatedSource, estimated: _Estimated, replicate
 
 def _sensitivities(source: SimulatedSource, estimated: _Estimated) -> str:
     """What psi are, in words."""
-    text = "the sensitivities of the output to the parameters"
-    if source.loop is None:
-        return text
-    return f"{text} in the {'noise-free loop' if estimated.instruments == 'closed_loop' else 'loop, noise included'}"
+    where = "noise-free loop" if estimated.instruments == "closed_loop" else "loop, noise included"
+    return "the sensitivities of the output to the parameters" + ("" if source.loop is None else f" in the {where}")
 
 
 def long_record_variances(plan: Plan) -> dict[tuple[int, int], dict[str, float]]:

@@ -91,11 +91,6 @@ def csv_text(rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = 
     return buffer.getvalue()
 
 
-def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]], align: str) -> str:
-    """A table as Markdown."""
-    return Table(header, rows, align).draw("md")
-
-
 def picked(item: object, names: Iterable[str]) -> dict[str, Any]:
     """Some attributes of an object, as data."""
     return {name: getattr(item, name) for name in names}

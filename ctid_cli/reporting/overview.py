@@ -54,7 +54,7 @@ def status_text(status: ExperimentStatus, estimates: Sequence[Mapping[str, Any]]
     if estimates:
         blocks.append("\n".join(_outcomes(estimates)))
     if status.left_aside:
-        blocks.append(f"{status.left_aside} stored estimates are set aside, as the latest run asked for others.")
+        blocks.append(f"{status.left_aside} stored estimates are set aside: the latest run asked for others.")
     command = f"ctid table {status.experiment}{out_option(out)}"
     if status.todo and not status.running:
         blocks.append(f"To continue, run the same `ctid run` command again; so far: {command}")

@@ -53,16 +53,6 @@ class Results:
         return sum(row["status"] in FAILURES for row in self.rows)
 
     @property
-    def mixed(self) -> bool:
-        """Whether other code or another processor computed some of the estimates."""
-        return self.stored.mixed
-
-    @property
-    def measured(self) -> bool:
-        """Whether the data are a measured record rather than simulated."""
-        return self.settings.get("data") is not None
-
-    @property
     def sampling(self) -> str | None:
         """``regular`` or ``irregular``; None for a measured record."""
         kind = lookup(self.settings, "sampling.kind")

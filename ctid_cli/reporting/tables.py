@@ -107,7 +107,7 @@ def _departures(results: Results, specification: Mapping[str, Any], shown: set[s
 def experiment_report(results: Results, notes: Sequence[str] = ()) -> Report:
     """What is said of one experiment."""
     rows = experiment_rows(results)
-    if results.measured:
+    if results.settings.get("data") is not None:
         return Report(record_blocks(results), _record_rows(results, rows), notes)
     blocks = frequency_blocks if is_of_signal(results.manifest) else percentage_blocks
     return Report(blocks(results, rows), rows, notes)
@@ -129,6 +129,6 @@ def _notes(results: Results, out: Path) -> list[str]:
     if results.failed:
         command = f"ctid status {results.experiment}{out_option(out)}"
         notes.append(f"{results.failed} estimates failed; to see why: {command}")
-    if results.mixed:
+    if results.stored.mixed:
         notes.append(f"{results.experiment} mixes results of different code versions or processors (--allow-mixed)")
     return notes

@@ -51,7 +51,7 @@ def commit_of(found: StudyResults) -> str:
         raise RefusedError(f"nothing is published from files that are not committed:\n{changed}")
     present = present_versions()
     for results in found.experiments.values():
-        if results.mixed:
+        if results.stored.mixed:
             raise RefusedError(f"{results.experiment} mixes results of different code versions or processors")
         if not {origin.code_version for origin in results.stored.origins} <= present:
             other = f"{results.experiment} was not computed by the code that is checked out"

@@ -9,7 +9,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.robust import sandwich_covariance
-from ctid_cli.reporting.layout import markdown_table
+from ctid_cli.reporting.layout import Table
 from ctid_cli.reporting.parameter_errors import error_statistics
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
@@ -103,4 +103,4 @@ def markdown(found: StudyResults) -> str:
     ]
     header = ["row", "data", "formula", "parameter", "true", "coverage %", "95 % interval"]
     header += ["standard error / deviation", "bias / Monte Carlo error"]
-    return markdown_table(header, rows, "llllrrlrr") + "\n"
+    return Table(header, rows, "llllrrlrr").draw("md") + "\n"

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.regression import determinant_from_tones, theta_of
-from ctid_cli.reporting.layout import markdown_table, number
+from ctid_cli.reporting.layout import Table, number
 from ctid_cli.studies.catalogue import find_study
 
 from .measures import settle
@@ -30,7 +30,7 @@ HEADER = ["what is printed", "measured", "as printed", "as corrected"]
 
 def table() -> str:
     """All lines as Markdown."""
-    return markdown_table(HEADER, list(rows()), "llrr")
+    return Table(HEADER, list(rows()), "llrr").draw("md")
 
 
 def rows() -> Iterator[list[str]]:

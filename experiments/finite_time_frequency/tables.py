@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ctid_cli.reporting.layout import markdown_table, number
+from ctid_cli.reporting.layout import Table, number
 from ctid_cli.reporting.results import Results
 from ctid_cli.studies.catalogue import StudyResults
 
@@ -42,7 +42,7 @@ def tables(found: StudyResults) -> str:
 
 def table(header: list[str], rows: list[list[str]], left: int = 1) -> str:
     """A table whose first column holds names."""
-    return markdown_table(header, rows, "l" * left + "r" * (len(header) - left))
+    return Table(header, rows, "l" * left + "r" * (len(header) - left)).draw("md")
 
 
 def named(estimator: str) -> str:
