@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, overload
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -45,13 +45,7 @@ class History(Sequence[IterationRecord]):
     def __len__(self) -> int:
         return len(self._entries)
 
-    @overload
-    def __getitem__(self, index: int) -> IterationRecord: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> tuple[IterationRecord, ...]: ...
-
-    def __getitem__(self, index: int | slice) -> IterationRecord | tuple[IterationRecord, ...]:
+    def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
             return tuple(self[k] for k in range(*index.indices(len(self))))
         stage, iteration, row = self._entries[index]
@@ -82,8 +76,8 @@ def estimate_submodels(
     radius = _loop_radius(problem, whole)
     if radius > 1.0 and problem.data.y.size * np.log(radius) > np.log(LARGEST_GROWTH):
         raise DataError(
-            f"the start makes an unstable loop with the controller (largest pole magnitude {radius:.4g}, it must be "
-            "below 1), so the instruments cannot be simulated; start closer, or with instruments 'open_loop'"
+            "the start makes an unstable loop with the controller: its poles reach the magnitude "
+            f"{radius:.4g}, and must stay below 1; start closer, or with instruments 'open_loop'"
         )
     history = History(problem)
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Generic, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.estimation.iteration import Equations, Iterated
+from ctid_cli.estimation.iteration import Equations, Iterated, Problem
 from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
@@ -132,9 +132,8 @@ def check_options(options: Any) -> None:
 def check_proper(poles: int, zeros: int) -> None:
     """Check the degrees of a strictly proper model."""
     if zeros >= poles:
-        raise OptionError(
-            "zeros", f"zeros must be fewer than poles (a strictly proper model): got {zeros} zeros and {poles} poles"
-        )
+        given = f"got {zeros} zeros and {poles} poles"
+        raise OptionError("zeros", f"zeros must be fewer than poles (a strictly proper model): {given}")
 
 
 def checked_bounds(bounds: tuple[float, float], known_allowed: bool = False) -> tuple[float, float]:
@@ -144,9 +143,8 @@ def checked_bounds(bounds: tuple[float, float], known_allowed: bool = False) -> 
     except (TypeError, ValueError):
         low, high = np.nan, np.nan
     if not 0 <= low <= high < np.inf or (low == high and not known_allowed):
-        raise OptionError(
-            "delay_bounds", f"delay_bounds must be two delays in seconds, the smaller (0 or more) first: got {bounds!r}"
-        )
+        wanted = "two delays in seconds, the smaller (0 or more) first"
+        raise OptionError("delay_bounds", f"delay_bounds must be {wanted}: got {bounds!r}")
     return low, high
 
 
@@ -161,25 +159,20 @@ def named(record: Record) -> str:
 def check_record(record: Record, data: FilterData, parameters: int) -> None:
     """Refuse records from which nothing can be estimated."""
     if data.count <= parameters:
-        raise DataError(
-            f"{named(record)}{data.count} usable samples for {parameters} parameters; "
-            "take a longer record, a smaller model, or a smaller largest delay"
-        )
+        what = f"{named(record)}{data.count} usable samples for {parameters} parameters"
+        raise DataError(f"{what}; take a longer record, a smaller model, or a smaller largest delay")
     if np.ptp(record.input.values) == 0.0:
-        raise DataError(
-            f"{named(record)}the input is constant ({record.input.values[0]:g}); it excites nothing to identify"
-        )
+        raise DataError(f"{named(record)}the input is constant ({record.input.values[0]:g}): it excites nothing")
     if np.ptp(data.y_used) == 0.0:
-        raise DataError(f"{named(record)}the output is constant ({data.y_used[0]:g}) over the samples that can be used")
+        raise DataError(f"{named(record)}the output is constant ({data.y_used[0]:g}) over the usable samples")
 
 
 def check_greatest_delay(record: Record, greatest: float) -> None:
     """Refuse a delay that may last as long as the record."""
     duration = record.t[-1] - record.input.t[0]
     if greatest >= duration:
-        raise DataError(
-            f"{named(record)}the greatest delay, {greatest:g} s, is not shorter than the record, {duration:g} s"
-        )
+        delay = f"{named(record)}the greatest delay, {greatest:g} s,"
+        raise DataError(f"{delay} is not shorter than the record, {duration:g} s")
 
 
 def initial_delay(start: Start | None, bounds: tuple[float, float]) -> float:
@@ -194,25 +187,14 @@ def initial_delay(start: Start | None, bounds: tuple[float, float]) -> float:
 # --- results ---------------------------------------------------------------------------------------
 
 
-class Splits(Protocol):
-    """An estimation problem, as far as its history needs to know it."""
-
-    @property
-    def samples(self) -> int:
-        """Number of samples in the sums."""
-
-    def split(self, theta: Array) -> tuple[Array, Array, float]:
-        """Denominator, numerator and delay of a parameter vector."""
-
-
-def history_entry(stage: str, iteration: int, problem: Splits, theta: Array, squared_error: float) -> IterationRecord:
+def history_entry(stage: str, iteration: int, problem: Problem, theta: Array, squared_error: float) -> IterationRecord:
     """Describe one accepted iteration."""
     a, b, delay = problem.split(theta)
     cost = squared_error / problem.samples
     return IterationRecord(stage, iteration, delay, cost, tuple(a.tolist()), tuple(b.tolist()))
 
 
-def history_of(stage: str, problem: Splits, result: Iterated | None) -> list[IterationRecord]:
+def history_of(stage: str, problem: Problem, result: Iterated | None) -> list[IterationRecord]:
     """Describe the start and the accepted steps of an iteration."""
     path = np.empty((0, 1)) if result is None else result.path
     return [history_entry(stage, k, problem, row[:-1], float(row[-1])) for k, row in enumerate(path)]
@@ -243,16 +225,8 @@ def quality(equations: Equations, spread: float, count: int) -> dict[str, Any]:
 
 def diverged(size: int, count: int) -> dict[str, Any]:
     """What stands in a `Fit` without a finite response."""
-    nan = float("nan")
-    return {
-        "covariance": np.full((size, size), nan),
-        "status": Status.DIVERGED,
-        "cost": nan,
-        "fit_percent": nan,
-        "r2": nan,
-        "count": count,
-        "condition_number": nan,
-    }
+    nothing = dict.fromkeys(("cost", "fit_percent", "r2", "condition_number"), float("nan"))
+    return {"covariance": np.full((size, size), np.nan), "status": Status.DIVERGED, "count": count, **nothing}
 
 
 def finish(
@@ -268,11 +242,8 @@ def finish(
         # A delay at its bound is no minimum: it has no standard error, and the others hold for that delay.
         accurate = 0 if status is Status.LEAST_SQUARES else size - int(status is Status.DELAY_AT_BOUND)
         covariance, status = covariance_of(found, np.arange(accurate), y.size, status)
-        values = {
-            "covariance": covariance,
-            "status": status,
-            **quality(found, float(np.sum((y - y.mean()) ** 2)), y.size),
-        }
+        spread = float(np.sum((y - y.mean()) ** 2))
+        values = {"covariance": covariance, "status": status, **quality(found, spread, y.size)}
     else:
         values = diverged(size, y.size)
     return Fit(

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -34,49 +33,33 @@ class GridCost(Protocol):
         """Least cost at a delay over several starts."""
 
 
-@dataclass(frozen=True, eq=False)
-class Level:
-    """One level of the search."""
+def search_grid(
+    levels: Sequence[tuple[FilteredCost, float]], bounds: tuple[float, float], fewest: int
+) -> tuple[Array, Array, list[Minimum]]:
+    """Search the whole range of the delay, each level a cost with the spacing of its grid [s].
 
-    cost: FilteredCost
-    #: Spacing of the grid [s]: no more than a quarter period of the highest frequency that passes the filter.
-    spacing: float
-
-
-@dataclass(frozen=True, eq=False)
-class GridSearch:
-    """What a search over a grid has found."""
-
-    #: Grid of the first level [s] and its costs; NaN where the equations were singular, shape (K,).
-    delays: Array
-    costs: Array
-    minima: tuple[Minimum, ...]
-
-
-def search_grid(levels: Sequence[Level], bounds: tuple[float, float], fewest: int) -> GridSearch:
-    """Search the whole range of the delay.
-
-    At each delay the coefficients start from those of both neighbours and from least squares, and the cheapest are
-    kept.
+    The spacing is no more than a quarter period of the highest frequency that passes the filter. At each delay the
+    coefficients start from those of both neighbours and from least squares, and the cheapest are kept. Returns the grid
+    of the first level [s] with its costs, NaN where the equations were singular, and the lowest minima of the last.
     """
     low, high = bounds
-    wanted = max(int(np.ceil((high - low) / levels[0].spacing)) + 1, fewest)
-    grid = delays = np.linspace(low, high, wanted)
-    first = found = scan(levels[0].cost, delays)
-    spacing = float(delays[1] - delays[0])
-    for level in levels[1:]:
-        centres = [delays[k] for k in _hopeful(costs_of(found), KEPT)]
-        count = int(np.ceil(REACH * spacing / level.spacing))
-        offsets = level.spacing * np.arange(-count, count + 1)
+    (cost, first_spacing), *finer = levels
+    grid = delays = np.linspace(low, high, max(int(np.ceil((high - low) / first_spacing)) + 1, fewest))
+    found = scan(cost, delays)
+    costs = costs_of(found)
+    coarser = float(delays[1] - delays[0])
+    for cost, spacing in finer:
+        count = int(np.ceil(REACH * coarser / spacing))
+        offsets = spacing * np.arange(-count, count + 1)
         # Grids that overlap share their points.
-        places = {round(float(centre + offset) / level.spacing) for centre in centres for offset in offsets}
-        delays = np.array([place * level.spacing for place in sorted(places)])
-        delays = np.unique(np.clip(delays, low, high))
-        found = scan(level.cost, delays)
-        spacing = level.spacing
-    minima = [_descended(levels[-1].cost, found[k], bounds) for k in _hopeful(costs_of(found), MINIMA)]
-    minima.sort(key=lambda minimum: minimum.squared_error)
-    return GridSearch(grid, costs_of(first), tuple(minima))
+        centres = [delays[k] for k in _hopeful(costs_of(found), KEPT)]
+        places = {round(float(centre + offset) / spacing) for centre in centres for offset in offsets}
+        delays = np.unique(np.clip([place * spacing for place in sorted(places)], low, high))
+        found = scan(cost, delays)
+        coarser = spacing
+    lowest = [found[k] for k in _hopeful(costs_of(found), MINIMA)]
+    minima = [_descended(cost, minimum, bounds) for minimum in lowest if minimum is not None]
+    return grid, costs, sorted(minima, key=lambda minimum: minimum.squared_error)
 
 
 def scan(cost: GridCost, delays: Array) -> list[Minimum | None]:
@@ -117,14 +100,7 @@ def costs_of(found: list[Minimum | None]) -> Array:
     return np.array([np.nan if minimum is None else minimum.squared_error for minimum in found])
 
 
-def _descended(cost: FilteredCost, minimum: Minimum | None, bounds: tuple[float, float]) -> Minimum:
-    assert minimum is not None
-    found = descend(
-        cost,
-        minimum.delay,
-        minimum.theta,
-        bounds,
-        max_iterations=DESCENT_ITERATIONS,
-        tolerance=DESCENT_TOLERANCE,
-    )
+def _descended(cost: FilteredCost, minimum: Minimum, bounds: tuple[float, float]) -> Minimum:
+    effort: Any = {"max_iterations": DESCENT_ITERATIONS, "tolerance": DESCENT_TOLERANCE}
+    found = descend(cost, minimum.delay, minimum.theta, bounds, **effort)
     return minimum if found is None or found.minimum.squared_error > minimum.squared_error else found.minimum

@@ -8,7 +8,7 @@ of, filtered or not, samples or spectra, is the business of the *cost*.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -53,11 +53,16 @@ class DelayCost(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Descent:
-    """Where a descent ended."""
+    """Where a descent went: its start and what it accepted, how it ended, and after how many iterations."""
 
-    minimum: Minimum
+    steps: Sequence[Minimum]
     status: Status
     iterations: int
+
+    @property
+    def minimum(self) -> Minimum:
+        """Where it ended."""
+        return self.steps[-1]
 
 
 @njit(cache=True, nogil=True)
@@ -125,7 +130,6 @@ def descend(
     smallest_step: float | None = None,
     largest_step: float = np.inf,
     reflect: bool = False,
-    on_step: Callable[[Minimum], None] | None = None,
 ) -> Descent | None:
     """Gauss-Newton on the delay from one start.
 
@@ -134,19 +138,10 @@ def descend(
     """
     low, high = bounds
     smallest = SMALLEST_STEP * (high - low) if smallest_step is None else smallest_step
-    current = cost.minimise(delay, theta)
-    if current is None:
-        return None
-    if on_step:
-        on_step(current)
-    for iteration in range(max_iterations):
-        step = current.step
-        if not np.isfinite(step):
-            return Descent(current, Status.SINGULAR, iteration)
-        if abs(step) > largest_step:
-            step = largest_step if step > 0 else -largest_step
-        accepted = None
-        while accepted is None:
+
+    def next_after(current: Minimum) -> Minimum | None:
+        step = current.step if abs(current.step) <= largest_step else float(np.copysign(largest_step, current.step))
+        while True:
             target = current.delay + step
             if reflect and not low <= target <= high:
                 target = 2.0 * (low if target < low else high) - target
@@ -154,19 +149,27 @@ def descend(
                 step *= 0.5
                 target = current.delay + step
             if abs(step) <= smallest:
-                return Descent(current, Status.CONVERGED, iteration)
+                return None
             trial = cost.minimise(target, current.theta)
             if trial is not None and trial.squared_error < current.squared_error:
-                accepted = trial
-            else:
-                step *= 0.5
-        fall = 1.0 - accepted.squared_error / current.squared_error
-        current = accepted
-        if on_step:
-            on_step(current)
-        if fall < tolerance:
-            return Descent(current, Status.CONVERGED, iteration + 1)
-    return Descent(current, Status.MAX_ITERATIONS, max_iterations)
+                return trial
+            step *= 0.5
+
+    start = cost.minimise(delay, theta)
+    if start is None:
+        return None
+    steps = [start]
+    for iteration in range(max_iterations):
+        current = steps[-1]
+        if not np.isfinite(current.step):
+            return Descent(steps, Status.SINGULAR, iteration)
+        accepted = next_after(current)
+        if accepted is None:
+            return Descent(steps, Status.CONVERGED, iteration)
+        steps.append(accepted)
+        if 1.0 - accepted.squared_error / current.squared_error < tolerance:
+            return Descent(steps, Status.CONVERGED, iteration + 1)
+    return Descent(steps, Status.MAX_ITERATIONS, max_iterations)
 
 
 def bound_in_the_way(current: Equations, delay: float, bounds: tuple[float, float]) -> float | None:

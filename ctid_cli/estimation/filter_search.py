@@ -63,10 +63,6 @@ class FilterSearch:
         self.period = float(filters.periods[-1])
         self._known: dict[int, tuple[float, list[Minimum | None]]] = {}
 
-    def member_costs(self, delay: float) -> Array:
-        """Costs of all filters at a delay, each with its own coefficients."""
-        return np.array([self._percent(k, minimum) for k, minimum in enumerate(self._minima(delay))])
-
     def reference_cost(self, delay: float) -> float:
         """J0 at the nearest point of a lattice of a tenth of the shortest period: the mean of all members' costs."""
         return self.at(delay)[0]
@@ -100,18 +96,14 @@ class FilterSearch:
         history: list[IterationRecord] = []
         n = self.costs[0].structure.poles
         for visit in search.trajectory[1:]:
-            path = next(
-                p for p in paths if (p.round, p.filter) == (visit.round, visit.path) and p.delays[-1] == visit.point
-            )
+            ends = {(path.round, path.filter, float(path.delays[-1])): path for path in reversed(paths)}
+            path = ends[visit.round, visit.path, visit.point]
             cost = self.costs[path.filter]
             squares = (path.costs / 100.0) ** 2 * cost.spread * cost.mean_factor
             stage = f"filter {path.filter + 1}"
-            for i, (delay, square, theta) in enumerate(zip(path.delays, squares, path.coefficients, strict=True)):
-                history.append(
-                    IterationRecord(
-                        stage, i, float(delay), float(square), (1.0, *theta[:n].tolist()), tuple(theta[n:].tolist())
-                    )
-                )
+            for i, (delay, square) in enumerate(zip(path.delays.tolist(), squares.tolist(), strict=True)):
+                theta = path.coefficients[i].tolist()
+                history.append(IterationRecord(stage, i, delay, square, (1.0, *theta[:n]), tuple(theta[n:])))
         return history
 
     def _path(self, k: int, paths: list[FilterPath], done: int, hop: bool) -> Path[float]:
@@ -133,7 +125,6 @@ class FilterSearch:
                 starts = [(delay, theta) for theta in ((None,) if here is None else (here.theta, None))]
             ends: list[float] = []
             for start, theta in starts:
-                steps: list[Minimum] = []
                 found = descend(
                     cost,
                     start,
@@ -144,12 +135,11 @@ class FilterSearch:
                     smallest_step=SMALLEST_STEP * self.period,
                     largest_step=LARGEST_STEP * (high - low),
                     reflect=True,
-                    on_step=steps.append,
                 )
                 if found is not None:
-                    costs = np.array([self._percent(k, step) for step in steps])
-                    delays = np.array([step.delay for step in steps])
-                    paths.append(FilterPath(rounds, k, delays, costs, np.array([step.theta[:-1] for step in steps])))
+                    costs = np.array([self._percent(k, step) for step in found.steps])
+                    thetas = np.array([step.theta for step in found.steps])
+                    paths.append(FilterPath(rounds, k, thetas[:, -1], costs, thetas[:, :-1]))
                     ends.append(found.minimum.delay)
             return ends
 
@@ -159,8 +149,7 @@ class FilterSearch:
         """J0 and the minima of all filters at the lattice point next to a delay."""
         place = round(delay / (LATTICE * self.period))
         if place not in self._known:
-            low, high = self.limits.bounds
-            minima = self._minima(min(max(place * LATTICE * self.period, low), high))
+            minima = self._minima(float(np.clip(place * LATTICE * self.period, *self.limits.bounds)))
             mean = float(np.mean([self._percent(k, minimum) for k, minimum in enumerate(minima)]))
             self._known[place] = mean, minima
         return self._known[place]

@@ -87,6 +87,13 @@ class Problem(Protocol):
     def free(self) -> int:
         """Number of parameters to iterate on, from the first; the others are held."""
 
+    @property
+    def samples(self) -> int:
+        """Number of samples in the sums."""
+
+    def split(self, theta: Array) -> tuple[Array, Array, float]:
+        """Denominator, numerator and delay [s] of a parameter vector."""
+
     def equations(self, theta: Array) -> Equations:
         """Second moments of sensitivities, regressors and output error."""
 

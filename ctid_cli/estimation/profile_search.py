@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.delay_grid import Level, costs_of, local_minima, scan, search_grid
+from ctid_cli.estimation.delay_grid import costs_of, local_minima, scan, search_grid
 from ctid_cli.estimation.delay_search import Minimum, best_minimum
 from ctid_cli.estimation.filtered_costs import filtered_costs
 from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps, iterate
@@ -132,11 +132,10 @@ def _search_levels(cost: RecordsCost, search: Literal["time", "spectral"]) -> Fo
     if costs[-1] is None:
         return [], None
     usable = [(level, cutoff) for level, cutoff in zip(costs, cutoffs, strict=True) if level is not None]
-    levels = [Level(level, 0.5 * np.pi / cutoff) for level, cutoff in usable]
-    found = search_grid(levels, treatment.delay_bounds, FEWEST_DELAYS)
+    levels = [(level, 0.5 * np.pi / cutoff) for level, cutoff in usable]
+    delays, found, minima = search_grid(levels, treatment.delay_bounds, FEWEST_DELAYS)
     first, cutoff = usable[0]
-    profile = Profile(found.delays, found.costs * first.mean_factor, bandwidth, cutoff)
-    minima = list(found.minima)
+    profile = Profile(delays, found * first.mean_factor, bandwidth, cutoff)
     interval = measured.data[0].interval
     if interval > 0.0:
         # On a regular clock the cost has a kink at every interval, and local minima between them that a model too small
@@ -149,9 +148,8 @@ def _search_levels(cost: RecordsCost, search: Literal["time", "spectral"]) -> Fo
 
 def _cutoffs(bounds: tuple[float, float], bandwidth: float) -> list[float]:
     """Cut-off frequencies of the levels of a search [rad/s], lowest first."""
-    low, high = bounds
     cutoffs = [bandwidth]
-    while (high - low) * cutoffs[0] / (0.5 * np.pi) > MOST_FIRST_DELAYS and len(cutoffs) < MOST_LEVELS:
+    while (bounds[1] - bounds[0]) * cutoffs[0] / (0.5 * np.pi) > MOST_FIRST_DELAYS and len(cutoffs) < MOST_LEVELS:
         cutoffs.insert(0, cutoffs[0] / LEVEL_RATIO)
     return cutoffs
 

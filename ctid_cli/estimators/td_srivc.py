@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -143,17 +143,10 @@ class TdSrivc(Estimator["Searches", Fit]):
     ) -> Descent | None:
         """Search from a delay; the accepted steps go to the history."""
         cost = SrivcCost(self, problem)
-        steps: list[Minimum] = []
-        found = descend(
-            cost,
-            delay,
-            theta,
-            self.delay_bounds,
-            max_iterations=self.max_iterations,
-            tolerance=cost.tolerance,
-            on_step=steps.append,
-        )
-        history += [history_entry(stage, k, problem, step.theta, step.squared_error) for k, step in enumerate(steps)]
+        effort: Any = {"max_iterations": self.max_iterations, "tolerance": cost.tolerance}
+        found = descend(cost, delay, theta, self.delay_bounds, **effort)
+        for k, step in enumerate(found.steps if found is not None else ()):
+            history.append(history_entry(stage, k, problem, step.theta, step.squared_error))
         return found
 
     def _finish(self, problem: SampledProblem, found: Descent, history: list[IterationRecord]) -> Fit:

@@ -214,7 +214,7 @@ class UsefulRedundancy(Estimator["RedundantSearch", RedundantFit]):
             starts += [found[least], found[max(least - SHORTER, 0)]]
         if not starts:
             raise DataError(Status.SINGULAR.value)
-        ends = [Descent(start, Status.CONVERGED, search.rounds) for start in starts]
+        ends = [Descent([start], Status.CONVERGED, search.rounds) for start in starts]
         fits = [self.refinement._refine(laid_out.unfiltered, end, list(history)) for end in ends]
         return min(fits, key=lambda fit: fit.cost)
 

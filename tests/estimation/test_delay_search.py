@@ -57,11 +57,8 @@ def waves(at=5.0, frequency=4.0):
 
 
 def search(cost, delay, theta=THETA, bounds=BOUNDS, *, max_iterations=50, tolerance=1e-9, **more):
-    seen = []
-    found = descend(
-        cost, delay, theta, bounds, max_iterations=max_iterations, tolerance=tolerance, on_step=seen.append, **more
-    )
-    return found, seen
+    found = descend(cost, delay, theta, bounds, max_iterations=max_iterations, tolerance=tolerance, **more)
+    return found, [] if found is None else list(found.steps)
 
 
 def test_newton_step_on_a_parabola_needs_one_step():
