@@ -30,10 +30,8 @@ Instruments = Literal["open_loop", "closed_loop"]
 def check_closed_loop(instruments: Instruments, variant: str) -> None:
     """Refuse to guard a cost that the solution does not minimise."""
     if instruments == "closed_loop" and variant == "guarded":
-        raise ValueError(
-            "variant guarded is for open-loop instruments: in closed loop the solution is not the minimum of the "
-            "output-error cost; use relaxed or plain"
-        )
+        reason = "in closed loop the solution is not the least output error"
+        raise ValueError(f"variant guarded is for open-loop instruments: {reason}; use relaxed or plain")
 
 
 def loop_data(record: Record, instruments: Instruments) -> LoopData:
@@ -41,25 +39,17 @@ def loop_data(record: Record, instruments: Instruments) -> LoopData:
     if instruments == "open_loop":
         return OPEN_LOOP
     if record.loop is None:
+        wanted = "the reference and the controller, and this record has neither"
         raise DataError(
-            f"{named(record)}closed-loop instruments need the reference and the controller, and this record has "
-            "neither; give them with the record, or use instruments 'open_loop'"
+            f"{named(record)}closed-loop instruments need {wanted}; give them, or use instruments 'open_loop'"
         )
     if not record.input_on_grid or record.input.hold != "zoh":
-        raise DataError(
-            f"{named(record)}closed-loop instruments need an input that is held from sample to sample of a regular "
-            "clock: the controller is discrete"
-        )
+        wanted = "an input that is held from sample to sample of a regular clock"
+        raise DataError(f"{named(record)}closed-loop instruments need {wanted}: the controller is discrete")
     controller = DiscreteController(record.loop.controller.numerator, record.loop.controller.denominator)
-    order = controller.denominator.size
-    numerator = np.zeros(order)
-    numerator[order - controller.numerator.size :] = controller.numerator
-    return LoopData(
-        plain_array(record.loop.reference),
-        numerator,
-        plain_array(controller.denominator),
-        record.loop.enters == "controller",
-    )
+    numerator = np.pad(controller.numerator, (controller.denominator.size - controller.numerator.size, 0))
+    reference, denominator = plain_array(record.loop.reference), plain_array(controller.denominator)
+    return LoopData(reference, numerator, denominator, record.loop.enters == "controller")
 
 
 class AdditiveProblem:
@@ -120,19 +110,17 @@ class AdditiveProblem:
         """
         if not np.isfinite(theta).all():
             return theta
-        result = theta
+        result = theta.copy()
         offset = 0
         for term in self.terms:
-            n = term.poles
-            rising = theta[offset : offset + n]
-            if n and rising[-1] != 0.0:
-                monic = np.append(rising[::-1], 1.0) / rising[-1]
+            own, n = result[offset : offset + term.size], term.poles
+            if n and own[n - 1] != 0.0:
+                monic = np.append(own[:n][::-1], 1.0) / own[n - 1]
                 if not is_hurwitz(monic):
                     stable = reflect_unstable(monic)
-                    result = result.copy() if result is theta else result
-                    result[offset : offset + n] = stable[-2::-1] / stable[-1]
+                    own[:n] = stable[-2::-1] / stable[-1]
                     if self._changes_sign(monic):
-                        result[offset + n : offset + term.size] *= -1.0
+                        own[n:] *= -1.0
             offset += term.size
         return result
 
@@ -152,7 +140,5 @@ class AdditiveProblem:
     def equations(self, theta: Array) -> Equations:
         """Second moments of the iteration."""
         moments = self.filter.moments(theta) if np.isfinite(theta).all() else None
-        if moments is None:
-            nothing: Equations = inadmissible(theta.size)
-            return nothing
-        return Equations(**vars(moments))
+        found: Equations = inadmissible(theta.size) if moments is None else Equations(**vars(moments))
+        return found

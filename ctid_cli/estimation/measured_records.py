@@ -45,16 +45,13 @@ class MeasuredRecords:
         self.layout = Layout(
             structure, len(records), treatment.initial_state == "estimate", treatment.offset == "estimate"
         )
-        self.offsets: list[float] = []
-        self.input_offsets: list[float] = []
-        self.records: list[Record] = []
         for record in records:
             self._check_input(record)
-            removed = treatment.offset == "remove"
-            centred, u0, y0 = _without_means(record) if removed else (record, 0.0, 0.0)
-            self.records.append(centred)
-            self.input_offsets.append(u0)
-            self.offsets.append(y0)
+        removed = treatment.offset == "remove"
+        centred = [_without_means(record) if removed else (record, 0.0, 0.0) for record in records]
+        self.records = [one for one, _, _ in centred]
+        self.input_offsets = [u0 for _, u0, _ in centred]
+        self.offsets = [y0 for _, _, y0 in centred]
         self.data = [self._lay_out(record) for record in self.records]
         for record, data in zip(self.records, self.data, strict=True):
             self._check(record, data)
@@ -77,15 +74,9 @@ class MeasuredRecords:
         if np.ptp(record.input.values) > 0.0:
             return
         constant = f"{named(record)}the input is constant ({record.input.values[0]:g}) over the whole record"
-        if low < high:
+        if low < high or self.treatment.initial_state != "estimate":
             raise DataError(
-                f"{constant}: it holds no event from which a delay could be read; give a known delay, and an initial "
-                "state to be estimated"
-            )
-        if self.treatment.initial_state != "estimate":
-            raise DataError(
-                f"{constant}; only with an estimated initial state (initial_state 'estimate') can a model be read "
-                "from the free response"
+                f"{constant}: only a free response tells anything; give a known delay and initial_state 'estimate'"
             )
 
     def _check(self, record: Record, data: FilterData) -> None:

@@ -11,21 +11,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, islice
+from typing import NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.common import check_record, named
+from ctid_cli.estimation import pole_relocation
+from ctid_cli.estimation.common import named
 from ctid_cli.estimation.iteration import GUARDED, Steps, iterate, solve_scaled
-from ctid_cli.estimation.pole_relocation import (
-    Lines,
-    find_poles,
-    local_weights,
-    relocate,
-    residual_weights,
-    spectral_lines,
-)
 from ctid_cli.estimation.sampled_problem import at_known_delay, least_squares_start
 from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.filtering.free_response import free_response, free_response_size
@@ -56,8 +50,7 @@ DECISIVE = 2.0
 SPLIT = 1.25
 
 
-@dataclass(frozen=True, eq=False)
-class ModalStart:
+class ModalStart(NamedTuple):
     """Where the estimation of a sum of submodels may start."""
 
     model: AdditiveModel
@@ -80,35 +73,25 @@ def automatic_start(record: Record, terms: Sequence[Term], delay: float = 0.0) -
 
     It fails for modes slower than the record or hidden in the noise, and for two modes that no frequency separates.
     """
-    structure = tuple(terms)
-    if not structure:
-        raise ValueError("terms must list at least one submodel, for example (Term(poles=2, zeros=0),)")
-    # Any distinct poles: a structure that determines no parameters is refused before the search.
-    _with_poles(
-        [[complex(-k - j / 100) for j in range(1, term.poles + 1)] for k, term in enumerate(structure)],
-        structure,
-        delay,
-    )
     data = filter_data(record, delay)
-    check_record(record, data, sum(term.size for term in structure))
-    fitter = _NumeratorFit(data, structure, delay)
-    best: _Fitted | None = None
+    fitter = _NumeratorFit(data, terms, delay)
+    best: tuple[AdditiveModel, _Fitted] | None = None
     method = ""
     sets = list(_pole_sets(record, fitter))
     for way, poles in sets:
-        for groups in islice(_arrangements(poles, structure), MOST_ARRANGEMENTS):
+        for groups in islice(_arrangements(poles, terms), MOST_ARRANGEMENTS):
             fitted = fitter.fit(groups)
-            if fitted is not None and (best is None or fitted.criterion < best.criterion):
+            if fitted is not None and (best is None or fitted[1].criterion < best[1].criterion):
                 best, method = fitted, way
     if best is None:
         raise DataError(
-            f"{named(record)}no start was found: {data.count} samples show no modes of the structure asked for; take "
-            "a longer record, fewer poles, or give the start"
+            f"{named(record)}no start was found: {data.count} samples show no modes of the structure asked for; give "
+            "the start, or take a longer record or fewer poles"
         )
     text = f"{method}; numerators by least squares on the output error; the best of {len(sets)} sets of poles."
-    if best.free:
+    if best[1].free:
         text += " The record does not start at rest: a free response was fitted along with the numerators."
-    return ModalStart(best.model, text)
+    return ModalStart(best[0], text)
 
 
 def _pole_sets(record: Record, fitter: _NumeratorFit) -> Iterator[tuple[str, list[complex]]]:
@@ -120,11 +103,11 @@ def _pole_sets(record: Record, fitter: _NumeratorFit) -> Iterator[tuple[str, lis
     if n == 0:
         yield "No poles to be found", []
         return
-    lines = spectral_lines(record, delay, integrators, any(term.zeros == term.order for term in terms))
+    lines = pole_relocation.spectral_lines(record, delay, integrators, any(term.zeros == term.order for term in terms))
     # Real and imaginary part of each line for numerators, transients and poles.
     if lines is not None and 2 * lines.frequencies.size > 3 * n + 2 * integrators + 1:
         yield "Poles from the spectra of the record, mode by mode", _spectral_poles(lines, pairs, reals)
-        weights = local_weights(lines)
+        weights = pole_relocation.local_weights(lines)
         if weights.max() > NEARLY_WHITE * weights.min():
             poles = _spectral_poles(lines.weighted(weights), pairs, reals)
             yield "Poles from the spectra of the record, mode by mode, weighted by local noise levels", poles
@@ -135,10 +118,11 @@ def _pole_sets(record: Record, fitter: _NumeratorFit) -> Iterator[tuple[str, lis
             yield f"Poles from a transfer function of order {order}", fitter.reduced(found, n)
 
 
-def _spectral_poles(lines: Lines, pairs: int, reals: int) -> list[complex]:
+def _spectral_poles(lines: pole_relocation.Lines, pairs: int, reals: int) -> list[complex]:
     """Poles found with the weights of the lines, then moved with those that their residual asks for."""
-    poles = find_poles(lines, pairs, reals)
-    return relocate(lines.weighted(residual_weights(lines, poles)), poles, WEIGHTED_MOVES)
+    poles = pole_relocation.find_poles(lines, pairs, reals)
+    weighted = lines.weighted(pole_relocation.residual_weights(lines, poles))
+    return pole_relocation.relocate(weighted, poles, WEIGHTED_MOVES)
 
 
 # --- poles of one transfer function ----------------------------------------------------------------
@@ -183,14 +167,8 @@ def _arrangements(poles: Sequence[complex], terms: Sequence[Term]) -> Iterator[l
     Complex pairs beyond the room of the terms become real poles, and real poles that are left over fill pairs as
     neighbours. Groups go to the terms by rising frequency, in every order of the different structures.
     """
-    pairs = sorted((pole for pole in poles if pole.imag), key=abs)
-    reals = sorted((pole for pole in poles if not pole.imag), key=abs)
-    single = sum(term.poles % 2 for term in terms)
-    room = sum(term.poles // 2 for term in terms)
-    while len(pairs) > room:
-        # The best damped pair is nearest to two real poles.
-        pole = pairs.pop(int(np.argmax([-pole.real / abs(pole) for pole in pairs])))
-        reals = sorted([*reals, complex(-abs(pole) / SPLIT), complex(-abs(pole) * SPLIT)], key=abs)
+    single, room = sum(term.poles % 2 for term in terms), sum(term.poles // 2 for term in terms)
+    pairs, reals = _with_room(poles, room)
     if len(reals) < single or len(reals) != single + 2 * (room - len(pairs)):
         return
     tried: list[list[list[complex]]] = []
@@ -198,100 +176,91 @@ def _arrangements(poles: Sequence[complex], terms: Sequence[Term]) -> Iterator[l
         rest = [pole for k, pole in enumerate(reals) if k not in alone]
         doubles = [[pole] for pole in pairs] + [rest[k : k + 2] for k in range(0, len(rest), 2)]
         doubles.sort(key=lambda group: abs(group[0]))
-        for order in _distinct_orders(terms):
+        for order in _distinct_orders(terms, range(len(terms))):
             two, one = iter(doubles), iter([reals[k] for k in alone])
             groups: list[list[complex]] = [[] for _ in terms]
             for k in order:
-                for _ in range(terms[k].poles // 2):
-                    groups[k] += next(two)
-                if terms[k].poles % 2:
-                    groups[k].append(next(one))
+                groups[k] = [pole for pair in islice(two, terms[k].poles // 2) for pole in pair]
+                groups[k] += islice(one, terms[k].poles % 2)
             # Exchanging a term of one pole with one of two changes nothing.
             if groups not in tried:
                 tried.append(groups)
                 yield groups
 
 
-def _distinct_orders(terms: Sequence[Term]) -> Iterator[list[int]]:
-    """Orders of the terms that differ in structure; equal terms keep theirs."""
-    if not terms:
+def _with_room(poles: Sequence[complex], room: int) -> tuple[list[complex], list[complex]]:
+    """Complex poles, no more than there is room for, and real ones; both by rising magnitude."""
+    pairs = sorted((pole for pole in poles if pole.imag), key=abs)
+    reals = [pole for pole in poles if not pole.imag]
+    while len(pairs) > room:
+        # The best damped pair is nearest to two real poles.
+        pole = pairs.pop(int(np.argmax([-pole.real / abs(pole) for pole in pairs])))
+        reals += [complex(-abs(pole) / SPLIT), complex(-abs(pole) * SPLIT)]
+    return pairs, sorted(reals, key=abs)
+
+
+def _distinct_orders(terms: Sequence[Term], left: Sequence[int]) -> Iterator[list[int]]:
+    """Orders of those of the terms that are left which differ in structure; equal terms keep theirs."""
+    if not left:
         yield []
-        return
-
-    def extended(left: list[int]) -> Iterator[list[int]]:
-        if not left:
-            yield []
-        used: set[Term] = set()
-        for k in left:
-            if terms[k] not in used:
-                used.add(terms[k])
-                for rest in extended([j for j in left if j != k]):
-                    yield [k, *rest]
-
-    yield from extended(list(range(len(terms))))
+    for k in sorted({terms[j]: j for j in reversed(left)}.values()):
+        for rest in _distinct_orders(terms, [j for j in left if j != k]):
+            yield [k, *rest]
 
 
 # --- numerators ------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Fitted:
-    """A model with fitted numerators, what it is judged by, and whether a free response was fitted too."""
+class _Fitted(NamedTuple):
+    """Fitted numerators, what they are judged by, and whether a free response was fitted too."""
 
-    model: AdditiveModel
+    gains: Array
     criterion: float
+    squared_error: float
     free: bool
 
 
 class _NumeratorFit:
     """Numerators for given poles, by linear least squares on the output error."""
 
-    def __init__(self, data: FilterData, terms: tuple[Term, ...], delay: float) -> None:
-        self.data, self.terms, self.delay = data, terms, delay
+    def __init__(self, data: FilterData, terms: Sequence[Term], delay: float) -> None:
+        self.data, self.terms, self.delay = data, tuple(terms), delay
 
-    def fit(self, groups: Sequence[Sequence[complex]]) -> _Fitted | None:
+    def fit(self, groups: Sequence[Sequence[complex]]) -> tuple[AdditiveModel, _Fitted] | None:
         """Fit with given poles of each term; None where they give no valid model or no finite response."""
-        try:
-            model = _with_poles(groups, self.terms, self.delay)
-        except DataError:
-            return None
-        responses = _responses(self.data, model)
+        responses = _responses(self.data, groups, self.terms, self.delay)
         found = None if responses is None else responses.fit(self.data.y_used)
-        if found is None:
+        if responses is None or found is None:
             return None
-        theta = model.theta
+        theta = responses.theta
         theta[_numerator_places(self.terms)] = found.gains
-        return _Fitted(AdditiveModel.from_theta(theta, self.terms, self.delay), found.criterion, found.free)
+        return AdditiveModel.from_theta(theta, self.terms, self.delay), found
 
     def reduced(self, poles: Sequence[complex], count: int) -> list[complex]:
         """The poles without which the output error would rise most, in all ``count``, conjugates counted."""
         kept = list(poles)
-        terms = [Term(2, 1) if pole.imag else Term(1, 0) for pole in kept]
         integrators = sum(term.integrators for term in self.terms)
-        if integrators:
-            terms.append(Term(0, integrators - 1, integrators))
+        others = [Term(0, integrators - 1, integrators)] if integrators else []
         if any(term.zeros == term.order for term in self.terms):
-            terms.append(Term(0, 0))
-        groups = [[pole] for pole in kept] + [[] for _ in terms[len(kept) :]]
-        try:
-            responses = _responses(self.data, _with_poles(groups, terms, self.delay))
-        except DataError:
-            responses = None
+            others.append(Term(0, 0))
+        terms = [Term(2, 1) if pole.imag else Term(1, 0) for pole in kept] + others
+        groups = [[pole] for pole in kept] + [[] for _ in others]
+        responses = _responses(self.data, groups, terms, self.delay)
         places = list(range(len(kept)))
 
         def squared_error(left_out: int) -> float:
-            used = [k for k in range(len(terms)) if k >= len(kept) or (k in places and k != left_out)]
+            used = [*range(len(kept), len(terms)), *(k for k in places if k != left_out)]
             found = None if responses is None else responses.of(used).fit(self.data.y_used)
             return np.inf if found is None else found.squared_error
 
         while (size := _size([kept[k] for k in places])) > count:
             possible = [k for k in places if size - _size([kept[k]]) >= count]
-            if not possible:
+            if possible:
+                places.remove(min(possible, key=squared_error))
+            else:
                 # One pole too many and only pairs: the best damped one makes room for a real pole.
                 k = max(places, key=lambda k: -kept[k].real / abs(kept[k]))
                 kept[k] = complex(-abs(kept[k]))
-                continue
-            places.remove(min(possible, key=squared_error))
         return [kept[k] for k in places]
 
 
@@ -299,6 +268,8 @@ class _NumeratorFit:
 class _Responses:
     """What each numerator coefficient and each initial condition contributes to the output, and whose they are."""
 
+    #: Of the model whose responses they are.
+    theta: Array
     forced: Array
     free: Array
     forced_owner: IndexArray
@@ -307,11 +278,12 @@ class _Responses:
     def of(self, owners: Sequence[int]) -> _Responses:
         """Those of some submodels."""
         forced, free = np.isin(self.forced_owner, owners), np.isin(self.free_owner, owners)
-        return _Responses(self.forced[:, forced], self.free[:, free], self.forced_owner[forced], self.free_owner[free])
+        own = self.forced[:, forced], self.free[:, free], self.forced_owner[forced], self.free_owner[free]
+        return _Responses(self.theta, *own)
 
-    def fit(self, y: Array) -> _Gains | None:
+    def fit(self, y: Array) -> _Fitted | None:
         """Numerators, with free responses where they are worth their parameters; None if all is singular."""
-        best: _Gains | None = None
+        best: _Fitted | None = None
         for free, columns in ((False, self.forced), (True, np.hstack((self.forced, self.free)))):
             gram = columns.T @ columns
             scales = np.diag(gram).copy()
@@ -321,32 +293,28 @@ class _Responses:
             error = y - columns @ solution
             criterion = _criterion(error) + DECISIVE * free * self.free.shape[1] * np.log(y.size)
             if best is None or criterion < best.criterion:
-                best = _Gains(solution[: self.forced.shape[1]], criterion, float(error @ error), free)
+                best = _Fitted(solution[: self.forced.shape[1]], criterion, float(error @ error), free)
         return best
 
 
-@dataclass(frozen=True, eq=False)
-class _Gains:
-    """Numerators in the order of the terms, what they leave, and whether free responses were fitted too."""
-
-    gains: Array
-    criterion: float
-    squared_error: float
-    free: bool
-
-
-def _responses(data: FilterData, model: AdditiveModel) -> _Responses | None:
-    """Responses of a model's submodels; None where one is not finite."""
-    terms = model.terms
-    rows = SubmodelFilter(data, terms, model.delay).rows(model.theta)
+def _responses(
+    data: FilterData, groups: Sequence[Sequence[complex]], terms: Sequence[Term], delay: float
+) -> _Responses | None:
+    """Responses of submodels with given poles; None where they give no valid model or one is not finite."""
+    try:
+        theta = _with_poles(groups, terms, delay).theta
+    except DataError:
+        return None
+    rows = SubmodelFilter(data, terms, delay).rows(theta)
     if rows is None or not np.isfinite(rows[0]).all():
         return None
     # Before the delayed input begins, which is where used samples do, nothing is known of the state.
     elapsed = np.maximum(data.t - data.t[data.use][0], 0.0)
-    response = free_response(model.theta, np.zeros(free_response_size(terms)), terms, elapsed)
+    response = free_response(theta, np.zeros(free_response_size(terms)), terms, elapsed)
     if response is None:
         return None
     return _Responses(
+        theta,
         rows[0][:, _numerator_places(terms)],
         response[2][data.use],
         np.repeat(np.arange(len(terms)), [term.zeros + 1 for term in terms]),
@@ -380,6 +348,3 @@ def _criterion(error: Array) -> float:
     means = np.add.reduceat(power, edges) / counts
     floor = np.finfo(float).tiny
     return float(2.0 * counts @ np.log(np.maximum(means, floor)))
-
-
-__all__ = ["ModalStart", "automatic_start"]

@@ -93,14 +93,8 @@ class Lines:
 
     def lowest(self, count: int) -> Lines:
         """The lines of the lowest frequencies."""
-        return Lines(
-            self.frequencies[:count],
-            self.inputs[:count],
-            self.outputs[:count],
-            self.weights[:count],
-            self.direct[:count],
-            self.integrators,
-        )
+        spectra = ("frequencies", "inputs", "outputs", "weights", "direct")
+        return replace(self, **{name: getattr(self, name)[:count] for name in spectra})
 
 
 def spectral_lines(record: Record, delay: float, integrators: int = 0, direct: bool = False) -> Lines | None:
@@ -178,16 +172,12 @@ def relocate(lines: Lines, poles: Sequence[complex], moves: int) -> list[complex
         error = float(residual @ residual)
         if error < least:
             best, least = current, error
-        if move == moves:
-            break
-        moved = _moved(lines, current, residual, known)
+        moved = _moved(lines, current, residual, known) if move < moves else None
         if moved is None:
             break
-        settled = len(moved) == len(current) and all(
-            abs(new - old) <= SETTLED * abs(old) for new, old in zip(moved, current, strict=True)
-        )
-        current = moved
-        if settled:
+        settled = [abs(new - old) <= SETTLED * abs(old) for new, old in zip(moved, current, strict=False)]
+        current, before = moved, len(current)
+        if all(settled) and len(moved) == before:
             break
     return sorted(best, key=abs)
 

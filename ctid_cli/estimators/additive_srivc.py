@@ -159,25 +159,17 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         check_terms(self.terms)
         check_closed_loop(self.instruments, self.variant)
         if self.initial_state == "periodic":
-            if self.instruments == "closed_loop":
-                raise OptionError(
-                    "initial_state", "initial_state periodic is for open-loop instruments; use rest or estimated"
-                )
-            if any(term.integrators for term in self.terms):
-                raise OptionError(
-                    "initial_state",
-                    "initial_state periodic needs terms without integrators: their output has no steady state",
-                )
+            text = "initial_state periodic needs open-loop instruments, and terms without integrators"
+            if self.instruments == "closed_loop" or any(term.integrators for term in self.terms):
+                raise OptionError("initial_state", f"{text}; use rest or estimated")
 
     def _lay_out(self, record: Record) -> Submodels:
         loop = loop_data(record, self.instruments)
         # A record of one period has an input before its first sample: the same one.
         data = filter_data(record, 0.0 if self.initial_state == "periodic" else self.delay, self.hold_output)
         if self.initial_state == "periodic" and (data.interval == 0.0 or not record.valid.all()):
-            raise DataError(
-                f"{named(record)}one period of a steady state must be sampled on one regular clock without missing "
-                "samples; use initial_state 'estimated'"
-            )
+            wanted = "one period of a steady state needs one regular clock without missing samples"
+            raise DataError(f"{named(record)}{wanted}; use initial_state 'estimated'")
         problem = AdditiveProblem(data, self.terms, self.delay, loop, self.initial_state)
         check_record(record, data, problem.free)
         return Submodels(record, problem)
@@ -186,25 +178,20 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         if start is not None and start.model is not None:
             model, method = start.model, "The start was given."
             if model.terms != self.terms:
-                given, wanted = _terms_text(model.terms), _terms_text(self.terms)
-                raise DataError(f"the start has the submodels {given} and the estimator {wanted}")
+                raise DataError(f"the start has the submodels {model.terms} and the estimator {self.terms}")
         else:
-            model, method = laid_out.start.model, laid_out.start.method
-        estimate = estimate_submodels(
-            laid_out.problem,
-            model.theta,
-            Steps(self.max_iterations, self.tolerance, RULES[self.variant]),
-            self.covariance,
-        )
+            model, method = laid_out.start
+        steps = Steps(self.max_iterations, self.tolerance, RULES[self.variant])
+        estimate = estimate_submodels(laid_out.problem, model.theta, steps, self.covariance)
         return _fit(laid_out.problem, estimate, model, method)
 
 
+@dataclass(frozen=True, eq=False)
 class Submodels:
     """A record laid out for a sum of submodels, and the start that it suggests."""
 
-    def __init__(self, record: Record, problem: AdditiveProblem) -> None:
-        self.record = record
-        self.problem = problem
+    record: Record
+    problem: AdditiveProblem
 
     @cached_property
     def start(self) -> ModalStart:
@@ -215,16 +202,12 @@ class Submodels:
 def check_terms(terms: tuple[Term, ...]) -> None:
     """Check that a sum of terms determines its parameters."""
     if sum(term.integrators > 0 for term in terms) > 1:
-        raise OptionError("terms", "terms may have integrators in one submodel only: several could not be told apart")
+        raise OptionError("terms", "terms may have integrators in one submodel only: others could not be told apart")
     if sum(term.zeros == term.order for term in terms) > 1:
-        raise OptionError(
-            "terms",
-            "terms may have as many zeros as poles in one submodel only: several constants could not be told apart",
-        )
-    if sum(term.order for term in terms) > 40:
-        raise OptionError(
-            "terms", f"terms have {sum(term.order for term in terms)} poles together; at most 40 are supported"
-        )
+        raise OptionError("terms", "terms may have as many zeros as poles in one submodel only")
+    order = sum(term.order for term in terms)
+    if order > 40:
+        raise OptionError("terms", f"terms have {order} poles together; at most 40 are supported")
 
 
 def _fit(problem: AdditiveProblem, estimate: SubmodelEstimate, start: AdditiveModel, method: str) -> AdditiveFit:
@@ -244,12 +227,4 @@ def _fit(problem: AdditiveProblem, estimate: SubmodelEstimate, start: AdditiveMo
         start_method=method,
         loop_radius=estimate.loop_radius,
         **{**estimate.values, "covariance": estimate.values["covariance"][np.ix_(order, order)]},
-    )
-
-
-def _terms_text(terms: tuple[Term, ...]) -> str:
-    return ", ".join(
-        f"{{poles: {term.poles}, zeros: {term.zeros}"
-        + (f", integrators: {term.integrators}}}" if term.integrators else "}")
-        for term in terms
     )

@@ -149,9 +149,8 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
         allowed = self.poles if low == high else self.poles - 1
         if self.zeros > allowed:
             reason = "" if low == high else " while the delay is estimated"
-            raise OptionError(
-                "zeros", f"zeros must be at most {allowed}{reason}: got {self.zeros} zeros and {self.poles} poles"
-            )
+            given = f"got {self.zeros} zeros and {self.poles} poles"
+            raise OptionError("zeros", f"zeros must be at most {allowed}{reason}: {given}")
 
     def _lay_out(self, records: Record | Sequence[Record]) -> Refinement:
         low, high = self.delay_bounds

@@ -135,9 +135,10 @@ class Srivc(Estimator[SampledProblem | AdditiveProblem, Fit]):
             theta = least_squares_start(problem.data, structure, self.delay, self.svf_cutoff, refit)
         if theta is None:
             raise DataError(Status.SINGULAR.value)
+        steps = Steps(self.max_iterations, self.tolerance, RULES[self.step_rule])
         if isinstance(problem, AdditiveProblem):
-            return self._as_submodel(problem, theta, structure)
-        result = iterate(problem, theta, Steps(self.max_iterations, self.tolerance, RULES[self.step_rule]))
+            return self._as_submodel(problem, theta, structure, steps)
+        result = iterate(problem, theta, steps)
         if result is None:
             return finish(problem, theta, Status.DIVERGED, 0, [])
         history = history_of("refine", problem, result)
@@ -149,35 +150,25 @@ class Srivc(Estimator[SampledProblem | AdditiveProblem, Fit]):
         regular = problem.data.interval > 0.0
         return replace(fit, covariance=sandwich_covariance([psi], [rows[:, structure.error_row]], regular=regular))
 
-    def _as_submodel(self, problem: AdditiveProblem, theta: Array, structure: Structure) -> Fit:
+    def _as_submodel(self, problem: AdditiveProblem, theta: Array, structure: Structure, steps: Steps) -> Fit:
         """Estimate a sum of one submodel; coefficients and covariance are converted to the monic form."""
         single = Submodel(theta[self.poles : -1], np.concatenate(([1.0], theta[: self.poles])))
-        estimate = estimate_submodels(
-            problem,
-            AdditiveModel([single]).theta,
-            Steps(self.max_iterations, self.tolerance, RULES[self.step_rule]),
-            self.covariance,
-        )
+        estimate = estimate_submodels(problem, AdditiveModel([single]).theta, steps, self.covariance)
         additive = problem.model(estimate.theta)
         jacobian = unfactored_jacobian(additive)
         # The numerator has all its powers there, and the highest of them are zero.
         kept = [*range(self.poles), *range(jacobian.shape[0] - self.zeros - 1, jacobian.shape[0])]
         covariance = jacobian[kept] @ estimate.values["covariance"] @ jacobian[kept].T
-        return Fit(
-            model=unfactored(additive),
-            parameter_names=structure.names,
-            **{**estimate.values, "covariance": covariance},
-        )
+        values = {**estimate.values, "covariance": covariance}
+        return Fit(model=unfactored(additive), parameter_names=structure.names, **values)
 
 
 def given_coefficients(model: AdditiveModel, structure: Structure, delay: float) -> Array:
     """Initial parameters from a sum of submodels."""
     whole = unfactored(model)
     if whole.order != structure.poles or whole.numerator.size > structure.zeros + 1:
-        raise DataError(
-            f"the start has {whole.order} poles and {whole.numerator.size - 1} zeros, and the estimator "
-            f"{structure.poles} and {structure.zeros}"
-        )
+        given = f"{whole.order} poles and {whole.numerator.size - 1} zeros"
+        raise DataError(f"the start has {given}, and the estimator {structure.poles} and {structure.zeros}")
     padded = np.concatenate((np.zeros(structure.zeros + 1 - whole.numerator.size), whole.numerator))
     stable: Array = with_stable_denominator(np.concatenate((whole.denominator[1:], padded, [delay])), structure.poles)
     return stable

@@ -175,10 +175,10 @@ class UsefulRedundancy(Estimator["RedundantSearch", RedundantFit]):
         )
         usable = [cost for cost in costs if cost is not None]
         if len(usable) < len(costs):
+            many = f"{len(costs) - len(usable)} of {len(costs)} filters, whose periods reach {filters.periods[0]:.3g} s"
             raise DataError(
                 f"{named(record)}after the greatest delay, {self.delay_bounds[1]:g} s, the record is too short for "
-                f"{len(costs) - len(usable)} of {len(costs)} filters, whose periods reach {filters.periods[0]:.3g} s; "
-                "take a smaller beta, a larger bandwidth, a smaller greatest delay or a longer record"
+                f"{many}; take a smaller beta or greatest delay, a larger bandwidth or a longer record"
             )
         limits = Limits(self.delay_bounds, self.max_iterations, self.tolerance, self.max_rounds)
         return RedundantSearch(FilterSearch(usable, filters, limits), unfiltered)
