@@ -14,15 +14,10 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
 from ctid_cli.estimators import identification_warnings as warnings
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.conditioning import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR
 from ctid_cli.inference.covariance import condition_number
-from ctid_cli.inference.criteria import (
-    InformationCriteria,
-    information_criteria,
-    r_t_squared,
-    young_information_criterion,
-)
-from ctid_cli.inference.delay_interval import DelayInterval, profile_likelihood_interval, quadratic_is_doubtful
+from ctid_cli.inference.delay_interval import CostOfDelay, DelayInterval
 from ctid_cli.inference.derived import derived_parameters
 from ctid_cli.inference.diagnostics import fit_percent, r_squared
 from ctid_cli.inference.residuals import ResidualTests, residual_tests
@@ -95,7 +90,7 @@ class Identification:
     delay_interval: DelayInterval | None
     derived: tuple[UncertainValue, ...]
     tests: tuple[ResidualTests, ...]
-    criteria: InformationCriteria
+    criteria: criteria_of.InformationCriteria
     yic: float
     r_t_squared: float
     warnings: tuple[str, ...]
@@ -134,7 +129,13 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
     Standard errors are those for white residuals if no experiment's residuals fail the test of whiteness, and the
     sandwich's otherwise. The delay has a profile-likelihood interval where the quadratic one is doubtful.
     """
-    checked = None if validation is None else _prepared_validation(options, validation)
+    checked = None
+    if validation is not None:
+        # Before the fit takes its time.
+        try:
+            checked = options.prepare(validation).laid_out
+        except DataError as error:
+            raise DataError(f"validation record: {error}") from None
     prepared = options.prepare(records)
     fit, refinement = prepared.fit(), prepared.laid_out
     residuals = np.concatenate(fit.residuals)
@@ -150,7 +151,7 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
         interval = _delay_interval(refinement, fit, covariance)
     judged = None if checked is None or validation is None else _validate(checked, fit, validation)
     size = refinement.structure.size - int(refinement.structure.delay)
-    coefficients = covariance[:size, :size]
+    coefficients = np.full((size, size), np.nan) if singular else covariance[:size, :size]
     return Identification(
         options=options,
         fit=fit,
@@ -158,13 +159,11 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
         robust=robust,
         estimates=_estimates(fit, covariance, unclear, interval),
         delay_interval=interval,
-        derived=derived_parameters(
-            fit.model, np.full_like(coefficients, np.nan) if singular else coefficients, level=LEVEL
-        ),
+        derived=derived_parameters(fit.model, coefficients, level=LEVEL),
         tests=tests,
-        criteria=information_criteria(float(residuals @ residuals), fit.count, fit.theta.size),
-        yic=young_information_criterion(residuals, output, fit.theta[free], covariance[np.ix_(free, free)]),
-        r_t_squared=r_t_squared(residuals, output),
+        criteria=criteria_of.information_criteria(float(residuals @ residuals), fit.count, fit.theta.size),
+        yic=criteria_of.young_information_criterion(residuals, output, fit.theta[free], covariance[np.ix_(free, free)]),
+        r_t_squared=criteria_of.r_t_squared(residuals, output),
         warnings=(
             *warnings.of_status(fit),
             *warnings.of_conditioning(fit, covariance, free, hessian),
@@ -241,17 +240,19 @@ def _delay_interval(refinement: Refinement, fit: MeasuredFit, covariance: Array)
     """Profile-likelihood interval of a free delay, None where estimate plus or minus two errors is as good."""
     place = refinement.structure.size - 1
     variance, white = float(covariance[place, place]), float(fit.covariance[place, place])
+    error = float(np.sqrt(variance))
     if fit.status is Status.DELAY_AT_BOUND:
-        variance = white = 1.0  # no standard error to inflate by
-    squared_error = fit.cost * fit.count
-    delay = float(fit.theta[place])
-    inflation = max(variance / white, np.finfo(float).tiny)
-    squared_error_at = cache(lambda trial: refinement.squared_error_at(fit.theta, trial))
-    common = (squared_error, fit.count, fit.theta.size, refinement.measured.treatment.delay_bounds)
-    error = float("nan") if fit.status is Status.DELAY_AT_BOUND else float(np.sqrt(variance))
-    if not quadratic_is_doubtful(squared_error_at, delay, error, *common, inflation=inflation):
-        return None
-    return profile_likelihood_interval(squared_error_at, delay, *common, level=LEVEL, inflation=inflation)
+        variance, white, error = 1.0, 1.0, float("nan")  # no standard error to inflate by
+    profile = CostOfDelay(
+        cache(lambda trial: refinement.squared_error_at(fit.theta, trial)),
+        float(fit.theta[place]),
+        fit.cost * fit.count,
+        fit.count,
+        fit.theta.size,
+        refinement.measured.treatment.delay_bounds,
+        max(variance / white, np.finfo(float).tiny),
+    )
+    return profile.interval(LEVEL) if profile.quadratic_is_doubtful(error) else None
 
 
 # --- results ---------------------------------------------------------------------------------------
@@ -295,14 +296,6 @@ def _estimates(
     return tuple(
         sorted(found.values(), key=lambda item: order.get("delay" if item.name == "delay" else item.name[0], 3))
     )
-
-
-def _prepared_validation(options: DelayProfile, record: Record) -> Refinement:
-    """Check the validation record before the fit takes its time."""
-    try:
-        return options.prepare(record).laid_out
-    except DataError as error:
-        raise DataError(f"validation record: {error}") from None
 
 
 def _validate(refinement: Refinement, fit: MeasuredFit, record: Record) -> Validation:

@@ -26,13 +26,11 @@ def of_conditioning(fit: MeasuredFit, covariance: Array, free: IndexArray, hessi
     """What the data do not determine; a delay at its bound is taken as known."""
     words = []
     if fit.status is Status.DELAY_AT_BOUND:
-        words.append(
-            "The delay has no standard error, because it stopped at a bound; those of the other parameters take it "
-            "as known and are too small if it is not."
-        )
+        reason = "because it stopped at a bound; the other standard errors take it as known"
+        words.append(f"The delay has no standard error, {reason} and are too small if it is not.")
     names = [fit.parameter_names[k] for k in free]
     block = covariance[np.ix_(free, free)]
-    return [*words, *describe_conditioning(block, fit.theta[free], names, condition_number(hessian), hessian=hessian)]
+    return [*words, *describe_conditioning(block, fit.theta[free], names, condition_number(hessian), hessian)]
 
 
 def of_interval(interval: DelayInterval | None, options: DelayProfile) -> list[str]:
@@ -44,10 +42,8 @@ def of_interval(interval: DelayInterval | None, options: DelayProfile) -> list[s
     ends = [f"{low:g}"] * (interval.open_low and low > 0) + [f"{high:g}"] * interval.open_high
     if not ends:
         return []
-    return [
-        f"The interval of the delay reaches the end of its search range ({' and '.join(ends)}): delays beyond may fit "
-        "as well; widen --delay."
-    ]
+    reached = f"the end of its search range ({' and '.join(ends)})"
+    return [f"The interval of the delay reaches {reached}: delays beyond may fit as well; widen --delay."]
 
 
 def of_residuals(tests: Sequence[ResidualTests], experiments: int, fewest: int) -> list[str]:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.text import listed
@@ -20,13 +19,8 @@ NEARLY_SINGULAR = 1e8
 
 
 def describe_conditioning(
-    covariance: ArrayLike,
-    estimates: ArrayLike,
-    names: Sequence[str],
-    condition_number: float,
-    *,
-    hessian: ArrayLike | None = None,
-) -> tuple[str, ...]:
+    covariance: Array, estimates: Array, names: Sequence[str], condition_number: float, hessian: Array
+) -> list[str]:
     """Sentences on parameters that the data do not determine, none if all is well.
 
     Three rules. A standard error is not defined, or the condition number exceeds 1e8: the parameters with more than a
@@ -34,76 +28,65 @@ def describe_conditioning(
     coefficient or of the delay; initial states and offsets may well be zero and are not looked at. Two estimates have
     a correlation beyond 0.999, or one has such a multiple correlation with several others.
     """
-    C = np.asarray(covariance, dtype=float)
-    theta = np.asarray(estimates, dtype=float)
-    size = theta.size
+    variances = np.diag(covariance)
+    defined = bool(np.isfinite(covariance).all() and (variances > 0).all())
     sentences: list[str] = []
-    variances = np.diag(C)
-    defined = bool(np.isfinite(C).all() and (variances > 0).all())
-
-    if not defined or not condition_number <= NEARLY_SINGULAR:
-        group = _singular_direction(C, hessian, defined)
-        what = listed([names[i] for i in group]) if 0 < len(group) < size else "all the parameters together"
+    singular = not condition_number <= NEARLY_SINGULAR
+    if singular or not defined:
+        group = [names[i] for i in _singular_direction(hessian)]
+        what = listed(group) if 0 < len(group) < len(names) else "all the parameters together"
         number = f"condition number {condition_number:.1e}" if np.isfinite(condition_number) else "singular equations"
+        start = f"These data do not determine {what} one by one ({number})"
         if len(group) == 1:
             start = f"{what} has no effect that these data show ({number})"
-        else:
-            start = f"These data do not determine {what} one by one ({number})"
         end = "their standard errors are not reliable" if defined else "no standard errors can be given"
-        sentences.append(f"{start}; {end}. {_advice([names[i] for i in group], names)}")
-    if not defined:
-        return tuple(sentences)
+        sentences.append(f"{start}; {end}. {_advice(group, names)}")
+    if defined:
+        errors = np.sqrt(variances)
+        sentences += _large_errors(estimates, errors, names)
+        # Of singular equations the correlations would say the same again.
+        sentences += [] if singular else _correlated(covariance / np.outer(errors, errors), names)
+    return sentences
 
-    errors = np.sqrt(variances)
-    for i in range(size):
-        if re.fullmatch(r"[ab]\d+|delay", names[i]) and errors[i] > LARGE_STANDARD_ERROR * abs(theta[i]):
-            times = f"{errors[i] / abs(theta[i]):.2g} times its value" if theta[i] else "its value being zero"
-            sentences.append(
-                f"{names[i]} = {theta[i]:.3g} has a standard error of {errors[i]:.3g}, {times}: "
-                "these data do not determine it, not even its sign; a simpler model may do."
+
+def _large_errors(theta: Array, errors: Array, names: Sequence[str]) -> Iterator[str]:
+    for name, value, error in zip(names, theta, errors, strict=True):
+        if re.fullmatch(r"[ab]\d+|delay", name) and error > LARGE_STANDARD_ERROR * abs(value):
+            times = f"{error / abs(value):.2g} times its value" if value else "its value being zero"
+            yield (
+                f"{name} = {value:.3g} has a standard error of {error:.3g}, {times}: these data do not determine it, "
+                "not even its sign; a simpler model may do."
             )
-    if not condition_number <= NEARLY_SINGULAR:
-        return tuple(sentences)  # the correlations would say the same again
 
-    correlation = C / np.outer(errors, errors)
-    pairs = [(i, j) for i in range(size) for j in range(i) if abs(correlation[i, j]) > CLOSE_TO_ONE]
-    for i, j in pairs:
-        both = [names[j], names[i]]
-        sentences.append(
-            f"{both[0]} and {both[1]} can hardly be told apart by these data (correlation {correlation[i, j]:.5f}): "
-            f"only a combination of them is well determined. {_advice(both, names)}"
-        )
+
+def _correlated(correlation: Array, names: Sequence[str]) -> Iterator[str]:
+    def told(group: Sequence[int], how: str, combinations: str) -> str:
+        several = [names[i] for i in group]
+        start = f"{listed(several)} can hardly be told apart by these data ({how}): only"
+        return f"{start} {combinations} well determined. {_advice(several, names)}"
+
+    size = len(names)
+    pairs = [(j, i) for i in range(size) for j in range(i) if abs(correlation[i, j]) > CLOSE_TO_ONE]
+    for pair in pairs:
+        yield told(pair, f"correlation {correlation[pair]:.5f}", "a combination of them is")
     with np.errstate(invalid="ignore", divide="ignore"):
         multiple = np.sqrt(1.0 - 1.0 / np.diag(np.linalg.inv(correlation)))
     paired = {index for pair in pairs for index in pair}
     group = [i for i in range(size) if multiple[i] > CLOSE_TO_ONE and i not in paired]
     if len(group) > 1:
-        several = [names[i] for i in group]
-        sentences.append(
-            f"{listed(several)} can hardly be told apart by these data (multiple correlations above {CLOSE_TO_ONE}): "
-            f"only combinations of them are well determined. {_advice(several, names)}"
-        )
-    return tuple(sentences)
+        yield told(group, f"multiple correlations above {CLOSE_TO_ONE}", "combinations of them are")
 
 
-def _singular_direction(C: Array, hessian: ArrayLike | None, defined: bool) -> list[int]:
+def _singular_direction(hessian: Array) -> list[int]:
     """Parameters with more than a tenth of the direction that changes the output least; none if unknown."""
-    if hessian is not None:
-        H = np.asarray(hessian, dtype=float)
-        diagonal = np.diag(H)
-        if not np.isfinite(H).all():
-            return []
-        silent = np.flatnonzero(diagonal <= 0)
-        if silent.size:
-            return [int(i) for i in silent]
-        scale = 1.0 / np.sqrt(diagonal)
-        direction = np.linalg.eigh(H * np.outer(scale, scale))[1][:, 0]
-    elif defined:
-        scale = 1.0 / np.sqrt(np.diag(C))
-        direction = np.linalg.eigh(C * np.outer(scale, scale))[1][:, -1]
-    else:
+    diagonal = np.diag(hessian)
+    if not np.isfinite(hessian).all():
         return []
-    return [int(i) for i in np.flatnonzero(np.abs(direction) > 0.1)]
+    if (diagonal <= 0).any():
+        return np.flatnonzero(diagonal <= 0).tolist()
+    scale = 1.0 / np.sqrt(diagonal)
+    direction = np.linalg.eigh(hessian * np.outer(scale, scale))[1][:, 0]
+    return np.flatnonzero(np.abs(direction) > 0.1).tolist()
 
 
 def _advice(group: Sequence[str], names: Sequence[str]) -> str:

@@ -24,48 +24,68 @@ class DelayInterval:
     open_high: bool
 
 
-def profile_likelihood_interval(
-    squared_error_at: Callable[[float], float],
-    estimate: float,
-    squared_error: float,
-    count: int,
-    parameters: int,
-    bounds: tuple[float, float],
-    level: float = 0.95,
-    *,
-    inflation: float = 1.0,
-) -> DelayInterval:
-    r"""Interval of delays around the estimate whose best fits are not significantly worse.
+@dataclass(frozen=True)
+class CostOfDelay:
+    r"""The least squared error as a function of the delay, about an estimate."""
 
-    The delays with
+    squared_error_at: Callable[[float], float]
+    #: The delay of least squared error [s], and that [output unit^2].
+    estimate: float
+    squared_error: float
+    count: int
+    parameters: int
+    bounds: tuple[float, float]
+    #: By what factor coloured noise raises the variance of the delay [-].
+    inflation: float = 1.0
 
-    .. math:: S(\tau) \le S_{\min} \Big(1 + c \, \frac{F_{1, N - p}(level)}{N - p}\Big),
+    def interval(self, level: float = 0.95) -> DelayInterval:
+        r"""Interval of delays around the estimate whose best fits are not significantly worse.
 
-    c the inflation: the F version of ``N ln(S/S_min) <= chi2_1(level)``, which it becomes for large N. Where S is a
-    parabola, this is the t interval ``estimate +- t se`` exactly. Each end is bracketed by steps that grow from a small
-    one outward, then found by Brent's method to 1e-6 of its distance from the estimate. A second basin further away is
-    not looked for.
-    """
-    low, high = bounds
-    if not low <= estimate <= high:
-        raise ValueError(f"the estimate {estimate} lies outside the bounds {low} to {high}")
-    freedom = count - parameters
-    if freedom <= 0 or not np.isfinite(inflation) or not squared_error >= 0:
-        return DelayInterval(float("nan"), float("nan"), False, False)
-    allowed = inflation * float(fdtri(1, freedom, level)) / freedom
+        The delays with
 
-    def excess(delay: float) -> float:
-        value = squared_error_at(delay)
-        if not np.isfinite(value):
-            return 1.0
-        if squared_error == 0:
-            return 1.0 if value > 0 else -1.0
-        # The square root is linear in the delay where the cost is quadratic: Brent's method then needs a step or two.
-        return float(np.sqrt(max(value / squared_error - 1.0, 0.0) / allowed)) - 1.0
+        .. math:: S(\tau) \le S_{\min} \Big(1 + c \, \frac{F_{1, N - p}(level)}{N - p}\Big),
 
-    first, at_low = _crossing(excess, estimate, low)
-    last, at_high = _crossing(excess, estimate, high)
-    return DelayInterval(first, last, at_low, at_high)
+        c the inflation: the F version of ``N ln(S/S_min) <= chi2_1(level)``, which it becomes for large N. Where S is a
+        parabola, this is the t interval ``estimate +- t se`` exactly. Each end is bracketed by steps that grow from a
+        small one outward, then found by Brent's method to 1e-6 of its distance from the estimate. A second basin
+        further away is not looked for.
+        """
+        freedom = self.count - self.parameters
+        if freedom <= 0 or not np.isfinite(self.inflation) or not self.squared_error >= 0:
+            return DelayInterval(float("nan"), float("nan"), False, False)
+        allowed = self.inflation * float(fdtri(1, freedom, level)) / freedom
+
+        def excess(delay: float) -> float:
+            value = self.squared_error_at(delay)
+            if not np.isfinite(value):
+                return 1.0
+            if self.squared_error == 0:
+                return 1.0 if value > 0 else -1.0
+            # The root is linear in the delay where the cost is quadratic: Brent's method then needs a step or two.
+            return float(np.sqrt(max(value / self.squared_error - 1.0, 0.0) / allowed)) - 1.0
+
+        low, at_low = _crossing(excess, self.estimate, self.bounds[0])
+        high, at_high = _crossing(excess, self.estimate, self.bounds[1])
+        return DelayInterval(low, high, at_low, at_high)
+
+    def quadratic_is_doubtful(self, standard_error: float) -> bool:
+        r"""Whether the interval ``estimate +- z se`` of the delay should not be trusted.
+
+        A quadratic profile rises by ``c (2 se)^2 s^2 / se^2 = 4 c s^2`` at ``estimate +- 2 se``, ``s^2 = S_min / (N -
+        p)``, c the inflation. The interval is doubtful if the square root of the actual rise, which is the length of
+        the interval, differs from that by more than 10 % on either side: a 95 % interval would cover below 93 % or
+        above 97 %.
+        """
+        if self.count <= self.parameters or not (0 < standard_error < np.inf and self.inflation > 0):
+            return True
+        expected = 4.0 * self.inflation * self.squared_error / (self.count - self.parameters)
+        for delay in (self.estimate - 2 * standard_error, self.estimate + 2 * standard_error):
+            if not self.bounds[0] <= delay <= self.bounds[1]:
+                return True
+            rise = self.squared_error_at(delay) - self.squared_error
+            if not (rise > 0 and expected > 0 and abs(np.sqrt(rise / expected) - 1.0) <= QUADRATIC_TOLERANCE):
+                return True
+        return False
 
 
 def _crossing(excess: Callable[[float], float], start: float, bound: float) -> tuple[float, bool]:
@@ -86,32 +106,3 @@ def _crossing(excess: Callable[[float], float], start: float, bound: float) -> t
             return start + share * room, False
         inside = outside
     return bound, True
-
-
-def quadratic_is_doubtful(
-    squared_error_at: Callable[[float], float],
-    estimate: float,
-    standard_error: float,
-    squared_error: float,
-    count: int,
-    parameters: int,
-    bounds: tuple[float, float],
-    *,
-    inflation: float = 1.0,
-) -> bool:
-    r"""Whether the interval ``estimate +- z se`` of the delay should not be trusted.
-
-    A quadratic profile rises by ``c (2 se)^2 s^2 / se^2 = 4 c s^2`` at ``estimate +- 2 se``, ``s^2 = S_min / (N - p)``,
-    c the inflation. The interval is doubtful if the square root of the actual rise, which is the length of the
-    interval, differs from that by more than 10 % on either side: a 95 % interval would cover below 93 % or above 97 %.
-    """
-    if count <= parameters or not (np.isfinite(standard_error) and standard_error > 0 and inflation > 0):
-        return True
-    expected = 4.0 * inflation * squared_error / (count - parameters)
-    for delay in (estimate - 2 * standard_error, estimate + 2 * standard_error):
-        if not bounds[0] <= delay <= bounds[1]:
-            return True
-        rise = squared_error_at(delay) - squared_error
-        if not (rise > 0 and expected > 0 and abs(np.sqrt(rise / expected) - 1.0) <= QUADRATIC_TOLERANCE):
-            return True
-    return False

@@ -90,7 +90,7 @@ U, Y = np.sin(3 * T), np.cos(T)
     ("record", "message"),
     [
         (record_of(T, np.full(100, 2.5), Y), r"motor.csv: the input is constant \(2.5\)"),
-        (record_of(T, U, np.full(100, 7.0)), r"motor.csv: the output is constant \(7\) over the samples"),
+        (record_of(T, U, np.full(100, 7.0)), r"motor.csv: the output is constant \(7\) over the usable samples"),
         (record_of(T, U, np.where(T < 9.8, np.nan, Y)), r"motor.csv: \d usable samples for \d parameters"),
     ],
     ids=["constant input", "constant output", "too few samples"],
