@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,17 +113,12 @@ def analyse_answer(record: Record, moves: InputMoves | None = None) -> Answer:
     # Of those that show the answer at all, whatever alignment shows it at the highest frequency is right there.
     spectra = [s for s in spectra if s.explained > 0.5 * best.explained]
     bandwidth = max((b for s in spectra for b in s.bandwidths), default=math.nan)
-    found = math.isfinite(bandwidth)
-    delay, period, before = _first_answer(grid, best.bandwidths if found else (nyquist, nyquist), moves)
-    return Answer(
-        min(bandwidth, nyquist) if found else nyquist,
-        max(s.visible_up_to for s in spectra) if found else math.nan,
-        best.explained,
-        best.input_band,
-        delay,
-        period,
-        before,
-    )
+    if math.isfinite(bandwidth):
+        visible, bandwidths = max(s.visible_up_to for s in spectra), best.bandwidths
+    else:
+        bandwidth, visible, bandwidths = nyquist, math.nan, (nyquist,)
+    timing = _first_answer(grid, bandwidths, moves)
+    return Answer(min(bandwidth, nyquist), visible, best.explained, best.input_band, *timing)
 
 
 def regular_grid(record: Record) -> Grid:
@@ -287,15 +283,7 @@ def _first_answer(
     r = _cross_correlation(u, y, longest) / power
     reference = slice(longest, None) if period else slice(None, longest)
     slowest = math.pi / (4 * min(bandwidths) * h)
-    pictures: list[_Picture] = []
-    for scale in (0.25, 0.5, 1.0, 2.0, 4.0):
-        width = 2 * (int(scale * slowest) // 2) + 1
-        if width > max(longest // 4, 1):
-            break
-        z = np.convolve(r, np.full(width, 1.0 / width), mode="same")
-        quiet = _quietest(z[reference]) if period else _deviation(z[reference])
-        if quiet > 0:
-            pictures.append(_Picture(z / quiet, longest, width))
+    pictures = list(_pictures(r, longest, slowest, reference, 4 if period else 1))
     if not pictures:
         return None, period * h or math.nan, math.nan
     # The sharpest picture that is clear enough, else the clearest.
@@ -306,12 +294,16 @@ def _first_answer(
     return hint, period * h or math.nan, before
 
 
-def _deviation(z: Array) -> float:
-    return 1.4826 * float(np.median(np.abs(z)))
-
-
-def _quietest(z: Array) -> float:
-    return min(_deviation(part) for part in np.array_split(z, 4))
+def _pictures(r: Array, longest: int, slowest: float, reference: slice, parts: int) -> Iterator[_Picture]:
+    """The correlation smoothed ever more, each over what chance gives in the quietest part of the reference."""
+    for scale in (0.25, 0.5, 1.0, 2.0, 4.0):
+        width = 2 * (int(scale * slowest) // 2) + 1
+        if width > max(longest // 4, 1):
+            return
+        z = np.convolve(r, np.full(width, 1.0 / width), mode="same")
+        quiet = min(1.4826 * float(np.median(np.abs(part))) for part in np.array_split(z[reference], parts))
+        if quiet > 0:
+            yield _Picture(z / quiet, longest, width)
 
 
 @dataclass(frozen=True)

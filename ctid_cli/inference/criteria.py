@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+
+from ctid_cli.arrays import Array
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,6 @@ def information_criteria(squared_error: float, count: int, parameters: int) -> I
     The criteria take residuals as independent: with coloured residuals all of them favour too many parameters.
     """
     undefined = float("nan")
-    if count < 1 or squared_error < 0:
-        return InformationCriteria(undefined, undefined, undefined, undefined, count, parameters)
     variance = squared_error / count
     fit = count * float(np.log(variance)) if variance > 0 else float("-inf")
     aic = fit + 2 * parameters
@@ -52,39 +51,26 @@ def information_criteria(squared_error: float, count: int, parameters: int) -> I
     return InformationCriteria(aic, aicc, bic, fpe, count, parameters)
 
 
-def r_t_squared(residuals: ArrayLike, output: ArrayLike) -> float:
+def r_t_squared(residuals: Array, output: Array) -> float:
     """``R_T^2 = 1 - s_e^2 / s_y^2``, the coefficient of determination of the simulated output by variances.
 
     Both variances are taken about the means, as in CONTSID and CAPTAIN: unlike :func:`r_squared`, it does not see a
     constant error.
     """
-    residual_variance, output_variance = _variances(residuals, output)
-    return 1.0 - residual_variance / output_variance if output_variance > 0 else float("nan")
+    output_variance = float(np.var(output))
+    return 1.0 - float(np.var(residuals)) / output_variance if output_variance > 0 else float("nan")
 
 
-def young_information_criterion(
-    residuals: ArrayLike, output: ArrayLike, estimates: ArrayLike, covariance: ArrayLike
-) -> float:
+def young_information_criterion(residuals: Array, output: Array, estimates: Array, covariance: Array) -> float:
     r"""Young's criterion: fit and relative parameter errors in one number; the more negative the better.
 
     .. math:: YIC = \ln \frac{s_e^2}{s_y^2} + \ln NEVN, \qquad NEVN = \frac{1}{p} \sum_i \frac{s^2 p_{ii}}{\theta_i^2},
 
     natural logarithms, variances about the means. A delay is one of the parameters if it is estimated.
     """
-    residual_variance, output_variance = _variances(residuals, output)
-    theta = np.asarray(estimates, dtype=float)
-    variances = np.diag(np.asarray(covariance, dtype=float))
+    output_variance, variances = float(np.var(output)), np.diag(covariance)
     if not output_variance > 0 or not np.isfinite(variances).all():
         return float("nan")
     with np.errstate(divide="ignore", invalid="ignore"):
-        normalised = float(np.mean(variances / theta**2))
-        return float(np.log(residual_variance / output_variance) + np.log(normalised))
-
-
-def _variances(residuals: ArrayLike, output: ArrayLike) -> tuple[float, float]:
-    """Variances of residuals and output about their means, over the samples that both have."""
-    e, y = np.asarray(residuals, dtype=float), np.asarray(output, dtype=float)
-    valid = np.isfinite(e) & np.isfinite(y)
-    if not valid.any():
-        return float("nan"), float("nan")
-    return float(np.var(e[valid])), float(np.var(y[valid]))
+        normalised = np.mean(variances / estimates**2)
+        return float(np.log(np.var(residuals) / output_variance) + np.log(normalised))

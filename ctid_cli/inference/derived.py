@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.inference.quantile import normal_quantile
@@ -18,9 +17,7 @@ NAN = float("nan")
 GAIN_UNIT = "output unit/input unit"
 
 
-def derived_parameters(
-    model: TransferFunction, covariance: ArrayLike, *, level: float = 0.95
-) -> tuple[UncertainValue, ...]:
+def derived_parameters(model: TransferFunction, covariance: Array, level: float = 0.95) -> tuple[UncertainValue, ...]:
     r"""What users read off a model, with standard errors by the delta method.
 
     ``var g = (dg/dtheta) C (dg/dtheta)'`` with analytic derivatives, those of the poles from :func:`pole_jacobian`, and
@@ -29,18 +26,10 @@ def derived_parameters(
     accuracy is NaN and the reason is given. Natural frequency and damping of a pair only need it to be far
     from the *other* poles: they are regular where the pair meets on the real axis.
     """
-    C = np.asarray(covariance, dtype=float)
-    n = model.order
-    coefficients = C.shape[0] - n
-    if C.shape != (C.shape[0],) * 2 or coefficients < model.numerator.size:
-        raise ValueError(
-            f"the covariance must be square, with a row for each of {n} denominator and at least "
-            f"{model.numerator.size} numerator coefficients; got shape {C.shape}"
-        )
-    poles = model.poles
-    rows = _Rows(C, level)
+    n, poles = model.order, model.poles
+    rows = _Rows(covariance, level)
     rows.add_poles(poles, pole_jacobian(model.denominator, poles))
-    gradient = np.zeros(C.shape[0])
+    gradient = np.zeros(covariance.shape[0])
     last = float(model.denominator[-1])
     reason = ""
     if last == 0:
@@ -53,22 +42,19 @@ def derived_parameters(
     return tuple(rows.found)
 
 
-def additive_derived(model: AdditiveModel, covariance: ArrayLike, *, level: float = 0.95) -> tuple[UncertainValue, ...]:
+def additive_derived(model: AdditiveModel, covariance: Array, *, level: float = 0.95) -> tuple[UncertainValue, ...]:
     r"""What users read off the submodels of a sum, as :func:`derived_parameters`.
 
     Each quantity depends on the parameters of its own submodel alone, so a pole is undetermined only where it cannot
     be told from another one of the same submodel. With ``A = 1 + a_1 p + … + a_n p^n``, a pole moves by
     ``dp/da_k = -p^k/A'(p)``.
     """
-    C = np.asarray(covariance, dtype=float)
-    size = model.theta.size
-    if C.shape != (size, size):
-        raise ValueError(f"the covariance must have a row and a column for each of {size} parameters; got {C.shape}")
     found: list[UncertainValue] = []
     first = 0
     for number, (submodel, term) in enumerate(zip(model.submodels, model.terms, strict=True), 1):
         own = slice(first, first + term.size)
-        found += [replace(row, name=f"g{number}_{row.name}") for row in _of_submodel(submodel, C[own, own], level)]
+        rows = _of_submodel(submodel, covariance[own, own], level)
+        found += [replace(row, name=f"g{number}_{row.name}") for row in rows]
         first = own.stop
     return tuple(found)
 
@@ -154,10 +140,7 @@ class _Rows:
             return ""
         distance = float(np.abs(poles[others] - poles[k]).min())
         size = float(np.abs(poles).max())
-        text = (
-            "This pole lies so close to another that these data cannot tell them apart: its standard error is not "
-            "defined; fewer poles may do."
-        )
+        text = "This pole is so close to another that these data cannot tell them apart; fewer poles may do."
         if distance <= 1e-7 * size or not np.isfinite(slope).all():
             return text
         A = self.covariance[: slope.size, : slope.size]

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.answer import Answer, analyse_answer, regular_grid
+from ctid_cli.inference.answer import Answer, DelayHint, analyse_answer, regular_grid
 from ctid_cli.inference.faults import outliers, quantum, saturated
 from ctid_cli.inference.input_moves import InputMoves, input_moves
 from ctid_cli.signals.record import Record
@@ -140,7 +140,7 @@ def examine(record: Record, enough_order: int) -> Examined:
         # A sine that comes later and one that is filtered look the same.
         answer = replace(answer, delay=None)
     t, y = record.t, record.y
-    present, delay = y[record.valid], answer.delay
+    present, delay = y[record.valid], answer.delay or DelayHint(math.nan, math.nan, math.nan)
     steps = np.diff(t) if t.size > 1 else np.array([math.nan])
     interval = float(np.median(steps))
     long = np.flatnonzero(steps > LONG_INTERVAL * interval)
@@ -177,13 +177,13 @@ def examine(record: Record, enough_order: int) -> Examined:
         outliers=tuple(t[record.valid][outliers(present)].tolist()),
         saturated=saturated(present),
         explained=explained,
-        snr_db=10 * math.log10(explained / (1 - explained)) if explained > 0 else math.nan,
+        snr_db=10 * math.log10(explained / (1 - explained)),
         output_bandwidth=answer.bandwidth,
         visible_up_to=answer.visible_up_to,
-        delay_early=delay.early if delay else math.nan,
-        delay_late=delay.late if delay else math.nan,
+        delay_early=delay.early,
+        delay_late=delay.late,
         starts=starts,
-        suggested_delay=(0.0, _round_up(max(2 * delay.late, 4 / answer.bandwidth))) if delay else None,
+        suggested_delay=(0.0, _round_up(max(2 * delay.late, 4 / answer.bandwidth))) if answer.delay else None,
         suggested_offset="none" if not offset else "estimate" if seldom else "remove",
         suggested_initial_state="estimate" if starts == "moving" else "rest",
         **_range("input", record.input.at(t)),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.special import chdtrc
 
 from ctid_cli.arrays import Array
@@ -51,12 +50,7 @@ class ResidualTests:
 
 
 def residual_tests(
-    residuals: ArrayLike,
-    inputs: ArrayLike,
-    *,
-    level: float = 0.95,
-    lags: int | None = None,
-    sensitivities: ArrayLike | None = None,
+    e: Array, u: Array, *, level: float = 0.95, lags: int | None = None, sensitivities: Array | None = None
 ) -> ResidualTests:
     r"""Test the residuals of an output-error model for whiteness and for correlation with the input.
 
@@ -76,15 +70,8 @@ def residual_tests(
 
     Samples are taken as equally spaced; with an irregular clock the lags count samples.
     """
-    e = np.asarray(residuals, dtype=float)
-    u = np.asarray(inputs, dtype=float)
-    if e.ndim != 1 or e.shape != u.shape:
-        raise ValueError("residuals and inputs must be one-dimensional and of the same length")
     count = e.size
-    if lags is None:
-        lags = min(25, count // 4)
-    if not 1 <= lags < count:
-        raise ValueError(f"lags must be between 1 and the number of samples less one, {count - 1}; got {lags}")
+    lags = min(25, count // 4) if lags is None else lags
     quantile = normal_quantile(level)
 
     power = float(e @ e)
@@ -95,8 +82,7 @@ def residual_tests(
         statistic = float(count * (count + 2) * np.sum(autocorrelation**2 / (count - np.arange(1, lags + 1))))
         whiteness_p = float(chdtrc(lags, statistic))
 
-    psi = None if sensitivities is None else np.asarray(sensitivities, dtype=float)
-    cross, band, cross_statistic, freedom = _cross_correlation(e, u, lags, quantile, psi)
+    cross, band, cross_statistic, freedom = _cross_correlation(e, u, lags, quantile, sensitivities)
     cross_p = float(chdtrc(freedom, cross_statistic)) if freedom else float("nan")
 
     # No evidence is no rejection; the sentence says that there was nothing to test.
@@ -162,28 +148,21 @@ def _cross_correlation(
 
 
 def _sentence(level: float, whiteness_p: float, white: bool, cross_p: float, uncorrelated: bool, cross: Array) -> str:
-    percent = f"{100 * level:g} %"
     if np.isnan(whiteness_p):
         return "The residuals are exactly zero: there is nothing to test."
-    if white:
-        first = f"The residuals pass as white at the {percent} level (p = {whiteness_p:.2g})."
-    else:
-        first = (
-            f"The residuals are not white at the {percent} level (p = {whiteness_p:.2g}): the noise is coloured, so "
-            "that standard errors for white noise do not hold."
-        )
+    first = f"The residuals pass as white at the {100 * level:g} % level (p = {whiteness_p:.2g})."
+    if not white:
+        first = first.replace("pass as white", "are not white").removesuffix(".")
+        first += ": the noise is coloured, so that standard errors for white noise do not hold."
+    correlated = f"They are correlated with the input (p = {cross_p:.2g})"
     if np.isnan(cross_p):
         second = "Their correlation with the input cannot be tested: the input does not vary enough."
     elif uncorrelated:
         second = f"They are not correlated with the input (p = {cross_p:.2g}): no missing dynamics are seen."
     elif int(np.argmax(np.abs(cross))) < cross.size // 2:
-        second = (
-            f"They are correlated with the input (p = {cross_p:.2g}), most with later inputs: there is feedback from "
-            "the output to the input, the delay is too long, or the clocks of input and output differ."
-        )
+        why = "feedback from the output to the input, the delay is too long, or the clocks of input and output differ"
+        second = f"{correlated}, most with later inputs: there is {why}."
     else:
-        second = (
-            f"They are correlated with the input (p = {cross_p:.2g}): the model misses a part of the response; "
-            "more poles or zeros, another delay, or a nonlinear model may be needed."
-        )
+        why = "more poles or zeros, another delay, or a nonlinear model may be needed"
+        second = f"{correlated}: the model misses a part of the response; {why}."
     return f"{first} {second}"

@@ -158,9 +158,3 @@ def test_integrators_and_undefined_covariances_are_said():
     assert rows["g1_time_constant"].standard_error > 0
     rows = by_name(TWO_MODES, np.full((6, 6), np.nan))
     assert all("not defined" in row.reason and np.isnan(row.standard_error) for row in rows.values())
-
-
-def test_covariance_must_fit_the_model():
-    for shape in ((5, 5), (6, 5), (6,)):
-        with pytest.raises(ValueError, match="a row and a column for each of 6 parameters"):
-            additive_derived(TWO_MODES, np.ones(shape))

@@ -11,7 +11,7 @@ from ctid_cli.inference.residuals import residual_tests
 def test_whiteness_by_hand():
     e = np.array([1.0, -1.0, 2.0, 0.0, 1.0])
     # sum e^2 = 7; lag 1: -1 - 2 + 0 + 0 = -3; lag 2: 2 + 0 + 2 = 4
-    tests = residual_tests(e, [1.0, -1.0, -1.0, 1.0, -1.0], lags=2)
+    tests = residual_tests(e, np.array([1.0, -1.0, -1.0, 1.0, -1.0]), lags=2)
     np.testing.assert_allclose(tests.autocorrelation, [-3 / 7, 4 / 7], rtol=1e-14)
     q = 5 * 7 * ((3 / 7) ** 2 / 4 + (4 / 7) ** 2 / 3)
     assert tests.whiteness_statistic == pytest.approx(q, rel=1e-14)
@@ -131,14 +131,6 @@ def test_every_estimated_lag_takes_a_degree_of_freedom():
     assert residual_tests(e, u, sensitivities=np.column_stack((u, delayed))).cross_degrees_of_freedom == 49
 
 
-@pytest.mark.parametrize("lags", [0, 5])
-def test_lags_must_fit_into_the_record(lags):
-    with pytest.raises(ValueError, match="between 1 and"):
-        residual_tests(np.ones(5), np.ones(5), lags=lags)
-
-
 def test_default_lags():
     assert residual_tests(np.ones(40), np.ones(40)).lags == 10
     assert residual_tests(np.ones(400), np.ones(400)).lags == 25
-    with pytest.raises(ValueError, match="same length"):
-        residual_tests(np.ones(40), np.ones(41))
