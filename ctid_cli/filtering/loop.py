@@ -103,16 +103,6 @@ def simulate_loop(
     return LoopSignals(u, x)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _advance(transition: Array, from_input: Array, value: float, state: Array, following: Array) -> None:
-    """``z_(k+1) = F z_k + g value``."""
-    for i in range(state.size):
-        total = from_input[i] * value
-        for j in range(state.size):
-            total += transition[i, j] * state[j]
-        following[i] = total
-
-
 @njit(cache=True, nogil=True)
 def _closed_loop(plant: SampledModel, law: SampledModel, r: Array, v: Array, before: float) -> tuple[Array, Array]:
     """Compiled body of :func:`simulate_loop`; ``before`` is the share of r that the controller sees, 1 or 0."""
@@ -140,8 +130,17 @@ def _closed_loop(plant: SampledModel, law: SampledModel, r: Array, v: Array, bef
             x[k] = free + direct * arriving
             u[k] = held + D * (error - x[k])
         # Both step on with what they have seen at this sample.
-        _advance(F, g, arriving, z, z_next)
-        _advance(A, B, error - x[k], s, s_next)
+        error -= x[k]
+        for i in range(z.size):
+            total = g[i] * arriving
+            for j in range(z.size):
+                total += F[i, j] * z[j]
+            z_next[i] = total
+        for i in range(s.size):
+            total = B[i] * error
+            for j in range(s.size):
+                total += A[i, j] * s[j]
+            s_next[i] = total
         z, z_next = z_next, z
         s, s_next = s_next, s
     return u, x

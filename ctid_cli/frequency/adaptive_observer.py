@@ -188,7 +188,7 @@ def observer_slope(states: Array, y: float, squares: Array, gains: Array, slope:
             slope[p, 2 * p - 1] -= states[0, 2 * p - 2]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def predict(
     before: float, change: float, interval: float, squares: Array, gains: Array, observer: Array, memory: Array
 ) -> None:
@@ -207,7 +207,7 @@ def predict(
         states[i] += interval / 6.0 * sums[i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def adapt(
     y: float, settings: Adaptation, state: Observer, xi: Array, step: Array, matrix: Array, factor: Array, scales: Array
 ) -> int:

@@ -77,7 +77,7 @@ def contradicts(row: Array, theta: Array, levels: Array, fast: float, slow: floa
     return bool(levels[1] > CONTRADICTION_RATIO * levels[2] + ROUNDING_FLOOR * levels[3])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def observe_second_delay(
     history: Array, newest: int, lag: int, table: Array, row: Array, gram: Array, keep: float
 ) -> None:

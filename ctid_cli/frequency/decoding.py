@@ -56,7 +56,7 @@ def horner(coefficients: Array, degree: int, x: float) -> tuple[float, float]:
     return value, slope
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def real_roots(coefficients: Array, work: Array, roots: Array) -> bool:
     """Roots of a monic polynomial whose roots are all real, largest first.
 
@@ -125,7 +125,7 @@ def real_roots(coefficients: Array, work: Array, roots: Array) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def root_real_parts(coefficients: Array, work: Array, roots: Array) -> bool:
     """Real parts of the roots of any monic polynomial, largest first."""
     n = roots.size
@@ -145,7 +145,7 @@ def root_real_parts(coefficients: Array, work: Array, roots: Array) -> bool:
     return bool(np.all(raw.imag == 0.0))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def bounded_roots(
     coefficients: Array, lowest: float, highest: float, polynomial: Array, quotient: Array, roots: Array
 ) -> int:

@@ -95,7 +95,7 @@ class DremWindow(MixingOptions):
         return self._mixed(clock, back, np.full(n, np.nan), most_rows=length)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def slide(window: Array, newer: Array, place: int, sums: Array) -> int:
     """Sum a sliding window after a new entry at ``place``; the place of the next entry.
 

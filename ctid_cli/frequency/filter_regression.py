@@ -184,7 +184,7 @@ def derivative_rows(tones: int, pole: float) -> Array:
     return rows
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def filter_sample(
     y: float, transition: Array, from_value: Array, from_change: Array, chain: Array, moved: Array
 ) -> None:
@@ -211,7 +211,7 @@ def take_gradient_step(row: Array, gains: Array, coefficients: Array) -> None:
         coefficients[i] += gains[i] * row[i] * residual / size
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def estimate_frequencies(settings: Filter, state: Chain, factor: Array, scales: Array, work: Decoding) -> int:
     """Frequencies and their possible errors from the moments, and the flags that follow."""
     # Singular moments determine nothing, whatever the gradient has made of them.

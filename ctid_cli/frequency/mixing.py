@@ -137,7 +137,7 @@ def weigh(tuning: Any, back: Any, theta: Array, errors: Array) -> tuple[float, f
 def back_end(state: type, absorbing: Callable[..., Any], weighing: Callable[..., Any]) -> None:
     """Let the loop find the kernels of a back end by the type of its state."""
 
-    @overload(absorb, strict=False, inline="always")
+    @overload(absorb, jit_options={"forceinline": True}, strict=False)
     def choose_absorb(scale: Any, count: Any, tuning: Any, back: Any, theta: Any, mixed: Any) -> Any:
         return absorbing.py_func if back.instance_class is state else None  # type: ignore[attr-defined]
 
@@ -146,7 +146,7 @@ def back_end(state: type, absorbing: Callable[..., Any], weighing: Callable[...,
         return weighing.py_func if back.instance_class is state else None  # type: ignore[attr-defined]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def judge_mixed(
     theta: Array,
     omega: Array,

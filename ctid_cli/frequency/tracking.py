@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.inputs import series_of
+from ctid_cli.frequency.inputs import LARGEST_SAMPLE, series_of
 from ctid_cli.frequency.prefilter import convolve, fast_convolve
 from ctid_cli.signals.checks import require_positive
 
@@ -224,7 +224,9 @@ class Tracker:
         FrequencyEstimate
             Frequencies at this instant.
         """
-        return self._advance(series_of([float(sample)]), fft=False)[0]
+        value = float(sample)
+        output = self._advance(np.array([value if abs(value) <= LARGEST_SAMPLE else np.nan]), fft=False)
+        return FrequencyEstimate(output.omega[0], Flag(int(output.flags[0])), output.uncertainty[0])
 
     def run(self, samples: ArrayLike, *, fft: bool = False) -> FrequencyTrack:
         """Take many samples.
@@ -247,7 +249,10 @@ class Tracker:
         DataError
             If the samples are not a series of real numbers.
         """
-        return self._advance(series_of(samples), fft=fft)
+        first = int(self._state["count"][0])
+        output = self._advance(series_of(samples), fft=fft)
+        t = self.interval * np.arange(first, first + len(output.flags), dtype=np.float64)
+        return FrequencyTrack(t, output.omega, output.flags, output.uncertainty)
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Everything that later estimates depend on.
@@ -289,7 +294,7 @@ class Tracker:
         for name, array in arrays.items():
             own[name][...] = array
 
-    def _advance(self, samples: Array, *, fft: bool) -> FrequencyTrack:
+    def _advance(self, samples: Array, *, fft: bool) -> Output:
         state, recursion = self._state, self._recursion
         size, tones = samples.size, self.options.tones
         if recursion.weights.size > 1:
@@ -301,10 +306,8 @@ class Tracker:
                 convolve(everything, self._reversed_weights, samples)
         output = Output(np.empty((size, tones)), np.empty((size, tones)), np.empty(size, np.uint16))
         recursion.advance(samples, output, *recursion.settings, *recursion.states)
-        first = int(state["count"][0])
         state["count"][0] += size
-        t = self.interval * np.arange(first, first + size, dtype=np.float64)
-        return FrequencyTrack(t, output.omega, output.flags, output.uncertainty)
+        return output
 
 
 def _fingerprint(options: OnlineEstimator, interval: float) -> bytes:
