@@ -95,7 +95,7 @@ class Plan:
 
     def manifest(self) -> Manifest:
         """The plan as plain data."""
-        canonical = self.spec.canonical()
+        canonical, wanted = self.spec.canonical(), self.keys(Task(0, 0))
         return {
             "experiment": self.experiment,
             "runs": self.runs,
@@ -114,7 +114,7 @@ class Plan:
                     "hash": cell.hash,
                     "swept": dict(cell.swept),
                     "content": cell.content,
-                    "starts": [start.label for start in starts_of(cell.estimator.start_from, self.starts)],
+                    "starts": [start.label for _, other, start in wanted if other is cell],
                 }
                 for cell in self.estimators
             ],

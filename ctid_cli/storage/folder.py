@@ -149,7 +149,7 @@ def _other_origin(folder: Path, other: Origin, origin: Origin) -> str:
     then, now = dict(other.packages), dict(origin.packages)
     pairs: list[tuple[str, str | None, str | None]] = [("code version", other.code_version, origin.code_version)]
     pairs += [(name, then.get(name), now.get(name)) for name in then | now]
-    pairs += [("numeric platform", other.platform, origin.platform)]
+    pairs += [("numeric platform", repr(other.platform), repr(origin.platform))]
     differences = "; ".join(f"{name} {old} then, {new} now" for name, old, new in pairs if old != new)
     ways = "use --fresh to move them aside and compute all anew, or --allow-mixed to add to them, which is recorded"
     return f"{folder} holds results of other code or arithmetic ({differences}); {ways}"
