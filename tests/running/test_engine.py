@@ -455,7 +455,7 @@ def test_mixing_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 # Storage
 
 
-def test_callbacks_of_a_pool_that_is_gone_print_no_traceback(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+f test_callbacks_of_a_pool_that_is_gone_print_no_traceback(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     run(FakePlan(runs=1), tmp_path)
     logger = logging.getLogger("concurrent.futures")
     logger.error("exception calling callback for <Future>")
