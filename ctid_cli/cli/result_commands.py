@@ -162,7 +162,7 @@ def figure(
 
     Without a name: all figures of the useful-redundancy study.
     """
-    from ctid_cli.studies.drawing import find_figures, require_results
+    from ctid_cli.studies.catalogue import find_figures, require_results
 
     figures = find_figures(names or [])
     if file is not None and len(figures) != 1:

@@ -162,8 +162,7 @@ class _Words:
     def _output(self) -> Iterator[Finding]:
         r, unit = self.r, self.unit
         if r.input_kind == "continuous" and self.found.record.input.hold != "foh":
-            text = "The input was not held: if it moves between its samples, as a measured flow does, straight lines "
-            text += "(--hold foh) describe it better than steps, which would shift the delay by half an interval."
+            text = "The input was not held: straight lines (--hold foh) describe it better if it moves between samples."
             yield Finding("note", "hold", text)
         if not r.output_deviation > 1e-9 * abs(r.output_mean):
             text = f"The output is constant at {unit.y(r.output_mean)}: it, or its sensor, does not answer."
@@ -216,8 +215,7 @@ class _Words:
             text = f"The output follows the input, but so weakly that noise dominates at every frequency. {weak}"
             yield Finding("warning", "answer", text)
         else:
-            text = "No part of the output follows the input visibly: the noise is too strong, the record too short, or "
-            text += "the two columns do not belong together."
+            text = "No part of the output follows the input visibly: too much noise, too short, or the wrong columns."
             yield Finding("problem" if r.n_samples - r.n_masked >= FEW_SAMPLES else "warning", "answer", text)
 
     def _speed(self) -> Iterator[Finding]:

@@ -1,10 +1,10 @@
-"""The studies that are shipped with the program: one folder each, with what belongs to it in ``study.yaml``."""
+"""The studies that are shipped with the program, one folder each with its ``study.yaml``, and their figures by name."""
 
 from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -12,11 +12,12 @@ from types import ModuleType
 from typing import Any
 
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.results import Results, find_results
-from ctid_cli.reporting.study import data_folder, study_contents
+from ctid_cli.reporting.results import Results, experiments_in, find_results, out_option, read_results
+from ctid_cli.reporting.study import DEFAULT_STUDY, data_folder, study_contents
 from ctid_cli.running.cells import Plan
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
+from ctid_cli.text import did_you_mean
 
 #: Name under which modules of studies are imported, whatever the working directory holds.
 _PACKAGE = "ctid_experiments"
@@ -120,3 +121,57 @@ def _study(content: Mapping[str, Any]) -> StudyFolder:
         figures={str(name): parts for name, parts in content["figures"].items()},
         **{name: content[name] for name in ("texts", "numbers", "claims", "first")},
     )
+
+
+@dataclass(frozen=True)
+class StudyFigure:
+    """A figure that can be drawn: a function ``figure_<number>`` of its study."""
+
+    study: StudyFolder
+    number: str
+
+    @property
+    def place(self) -> Path:
+        """Its file, relative to the results folder."""
+        return Path(f"{self.study.folder.name}_figures") / f"figure_{self.number}.svg"
+
+    @property
+    def experiments(self) -> list[str]:
+        """Names of the experiments whose results it shows."""
+        return [self.study.experiment(short) for short in self.study.figures[self.number]]
+
+    def svg(self, out: Path) -> bytes:
+        """Draw it."""
+        require_results([self], out)
+        draw = getattr(self.study.module("figures"), f"figure_{self.number}")
+        return bytes(draw(*(read_results(out, name) for name in self.experiments)))
+
+
+def find_figures(names: Sequence[str]) -> list[StudyFigure]:
+    """The figures that were asked for."""
+    studies = {name: study for name, study in all_studies().items() if study.figures}
+    found: list[StudyFigure] = []
+    for name in names or [DEFAULT_STUDY]:
+        place, _, number = name.rpartition("/")
+        place = place or DEFAULT_STUDY
+        if name in studies:
+            found += [StudyFigure(studies[name], number) for number in studies[name].figures]
+        elif place in studies and number in studies[place].figures:
+            found.append(StudyFigure(studies[place], number))
+        elif place in studies and number.isdigit():
+            raise UsageError(f"{place} has no figure {number}; it has {', '.join(studies[place].figures)}")
+        else:
+            known = [*studies[DEFAULT_STUDY].figures]
+            known += [entry for s in studies.values() for entry in (s.name, *(f"{s.name}/{k}" for k in s.figures))]
+            hint = did_you_mean(name, known) or "."
+            raise UsageError(f"{name!r} is neither a figure nor a study with figures{hint} Known: {', '.join(known)}")
+    return list(dict.fromkeys(found))
+
+
+def require_results(figures: Iterable[StudyFigure], out: Path) -> None:
+    """Refuse figures whose results are missing, before any is drawn."""
+    known = experiments_in(out)
+    missing = [item.study.configs[name] for item in figures for name in item.experiments if name not in known]
+    if missing:
+        command = " ".join(["ctid run", *(f"configs/{config}" for config in dict.fromkeys(missing))])
+        raise UsageError(f"there are no results in {out} to draw this from; run first: {command}{out_option(out)}")

@@ -32,9 +32,8 @@ COMPARED = ("CONVERGED", "VALID", "INVALID")
 Estimates = dict[str, dict[str, Any]]
 
 
-def first_file(study: StudyFolder) -> Path:
-    """Where the committed estimates lie."""
-    return study.folder / "first_estimates.json"
+#: Where the committed estimates lie in the folder of a study.
+FILE = "first_estimates.json"
 
 
 def compute_first(study: StudyFolder, out: Path, jobs: int | None = None) -> Estimates:
@@ -69,14 +68,13 @@ def _numbers(content: Any, name: str = "") -> Iterator[tuple[str, float]]:
 
 def read_first(study: StudyFolder) -> Estimates:
     """The committed estimates of a study."""
-    found: Estimates = json.loads(first_file(study).read_text(encoding="utf-8"))
-    return found
+    return dict(json.loads((study.folder / FILE).read_text(encoding="utf-8")))
 
 
 def write_first(study: StudyFolder, found: Estimates) -> None:
     """Commit to these estimates: one line for each, so that a change can be read."""
     lines = [f"{json.dumps(name)}: {json.dumps(found[name])}" for name in found]
-    first_file(study).write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+    (study.folder / FILE).write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
 
 
 def differences(found: Estimates, committed: Estimates) -> list[str]:

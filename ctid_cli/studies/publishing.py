@@ -15,9 +15,8 @@ from ctid_cli.reporting.layout import csv_text
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.storage.folder import PROVENANCE
 from ctid_cli.storage.identity import present_versions
-from ctid_cli.studies.catalogue import StudyFolder, StudyResults, last_part
+from ctid_cli.studies.catalogue import StudyFigure, StudyFolder, StudyResults, last_part
 from ctid_cli.studies.claim import COLUMNS, Claim, claims_table
-from ctid_cli.studies.drawing import StudyFigure
 
 #: What is kept of a session: nothing that names a machine, a user or a folder.
 KEPT = (

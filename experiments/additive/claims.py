@@ -126,9 +126,8 @@ def feedback_biases_direct_instruments(results: Results) -> Iterator[Claim]:
     for row in errors_of(results):
         if row.bias_per_deviation is None or row.bias_per_error is None:
             continue
-        measured = (
-            f"{row.bias_per_deviation:+.2f} deviations of one estimate, {row.bias_per_error:+.1f} standard errors"
-        )
+        measured = f"{row.bias_per_deviation:+.2f} deviations of one estimate"
+        measured += f", {row.bias_per_error:+.1f} standard errors"
         required, holds = "", None
         if row.estimator == "srivc" and row.parameter in ("g2_a1", "g2_b0"):
             required, holds = f"beyond {BIASED:g} deviations", abs(row.bias_per_deviation) > BIASED
@@ -141,22 +140,18 @@ def beam_is_found(results: Results) -> Iterator[Claim]:
     """Whether the simulated beam is found from the printed initial values."""
     floor = NOISE_FLOOR * 10 ** (-float(results.settings["noise"]["snr_db"]) / 10)
     reached = [r for r in results.rows if r["fit_percent"] is not None and (1 - r["fit_percent"] / 100) ** 2 < floor]
-    shown = f"{len(reached)} of {len(results.rows)} data sets"
+    shown, share = f"{len(reached)} of {len(results.rows)} data sets", 100 * len(reached) / len(results.rows)
     claim = f"squared output error below {NOISE_FLOOR:g} times that of the noise"
-    share = 100 * len(reached) / len(results.rows)
     yield Claim(claim, shown, f"{BEAM_SHARE:g} %", share >= BEAM_SHARE)
     if reached:
         iterations = [row["iterations"] for row in reached]
-        median = float(np.median(iterations))
+        median, required = float(np.median(iterations)), f"median {BEAM_ITERATIONS} at most"
         shown = f"median {median:g}, at most {max(iterations)}"
-        required = f"median {BEAM_ITERATIONS} at most"
         yield Claim("iterations there", shown, required, median <= BEAM_ITERATIONS)
         truth = {row.parameter: row.true for row in errors_of(results) if row.parameter.endswith("_a2")}
         errors = [np.sqrt(true / row["parameters"][name]) - 1 for row in reached for name, true in truth.items()]
-        worst = float(np.max(np.abs(errors)))
-        yield within(
-            "relative error of the natural frequencies there", worst, high=FREQUENCY, shown=f"at most {worst:.1e}"
-        )
+        worst, claim = float(np.max(np.abs(errors))), "relative error of the natural frequencies there"
+        yield within(claim, worst, high=FREQUENCY, shown=f"at most {worst:.1e}")
 
 
 def _covered(results: Results) -> dict[str, list[float]]:
@@ -187,9 +182,5 @@ def intervals_cover(*experiments: Results) -> Iterator[Claim]:
     ]
     if found:
         outside = sum(not low <= percentage <= high for percentage in found)
-        yield within(
-            f"coverage outside {low:g} to {high:g} %, formula as it should be",
-            outside,
-            high=OUTSIDE,
-            shown=f"{outside} of {len(found)} parameters",
-        )
+        claim = f"coverage outside {low:g} to {high:g} %, formula as it should be"
+        yield within(claim, outside, high=OUTSIDE, shown=f"{outside} of {len(found)} parameters")

@@ -18,8 +18,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
 from ctid_cli.filtering.filter_set import FilterCheck, FilterSet, check_filters
 from ctid_cli.filtering.filter_theory import convergence_region, extrema, ideal_cost
-from ctid_cli.reporting.figures.redundant_search import Landscape, landscape
-from ctid_cli.reporting.figures.search_plot import costs_svg, trajectory_svg
+from ctid_cli.reporting.figures.search_plot import Landscape, costs_svg, landscape, trajectory_svg
 from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, pointed, ramp, spread, svg
 from ctid_cli.signals.record import Record
 from ctid_cli.simulation.dataset import DataSet

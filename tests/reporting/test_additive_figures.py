@@ -14,8 +14,7 @@ from ctid_cli.reporting.figures.parameter_plot import bias_svg, coverage_svg, la
 from ctid_cli.reporting.parameter_errors import parameter_errors, parameter_estimates
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
-from ctid_cli.studies.catalogue import all_studies, find_study
-from ctid_cli.studies.drawing import find_figures, require_results
+from ctid_cli.studies.catalogue import all_studies, find_figures, find_study, require_results
 from tests.reporting.ideal_results import TWO_MODES, ideal_results, plan_of
 
 STUDY = find_study("additive")

@@ -10,12 +10,10 @@ import pytest
 from ctid_cli.errors import UsageError
 from ctid_cli.filtering.filter_set import FilterSet, check_filters
 from ctid_cli.filtering.filter_theory import extrema, ideal_cost
-from ctid_cli.reporting.figures.redundant_search import landscape
-from ctid_cli.reporting.figures.search_plot import costs_svg, trajectory_svg
+from ctid_cli.reporting.figures.search_plot import costs_svg, landscape, trajectory_svg
 from ctid_cli.reporting.figures.style import ramp, spread
 from ctid_cli.studies import catalogue
-from ctid_cli.studies.catalogue import find_study
-from ctid_cli.studies.drawing import find_figures
+from ctid_cli.studies.catalogue import find_figures, find_study
 
 useful_redundancy = find_study("useful-redundancy").module("figures")
 CASE_1, CASE_2 = useful_redundancy.CASE_1, useful_redundancy.CASE_2

@@ -11,7 +11,7 @@ from ctid_cli.reporting.figures import error_plot
 from ctid_cli.reporting.figures.error_plot import Curve, Group, Row, errors_svg
 from ctid_cli.reporting.results import read_results
 from ctid_cli.storage.store import read_tracks
-from ctid_cli.studies.drawing import find_figures, require_results
+from ctid_cli.studies.catalogue import find_figures, require_results
 from tests.reporting.frequency_results import STUDY, run_here
 
 figures = STUDY.module("figures")
