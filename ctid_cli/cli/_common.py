@@ -29,6 +29,7 @@ Overrides = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the file, e.g. noise.snr_db=15; repeatable."),
 ]
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Worker processes; all processors by default.")]
+Runs = Annotated[int | None, typer.Option("--runs", min=1, help="Data sets per setting, not the file's own number.")]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Move older results aside and start anew.")]
 Config = Annotated[Path, typer.Argument(metavar="CONFIG", help="Experiment file (YAML).")]
 Configs = Annotated[list[Path], typer.Argument(metavar="CONFIG", help="Experiment files (YAML).")]

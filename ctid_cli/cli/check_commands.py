@@ -59,16 +59,10 @@ def check(
 @further.command("filters", cls=Command)
 @guarded
 def check_filters(
-    bandwidth: Annotated[
-        float, typer.Option("--bandwidth", metavar="RAD/S", help="Bandwidth of the system, its last -3 dB crossing.")
-    ],
-    largest_error: Annotated[
-        float, typer.Option("--largest-error", metavar="SECONDS", help="Largest error of an initial delay.")
-    ],
+    bandwidth: Annotated[float, typer.Option("--bandwidth", metavar="RAD/S", help="The system's last -3 dB crossing.")],
+    largest_error: Annotated[float, typer.Option("--largest-error", metavar="SECONDS", help="Of an initial delay.")],
     filters: Annotated[int, typer.Option("--filters", metavar="N", help="Number of filters, at least 2.")] = 10,
-    beta: Annotated[
-        float, typer.Option("--beta", metavar="RATIO", help="Longest over shortest period, 1.717 to 10.")
-    ] = 10.0,
+    beta: Annotated[float, typer.Option("--beta", metavar="RATIO", help="Ratio of the periods, 1.717 to 10.")] = 10.0,
     as_json: Json = False,
 ) -> None:
     """Say whether a set of low-pass filters leads a delay estimate past local minima.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ctid_cli.cli._common import Configs, Fresh, Jobs, Out, Overrides, guarded
+from ctid_cli.cli._common import Configs, Fresh, Jobs, Out, Overrides, Runs, guarded
 from ctid_cli.cli._progress import Reporter, json_lines
 from ctid_cli.errors import Problem, SpecError, TooManyFailuresError, UsageError
 from ctid_cli.reporting.layout import count, seconds
@@ -59,16 +59,12 @@ def _workload(plan: Plan) -> str:
 def run(
     configs: Configs,
     jobs: Jobs = None,
-    runs: Annotated[
-        int | None, typer.Option("--runs", min=1, help="Data sets per setting, instead of the file's own number.")
-    ] = None,
+    runs: Runs = None,
     overrides: Overrides = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and stop.")] = False,
     out: Out = Path("results"),
     fresh: Fresh = False,
-    allow_mixed: Annotated[
-        bool, typer.Option("--allow-mixed", help="Add to results of another code version or processor.")
-    ] = False,
+    allow_mixed: Annotated[bool, typer.Option("--allow-mixed", help="Mix code versions or processors.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Write one JSON object per line to stdout.")] = False,
 ) -> None:

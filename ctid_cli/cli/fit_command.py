@@ -17,14 +17,10 @@ from ctid_cli.signals.treatment import InitialState, Offset
 
 @guarded
 def fit(
-    files: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat); each is one experiment.")
-    ],
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat), an experiment each.")],
     poles: Annotated[int, typer.Option("--poles", help="Number of poles, 1 to 12.")],
     zeros: Annotated[int, typer.Option("--zeros", help="Number of zeros, fewer than poles.")] = 0,
-    delay: Annotated[
-        str, typer.Option("--delay", metavar="LOW:HIGH|VALUE", help="Range to search, or the known delay [time unit].")
-    ] = "0",
+    delay: Annotated[str, typer.Option("--delay", metavar="LOW:HIGH|VALUE", help="Range or value [time unit].")] = "0",
     initial_state: Annotated[InitialState, typer.Option("--initial-state", help="State before the record.")] = "rest",
     offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output.")] = "none",
     hold: InputHold = "zoh",
@@ -33,9 +29,7 @@ def fit(
     output: OutputColumn = None,
     start: From = None,
     stop: To = None,
-    validate: Annotated[
-        Path | None, typer.Option("--validate", metavar="FILE", help="Judge the model on this record, all of it.")
-    ] = None,
+    validate: Annotated[Path | None, typer.Option("--validate", metavar="FILE", help="Judge on this record.")] = None,
     as_json: Json = False,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for fit.json and fit.svg.")] = Path("."),
 ) -> None:

@@ -14,9 +14,7 @@ from ctid_cli.errors import MismatchError, UsageError
 
 @guarded
 def status(
-    experiment: Annotated[
-        str | None, typer.Argument(metavar="[EXPERIMENT]", help="Only this experiment, with its estimates.")
-    ] = None,
+    experiment: Annotated[str | None, typer.Argument(metavar="[EXPERIMENT]", help="Only this one, in full.")] = None,
     out: Out = Path("results"),
     as_json: Json = False,
 ) -> None:
@@ -50,9 +48,7 @@ def table(
         list[str] | None,
         typer.Argument(metavar="[NAME]...", help="Table (1, useful-redundancy/3) or experiment (quickstart)."),
     ] = None,
-    style: Annotated[
-        Literal["text", "md", "csv", "json"], typer.Option("--format", help="Form of the output.")
-    ] = "text",
+    style: Annotated[Literal["text", "md", "csv", "json"], typer.Option("--format", help="Form of output.")] = "text",
     check: Annotated[
         bool,
         typer.Option("--check", help="Compare with the committed tables and the paper; exit code 7 if they differ."),
@@ -96,9 +92,7 @@ def show(
     id: Annotated[str, typer.Argument(metavar="ID", help="Identifier of the estimate, or its first letters.")],
     out: Out = Path("results"),
     as_json: Json = False,
-    history: Annotated[
-        bool, typer.Option("--history", help="Make the data set and the estimate again, and print every iteration.")
-    ] = False,
+    history: Annotated[bool, typer.Option("--history", help="Estimate again, and print every iteration.")] = False,
 ) -> None:
     """Print one estimate in full.
 
@@ -118,9 +112,7 @@ def export(
     experiment: Annotated[str, typer.Argument(metavar="EXPERIMENT", help="Name of the experiment.")],
     style: Annotated[Literal["csv", "json"], typer.Option("--format", help="Form of the output.")] = "csv",
     out: Out = Path("results"),
-    file: Annotated[
-        Path | None, typer.Option("--file", metavar="FILE", help="Write here instead of to stdout.")
-    ] = None,
+    file: Annotated[Path | None, typer.Option("--file", metavar="FILE", help="Write here, not to stdout.")] = None,
 ) -> None:
     """Write every estimate of an experiment, one row each."""
     from ctid_cli.reporting.estimate import as_object
@@ -144,15 +136,10 @@ def export(
 def figure(
     names: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="[NAME]...",
-            help="Figure (2, useful-redundancy/2, additive/3) or study (useful-redundancy, additive).",
-        ),
+        typer.Argument(metavar="[NAME]...", help="Figure (2, additive/3) or study (additive)."),
     ] = None,
     out: Out = Path("results"),
-    file: Annotated[
-        Path | None, typer.Option("--file", metavar="FILE", help="Where a single figure goes instead.")
-    ] = None,
+    file: Annotated[Path | None, typer.Option("--file", metavar="FILE", help="Where a single figure goes.")] = None,
 ) -> None:
     """Draw figures of a study as SVG files.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ctid_cli.cli._common import Fresh, Jobs, Out, guarded
+from ctid_cli.cli._common import Fresh, Jobs, Out, Runs, guarded
 from ctid_cli.cli.experiment_commands import run
 from ctid_cli.errors import MismatchError
 
@@ -46,9 +46,7 @@ def list_studies() -> None:
 @guarded
 def run_study(
     names: Names = None,
-    runs: Annotated[
-        int | None, typer.Option("--runs", min=1, help="Data sets per setting, instead of the specifications' own.")
-    ] = None,
+    runs: Runs = None,
     jobs: Jobs = None,
     out: Out = Path("results"),
     fresh: Fresh = False,
@@ -64,13 +62,8 @@ def run_study(
 @guarded
 def check_study(
     names: Names = None,
-    first: Annotated[
-        bool,
-        typer.Option("--first", help="Compute the first data sets again and compare with the committed estimates."),
-    ] = False,
-    update_first: Annotated[
-        bool, typer.Option("--update-first", help="Compute the first data sets again and commit to their estimates.")
-    ] = False,
+    first: Annotated[bool, typer.Option("--first", help="Compare the first data sets with those committed.")] = False,
+    update_first: Annotated[bool, typer.Option("--update-first", help="Commit to the first data sets anew.")] = False,
     jobs: Jobs = None,
     out: Out = Path("results"),
 ) -> None:

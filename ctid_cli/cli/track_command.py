@@ -27,24 +27,16 @@ def track(
     tones: Annotated[int, typer.Option("--tones", help="Number of sinusoids, 1 to 8: the strongest ones.")],
     method: Annotated[Method, typer.Option("--method", help="How the frequencies are estimated.")] = "automatic",
     time: TimeColumn = None,
-    signal: Annotated[
-        str | None, typer.Option("--signal", metavar="NAME", help="Column or channel of the signal.")
-    ] = None,
-    interval: Annotated[
-        float | None, typer.Option("--interval", metavar="SECONDS", help="Sampling interval, for files without times.")
-    ] = None,
-    rate: Annotated[
-        float | None, typer.Option("--rate", metavar="HERTZ", help="Sampling rate, in place of the interval.")
-    ] = None,
+    signal: Annotated[str | None, typer.Option("--signal", metavar="NAME", help="Column or channel to use.")] = None,
+    interval: Annotated[float | None, typer.Option("--interval", metavar="SECONDS", help="Sampling interval.")] = None,
+    rate: Annotated[float | None, typer.Option("--rate", metavar="HERTZ", help="In place of the interval.")] = None,
     start: From = None,
     stop: To = None,
     every: Annotated[
         float | None,
         typer.Option("--every", metavar="SECONDS", help="One row every so often; about 1000 if not given."),
     ] = None,
-    window: Annotated[
-        float | None, typer.Option("--window", metavar="SECONDS", help="Length of the windows, in place of automatic.")
-    ] = None,
+    window: Annotated[float | None, typer.Option("--window", metavar="SECONDS", help="Length of the windows.")] = None,
     as_json: Json = False,
     style: Annotated[Literal["csv", "h5"], typer.Option("--format", help="Form of the track.")] = "csv",
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the track and its figure.")] = Path("."),

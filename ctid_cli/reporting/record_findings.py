@@ -230,10 +230,8 @@ class _Words:
             text += " What happens between the samples rests on the assumed hold of the input. Sample faster."
             yield Finding("warning", "clock", text)
         elif spans < 20:
-            text += (
-                f" The record lasts only {spans:.2g} times as long as the time that goes with it; slow dynamics and "
-            )
-            yield Finding("warning", "duration", f"{text}noise can hardly be told apart.")
+            text += f" The record lasts only {spans:.2g} times as long as the time that goes with it; slow dynamics "
+            yield Finding("warning", "duration", f"{text}and noise can hardly be told apart.")
         else:
             yield Finding("ok", "clock", text)
 
@@ -256,9 +254,7 @@ class _Words:
             low, high = r.suggested_delay or (0.0, math.nan)
             late = unit.t(r.delay_late)
             when = f"between {unit.t(r.delay_early)} and {late} after" if r.delay_early > 0 else f"within {late} of"
-            text = (
-                f"The output begins to answer {when} a change of the input, slow dynamics included; search the delay "
-            )
+            text = f"The output begins to answer {when} a change of the input, slow dynamics included; search it "
             text += f"from {low:g} to {unit.t(high)} (--delay {low:g}:{high:g})."
             if math.isfinite(r.input_period):
                 text += f" The input repeats itself every {unit.t(r.input_period)}: delays that far apart look alike."

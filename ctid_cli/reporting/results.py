@@ -68,10 +68,8 @@ class Results:
 
         frame = pd.DataFrame(self.rows, columns=[*by, "status", "converged", "seconds"])
         counted = summarise(frame.astype({"converged": "boolean", "seconds": "float64"}), by).astype(object)
-        return [
-            {str(key): value for key, value in row.items()}
-            for row in counted.where(counted.notna(), None).to_dict("records")
-        ]
+        found: list[Any] = counted.where(counted.notna(), None).to_dict("records")
+        return found
 
 
 def out_option(out: Path) -> str:

@@ -25,11 +25,7 @@ GROUPS_PER_BLOCK = 2
 ESTIMATES_PER_BLOCK = 3
 
 #: Titles of the columns of measured frequencies.
-MEASURE_TITLES = {
-    "median_settling_time": "settling",
-    "median_settling_after_step": "after step",
-    "false_alarms": "alarms",
-}
+MEASURE_TITLES = {"median_settling_time": "settling", "median_settling_after_step": "after step"}
 
 _SHORT = {"snr_db": ("SNR", " dB")}
 
@@ -242,7 +238,8 @@ def _heading(results: Results) -> list[str | Table]:
 def frequency_blocks(results: Results, rows: Sequence[Row]) -> Blocks:
     """Swept fields and estimators down, percentages and measures across."""
     keys, measures = settings_of(rows), measures_of(rows)
-    titles = (MEASURE_TITLES.get(key, key.removeprefix("median_").replace("_", " ")) for key in measures)
+    plain = (key.removeprefix("median_").removeprefix("false_").replace("_", " ") for key in measures)
+    titles = (MEASURE_TITLES.get(key, title) for key, title in zip(measures, plain, strict=True))
     header = [*map(setting_title, keys), "estimator", "%", "95 %", "n", *titles, "time"]
     body = [
         [

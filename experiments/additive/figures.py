@@ -39,16 +39,14 @@ def figure_2() -> bytes:
     """Frequency response of the eighth-order system."""
     model = find_study("additive").plan("open-loop").data_cells[0].source.system
     frequencies = np.geomspace(0.1, 50.0, 1200)
-    submodels = [
-        Response(
-            f"submodel {k}", frequencies, submodel.frequency_response(frequencies), line | {"linewidth": 0.9}, False
-        )
-        for k, (submodel, line) in enumerate(zip(model.submodels, ramp(len(model.submodels)), strict=True), 1)
-    ]
+    submodels = []
+    for k, (submodel, line) in enumerate(zip(model.submodels, ramp(len(model.submodels)), strict=True), 1):
+        style = line | {"linewidth": 0.9}
+        response = submodel.frequency_response(frequencies)
+        submodels.append(Response(f"submodel {k}", frequencies, response, style, phase=False))
     whole = Response("system", frequencies, model.frequency_response(frequencies), {"color": MARK, "linewidth": 1.5})
-    return response_svg(
-        [*submodels, whole], "Section 6.1: the eighth-order system and its four submodels", unit="rad/s"
-    )
+    title = "Section 6.1: the eighth-order system and its four submodels"
+    return response_svg([*submodels, whole], title, unit="rad/s")
 
 
 def figure_3(results: Results) -> bytes:
@@ -74,14 +72,8 @@ def figure_6() -> bytes:
     lowest, highest = np.pi, 1000 * np.pi
     tones, measured = empirical_response(data.record, lowest, highest)
     begun = AdditiveModel(start.model.submodels, fit.additive.delay)
-    curves = [
-        Response(
-            "non-parametric estimate, every 0.5 Hz",
-            tones / (2 * np.pi),
-            measured,
-            {"color": LIGHT, "marker": ".", "markersize": 2.5, "linestyle": "none"},
-        )
-    ]
+    points = {"color": LIGHT, "marker": ".", "markersize": 2.5, "linestyle": "none"}
+    curves = [Response("non-parametric estimate, every 0.5 Hz", tones / (2 * np.pi), measured, points)]
     for label, model, style in (
         ("start of the iterations", begun, {"color": MIDDLE, "linestyle": "--", "linewidth": 0.9}),
         ("true simulated system", true, {"color": DARK, "linewidth": 2.4, "alpha": 0.5}),
@@ -101,11 +93,8 @@ def figure_6() -> bytes:
 def figure_coloured(results: Results) -> bytes:
     """Biases under coloured noise in closed loop."""
     rows = errors_of(results)
-    title = (
-        r"Biases in the loop of section 6.2 with noise $v = e/(1 - 0.9 q^{-1})$ of variance 0.01, "
-        f"N = {_samples(rows)}"
-    )
-    return bias_svg(rows, COLOURED, parameters(results), title)
+    title = r"Biases in the loop of section 6.2 with noise $v = e/(1 - 0.9 q^{-1})$ of variance 0.01, "
+    return bias_svg(rows, COLOURED, parameters(results), f"{title}N = {_samples(rows)}")
 
 
 def figure_coverage(open_loop: Results, closed_loop: Results) -> bytes:

@@ -63,8 +63,7 @@ def _phase(values: ComplexArray, unwrap: bool) -> Array:
 def dense_frequencies(model: AdditiveModel, lowest: float, highest: float) -> Array:
     """Frequencies that show every resonance of a model, however narrow."""
     distances = np.geomspace(1e-6, 0.1, 60)
-    near = [
-        model.natural_frequency * np.concatenate([1 - distances, [1.0], 1 + distances]) for model in model.submodels
-    ]
+    around = np.concatenate([1 - distances, [1.0], 1 + distances])
+    near = [submodel.natural_frequency * around for submodel in model.submodels]
     every = np.concatenate([np.geomspace(lowest, highest, 600), *near])
     return np.unique(every[(every >= lowest) & (every <= highest)])
