@@ -52,13 +52,12 @@ def search_grid(
         count = int(np.ceil(REACH * coarser / spacing))
         offsets = spacing * np.arange(-count, count + 1)
         # Grids that overlap share their points.
-        centres = [delays[k] for k in _hopeful(costs_of(found), KEPT)]
+        centres = [minimum.delay for minimum in _hopeful(found, KEPT)]
         places = {round(float(centre + offset) / spacing) for centre in centres for offset in offsets}
         delays = np.unique(np.clip([place * spacing for place in sorted(places)], low, high))
         found = scan(cost, delays)
         coarser = spacing
-    lowest = [found[k] for k in _hopeful(costs_of(found), MINIMA)]
-    minima = [_descended(cost, minimum, bounds) for minimum in lowest if minimum is not None]
+    minima = [_descended(cost, minimum, bounds) for minimum in _hopeful(found, MINIMA)]
     return grid, costs, sorted(minima, key=lambda minimum: minimum.squared_error)
 
 
@@ -81,21 +80,23 @@ def scan(cost: GridCost, delays: Array) -> list[Minimum | None]:
     return found
 
 
-def local_minima(costs: Array, most: int) -> list[int]:
-    """Indices of the lowest local minima of a profile, lowest first."""
+def lowest_minima(found: Sequence[Minimum | None], most: int) -> list[Minimum]:
+    """The lowest local minima of a profile, lowest first."""
+    costs = costs_of(found)
     padded = np.concatenate(([np.inf], np.where(np.isnan(costs), np.inf, costs), [np.inf]))
     lowest = (padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]) & np.isfinite(padded[1:-1])
     indices = np.flatnonzero(lowest)
-    return [int(k) for k in indices[np.argsort(costs[indices], kind="stable")][:most]]
+    chosen = [found[k] for k in indices[np.argsort(costs[indices], kind="stable")][:most]]
+    return [minimum for minimum in chosen if minimum is not None]
 
 
-def _hopeful(costs: Array, most: int) -> list[int]:
+def _hopeful(found: Sequence[Minimum | None], most: int) -> list[Minimum]:
     """The lowest local minima, without those that are far above the least."""
-    lowest = local_minima(costs, most)
-    return [k for k in lowest if costs[k] <= HOPELESS * costs[lowest[0]]]
+    lowest = lowest_minima(found, most)
+    return [minimum for minimum in lowest if minimum.squared_error <= HOPELESS * lowest[0].squared_error]
 
 
-def costs_of(found: list[Minimum | None]) -> Array:
+def costs_of(found: Sequence[Minimum | None]) -> Array:
     """Squared errors, NaN where nothing was found."""
     return np.array([np.nan if minimum is None else minimum.squared_error for minimum in found])
 

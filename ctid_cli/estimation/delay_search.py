@@ -136,25 +136,7 @@ def descend(
     A step is halved while it leaves the bounds (unless it is mirrored) or does not lower the cost, and the search ends
     where that makes it shorter than the shortest step.
     """
-    low, high = bounds
-    smallest = SMALLEST_STEP * (high - low) if smallest_step is None else smallest_step
-
-    def next_after(current: Minimum) -> Minimum | None:
-        step = current.step if abs(current.step) <= largest_step else float(np.copysign(largest_step, current.step))
-        while True:
-            target = current.delay + step
-            if reflect and not low <= target <= high:
-                target = 2.0 * (low if target < low else high) - target
-            while not low <= target <= high:
-                step *= 0.5
-                target = current.delay + step
-            if abs(step) <= smallest:
-                return None
-            trial = cost.minimise(target, current.theta)
-            if trial is not None and trial.squared_error < current.squared_error:
-                return trial
-            step *= 0.5
-
+    smallest = SMALLEST_STEP * (bounds[1] - bounds[0]) if smallest_step is None else smallest_step
     start = cost.minimise(delay, theta)
     if start is None:
         return None
@@ -163,13 +145,34 @@ def descend(
         current = steps[-1]
         if not np.isfinite(current.step):
             return Descent(steps, Status.SINGULAR, iteration)
-        accepted = next_after(current)
+        accepted = _lower(cost, current, bounds, smallest, largest_step, reflect)
         if accepted is None:
             return Descent(steps, Status.CONVERGED, iteration)
         steps.append(accepted)
         if 1.0 - accepted.squared_error / current.squared_error < tolerance:
             return Descent(steps, Status.CONVERGED, iteration + 1)
     return Descent(steps, Status.MAX_ITERATIONS, max_iterations)
+
+
+def _lower(
+    cost: DelayCost, current: Minimum, bounds: tuple[float, float], smallest: float, largest: float, reflect: bool
+) -> Minimum | None:
+    """A lower cost in the direction of the step; None where that is too short."""
+    low, high = bounds
+    step = current.step if abs(current.step) <= largest else float(np.copysign(largest, current.step))
+    while True:
+        target = current.delay + step
+        if reflect and not low <= target <= high:
+            target = 2.0 * (low if target < low else high) - target
+        while not low <= target <= high:
+            step *= 0.5
+            target = current.delay + step
+        if abs(step) <= smallest:
+            return None
+        trial = cost.minimise(target, current.theta)
+        if trial is not None and trial.squared_error < current.squared_error:
+            return trial
+        step *= 0.5
 
 
 def bound_in_the_way(current: Equations, delay: float, bounds: tuple[float, float]) -> float | None:

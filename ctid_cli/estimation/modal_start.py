@@ -177,15 +177,23 @@ def _arrangements(poles: Sequence[complex], terms: Sequence[Term]) -> Iterator[l
         doubles = [[pole] for pole in pairs] + [rest[k : k + 2] for k in range(0, len(rest), 2)]
         doubles.sort(key=lambda group: abs(group[0]))
         for order in _distinct_orders(terms, range(len(terms))):
-            two, one = iter(doubles), iter([reals[k] for k in alone])
-            groups: list[list[complex]] = [[] for _ in terms]
-            for k in order:
-                groups[k] = [pole for pair in islice(two, terms[k].poles // 2) for pole in pair]
-                groups[k] += islice(one, terms[k].poles % 2)
+            groups = _dealt(terms, order, doubles, [reals[k] for k in alone])
             # Exchanging a term of one pole with one of two changes nothing.
             if groups not in tried:
                 tried.append(groups)
                 yield groups
+
+
+def _dealt(
+    terms: Sequence[Term], order: Sequence[int], doubles: list[list[complex]], singles: list[complex]
+) -> list[list[complex]]:
+    """Pairs and single poles given to the terms in an order."""
+    two, one = iter(doubles), iter(singles)
+    groups: list[list[complex]] = [[] for _ in terms]
+    for k in order:
+        groups[k] = [pole for pair in islice(two, terms[k].poles // 2) for pole in pair]
+        groups[k] += islice(one, terms[k].poles % 2)
+    return groups
 
 
 def _with_room(poles: Sequence[complex], room: int) -> tuple[list[complex], list[complex]]:
@@ -236,13 +244,15 @@ class _NumeratorFit:
         theta[_numerator_places(self.terms)] = found.gains
         return AdditiveModel.from_theta(theta, self.terms, self.delay), found
 
+    def _without_poles(self) -> list[Term]:
+        """What stands beside the modes: the integrators, and a direct feedthrough."""
+        integrators = sum(term.integrators for term in self.terms)
+        found = [Term(0, integrators - 1, integrators)] if integrators else []
+        return [*found, Term(0, 0)] if any(term.zeros == term.order for term in self.terms) else found
+
     def reduced(self, poles: Sequence[complex], count: int) -> list[complex]:
         """The poles without which the output error would rise most, in all ``count``, conjugates counted."""
-        kept = list(poles)
-        integrators = sum(term.integrators for term in self.terms)
-        others = [Term(0, integrators - 1, integrators)] if integrators else []
-        if any(term.zeros == term.order for term in self.terms):
-            others.append(Term(0, 0))
+        kept, others = list(poles), self._without_poles()
         terms = [Term(2, 1) if pole.imag else Term(1, 0) for pole in kept] + others
         groups = [[pole] for pole in kept] + [[] for _ in others]
         responses = _responses(self.data, groups, terms, self.delay)

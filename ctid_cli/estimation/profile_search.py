@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.delay_grid import costs_of, local_minima, scan, search_grid
+from ctid_cli.estimation.delay_grid import costs_of, lowest_minima, scan, search_grid
 from ctid_cli.estimation.delay_search import Minimum, best_minimum
 from ctid_cli.estimation.filtered_costs import filtered_costs
 from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps, iterate
@@ -167,8 +167,7 @@ def _search_samples(cost: RecordsCost) -> Found:
         assert least is not None
         measured.make_periodic(least.theta[: cost.coefficients.poles])
     count = sum(data.count for data in measured.data)
-    minima = [found[k] for k in local_minima(costs, MINIMA)]
-    chosen = [minimum for minimum in minima if minimum is not None]
+    chosen = lowest_minima(found, MINIMA)
     if delays.size == 1:
         return chosen, None
     # Held inputs that change on the sampling clock put a kink into the cost at every sampling interval, and local
@@ -196,15 +195,11 @@ def _local_grid(cost: RecordsCost, centres: Sequence[Minimum], reach: float, par
     for centre in centres:
         for side in (-1, 1):
             start = centre.theta
-            row: list[tuple[float, Minimum | None]] = []
             for part in range(0 if side > 0 else 1, parts + 1):
                 delay = centre.delay + side * part * reach / parts
                 if low <= delay <= high:
                     found = cost.minimise_from(delay, [start])
                     start = start if found is None else found.theta
-                    row.append((delay, found))
-            fine += row if side > 0 else row[::-1]
+                    fine.append((delay, found))
     fine.sort(key=lambda entry: entry[0])
-    minima = [minimum for _, minimum in fine]
-    lowest = [minima[k] for k in local_minima(costs_of(minima), most)]
-    return [minimum for minimum in lowest if minimum is not None]
+    return lowest_minima([minimum for _, minimum in fine], most)

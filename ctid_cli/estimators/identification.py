@@ -292,10 +292,8 @@ def _estimates(
             item = replace(item, standard_error=float("nan"), status="at bound")
         found[name] = item
     found.setdefault("delay", UncertainValue("delay", fit.model.delay, status="fixed"))
-    order = {"b": 0, "a": 1, "delay": 2}
-    return tuple(
-        sorted(found.values(), key=lambda item: order.get("delay" if item.name == "delay" else item.name[0], 3))
-    )
+    order = {"b": 0, "a": 1, "d": 2}
+    return tuple(sorted(found.values(), key=lambda item: order.get(item.name[0], 3)))
 
 
 def _validate(refinement: Refinement, fit: MeasuredFit, record: Record) -> Validation:

@@ -174,6 +174,19 @@ def _groups(fractions: _PartialFractions, terms: Sequence[Term] | None) -> list[
         groups = [_Group(couple) for couple in couples] + [_Group((k,)) for k in lone]
         groups += [_Group((), integrators)] * (integrators > 0)
         return groups + [_Group((), 0, True)] * fractions.direct.size
+    direct = [fractions.direct.size > 0 and term.zeros == term.order for term in terms]
+    _check_terms(fractions, terms, sum(direct))
+    left, alone = iter(couples), iter(lone)
+    taken = [[k for couple in islice(left, term.poles // 2) for k in couple] for term in terms]
+    return [
+        _Group((*places, *islice(alone, term.poles - len(places))), term.integrators, takes)
+        for places, term, takes in zip(taken, terms, direct, strict=True)
+    ]
+
+
+def _check_terms(fractions: _PartialFractions, terms: Sequence[Term], direct: int) -> None:
+    """Refuse terms that cannot take all of a sum; so many take the feedthrough."""
+    pairs, n, integrators = fractions.pairs, fractions.poles.size, fractions.at_origin.size
     asked = sum(term.poles for term in terms), sorted(term.integrators for term in terms if term.integrators)
     if asked != (n, [integrators] * (integrators > 0)):
         raise DataError(
@@ -185,18 +198,11 @@ def _groups(fractions: _PartialFractions, terms: Sequence[Term] | None) -> list[
         raise DataError(
             f"the model has {pairs} complex pairs of poles, the terms room for {room}; let more have two poles"
         )
-    direct = [fractions.direct.size > 0 and term.zeros == term.order for term in terms]
-    if fractions.direct.size != sum(direct):
+    if fractions.direct.size != direct:
         raise DataError(
             "the model has as many zeros as poles, so exactly one term must too, to take its direct feedthrough; "
-            f"{sum(direct)} of the terms have"
+            f"{direct} of the terms have"
         )
-    left, alone = iter(couples), iter(lone)
-    taken = [[k for couple in islice(left, term.poles // 2) for k in couple] for term in terms]
-    return [
-        _Group((*places, *islice(alone, term.poles - len(places))), term.integrators, takes)
-        for places, term, takes in zip(taken, terms, direct, strict=True)
-    ]
 
 
 def _collected(fractions: _PartialFractions, group: _Group) -> Submodel:
