@@ -82,6 +82,7 @@ def _round(
     from joblib.externals.loky import get_reusable_executor
 
     running: dict[Future[list[Outcome]], Job] = {}
+    starting: list[Job] = []
     # A worker that has waited in vain for so long ends [s].
     settings = {"timeout": 300, "initializer": initialise, "initargs": (os.getpid(),), "env": _ONE_THREAD}
     try:
@@ -90,8 +91,10 @@ def _round(
         while running or (waiting and not stopping()):
             # One job each in advance, so that no worker waits; a job that is run alone is lost alone.
             while waiting and not stopping() and len(running) < (2 * workers if workers > 1 else 1):
-                job = waiting.popleft()
-                running[executor.submit(run_job, job)] = job
+                # Workers die with the thread that started them, which is this one.
+                starting.append(waiting.popleft())
+                future = executor.submit(run_job, starting[0])
+                running[future] = starting.pop()
             if deadline is None and stopping():
                 deadline = time.monotonic() + DRAIN
             done, _ = wait(running, timeout=TICK, return_when=FIRST_COMPLETED)
@@ -106,7 +109,7 @@ def _round(
                 yield Finished(running.pop(future), outcomes)
     except Exception as error:
         kill_workers()
-        return list(running.values()), _reason(error)
+        return [*running.values(), *starting], _reason(error)
     return list(running.values()), ""
 
 

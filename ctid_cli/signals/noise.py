@@ -83,10 +83,8 @@ class Noise:
                 raise DataError("a signal-to-noise ratio is a level only beside a noise-free output; give that")
             power = float(np.mean(noise_free**2))
             if power == 0.0:
-                raise DataError(
-                    "the noise-free output is zero, so no noise has a signal-to-noise ratio to it; is the delay longer "
-                    "than the record? Give noise.variance, or a longer record"
-                )
+                why = "the noise-free output is zero, so no noise has a signal-to-noise ratio to it"
+                raise DataError(f"{why}; is the delay longer than the record? Give noise.variance, or a longer record")
             variance = power / 10 ** (self.snr_db / 10)
         assert variance is not None
         return variance / self._unit_variance

@@ -148,14 +148,10 @@ def _on_grid(table: Table, name: str, t: Array, values: Array, unit: str) -> tup
     if stray[worst] > CLOCK_TOLERANCE * interval + tolerance:
         # Where most neighbours of a sample are missing, the median is a multiple of the interval.
         beside = f"{t[worst]:.9g} {unit} lies {stray[worst]:.3g} {unit} beside a grid of {interval:.6g} {unit}"
-        complaint = (
-            f"{table.place(worst)}: the clock is not regular: {beside}, at intervals from {steps.min():.6g} to "
-            f"{steps.max():.6g} {unit}. Resample the record, or give its clock (--interval or --rate) if the times in "
-            "the file are only rounded"
-        )
         places, interval, stray = _nearest_grid(t, float(steps.min()))
         if not stray.max() <= CLOCK_TOLERANCE * interval + tolerance:
-            raise DataError(complaint)
+            ways = "Resample the record, or give its clock (--interval or --rate) if its times are only rounded"
+            raise DataError(f"{table.place(worst)}: the clock is not regular: {beside}. {ways}")
     if places[-1] > MOST_FILLED * t.size:
         some = f"of {places[-1] + 1:.6g} instants of a clock of {interval:.6g} {unit} the file has only {t.size}"
         raise DataError(f"{table.file}: {some}; use a part with fewer gaps (--from, --to), or resample the record")

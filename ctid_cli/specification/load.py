@@ -73,15 +73,8 @@ def spec_from_canonical(canonical: Mapping[str, Any], folder: Path | None = None
 def json_schema() -> dict[str, Any]:
     """JSON Schema of specifications, for editors."""
     schema = Spec.model_json_schema()
-    schema["anyOf"] = [
-        {"required": list(names)}
-        for names in (
-            ("data",),
-            ("system", "excitation", "sampling"),
-            ("system", "loop", "sampling"),
-            ("signal", "sampling"),
-        )
-    ]
+    ways = ("data", "system excitation sampling", "system loop sampling", "signal sampling")
+    schema["anyOf"] = [{"required": way.split()} for way in ways]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "ctid experiment"}
 
 

@@ -49,8 +49,8 @@ class GivenStart(AdditiveSection):
 
 
 def _form(value: Any) -> str | None:
-    forms = (("relative_uniform", RelativeStart), ("additive", GivenStart))
-    found = [name for name, form in forms if isinstance(value, form) or (isinstance(value, Mapping) and name in value)]
+    given = value if isinstance(value, Mapping) else ()
+    found = [name for name, form in _FORMS.items() if isinstance(value, form) or name in given]
     return found[0] if len(found) == 1 else None
 
 
@@ -61,14 +61,8 @@ def _several(one: OneOf) -> ByShape:
 
 
 _DELAYS = _several(ByShape(NotNegative, "{uniform: [low, high]} is allowed too", mapping=UniformStart))
-_PARAMETERS = _several(
-    OneOf(
-        _form,
-        {"relative_uniform": RelativeStart, "additive": GivenStart},
-        "no_form",
-        "{relative_uniform: fraction} or {additive: [submodels]}",
-    )
-)
+_FORMS = {"relative_uniform": RelativeStart, "additive": GivenStart}
+_PARAMETERS = _several(OneOf(_form, _FORMS, "no_form", "{relative_uniform: fraction} or {additive: [submodels]}"))
 _LISTED = AfterValidator(lambda value: value if isinstance(value, list) else [value])
 
 

@@ -52,8 +52,7 @@ class SystemSection(Section):
         if model.relative_degree < 1:
             yield (
                 (),
-                f"there are {zeros} zeros and {model.order} poles; the system must be strictly proper, "
-                "with fewer zeros than poles",
+                f"there are {zeros} zeros and {model.order} poles; a strictly proper system has fewer zeros than poles",
             )
         elif model.order > MAX_ORDER:
             yield ("denominator",), f"{model.order} poles are too many; at most {MAX_ORDER} can be simulated exactly"
