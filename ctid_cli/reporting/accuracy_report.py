@@ -16,11 +16,7 @@ from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.text import listed
 
 #: On what all of it rests.
-REMARK = (
-    "To first order in the noise: this holds where the estimator converges to the right solution, standard errors are "
-    "small against the parameters, and system and noise are as the experiment says, from rest. Initial states and "
-    "offsets that are estimated besides are not counted."
-)
+REMARK = "This is to first order in the noise, from rest, where the estimator converges to the right solution."
 #: Different numbers of samples that are shown, of all that are swept.
 SIZES = 4
 #: Combinations of the other swept settings that are shown.

@@ -48,25 +48,21 @@ def filter_text(filters: FilterSet, check: FilterCheck) -> str:
     error_rows = []
     for row in sorted([*content["intervals"], *content["gaps"]], key=lambda row: float(row["low"])):
         leads = number(row["minimum"], 5) if "minimum" in row else "nothing closer"
-        error_rows.append(
-            [f"{number(row['low'], 5)} to {number(row['high'], 5)}", str(row.get("filter", "none")), leads]
-        )
+        span = f"{number(row['low'], 5)} to {number(row['high'], 5)}"
+        error_rows.append([span, str(row.get("filter", "none")), leads])
     longest = f"periods from {number(filters.beta, 4)} to 1 times {_time(float(filters.periods[-1]))}"
     text = f"{count(filters.count, 'filter')}, {longest}, that of the bandwidth {number(filters.bandwidth, 4)} rad/s."
+    alone = Table(["filter", "period [s]", "cut-off [rad/s]", "alone from [s]"], filter_rows, "rrrr")
+    leading = Table(["delay error [s]", "filter", "leads to [s]"], error_rows, "lrr")
+    remark = "Checked is the necessary condition for ideal filters, white input and a known rational part, no noise."
     blocks: list[list[str | Table]] = [
         [_verdict(content, top)],
         [text],
-        [
-            Table(["filter", "period [s]", "cut-off [rad/s]", "alone from [s]"], filter_rows, "rrrr"),
-            "alone from: delay errors up to this one lead to zero with this filter alone.",
-        ],
-        [
-            Table(["delay error [s]", "filter", "leads to [s]"], error_rows, "lrr"),
-            "filter: of those that lead closer to zero, the one that leads closest.",
-        ],
+        [alone, "alone from: delay errors up to this one lead to zero with this filter alone."],
+        [leading, "filter: of those that lead closer to zero, the one that leads closest."],
         [_path(content)],
         [_sufficient(content, top)],
-        ["Checked is the necessary condition for ideal filters, white input and a known rational part, without noise."],
+        [remark],
     ]
     return Report(blocks).draw()
 

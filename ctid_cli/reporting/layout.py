@@ -30,13 +30,9 @@ class Table:
         else:
             widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
             columns = list(zip(self.align, widths, strict=True))
-            drawn = [
-                "  ".join(
-                    cell.ljust(width) if side == "l" else cell.rjust(width)
-                    for cell, (side, width) in zip(cells, columns, strict=True)
-                ).rstrip()
-                for cells in lines
-            ]
+            pad = {"l": str.ljust, "r": str.rjust}
+            padded = ((pad[side](cell, n) for cell, (side, n) in zip(cells, columns, strict=True)) for cells in lines)
+            drawn = ["  ".join(cells).rstrip() for cells in padded]
             rule = "-" * (sum(widths) + 2 * (len(widths) - 1))
         return "\n".join([drawn[0], rule, *drawn[1:]])
 

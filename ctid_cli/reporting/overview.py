@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ctid_cli.reporting.estimate import as_object
-from ctid_cli.reporting.layout import Table, number
+from ctid_cli.reporting.layout import Table, number, picked
 from ctid_cli.reporting.results import out_option
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.store import ExperimentStatus
@@ -21,11 +21,8 @@ LISTED = 10
 def status_object(status: ExperimentStatus, estimates: Sequence[Mapping[str, Any]] | None = None) -> dict[str, Any]:
     """Progress of an experiment for ``ctid status --json``."""
     content = asdict(status) | {"folder": str(status.folder), "todo": status.todo}
-    content["groups"] = [
-        {"estimator": group.estimator, "cell": group.cell, **group.swept}
-        | {name: getattr(group, name) for name in ("planned", "done", "todo", "failed")}
-        for group in status.groups
-    ]
+    before, after = ("estimator", "cell"), ("planned", "done", "todo", "failed")
+    content["groups"] = [{**picked(group, before), **group.swept, **picked(group, after)} for group in status.groups]
     return content if estimates is None else content | {"estimates": [as_object(row) for row in estimates]}
 
 

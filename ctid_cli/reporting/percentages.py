@@ -172,9 +172,7 @@ def _together(group: pd.DataFrame) -> dict[str, float | None]:
         if own:
             medians[f"median_{base}"] = late[own].max(axis=1).median()
     medians |= {f"median_{name}": late[name].median() for name in names if base_name(name)[0] == "rms"}
-    found: dict[str, float | None] = {
-        name: float(middle) if math.isfinite(middle) else None for name, middle in medians.items()
-    }
+    found: dict[str, float | None] = {k: float(v) if math.isfinite(v) else None for k, v in medians.items()}
     if "false_alarms" in group:
         alarms = group["false_alarms"]
         found["false_alarms"] = float(alarms.sum()) if alarms.notna().any() else None

@@ -81,13 +81,9 @@ def figure_6() -> bytes:
     ):
         frequencies = dense_frequencies(model, lowest, highest)
         curves.append(Response(label, frequencies / (2 * np.pi), model.frequency_response(frequencies), style))
-    return response_svg(
-        curves,
-        "SIMULATED stand-in for the flexible beam of section 7, no measured data: 2 s from rest, 4096 Hz,\n"
-        f"noise 100 dB below the output, a delay of 4 samples; {fit.iterations} iterations, {fit.status.name}",
-        unit="Hz",
-        unwrap=False,
-    )
+    title = "SIMULATED stand-in for the flexible beam of section 7, no measured data: 2 s from rest, 4096 Hz,\n"
+    title += f"noise 100 dB below the output, a delay of 4 samples; {fit.iterations} iterations, {fit.status.name}"
+    return response_svg(curves, title, unit="Hz", unwrap=False)
 
 
 def figure_coloured(results: Results) -> bytes:
@@ -100,13 +96,11 @@ def figure_coloured(results: Results) -> bytes:
 def figure_coverage(open_loop: Results, closed_loop: Results) -> bytes:
     """How often 95 % intervals contain the true parameters."""
     ours, theirs = errors_of(open_loop), errors_of(closed_loop)
-    return coverage_svg(
-        [
-            (f"open loop, coloured noise, N = {_samples(ours)}", ours, COVERAGE_OPEN_LOOP),
-            (f"closed loop, N = {_samples(theirs)}", theirs, COVERAGE_CLOSED_LOOP),
-        ],
-        "95 % intervals from the standard errors of single estimates of the sum of submodels",
-    )
+    panels = [
+        (f"open loop, coloured noise, N = {_samples(ours)}", ours, COVERAGE_OPEN_LOOP),
+        (f"closed loop, N = {_samples(theirs)}", theirs, COVERAGE_CLOSED_LOOP),
+    ]
+    return coverage_svg(panels, "95 % intervals from the standard errors of single estimates of the sum of submodels")
 
 
 def empirical_response(record: Record, lowest: float, highest: float) -> tuple[Array, ComplexArray]:

@@ -87,15 +87,10 @@ def markdown(found: StudyResults) -> str:
     titles = dict(ROWS.values())
     rows = [
         [
-            line["row"],
-            titles[line["row"]],
-            line["formula"] + (" (misused)" if line["misused"] else ""),
-            line["parameter"],
-            f"{line['true']:.5g}",
-            f"{line['percent']:.1f}",
-            f"{line['low']:.1f} to {line['high']:.1f}",
-            f"{line['standard_error_ratio']:.3f}",
-            f"{line['bias_in_monte_carlo_errors']:+.1f}",
+            *(line["row"], titles[line["row"]], line["formula"] + (" (misused)" if line["misused"] else "")),
+            *(line["parameter"], f"{line['true']:.5g}"),
+            *(f"{line['percent']:.1f}", f"{line['low']:.1f} to {line['high']:.1f}"),
+            *(f"{line['standard_error_ratio']:.3f}", f"{line['bias_in_monte_carlo_errors']:+.1f}"),
         ]
         for name in ROWS
         if name in found

@@ -164,11 +164,9 @@ def _joined(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
 
 def figure_3() -> bytes:
     """Ten filtered costs of case 1 with the model error, without noise."""
-    return costs_svg(
-        _computed(CASE_1, noise=False),
-        "Case 1 without noise: costs of the ten filters, normalised as in (45), "
-        "coefficients re-estimated at every delay",
-    )
+    title = "Case 1 without noise: costs of the ten filters, normalised as in (45), "
+    title += "coefficients re-estimated at every delay"
+    return costs_svg(_computed(CASE_1, noise=False), title)
 
 
 def figure_4() -> bytes:
@@ -179,10 +177,8 @@ def figure_4() -> bytes:
 
 def figure_5() -> bytes:
     """Costs of the ten filters on one data set of case 1."""
-    return costs_svg(
-        _computed(CASE_1, noise=True),
-        f"Case 1, one data set, regular sampling, SNR {SNR:g} dB: costs of the ten filters, normalised as in (45)",
-    )
+    title = f"Case 1, one data set, regular sampling, SNR {SNR:g} dB: costs of the ten filters, normalised as in (45)"
+    return costs_svg(_computed(CASE_1, noise=True), title)
 
 
 def figure_6() -> bytes:
