@@ -25,10 +25,10 @@ WHY = {
     "esprit": "ESPRIT, the most exact one for a whole record without gaps",
     "nonlinear_least_squares": "nonlinear least squares, since samples are missing",
 }
-#: Samples in a period of the highest tone, for estimators that take windows, that delay, and that integrate.
-WINDOW_SAMPLES = 4
-DELAY_SAMPLES = 12
-INTEGRATION_SAMPLES = 60
+#: Samples in a period of the highest tone, and how many tones more than the wanted ones may share the band, for
+#: estimators that take windows, that integrate, and for the others, that delay.
+SAMPLING = dict.fromkeys(BATCH, (4, MOST_TONES)) | dict.fromkeys(INTEGRATING, (60, 0))
+DELAYING = (12, 2)
 #: Fewest samples for each tone.
 SAMPLES_PER_TONE = 8
 #: A signal that varies by less than this fraction of itself is constant.
@@ -64,9 +64,6 @@ LARGEST_SHARE = 1.0 / 3.0
 WINDOW_SAMPLES_PER_TONE = 8
 #: Length of the prefilter in delays.
 PREFILTER_DELAYS = 2.0
-#: Tones that share the band: so many at most for estimators that delay, and for those that integrate.
-DELAY_SPARES = 2
-INTEGRATION_SPARES = 0
 #: Share of the Nyquist frequency above which a tone may be the image of one that the sampling has folded.
 SUSPICIOUS = 0.9
 
@@ -230,12 +227,7 @@ def _choose_band(
     loud = peaks.amplitudes[tones:] > HARMLESS * weakest
     others, loudness = peaks.omega[tones:][loud], peaks.amplitudes[tones:][loud]
 
-    if kind in BATCH:
-        per_period, most = WINDOW_SAMPLES, MOST_TONES
-    elif kind in INTEGRATING:
-        per_period, most = INTEGRATION_SAMPLES, tones + INTEGRATION_SPARES
-    else:
-        per_period, most = DELAY_SAMPLES, tones + DELAY_SPARES
+    per_period, most_spares = SAMPLING.get(kind, DELAYING)
     factor = max(1, int(2.0 * np.pi / (per_period * top * interval)))
     pass_edge = PASS * top
     stop_edge = min(2.0 * np.pi / (factor * interval) - pass_edge, np.pi / interval)
@@ -266,7 +258,7 @@ def _choose_band(
         )
         reached = others <= LOW_STOP * low
         others, loudness = others[~reached], loudness[~reached]
-    spares = others[: max(0, min(most, MOST_TONES) - tones)]
+    spares = others[: min(most_spares, MOST_TONES - tones)]
     if spares.size:
         hertz = _listed(np.sort(spares) / (2.0 * np.pi))
         sentences.append(f"Estimated too, since they disturb, but not shown: tones at {hertz} Hz.")

@@ -78,13 +78,19 @@ def paper_tables(results: Results) -> list[str]:
         times = by_estimator(settled, reading=reading)
         rows = []
         for estimator, tones in by_estimator(left, reading=reading).items():
-            found = {row["piece"]: row for row in times.get(estimator, [])}
-            cells = [time(found[p][f"within_{band:g}"]) if found else "-" for p in pieces for band in BANDS]
-            wrong = number(next(iter(found.values()))["valid_but_off_by_0.05"], 3) if found else "-"
+            cells, wrong = settling_cells({row["piece"]: row for row in times.get(estimator, [])}, pieces)
             errors = [number(tone["rms"], 2) for tone in tones]
             rows.append([named(estimator), *cells, *errors, number(tones[0]["valid_share"], 3), wrong])
         written += [after.get(reading, "") + explained, table(header, rows)]
     return written
+
+
+def settling_cells(found: dict[str, Any], pieces: list[str]) -> tuple[list[str], str]:
+    """When an estimator has settled in each piece and band, and how long it was wrong and called valid."""
+    if not found:
+        return ["-"] * (len(pieces) * len(BANDS)), "-"
+    cells = [time(found[piece][f"within_{band:g}"]) for piece in pieces for band in BANDS]
+    return cells, number(next(iter(found.values()))["valid_but_off_by_0.05"], 3)
 
 
 def recovery_table(results: Results) -> list[str]:
