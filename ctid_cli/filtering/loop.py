@@ -97,8 +97,8 @@ def simulate_loop(
     u, x = _closed_loop(plant, law, r, v, float(enters == "controller"))
     if not (np.isfinite(u).all() and np.isfinite(x).all()):
         raise DataError(
-            "the signals of the closed loop are not finite: check reference and noise, and whether the loop is stable; "
-            f"its largest pole has the magnitude {loop_radius(model, controller, interval):.6g}"
+            "the signals of the closed loop are not finite; check reference, noise and stability: its largest pole has "
+            f"the magnitude {loop_radius(model, controller, interval):.6g}"
         )
     return LoopSignals(u, x)
 
@@ -187,6 +187,5 @@ def _require_solvable(plant: SampledModel, controller: DiscreteController) -> No
     gain = 0.0 if plant.shift else controller.direct * plant.direct
     if abs(1.0 + gain) <= NO_GAIN * max(1.0, abs(gain)):
         raise DataError(
-            "the loop has no solution: model and controller both act at once, with gains whose product is -1; change "
-            "the gain of the controller, or give the model a delay or fewer zeros"
+            "the loop has no solution: direct gains of -1 round it; change the controller's gain, or delay the model"
         )

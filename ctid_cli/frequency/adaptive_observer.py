@@ -120,8 +120,8 @@ class AdaptiveObserver(OnlineEstimator):
         if self.highest_frequency < self.lowest_frequency + (self.tones - 1) * self.smallest_gap:
             raise OptionError(
                 "highest_frequency",
-                f"{self.tones} frequencies, {self.smallest_gap:g} rad/s apart, do not fit between lowest_frequency "
-                f"({self.lowest_frequency:g} rad/s) and highest_frequency ({self.highest_frequency:g} rad/s).",
+                f"{self.tones} frequencies, {self.smallest_gap:g} rad/s apart, do not fit between "
+                f"{self.lowest_frequency:g} and {self.highest_frequency:g} rad/s.",
             )
         initial = one_for_each("initial_frequencies", self.initial_frequencies, self.tones, "rad/s")
         object.__setattr__(self, "initial_frequencies", initial)

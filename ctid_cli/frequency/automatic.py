@@ -128,9 +128,8 @@ def choose_settings(
     peaks = find_peaks(samples, interval, tones)
     if peaks.omega.size == 0:
         raise DataError(
-            f"no tone stands out of the spectrum of {samples.size * interval:.4g} s: the signal is noise, its tones "
-            "move too fast, the record is shorter than two periods, or too much of it is missing; use a longer record, "
-            "or another part of it"
+            f"no tone stands out of the spectrum of {samples.size * interval:.4g} s: noise, fast-moving tones, fewer "
+            "than two periods, or too many gaps; use a longer record, or another part of it"
         )
     offset = _offset(samples, float(peaks.amplitudes[:tones][-1]))
     bridge = int(BRIDGED * 2.0 * np.pi / (peaks.omega[:tones].max() * interval))
@@ -178,8 +177,7 @@ def _refuse_unusable(samples: Array, tones: int) -> None:
     present = samples[np.isfinite(samples)]
     if present.size < SAMPLES_PER_TONE * tones:
         raise DataError(
-            f"samples that are not missing: {present.size}, too few for {tones} tones; at least "
-            f"{SAMPLES_PER_TONE * tones} are needed"
+            f"{present.size} samples are present, too few for {tones} tones: {SAMPLES_PER_TONE * tones} are needed"
         )
     low, high = float(present.min()), float(present.max())
     if high - low <= CONSTANT * max(abs(low), abs(high)):
@@ -188,8 +186,7 @@ def _refuse_unusable(samples: Array, tones: int) -> None:
     largest = max(abs(low), abs(high))
     if not SMALLEST_SAMPLE <= largest <= LARGEST_SAMPLE:
         raise DataError(
-            f"the largest sample is {largest:.3g}, and the squares of such numbers cannot be computed with; give the "
-            "signal in another unit"
+            f"the largest sample is {largest:.3g}, whose square leaves the range of numbers; use another unit"
         )
 
 
@@ -284,8 +281,7 @@ def _choose_window(
         length = round(min(window / thin, thinned.size + 1.0))
         if not least <= length <= thinned.size:
             raise ValueError(
-                f"window must be between {least * thin:.4g} s, for {count} tones, and the {duration:.4g} s that the "
-                f"filters leave of the record, not {window:g}."
+                f"window must be between {least * thin:.4g} s ({count} tones) and {duration:.4g} s, not {window:g}."
             )
         return length, f"Windows of {length * thin:.4g} s, as asked for."
     closest = _closest(band.expected, tones, thin)

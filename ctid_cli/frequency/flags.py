@@ -37,13 +37,10 @@ class Flag(IntFlag):
 MEANINGS: dict[Flag, str] = {
     Flag.STARTING: "Too few samples have arrived since the start or since the last restart.",
     Flag.GAP: "A sample that the estimate needs at this instant is missing or not finite.",
-    Flag.CHANGED: (
-        "The signal changed: the estimate is held until every sample from before the change has left the delays."
-    ),
+    Flag.CHANGED: "The signal changed: the estimate is held until all samples from before have left the delays.",
     Flag.UNDETERMINED: (
-        "The samples do not determine as many frequencies as asked for: "
-        "the signal is zero, constant or has fewer tones, or two of its tones look alike at this delay; "
-        "use fewer tones."
+        "The samples do not determine as many frequencies as asked for: the signal is zero, constant or has fewer "
+        "tones, or two of its tones look alike at this delay; use fewer tones."
     ),
     Flag.UNCERTAIN: (
         "The equations hold so badly or determine so little that a frequency may be wrong by a tenth of itself or of "
@@ -51,9 +48,7 @@ MEANINGS: dict[Flag, str] = {
         "use a prefilter, more tones or a longer record."
     ),
     Flag.COMPLEX_ROOTS: "The estimated parameters belong to no set of real frequencies.",
-    Flag.OUT_OF_BOUNDS: (
-        "A frequency lies outside the bounds lowest_frequency and highest_frequency and was put on the bound."
-    ),
+    Flag.OUT_OF_BOUNDS: "A frequency beyond lowest_frequency or highest_frequency was put on the bound.",
     Flag.INCONSISTENT: (
         "The frequencies do not explain the signal at a second delay: a tone above pi/h is seen as another one "
         "(use a smaller h), or the estimate is still inexact or lags behind a change."

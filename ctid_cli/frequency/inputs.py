@@ -52,8 +52,7 @@ def series_of(samples: ArrayLike) -> Array:
     values = np.asarray(samples)
     if values.ndim != 1 or values.dtype.kind not in "fiu":
         raise DataError(
-            f"the samples must be one series of real numbers, not an array of shape {values.shape} "
-            f"and type {values.dtype}."
+            f"the samples must be one series of real numbers, not of shape {values.shape} and type {values.dtype}."
         )
     values = values.astype(np.float64)
     with np.errstate(invalid="ignore"):

@@ -44,8 +44,7 @@ def whole_delay(name: str, delay: float, interval: float) -> int:
     if delay / interval > LONGEST_DELAY:
         raise OptionError(
             name,
-            f"{name} = {delay:g} s is more than {LONGEST_DELAY:,} sampling intervals of {interval:g} s; keep fewer "
-            "of the samples.",
+            f"{name} = {delay:g} s is more than {LONGEST_DELAY:,} sampling intervals of {interval:g} s; thin them.",
         )
     count = round(delay / interval)
     if count < 1:
