@@ -1,24 +1,27 @@
 """A pool of worker processes that survives the death of any of them.
 
-The executor of loky, which comes with joblib, does the work. It is used for one job at a time as well, because only
-separate processes can be lost without losing the run, and only they can be given one BLAS thread: with more, results
-have other last bits.
+joblib's loky backend does the work. It is used for one job at a time as well, because only separate processes can be
+lost without losing the run, and only they can be given one BLAS thread: with more, results have other last bits.
 
-When a worker dies, the executor drops every unfinished job and does not say which one did it. So each of them is
+When a worker dies, the backend drops every unfinished job and does not say which one did it. So each of them is
 repeated alone; a job that kills its worker again is split into single estimates, and those that still do are
 ``CRASHED``.
 """
 
 from __future__ import annotations
 
+import logging
 import os
+import queue
 import re
+import threading
 import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 from ctid_cli.running.job import Job, run_job
 from ctid_cli.running.worker import initialise
@@ -27,9 +30,6 @@ from ctid_cli.storage.manifest import Outcome
 
 #: How often the caller gets a chance to do something else while nothing is finished [s].
 TICK = 0.05
-#: Environment of workers.
-_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")}
-_ONE_THREAD["VECLIB_MAXIMUM_THREADS"] = "1"
 #: How long running jobs may go on after a request to stop [s].
 DRAIN = 1.0
 
@@ -77,40 +77,77 @@ def _round(
     waiting: deque[Job], workers: int, stopping: Callable[[], bool]
 ) -> Generator[Finished | None, None, tuple[list[Job], str]]:
     """Run jobs until all are finished or a worker dies; return the jobs that were lost, and why."""
-    from concurrent.futures import FIRST_COMPLETED, Future, wait
+    import joblib
 
-    from joblib.externals.loky import get_reusable_executor
+    logging.getLogger("concurrent.futures").addFilter(_no_failed_callback)
+    running: dict[int, Job] = {}
 
-    running: dict[Future[list[Outcome]], Job] = {}
-    starting: list[Job] = []
-    # A worker that has waited in vain for so long ends [s].
-    settings = {"timeout": 300, "initializer": initialise, "initargs": (os.getpid(),), "env": _ONE_THREAD}
+    def calls() -> Iterator[Any]:
+        # joblib asks for the next job from a thread of its own whenever one is finished.
+        while waiting and not stopping():
+            job = waiting.popleft()
+            running[id(job)] = job
+            yield joblib.delayed(_numbered)(id(job), job)
+
+    # joblib would run a single job at a time in this very process; two workers, one of them idle, keep it out.
+    with joblib.parallel_config(
+        backend="loky", n_jobs=max(workers, 2), inner_max_num_threads=1, initializer=initialise, initargs=(os.getpid(),)
+    ):
+        parallel = joblib.Parallel(
+            return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs" if workers > 1 else 1
+        )
     try:
-        executor = get_reusable_executor(workers, **settings)
-        deadline: float | None = None
-        while running or (waiting and not stopping()):
-            # One job each in advance, so that no worker waits; a job that is run alone is lost alone.
-            while waiting and not stopping() and len(running) < (2 * workers if workers > 1 else 1):
-                # Workers die with the thread that started them, which is this one.
-                starting.append(waiting.popleft())
-                future = executor.submit(run_job, starting[0])
-                running[future] = starting.pop()
-            if deadline is None and stopping():
-                deadline = time.monotonic() + DRAIN
-            done, _ = wait(running, timeout=TICK, return_when=FIRST_COMPLETED)
-            if not done and deadline is not None and time.monotonic() > deadline:
+        results = parallel(calls())
+    except Exception as error:
+        # The pool can break while the first jobs are handed to it.
+        return list(running.values()), _reason(error)
+    inbox: queue.SimpleQueue[tuple[int, list[Outcome]] | BaseException | None] = queue.SimpleQueue()
+    # The pool itself was started above, by the calling thread: workers die with the thread that started them.
+    threading.Thread(target=_collect, args=(results, inbox), name="ctid-collect", daemon=True).start()
+    deadline: float | None = None
+    reason = ""
+    while True:
+        if deadline is None and stopping():
+            deadline = time.monotonic() + DRAIN
+        try:
+            item = inbox.get(timeout=TICK)
+        except queue.Empty:
+            if deadline is not None and time.monotonic() > deadline:
                 kill_workers()
                 break
-            if not done:
-                yield None
-            # What was finished before a worker died is not lost with it.
-            for future in sorted(done, key=lambda future: future.exception() is not None):
-                outcomes = future.result()
-                yield Finished(running.pop(future), outcomes)
-    except Exception as error:
-        kill_workers()
-        return [*running.values(), *starting], _reason(error)
-    return list(running.values()), ""
+            yield None
+            continue
+        if item is None:
+            break
+        if isinstance(item, BaseException):
+            reason = _reason(item)
+            break
+        number, outcomes = item
+        yield Finished(running.pop(number), outcomes)
+    return list(running.values()), reason
+
+
+def _no_failed_callback(record: logging.LogRecord) -> bool:
+    """Whether a log record is anything but a callback that met a pool being torn down.
+
+    joblib starts the next job from such a callback. When a run ends early the pool may be gone by then; the backend
+    logs a traceback, although nothing is wrong and the outcome of every job reaches us as a result.
+    """
+    return not str(record.msg).startswith("exception calling callback")
+
+
+def _numbered(number: int, job: Job) -> tuple[int, list[Outcome]]:
+    return number, run_job(job)
+
+
+def _collect(results: Iterator[Any], inbox: queue.SimpleQueue[Any]) -> None:
+    try:
+        for result in results:
+            inbox.put(result)
+    except BaseException as error:
+        inbox.put(error)
+    else:
+        inbox.put(None)
 
 
 def _reason(error: BaseException) -> str:
