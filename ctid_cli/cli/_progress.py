@@ -99,7 +99,7 @@ class Reporter(_Progress):
             case events.PlanReady():
                 self._plan(event)
             case events.KernelsCompiling():
-                self._say("preparing numerical kernels (compiled the first time, in up to a minute; then cached)")
+                self._say("preparing numerical kernels (compiled the first time, in a minute or more; then cached)")
             case events.KernelsCompiled():
                 if event.seconds > QUICK:
                     self._say(f"kernels ready after {seconds(event.seconds)}")

@@ -47,6 +47,8 @@ class Excitation(ABC):
     """An input: options that generate a held signal."""
 
     kind: ClassVar[str]
+    #: Whether nothing is drawn, so that a specification needs no seed for it.
+    deterministic: ClassVar[bool] = False
 
     @abstractmethod
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:

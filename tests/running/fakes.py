@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -86,6 +86,8 @@ class FakeCell:
 @dataclass(frozen=True)
 class Toy:
     """Estimates from random numbers; `mischief` happens in replicate `at`."""
+
+    start_from: ClassVar[str | None] = None
 
     mischief: str = "none"
     at: int = -1
