@@ -41,7 +41,7 @@ def track(
     style: Annotated[Literal["csv", "h5"], typer.Option("--format", help="Form of the track.")] = "csv",
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the track and its figure.")] = Path("."),
 ) -> None:
-    """Follow the frequencies of a recorded signal that is a sum of sinusoids.
+    """Follow the frequencies of a recorded sum of sinusoids.
 
     Prints the frequency of each tone, how far it moves, and for how much of the time it can be trusted; writes the
     frequencies and amplitudes over time to track.csv (or track.h5) and track.svg. All the rest is chosen from the
