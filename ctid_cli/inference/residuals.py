@@ -33,7 +33,6 @@ class ResidualTests:
     whiteness_degrees_of_freedom: int
     #: Probability of a larger statistic if the residuals are white [-]; NaN where it cannot be computed.
     whiteness_p_value: float
-    white: bool
     #: Between ``residual(t)`` and ``input(t - k)``, k = -L … L [-], shape (2 L + 1,).
     cross_correlation: Array = field(repr=False)
     #: Residuals of their colour that are independent of the input stay within plus or minus this at each single lag,
@@ -45,8 +44,38 @@ class ResidualTests:
     #: Probability of a larger statistic if the residuals are independent of the input [-]; NaN where it cannot be
     #: computed.
     cross_p_value: float
-    uncorrelated: bool
-    sentence: str
+
+    @property
+    def white(self) -> bool:
+        """Whether they pass as white; no evidence is no rejection, and the sentence says what could not be tested."""
+        return not self.whiteness_p_value < 1 - self.level
+
+    @property
+    def uncorrelated(self) -> bool:
+        """Whether they pass as independent of the input."""
+        return not self.cross_p_value < 1 - self.level
+
+    @property
+    def sentence(self) -> str:
+        """What the tests mean."""
+        if np.isnan(self.whiteness_p_value):
+            return "The residuals are exactly zero: there is nothing to test."
+        first = f"The residuals pass as white at the {100 * self.level:g} % level (p = {self.whiteness_p_value:.2g})."
+        if not self.white:
+            first = first.replace("pass as white", "are not white").removesuffix(".")
+            first += ": the noise is coloured, so that standard errors for white noise do not hold."
+        correlated = f"They are correlated with the input (p = {self.cross_p_value:.2g})"
+        if np.isnan(self.cross_p_value):
+            second = "Their correlation with the input cannot be tested: the input does not vary enough."
+        elif self.uncorrelated:
+            second = f"{correlated.replace('are', 'are not')}: no missing dynamics are seen."
+        elif int(np.argmax(np.abs(self.cross_correlation))) < self.lags:
+            why = "feedback from the output, the delay is too long, or the clocks of input and output differ"
+            second = f"{correlated}, most with later inputs: there is {why}."
+        else:
+            why = "more poles or zeros, another delay, or a nonlinear model may be needed"
+            second = f"{correlated}: the model misses a part of the response; {why}."
+        return f"{first} {second}"
 
 
 def residual_tests(
@@ -82,45 +111,23 @@ def residual_tests(
         statistic = float(count * (count + 2) * np.sum(autocorrelation**2 / (count - np.arange(1, lags + 1))))
         whiteness_p = float(chdtrc(lags, statistic))
 
-    cross, band, cross_statistic, freedom = _cross_correlation(e, u, lags, quantile, sensitivities)
-    cross_p = float(chdtrc(freedom, cross_statistic)) if freedom else float("nan")
-
-    # No evidence is no rejection; the sentence says that there was nothing to test.
-    white = not whiteness_p < 1 - level
-    uncorrelated = not cross_p < 1 - level
-    return ResidualTests(
-        count=count,
-        lags=lags,
-        level=level,
-        autocorrelation=autocorrelation,
-        autocorrelation_band=quantile / float(np.sqrt(count)),
-        whiteness_statistic=statistic,
-        whiteness_degrees_of_freedom=lags,
-        whiteness_p_value=whiteness_p,
-        white=white,
-        cross_correlation=cross,
-        cross_correlation_band=band,
-        cross_statistic=cross_statistic,
-        cross_degrees_of_freedom=freedom,
-        cross_p_value=cross_p,
-        uncorrelated=uncorrelated,
-        sentence=_sentence(level, whiteness_p, white, cross_p, uncorrelated, cross),
-    )
+    band = quantile / float(np.sqrt(count))
+    cross = _cross_correlation(e, u, lags, quantile, sensitivities)
+    return ResidualTests(count, lags, level, autocorrelation, band, statistic, lags, whiteness_p, *cross)
 
 
 def _cross_correlation(
     e: Array, u: Array, lags: int, quantile: float, psi: Array | None
-) -> tuple[Array, float, float, int]:
-    """Cross-correlation at -lags … lags, its band, the portmanteau statistic and the rank of its covariance."""
+) -> tuple[Array, float, float, int, float]:
+    """Cross-correlation at -lags … lags, its band, the portmanteau statistic, its degrees of freedom and p-value."""
     from scipy.signal import correlate  # slow to import
 
     e, u = e - e.mean(), u - u.mean()
     count = e.size
     # A constant leaves rounding behind when its mean is taken off.
     scale = float(np.sqrt((e @ e) * (u @ u)))
-    undefined = np.full(2 * lags + 1, np.nan), float("nan"), float("nan"), 0
     if not scale > 0 or np.ptp(u) <= 1e-12 * np.abs(u).max(initial=0.0):
-        return undefined
+        return np.full(2 * lags + 1, np.nan), np.nan, np.nan, 0, np.nan
     shifted = np.zeros((count, 2 * lags + 1))
     for column, k in enumerate(range(-lags, lags + 1)):
         if k >= 0:
@@ -144,25 +151,5 @@ def _cross_correlation(
     values, vectors = np.linalg.eigh(covariance)
     kept = values > NEGLIGIBLE_VARIANCE * values[-1]
     statistic = float(np.sum((vectors[:, kept].T @ (shifted.T @ e)) ** 2 / values[kept]))
-    return cross, band, statistic, int(kept.sum())
-
-
-def _sentence(level: float, whiteness_p: float, white: bool, cross_p: float, uncorrelated: bool, cross: Array) -> str:
-    if np.isnan(whiteness_p):
-        return "The residuals are exactly zero: there is nothing to test."
-    first = f"The residuals pass as white at the {100 * level:g} % level (p = {whiteness_p:.2g})."
-    if not white:
-        first = first.replace("pass as white", "are not white").removesuffix(".")
-        first += ": the noise is coloured, so that standard errors for white noise do not hold."
-    correlated = f"They are correlated with the input (p = {cross_p:.2g})"
-    if np.isnan(cross_p):
-        second = "Their correlation with the input cannot be tested: the input does not vary enough."
-    elif uncorrelated:
-        second = f"They are not correlated with the input (p = {cross_p:.2g}): no missing dynamics are seen."
-    elif int(np.argmax(np.abs(cross))) < cross.size // 2:
-        why = "feedback from the output to the input, the delay is too long, or the clocks of input and output differ"
-        second = f"{correlated}, most with later inputs: there is {why}."
-    else:
-        why = "more poles or zeros, another delay, or a nonlinear model may be needed"
-        second = f"{correlated}: the model misses a part of the response; {why}."
-    return f"{first} {second}"
+    freedom = int(kept.sum())
+    return cross, band, statistic, freedom, float(chdtrc(freedom, statistic)) if freedom else np.nan

@@ -16,7 +16,10 @@ from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.text import listed
 
 #: On what all of it rests.
-REMARK = "This is to first order in the noise, from rest, where the estimator converges to the right solution."
+REMARK = (
+    "This is to first order in the noise, where the estimator converges to the right solution; it takes the noise to "
+    "be as specified and the system to be at rest, and does not count initial states and offsets."
+)
 #: Different numbers of samples that are shown, of all that are swept.
 SIZES = 4
 #: Combinations of the other swept settings that are shown.

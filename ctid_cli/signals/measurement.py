@@ -184,5 +184,10 @@ def _window(table: Table, t: Array, start: float | None, stop: float | None, uni
 
 def no_sample(table: Table, low: float, high: float, begin: float, end: float, unit: str) -> DataError:
     """The error for a window without a sample."""
+    where = f"between {low:g} and {high:g} {unit}"
+    if np.isinf(high):
+        where = f"after {low:g} {unit}"
+    elif np.isinf(low):
+        where = f"before {high:g} {unit}"
     runs = f"the record runs from {begin:.9g} to {end:.9g} {unit}"
-    return DataError(f"{table.file}: no sample lies between {low:g} and {high:g} {unit}; {runs}")
+    return DataError(f"{table.file}: no sample lies {where}; {runs}")

@@ -6,14 +6,7 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Union
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    Discriminator,
-    Field,
-    GetCoreSchemaHandler,
-    Tag,
-)
+from pydantic import AfterValidator, BaseModel, Discriminator, Field, GetCoreSchemaHandler, Tag
 from pydantic_core import CoreSchema
 
 from ctid_cli.specification.messages import HINT, TAG, several_wrong, shown, wrong

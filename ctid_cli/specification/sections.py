@@ -18,19 +18,8 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    GetJsonSchemaHandler,
-    SerializerFunctionWrapHandler,
-    ValidationError,
-    create_model,
-    model_serializer,
-    model_validator,
-)
-from pydantic.functional_validators import ModelWrapValidatorHandler
+import pydantic
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import CtidError
@@ -68,8 +57,8 @@ class Section(BaseModel):
     #: Sentences for keys that belong to another form of the section.
     elsewhere: ClassVar[Mapping[str, str]] = {}
 
-    @model_serializer(mode="wrap")
-    def _as_before(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    @pydantic.model_serializer(mode="wrap")
+    def _as_before(self, handler: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
         content: dict[str, Any] = handler(self)
         fields = type(self).model_fields
         return {
@@ -85,7 +74,7 @@ class Section(BaseModel):
         return {name: docs.get(name, "") for name in cls.model_fields}
 
     @classmethod
-    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: pydantic.GetJsonSchemaHandler) -> dict[str, Any]:
         reference = handler(core_schema)
         schema = handler.resolve_ref_schema(reference)
         schema["description"] = inspect.cleandoc(cls.__doc__ or "").partition("\n\n")[0]
@@ -93,9 +82,9 @@ class Section(BaseModel):
             schema["properties"][name] |= {"description": text} if text else {}
         return reference
 
-    @model_validator(mode="wrap")
+    @pydantic.model_validator(mode="wrap")
     @classmethod
-    def _in_plain_words(cls, value: Any, handler: ModelWrapValidatorHandler[Section]) -> Section:
+    def _in_plain_words(cls, value: Any, handler: pydantic.ModelWrapValidatorHandler[Section]) -> Section:
         required = cls.requirements(value) if isinstance(value, Mapping) else ()
         problems = [(path, message, True) for path, message in required]
         try:
@@ -204,7 +193,7 @@ def section_for(target: type, kind: str = "", *, sweeping: bool = True, without:
             form = Annotated[form, LATER]
         fields[option.name] = (form, _default(option))
     summary = (target.__doc__ or target.__name__).strip().splitlines()[0]
-    section = create_model(target.__name__, __base__=Section, __doc__=summary, **fields)
+    section = pydantic.create_model(target.__name__, __base__=Section, __doc__=summary, **fields)
     section.target = target
     return section
 
