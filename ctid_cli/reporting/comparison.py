@@ -100,10 +100,10 @@ def check_tables(names: Sequence[str], out: Path, reference: Path | None = None)
         raise UsageError("\n".join(["nothing can be compared, because none of these cells was run.", *notes]))
     command = " ".join(["ctid table", *names])
     where = "there are no committed tables" if file is None else f"{comparison.reference} has none of their cells"
-    text = f"the results in {out} have nothing to be compared with: {where}, and of the paper's only those of "
-    text += f"{', '.join(study.must_reach)} decide. To keep these results as a reference for later: "
-    text += f"{command}{out_option(out)} --format csv > FILE, then {command} --check --reference FILE"
-    raise UsageError(text)
+    paper = f"of the paper's only those of {', '.join(study.must_reach)} decide"
+    later = f"{command}{out_option(out)} --format csv > FILE, then {command} --check --reference FILE"
+    wrong = f"the results in {out} have nothing to be compared with: {where}, and {paper}"
+    raise UsageError(f"{wrong}. To keep these results as a reference for later: {later}")
 
 
 def compare(
@@ -129,28 +129,48 @@ def compare(
         if _is_counted(row):
             known.setdefault(_identity(row), row)
 
-    pairs = list(_pairs(fresh, known, study))
-    cells: dict[int, Cell] = {}
+    cells = list(_compared(fresh, known, study))
     for family in (True, False):
-        members = [k for k, (_, _, decisive, *_) in enumerate(pairs) if decisive is family]
-        p_values = [fisher(pairs[k][0]["converged"], pairs[k][0]["n"], *pairs[k][3:]) for k in members]
-        for k, p_value, adjusted in zip(members, p_values, holm(p_values), strict=True):
-            cells[k] = _compared(*pairs[k], p_value, adjusted, LEVEL / len(members))
+        members = [cell for cell in cells if cell["decisive"] is family]
+        for cell, adjusted in zip(members, holm([cell["p_value"] for cell in members]), strict=True):
+            _judge(cell, adjusted, LEVEL / len(members))
     lacking = sum(_is_counted(row) and key not in known for key, row in fresh.items()) if committed is not None else 0
-    not_run = _not_run(fresh, known)
-    return Comparison([cells[k] for k in range(len(pairs))], reference, not_run, lacking, notes)
+    return Comparison(cells, reference, _not_run(fresh, known), lacking, notes)
 
 
-def _pairs(
-    fresh: Mapping[Any, Row], known: Mapping[Any, Row], study: Study
-) -> Iterator[tuple[Row, str, bool, int, int]]:
-    """Fresh row, what it is compared with, whether that decides, converged and all data sets of the reference."""
+def _compared(fresh: Mapping[Any, Row], known: Mapping[Any, Row], study: Study) -> Iterator[Cell]:
+    """Fresh cells beside those of the committed tables and of the paper, not yet judged."""
     trials = study.published_data_sets
     for identity, row in fresh.items():
         if _is_counted(row) and identity in known:
-            yield row, "committed", True, known[identity]["converged"], known[identity]["n"]
+            yield _cell(row, "committed", True, known[identity]["converged"], known[identity]["n"])
         if _is_counted(row) and (published := row.get("published_percent")) is not None:
-            yield row, "paper", row["method"] in study.must_reach, round(published * trials / 100), trials
+            yield _cell(row, "paper", row["method"] in study.must_reach, round(published * trials / 100), trials)
+
+
+def _cell(row: Row, against: str, decisive: bool, converged: int, n: int) -> Cell:
+    keys = ("table", "experiment", "sampling", *settings_of([row]), "initial_delay", "method", "n", "converged")
+    return {
+        "against": against,
+        **{key: row.get(key) for key in keys},
+        "percent": 100 * row["converged"] / row["n"],
+        "reference_n": n,
+        "reference_converged": converged,
+        "reference_percent": 100 * converged / n,
+        "p_value": fisher(row["converged"], row["n"], converged, n),
+        **dict.fromkeys(("adjusted_p_value", "detectable", "differs")),
+        "decisive": decisive,
+    }
+
+
+def _judge(cell: Cell, adjusted: float, level: float) -> None:
+    """Any difference from committed tables is a mismatch, from the paper only a lower percentage."""
+    committed, differs = cell["against"] == "committed", adjusted < LEVEL
+    reference = cell["reference_converged"], cell["reference_n"]
+    cell["adjusted_p_value"], cell["differs"] = adjusted, differs
+    cell["detectable"] = smallest_detectable(cell["n"], *reference, level, rise=committed)
+    lower = cell["percent"] < cell["reference_percent"]
+    cell["mismatch"] = cell["decisive"] and differs and (committed or lower)
 
 
 def _not_run(fresh: Mapping[Any, Row], known: Mapping[Any, Row]) -> int:
@@ -159,29 +179,6 @@ def _not_run(fresh: Mapping[Any, Row], known: Mapping[Any, Row]) -> int:
     asked = {key for key, row in known.items() if not tables.isdisjoint((str(row["table"]), row["experiment"]))}
     asked |= {key for key, row in fresh.items() if row.get("published_percent") is not None}
     return sum(not (key in fresh and fresh[key]["n"]) for key in asked)
-
-
-def _compared(
-    row: Row, against: str, decisive: bool, converged: int, n: int, p_value: float, adjusted: float, level: float
-) -> Cell:
-    """One cell: any difference from committed tables is a mismatch, from the paper only a lower percentage."""
-    percent, other = 100 * row["converged"] / row["n"], 100 * converged / n
-    differs, committed = adjusted < LEVEL, against == "committed"
-    keys = ("table", "experiment", "sampling", *settings_of([row]), "initial_delay", "method", "n", "converged")
-    return {
-        "against": against,
-        **{key: row.get(key) for key in keys},
-        "percent": percent,
-        "reference_n": n,
-        "reference_converged": converged,
-        "reference_percent": other,
-        "p_value": p_value,
-        "adjusted_p_value": adjusted,
-        "detectable": smallest_detectable(row["n"], converged, n, level, rise=committed),
-        "differs": differs,
-        "decisive": decisive,
-        "mismatch": decisive and differs and (committed or percent < other),
-    }
 
 
 @cache
@@ -269,9 +266,9 @@ def _verdict(comparison: Comparison) -> str:
     least, most = (extreme(cell["n"] for cell in cells) for extreme in (min, max))
     sizes = count(most, "data set") if least == most else f"{least} to {count(most, 'data set')}"
     agrees = f"No difference beyond sampling error in {count(len(cells), 'comparison')}"
-    text = mismatch_sentence(comparison) if comparison.mismatches else agrees
-    text += f": {listed(parts)}, from {sizes} a cell. Fisher's exact test, Holm's correction: a chance of at most "
-    text += f"{100 * LEVEL:g} % of any false alarm. {_power(cells)}"
+    result = mismatch_sentence(comparison) if comparison.mismatches else agrees
+    rule = f"Fisher's exact test, Holm's correction: a chance of at most {100 * LEVEL:g} % of any false alarm."
+    text = f"{result}: {listed(parts)}, from {sizes} a cell. {rule} {_power(cells)}"
     if comparison.not_run:
         text += f" Not run, so not compared: {count(comparison.not_run, 'cell')}."
     if comparison.not_in_reference:
@@ -288,7 +285,6 @@ def _power(cells: Sequence[Cell]) -> str:
         return "With so few data sets no difference could have been detected, however large."
     ends = " to ".join(dict.fromkeys(f"{end:.0f}" for end in (min(found), max(found))))
     text = f"A single cell that differs by {ends} percentage points is detected with {100 * POWER:g} % probability"
-    text += ", by the exact binomial distribution and with the reference as given"
     blind = len(cells) - len(found)
     return f"{text}; in {count(blind, 'cell')} no difference could have been detected." if blind else f"{text}."
 

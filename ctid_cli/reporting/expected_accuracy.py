@@ -40,7 +40,6 @@ class ExpectedAccuracy:
     """What theory says of one estimator on one kind of data."""
 
     parameters: ParameterAccuracy
-    samples: int
     limit: bool
     formula: str
 
@@ -79,16 +78,13 @@ def _estimated(system: AdditiveModel | TransferFunction, estimator: Any) -> _Est
     """The system as the estimator has it, or why it cannot hold the system."""
     if estimator.kind == "svf":
         raise DataError("svf is the least-squares start of other estimators; noise biases it, by an unknown amount")
-    delay_from = None
-    bounds, wrong = getattr(estimator, "delay_bounds", None), ""
-    if bounds is not None:
-        delay_from = bounds[1] if bounds[0] < bounds[1] else None
-        if not bounds[0] <= system.delay <= bounds[1]:
-            wrong = f"the delay is sought from {bounds[0]:g} to {bounds[1]:g} s"
-    elif abs(estimator.delay - system.delay) > SAME_DELAY * system.delay:
-        wrong = f"the estimator takes the delay as {estimator.delay:g} s"
-    if wrong:
-        raise DataError(f"{wrong} and the true one is {system.delay:g} s: the estimate is biased")
+    bounds = getattr(estimator, "delay_bounds", None)
+    low, high = bounds or (estimator.delay, estimator.delay)
+    reach = 0.0 if bounds else SAME_DELAY * system.delay
+    if not low - reach <= system.delay <= high + reach:
+        sought = f"sought from {low:g} to {high:g} s" if bounds else f"taken as {low:g} s"
+        raise DataError(f"the delay is {sought} and the true one is {system.delay:g} s: the estimate is biased")
+    delay_from = high if low < high else None
     instruments = getattr(estimator, "instruments", "open_loop")
     if hasattr(estimator, "terms"):
         return _Estimated(_in_terms(system, estimator.terms), None, delay_from, instruments)
@@ -129,8 +125,7 @@ def _matched(submodels: list[Submodel], terms: Sequence[Term]) -> list[Submodel]
         if not fitting:
             return None
         left.remove(fitting[0])
-        numerator = np.concatenate([np.zeros(fitting[0].zeros - own.zeros), submodel.numerator])
-        found.append(Submodel(numerator, submodel.denominator, submodel.integrators))
+        found.append(replace(submodel, numerator=np.pad(submodel.numerator, (fitting[0].zeros - own.zeros, 0))))
     return None if left else found
 
 
@@ -188,24 +183,22 @@ def _of_long_records(source: Any, estimated: _Estimated) -> ExpectedAccuracy:
         matrices += ", Sigma = sigma_e^2 cov(H psi), H the filter and sigma_e^2 the innovation variance of the noise"
     formula = f"the limit for long records, {product} / N with {matrices}, psi {_sensitivities(source, estimated)}; "
     formula += f"by discrete Lyapunov equations, as the {name} is white Gaussian noise"
-    return ExpectedAccuracy(parameters, sampling.samples, True, formula)
+    return ExpectedAccuracy(parameters, True, formula)
 
 
 def _of_records(source: Any, estimated: _Estimated, why: str) -> ExpectedAccuracy:
-    samples = source.sampling.samples
-    sets = max(1, min(MOST_SETS, SET_SAMPLES // samples))
+    sets = max(1, min(MOST_SETS, SET_SAMPLES // source.sampling.samples))
     covariance = np.mean([_record_covariance(source, estimated, replicate) for replicate in range(sets)], axis=0)
     if not np.isfinite(covariance).all():
         raise DataError("the data would not determine the parameters, even without noise")
-    sought = estimated.delay_from is not None
-    parameters = ParameterAccuracy.of(estimated.model, covariance, estimated.zeros, sought)
+    parameters = ParameterAccuracy.of(estimated.model, covariance, estimated.zeros, estimated.delay_from is not None)
     # Instruments other than the input itself are not the best there are.
     start = f"{'the Cramér-Rao bound ' if estimated.instruments == 'open_loop' else ''}sigma^2 (psi' psi)^-1"
     if source.noise.coloured:
         start = "(psi' psi)^-1 psi' R psi (psi' psi)^-1, R the covariance matrix of the noise"
     where = "in the first data set" if sets == 1 else f"averaged over the first {sets} data sets"
     formula = f"{start}, psi {_sensitivities(source, estimated)}, {where}, as {why}"
-    return ExpectedAccuracy(parameters, samples, False, formula)
+    return ExpectedAccuracy(parameters, False, formula)
 
 
 def _record_covariance(source: Any, estimated: _Estimated, replicate: int) -> Array:
@@ -256,5 +249,5 @@ def _limit(source: Any, estimator: Any, terms: tuple[Term, ...] | None) -> dict[
         expected = expected_accuracy(replace(source, sampling=replace(source.sampling, samples=LONG)), estimator, terms)
     except DataError:
         return {}
-    variances = (expected.samples * expected.parameters.covariance).diagonal()
+    variances = (LONG * expected.parameters.covariance).diagonal()
     return dict(zip(expected.parameters.names, variances.tolist(), strict=True)) if expected.limit else {}

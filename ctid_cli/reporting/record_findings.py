@@ -188,8 +188,8 @@ class _Words:
             text = f"{lie} far from the neighbours (t = {where}); leave faults of the sensor empty."
             yield Finding("warning", "outliers", text)
         if r.saturated and not self._seldom:
-            share = f"{100 * r.saturated:.2g} % of the output samples sit exactly at the least or greatest value"
-            yield Finding("warning", "saturation", f"{share}, as at a limit of the sensor; leave those fields empty.")
+            many = f"{100 * r.saturated:.2g} % of the output samples sit exactly at the least or greatest value"
+            yield Finding("warning", "saturation", f"{many}, as at a limit of the sensor; leave those fields empty.")
         if math.isfinite(r.output_quantum):
             share = r.output_quantum / r.output_deviation
             steps = f"in steps of {unit.y(r.output_quantum)}, {100 * share:.2g} % of its standard deviation"

@@ -86,8 +86,7 @@ def joint_warnings(spec: Spec) -> list[Complaint]:
         taken = {variants(section)[0].options.start_from for section in spec.estimators.values()}
         for name, kind in (("initial_delay", "delay"), ("parameters", "parameters")):
             if getattr(spec.starts, name) and kind not in taken:
-                unused = "no estimator here uses a start of this kind; each is run once"
-                warnings.append((("starts", name), unused))
+                warnings.append((("starts", name), "no estimator here uses a start of this kind; each is run once"))
     return warnings
 
 
@@ -100,11 +99,11 @@ def _extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
         record = spec.measured.dataset(0).record
         interval = record.duration / max(record.n_samples - 1, 1)
         return [Variant({}, {}, _Extent(interval, record.n_samples, (record.t - record.t[0])[record.valid]))]
-    return [
-        # Random intervals stand for themselves at their mean.
-        Variant({}, case.swept, _Extent(_mean_interval(case.options), case.options.samples, sampling=case.options))
-        for case in samplings
+    # Random intervals stand for themselves at their mean.
+    plans = [
+        (case, _Extent(_mean_interval(case.options), case.options.samples, None, case.options)) for case in samplings
     ]
+    return [Variant({}, case.swept, extent) for case, extent in plans]
 
 
 def _mean_interval(sampling: Any) -> float:
@@ -134,12 +133,10 @@ def _of_record(at: KeyPath, options: Any, extent: _Extent) -> Iterator[Complaint
     parameters = int(coefficients + (bounds is not None))
     left = extent.samples_after(latest)
     if latest >= extent.duration and latest > 0:
-        longer = f"a delay of {latest:g} s is not shorter than the record ({extent.duration:g} s)"
-        yield (*at, key), f"{longer}; lower it, or take more samples"
+        yield (*at, key), f"a delay of {latest:g} s is not shorter than the record ({extent.duration:g} s); lower it"
     elif left <= parameters:
         masked = f" after the first {latest:g} s" if left < extent.samples_after(0.0) else ""
-        few = f"{left} samples{masked} are too few for {parameters} parameters"
-        yield at, f"{few}; take more samples, fewer poles or zeros, or a smaller largest delay"
+        yield at, f"{left} samples{masked} are too few for {parameters} parameters; take more, or a smaller model"
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -161,9 +158,8 @@ def _estimator_complaints(spec: Spec, extents: Sequence[Variant], *, open_loop: 
 
 def _of_instruments(at: KeyPath, options: Any) -> Iterator[Complaint]:
     if getattr(options, "instruments", None) == "closed_loop":
-        needs = "need the reference and the controller, and both are missing"
         give = "give loop, or data.reference and loop.controller for a measured record"
-        yield (*at, "instruments"), f"closed-loop instruments {needs}; {give}"
+        yield (*at, "instruments"), f"closed-loop instruments need the reference and the controller; {give}"
 
 
 def _of_delays(name: str, delays: Sequence[float | UniformStart], options: Any) -> Iterator[Complaint]:
@@ -277,19 +273,17 @@ def _of_stability(system: Any, loop: LoopOptions, sampling: Any) -> Iterator[Com
     """Say why a loop cannot be simulated."""
     from ctid_cli.filtering.loop import loop_radius
 
-    path, interval = ("loop", "controller"), sampling.interval
+    path, interval, radius = ("loop", "controller"), sampling.interval, 0.0
     try:
         with np.errstate(all="ignore"):
             radius = loop_radius(system, loop.controller, interval)
     except DataError as error:
         yield path, str(error)
-        return
     except np.linalg.LinAlgError:
         yield path, f"the loop: its numbers overflow at intervals of {interval:g} s; scale the coefficients"
-        return
     if not radius < 1.0:
         largest = f"at intervals of {interval:g} s its largest pole has the magnitude {radius:.6g}"
-        yield path, f"the loop with the true system is unstable: {largest}, which must be below 1; lower the gain"
+        yield path, f"the loop with the true system is unstable: {largest}; lower the gain"
 
 
 def _simulation_complaints(spec: Spec, extents: Sequence[Variant]) -> Iterator[Complaint]:
@@ -320,5 +314,4 @@ def _simulation_complaints(spec: Spec, extents: Sequence[Variant]) -> Iterator[C
 
 def _of_delay(system: Any, extent: _Extent) -> Iterator[Complaint]:
     if system.delay >= extent.duration:
-        message = f"a delay of {system.delay:g} s is not shorter than the record ({extent.duration:g} s)"
-        yield ("system", "delay"), f"{message}; the output would be noise alone"
+        yield ("system", "delay"), f"{system.delay:g} s is not shorter than the record ({extent.duration:g} s)"

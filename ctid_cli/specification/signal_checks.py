@@ -92,8 +92,7 @@ def _of_tones(at: KeyPath, disturbances: list[Any], options: Any, signal: SumOfS
     except ValueError:
         sine = any(isinstance(item, SineDisturbance) for item in disturbances)
         more = ", or one more for the sinusoid that disturbs it" if sine else ""
-        message = f"must be {len(signal.tones)}, as many as the signal has{more}, not {options.tones}"
-        yield (*at, "tones"), message
+        yield (*at, "tones"), f"must be {len(signal.tones)}, as many as the signal has{more}, not {options.tones}"
 
 
 def _of_clock(spec: Spec, signal: SumOfSinusoids, clock: RegularSampling) -> Iterator[Complaint]:
@@ -101,12 +100,10 @@ def _of_clock(spec: Spec, signal: SumOfSinusoids, clock: RegularSampling) -> Ite
     duration = interval * clock.samples
     highest, limit = signal.highest_frequency, math.pi / interval
     if highest >= limit:
-        message = f"samples every {interval:g} s show frequencies below {limit:.4g} rad/s, the signal has {highest:g}"
-        yield ("sampling", "interval"), message
+        yield ("sampling", "interval"), f"shows frequencies below {limit:.4g} rad/s only, the signal has {highest:g}"
     for step in signal.steps:
         if step >= duration - interval:
-            message = f"a step at {step:g} s comes after the last sample, at {duration - interval:g} s"
-            yield ("signal", "tones"), message
+            yield ("signal", "tones"), f"a step at {step:g} s comes after the last sample, {duration - interval:g} s"
     if spec.tracks is not None:
         if not interval * (1.0 - 1e-9) <= spec.tracks.interval <= duration:
             yield ("tracks", "interval"), f"must lie from the sampling interval, {interval:g} s, to {duration:g} s"

@@ -50,10 +50,7 @@ class SystemSection(Section):
         if not model.numerator.any():
             yield ("numerator",), "all coefficients are zero, so the output would be too"
         if model.relative_degree < 1:
-            yield (
-                (),
-                f"there are {zeros} zeros and {model.order} poles; a strictly proper system has fewer zeros than poles",
-            )
+            yield (), f"there are {zeros} zeros and {model.order} poles; the system needs fewer zeros than poles"
         elif model.order > MAX_ORDER:
             yield ("denominator",), f"{model.order} poles are too many; at most {MAX_ORDER} can be simulated exactly"
         elif not model.is_stable:

@@ -15,9 +15,11 @@ alias (``b: *a``) says the same openly.
 
 from __future__ import annotations
 
+import operator
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -92,13 +94,10 @@ class YamlSource:
 
     def value(self, path: KeyPath) -> Any:
         """The value at a key path, or None where there is none."""
-        node = self.tree
-        for part in path:
-            try:
-                node = node[part]
-            except (KeyError, IndexError, TypeError):
-                return None
-        return node
+        try:
+            return reduce(operator.getitem, path, self.tree)
+        except (KeyError, IndexError, TypeError):
+            return None
 
     def problem(self, path: KeyPath, message: str, *, key: bool = False) -> Problem:
         """A problem at a key path."""
@@ -115,8 +114,9 @@ class YamlSource:
         """The value of a node; what is wrong with it goes to the problems."""
         place = self.values[path] = self.at(node.start_mark)
         if len(self.values) > MAX_VALUES:
-            message = f"more than {MAX_VALUES} values, aliases counted as often as they are used"
-            raise SpecError([*self.problems, place.problem(path, message)])
+            raise SpecError(
+                [*self.problems, place.problem(path, f"more than {MAX_VALUES} values, those of aliases too")]
+            )
         if any(node is parent for parent in parents):
             raise SpecError([*self.problems, place.problem(path, "an alias refers to its own parent")])
         if isinstance(node, yaml.ScalarNode):
@@ -144,11 +144,9 @@ class YamlSource:
             key = key_node.value
             here = (*path, key)
             if key == "<<":
-                message = "merge keys (<<) are not supported; write the keys out, or use an alias for a whole value"
-                self.problems.append(place.problem(here, message))
+                self.problems.append(place.problem(here, "merge keys (<<) are not supported; write the keys out"))
             elif key in mapping:
-                first = self.keys[here].line
-                message = f"the key {key!r} is given twice, on line {first} and on line {place.line}; keep one"
+                message = f"the key {key!r} is given twice, first on line {self.keys[here].line}; keep one"
                 self.problems.append(place.problem(here, message))
             else:
                 self.keys[here] = place
@@ -191,8 +189,6 @@ def read_yaml(path: Path) -> YamlSource:
         raise UsageError(f"{path}: this is a folder; name the YAML file in it")
     try:
         data = path.read_bytes()
-    except FileNotFoundError:
-        raise UsageError(f"{path}: there is no such file") from None
     except OSError as error:
         raise UsageError(f"{path}: the file cannot be read: {error.strerror or error}") from None
     if len(data) > MAX_BYTES:
@@ -200,10 +196,9 @@ def read_yaml(path: Path) -> YamlSource:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        column = error.start - (data.rfind(b"\n", 0, error.start) + 1) + 1
-        message = "the file is not UTF-8 text; save it as UTF-8"
-        raise SpecError([Place(str(path), line, column).problem((), message)]) from None
+        before = data[: error.start]
+        place = Place(str(path), before.count(b"\n") + 1, error.start - before.rfind(b"\n"))
+        raise SpecError([place.problem((), "the file is not UTF-8 text; save it as UTF-8")]) from None
     return parse_yaml(text, str(path))
 
 
@@ -219,7 +214,7 @@ def parse_yaml(text: str, file: str, *, line: int = 1, column: int = 1) -> YamlS
         raise SpecError([source.at(mark).problem((), _syntax_message(error))]) from None
     except yaml.reader.ReaderError as error:
         before = text[: error.position]
-        place = Place(file, line + before.count("\n"), error.position - (before.rfind("\n") + 1) + 1)
+        place = Place(file, line + before.count("\n"), error.position - before.rfind("\n"))
         code = ord(error.character) if isinstance(error.character, str) else error.character
         raise SpecError([place.problem((), f"the character U+{code:04X} is not allowed in YAML")]) from None
     except RecursionError:
@@ -257,8 +252,7 @@ def _apply_override(source: YamlSource, override: str, number: int) -> None:
     node = source.tree
     for depth, part in enumerate(path):
         if not isinstance(node, dict):
-            where = f"{path_text(path[:depth])} is not a mapping" if depth else "there is no mapping in the file"
-            raise refuse(f"{where}, so nothing can be set inside it")
+            raise refuse(f"{path_text(path[:depth]) or 'the file'} is not a mapping, so nothing can be set inside it")
         if depth == len(path) - 1:
             node[part] = value.tree
             break
@@ -281,7 +275,7 @@ def _syntax_message(error: yaml.MarkedYAMLError) -> str:
     if "but found another document" in problem:
         return "the file holds more than one YAML document ('---'); keep one experiment per file"
     context = f" ({error.context.strip()})" if error.context else ""
-    hints: Mapping[str, str] = {
+    hints = {
         "mapping values are not allowed": "; text with a colon needs quotes, keys of a mapping the same indentation",
         "could not find expected ':'": "; a key needs a colon and a space after it",
         "expected ',' or '}'": "; separate the entries by commas and close the brace",

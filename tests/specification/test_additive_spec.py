@@ -347,7 +347,7 @@ def test_closed_loop_instruments_need_a_loop(tmp_path):
         (10, 98, "estimators.both.instruments"),
         (11, 55, "estimators.one.instruments"),
     ]
-    assert all("the reference and the controller, and both are missing" in p.message for p in found)
+    assert all("instruments need the reference and the controller" in p.message for p in found)
     swept = problems(
         tmp_path, text, "estimators={one: {kind: srivc, poles: 4, zeros: 2, instruments: [open_loop, closed_loop]}}"
     )

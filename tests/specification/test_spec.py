@@ -177,7 +177,7 @@ def test_files_that_hold_no_mapping(tmp_path, name, text, message):
 
 
 def test_missing_file_and_folder(tmp_path):
-    with pytest.raises(UsageError, match="no such file"):
+    with pytest.raises(UsageError, match="No such file"):
         load_spec(tmp_path / "none.yaml")
     with pytest.raises(UsageError, match="folder"):
         load_spec(tmp_path)

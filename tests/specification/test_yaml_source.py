@@ -74,7 +74,7 @@ def test_places():
 @pytest.mark.parametrize(
     ("text", "line", "column", "message"),
     [
-        ("a: 1\nb: 2\na: 3", 3, 1, "given twice, on line 1 and on line 3"),
+        ("a: 1\nb: 2\na: 3", 3, 1, "given twice, first on line 1"),
         ("a: {x: 1, x: 2}", 1, 11, "given twice"),
         ("a:\n\tb: 1", 2, 1, "indent with spaces"),
         ("a: 1\nb: [1,\n  2\n", 2, 4, "close the bracket"),
@@ -116,7 +116,7 @@ def test_aliases_that_multiply_are_stopped():
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(UsageError, match="no such file"):
+    with pytest.raises(UsageError, match="No such file"):
         read_yaml(tmp_path / "missing.yaml")
     with pytest.raises(UsageError, match="this is a folder"):
         read_yaml(tmp_path)
