@@ -156,12 +156,14 @@ def named(record: Record) -> str:
     return f"{record.name}: " if record.name else ""
 
 
-def check_record(record: Record, data: FilterData, parameters: int) -> None:
-    """Refuse records from which nothing can be estimated."""
+def check_record(record: Record, data: FilterData, parameters: int, free_response: bool = False) -> None:
+    """Refuse records from which nothing can be estimated; a free response needs no input that varies."""
     if data.count <= parameters:
         what = f"{named(record)}{data.count} usable samples for {parameters} parameters"
         raise DataError(f"{what}; take a longer record, a smaller model, or a smaller largest delay")
     if np.ptp(record.input.values) == 0.0:
+        if free_response:
+            return
         raise DataError(f"{named(record)}the input is constant ({record.input.values[0]:g}): it excites nothing")
     if np.ptp(data.y_used) == 0.0:
         raise DataError(f"{named(record)}the output is constant ({data.y_used[0]:g}) over the usable samples")

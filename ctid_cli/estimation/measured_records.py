@@ -54,7 +54,7 @@ class MeasuredRecords:
         self.offsets = [y0 for _, _, y0 in centred]
         self.data = [self._lay_out(record) for record in self.records]
         for record, data in zip(self.records, self.data, strict=True):
-            self._check(record, data)
+            check_record(record, data, self.layout.size, self.layout.initial_state)
 
     @cached_property
     def bandwidth(self) -> float:
@@ -78,13 +78,6 @@ class MeasuredRecords:
             raise DataError(
                 f"{constant}: only a free response tells anything; give a known delay and initial_state 'estimate'"
             )
-
-    def _check(self, record: Record, data: FilterData) -> None:
-        """Refuse what cannot be estimated; a constant input is no obstacle to an estimated initial state."""
-        if np.ptp(record.input.values) > 0.0 or not self.layout.initial_state:
-            check_record(record, data, self.layout.size)
-        elif data.count <= self.layout.size:
-            raise DataError(f"{data.count} usable samples for {self.layout.size} parameters; take a longer record")
 
     def _lay_out(self, record: Record, periods: int = 0) -> FilterData:
         """Filter data; ``periods`` copies of the record's input come before it, with masked outputs."""

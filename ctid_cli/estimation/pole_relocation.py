@@ -184,6 +184,8 @@ def relocate(lines: Lines, poles: Sequence[complex], moves: int) -> list[complex
 
 def _moved(lines: Lines, poles: list[complex], residual: Array, known: Array) -> list[complex] | None:
     """Zeros of sigma, reflected into the left half-plane; None where the equations are singular."""
+    from scipy.linalg import block_diag  # slow to import
+
     basis = _basis(lines.s, poles)
     fitted = lines.outputs - _complex(residual)
     instruments = _stacked(basis * fitted[:, None])
@@ -196,17 +198,9 @@ def _moved(lines: Lines, poles: list[complex], residual: Array, known: Array) ->
         return None
     if not np.isfinite(c).all():
         return None
-    dynamics, entry = np.zeros((c.size, c.size)), np.zeros(c.size)
-    place = 0
-    for pole in poles:
-        if pole.imag:
-            dynamics[place : place + 2, place : place + 2] = [[pole.real, pole.imag], [-pole.imag, pole.real]]
-            entry[place] = 2.0
-            place += 2
-        else:
-            dynamics[place, place], entry[place] = pole.real, 1.0
-            place += 1
-    roots = np.linalg.eigvals(dynamics - np.outer(entry, c))
+    sections = [[[p.real, p.imag], [-p.imag, p.real]] if p.imag else [[p.real]] for p in poles]
+    entry = np.concatenate([[2.0, 0.0] if pole.imag else [1.0] for pole in poles])
+    roots = np.linalg.eigvals(block_diag(*sections) - np.outer(entry, c))
     damping = np.maximum(np.abs(roots.real), LEAST_DAMPING * np.abs(roots))
     # Poles that run out of the band would leave the equations singular.
     low, high = 0.1 * lines.frequencies[0], 10.0 * lines.frequencies[-1]

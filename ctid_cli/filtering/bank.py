@@ -25,11 +25,11 @@ from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.filtering.chain_pass import irregular_chain_pass, regular_chain_pass
-from ctid_cli.filtering.exponential import held_step, place
+from ctid_cli.filtering.exponential import held_readout, held_step, place
 from ctid_cli.filtering.filter_data import FilterData, in_unit, plain_array, split_delay
 from ctid_cli.filtering.modal_pass import modal_pass
-from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT, modal_condition, pole_slopes
-from ctid_cli.filtering.realisation import chain, scaled_roots
+from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT, add_mode, modal_condition, pole_slopes
+from ctid_cli.filtering.realisation import chain, horner, scaled_roots
 from ctid_cli.filtering.row_sink import RowSink, row_sink
 
 Form = Literal["auto", "modal", "chain"]
@@ -91,68 +91,33 @@ def _to_standard(mapping: Array, sink: RowSink, want_rows: bool) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _regular_chain(a: Array, b: Array, delay: float, data: FilterData, want_rows: bool) -> Array:
-    """Standard rows of a regular clock, for any poles."""
+def _chain_rows(a: Array, b: Array, delay: float, data: FilterData, want_rows: bool) -> Array:
+    """Standard rows for any poles, from [z (both chains), u and on a regular clock its change, filtered y, y - x]."""
     n = a.size - 1
     w0, dynamics, gain, powers, output = _double_chain(a, b)
-    shift, fraction = split_delay(delay, data.interval)
-    # The states at the instant that arrives now, from the states and the held input at the break before it.
-    readout = np.zeros((2 * n, 2 * n + 2))
-    if fraction > 0.0:
-        part = held_step(dynamics, gain, fraction * data.interval * w0)
-        place(readout, 0, 0, part.transition)
-        for i in range(2 * n):
-            readout[i, 2 * n] = part.from_value[i]
-            readout[i, 2 * n + 1] = part.from_change[i] * fraction
-    else:
-        for i in range(2 * n):
-            readout[i, i] = 1.0
-    # Standard rows from [z (both chains), u, change of u, filtered y, y - x].
-    q = 3 * n + 3
-    mapping = np.zeros((q, q))
+    regular = data.interval > 0.0
+    shift, fraction = split_delay(delay, data.interval) if regular else (0, 0.0)
+    # On a regular clock the states stand at the break before the instant that arrives now: this reads them out there.
+    readout = held_readout(dynamics, gain, data.interval * w0, fraction)
+    filtered = 2 * n + (2 if regular else 1)
+    mapping = np.zeros((3 * n + 3, filtered + n + 1))
     place(mapping, 0, 0, powers @ readout[:n])
-    mapping[n, 2 * n] = 1.0
-    mapping[n, 2 * n + 1] = fraction
     place(mapping, n + 1, 0, powers @ readout[n:])
-    place(mapping, 2 * n + 1, 2 * n + 2, powers)
-    mapping[3 * n + 1, 3 * n + 2] = 1.0
-    _fill_derivative(a, b, mapping)
-    # The states step by whole intervals whatever the delay; y - x needs x at the instant read.
-    sink = row_sink(q, data.use, want_rows)
-    step = held_step(dynamics, gain, data.interval * w0)
-    regular_chain_pass(step, output @ readout[:n], shift, n, data, sink)
-    return _to_standard(mapping, sink, want_rows)
-
-
-@njit(cache=True, nogil=True)
-def _irregular_chain(a: Array, b: Array, delay: float, data: FilterData, want_rows: bool) -> Array:
-    """Standard rows of an irregular clock, for any poles, from [z (both chains), u, filtered y, y - x]."""
-    n = a.size - 1
-    w0, dynamics, gain, powers, output = _double_chain(a, b)
-    q = 3 * n + 2
-    mapping = np.zeros((3 * n + 3, q))
-    place(mapping, 0, 0, powers)
     mapping[n, 2 * n] = 1.0
-    place(mapping, n + 1, n, powers)
-    place(mapping, 2 * n + 1, 2 * n + 1, powers)
-    mapping[3 * n + 1, 3 * n + 1] = 1.0
+    place(mapping, 2 * n + 1, filtered, powers)
+    mapping[3 * n + 1, filtered + n] = 1.0
+    sink = row_sink(mapping.shape[1], data.use, want_rows)
+    # y - x needs x at the instant read.
+    output_map = output @ readout[:n]
+    if regular:
+        mapping[n, 2 * n + 1] = fraction
+        # The states step by whole intervals whatever the delay.
+        step = held_step(dynamics, gain, data.interval * w0)
+        regular_chain_pass(step, output_map, shift, n, data, sink)
+    else:
+        irregular_chain_pass(dynamics, gain, output_map, delay * w0, n, in_unit(data, w0), sink)
     _fill_derivative(a, b, mapping)
-    sink = row_sink(q, data.use, want_rows)
-    output_map = np.zeros(2 * n)
-    for i in range(n):
-        output_map[i] = output[i]
-    irregular_chain_pass(dynamics, gain, output_map, delay * w0, n, in_unit(data, w0), sink)
     return _to_standard(mapping, sink, want_rows)
-
-
-@njit(cache=True, nogil=True)
-def _evaluate(coefficients: Array, point: complex) -> tuple[complex, complex]:
-    """Value and derivative of a polynomial."""
-    value, slope = 0.0j, 0.0j
-    for k in range(coefficients.size):
-        slope = slope * point + value
-        value = value * point + coefficients[k]
-    return value, slope
 
 
 @njit(cache=True, nogil=True)
@@ -176,28 +141,20 @@ def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Ar
         if pole.imag < 0.0:
             continue
         paired = pole.imag > 0.0
-        weight = 2.0 if paired else 1.0  # a pair gives twice the real part of one
         poles[mode] = pole
-        value, first = _evaluate(b, pole)
-        residues[mode] = weight * value / slope
+        value, first = horner(b, pole)
+        residues[mode] = (2.0 if paired else 1.0) * value / slope
         # p^k/A at its pole, and p^k B/A^2, a double pole: with f = p^k B it is f/A'^2 of w and
         # (f' - f A''/A')/A'^2 of z.
         power, power_slope = 1.0 + 0.0j, 0.0j
         for k in range(n):
-            single = weight * power / slope
             numerator = power * value
             numerator_slope = power_slope * value + power * first
-            double = weight * numerator / (slope * slope)
-            mixed = weight * (numerator_slope - numerator * curvatures[i]) / (slope * slope)
-            mapping[k, row] = single.real
-            mapping[2 * n + 1 + k, 2 * n + 1 + row] = single.real
-            mapping[n + 1 + k, row] = mixed.real
-            mapping[n + 1 + k, n + row] = double.real
-            if paired:
-                mapping[k, row + 1] = -single.imag
-                mapping[2 * n + 1 + k, 2 * n + 2 + row] = -single.imag
-                mapping[n + 1 + k, row + 1] = -mixed.imag
-                mapping[n + 1 + k, n + row + 1] = -double.imag
+            squared = slope * slope
+            add_mode(mapping, k, row, paired, power / slope)
+            add_mode(mapping, 2 * n + 1 + k, 2 * n + 1 + row, paired, power / slope)
+            add_mode(mapping, n + 1 + k, row, paired, (numerator_slope - numerator * curvatures[i]) / squared)
+            add_mode(mapping, n + 1 + k, n + row, paired, numerator / squared)
             power_slope = power_slope * pole + power
             power *= pole
         row += 2 if paired else 1
@@ -219,9 +176,7 @@ def standard_moments(a: Array, b: Array, delay: float, data: FilterData, want_ro
         sink = row_sink(mapping.shape[1], data.use, want_rows)
         modal_pass(poles, residues, delay, data, sink)
         return _to_standard(mapping, sink, want_rows)
-    if data.interval > 0.0:
-        return _regular_chain(a, b, delay, data, want_rows)
-    return _irregular_chain(a, b, delay, data, want_rows)
+    return _chain_rows(a, b, delay, data, want_rows)
 
 
 def _run(data: FilterData, a: Array, b: Array, delay: float, want_rows: bool, form: Form) -> Array:

@@ -17,9 +17,9 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array
-from ctid_cli.filtering.exponential import HeldStep, exponential_minus_identity, place
+from ctid_cli.filtering.exponential import HeldStep, exponential_minus_identity, place, row_norm
 from ctid_cli.filtering.filter_data import FilterData, clock_slack
-from ctid_cli.filtering.row_sink import BLOCK, RowSink, emit, finish
+from ctid_cli.filtering.row_sink import RowSink, finish, row_filled
 
 #: Digits per level and Taylor degree of the transitions on an irregular clock.
 BASE = 16
@@ -74,10 +74,7 @@ def regular_chain_pass(
             for i in range(ny):
                 block[nz + 2 + i, filled] = w[i]
             block[nz + 2 + ny, filled] = y[k] - x
-            filled += 1
-            if filled == BLOCK:
-                written = emit(sink, filled, written)
-                filled = 0
+            filled, written = row_filled(sink, filled, written)
         if output.size:
             output[k] = x
         # Read first, then step on: row k holds the states at sample k.
@@ -110,14 +107,8 @@ def _transitions(dynamics: Array, gain: Array, longest: float) -> _Transitions:
     for i in range(n):
         augmented[i, n] = gain[i]
     augmented[n, n + 1] = 1.0
-    norm = 0.0
-    for i in range(n + 2):
-        total = 0.0
-        for j in range(n + 2):
-            total += abs(augmented[i, j])
-        norm = max(norm, total)
     # Within a quantum the Taylor remainder, (2^-9)^6/6!, is below rounding.
-    quantum = QUANTUM_NORM / norm
+    quantum = QUANTUM_NORM / row_norm(augmented)
     levels = 1
     while quantum * float(BASE) ** levels <= longest and levels < 40:
         levels += 1
@@ -173,8 +164,6 @@ def _step(table: _Transitions, step: float, state: Array, work: Array) -> None:
 @njit(cache=True, nogil=True)
 def _longest_step(t: Array, tu: Array, delay: float) -> float:
     """Longest step that a pass takes, on either clock or from the last break to the last sample."""
-    if t.size == 1:
-        return float(t[0] - min(t[0], tu[0]))
     longest = 0.0
     for k in range(t.size - 1):
         longest = max(longest, t[k + 1] - t[k])
@@ -229,10 +218,7 @@ def irregular_chain_pass(
             for i in range(ny):
                 block[nz + 1 + i, filled] = filtered[i]
             block[nz + 1 + ny, filled] = y[k] - x
-            filled += 1
-            if filled == BLOCK:
-                written = emit(sink, filled, written)
-                filled = 0
+            filled, written = row_filled(sink, filled, written)
         if output.size:
             output[k] = x
         # w, driven by the samples themselves: held, or joined by straight lines.

@@ -43,6 +43,18 @@ def _multiply(left: Array, right: Array, out: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
+def row_norm(matrix: Array) -> float:
+    """Largest sum of magnitudes in a row."""
+    norm = 0.0
+    for i in range(matrix.shape[0]):
+        total = 0.0
+        for j in range(matrix.shape[1]):
+            total += abs(matrix[i, j])
+        norm = max(norm, total)
+    return norm
+
+
+@njit(cache=True, nogil=True)
 def exponential_minus_identity(matrix: Array) -> Array:
     r"""``exp(M) - I`` of a small matrix.
 
@@ -50,12 +62,7 @@ def exponential_minus_identity(matrix: Array) -> Array:
     relative accuracy of slow modes when a fast one forces many squarings (poles spread over six decades).
     """
     n = matrix.shape[0]
-    norm = 0.0
-    for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total += abs(matrix[i, j])
-        norm = max(norm, total)
+    norm = row_norm(matrix)
     squarings = 0
     while norm > 0.25 and squarings < 200:
         norm *= 0.5
@@ -94,3 +101,17 @@ def held_step(dynamics: Array, gain: Array, step: float) -> HeldStep:
     for i in range(n):
         transition[i, i] += 1.0
     return HeldStep(transition, result[:n, n].copy(), result[:n, n + 1].copy())
+
+
+@njit(cache=True, nogil=True)
+def held_readout(dynamics: Array, gain: Array, interval: float, fraction: float) -> Array:
+    """States a fraction of an interval after a break, from ``[z, v, change of v]``, v's change over the interval."""
+    n = gain.size
+    readout = np.eye(n, n + 2)
+    if fraction > 0.0:
+        part = held_step(dynamics, gain, fraction * interval)
+        place(readout, 0, 0, part.transition)
+        for i in range(n):
+            readout[i, n] = part.from_value[i]
+            readout[i, n + 1] = part.from_change[i] * fraction
+    return readout

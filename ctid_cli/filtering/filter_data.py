@@ -101,14 +101,5 @@ def clock_slack(data: FilterData) -> float:
 @njit(cache=True, nogil=True)
 def in_unit(data: FilterData, w0: float) -> FilterData:
     """The record with its clocks in the time unit 1/w0."""
-    return FilterData(
-        data.t * w0,
-        data.y,
-        data.use,
-        data.tu * w0,
-        data.u,
-        data.input_foh,
-        data.y_foh,
-        data.interval * w0,
-        data.common_clock,
-    )
+    t, y, use, tu, u, input_foh, y_foh, interval, common_clock = data
+    return FilterData(t * w0, y, use, tu * w0, u, input_foh, y_foh, interval * w0, common_clock)

@@ -28,38 +28,29 @@ def free_response(
     theta: Array, free: Array, terms: Sequence[Term], elapsed: Array
 ) -> tuple[Array, Array, Array] | None:
     """Free response and its sensitivities."""
-    combined: list[Array] = []
+    # The parameters of the terms that have states, and where they stand in (theta, free).
+    places: list[int] = []
     degrees = []
-    place_theta, place_free = 0, 0
+    first_theta, first_free = 0, theta.size
     for term in terms:
         if term.order:
-            combined += [theta[place_theta : place_theta + term.poles], free[place_free : place_free + term.order]]
+            places += [*range(first_theta, first_theta + term.poles), *range(first_free, first_free + term.order)]
             degrees.append((term.poles, term.order - 1, term.integrators))
-        place_theta += term.size
-        place_free += term.order
-    by_theta, by_free = np.zeros((elapsed.size, theta.size)), np.zeros((elapsed.size, free.size))
+        first_theta += term.size
+        first_free += term.order
+    derivatives = np.zeros((elapsed.size, theta.size + free.size))
+    by_theta, by_free = derivatives[:, : theta.size], derivatives[:, theta.size :]
     if not degrees:
         return np.zeros(elapsed.size), by_theta, by_free
-    modes = simple_modes(np.concatenate(combined), np.array(degrees, dtype=np.int64), False)
+    modes = simple_modes(np.concatenate((theta, free))[places], np.array(degrees, dtype=np.int64))
     if modes is None:
         return None
     singles: list[Array] = []
-    doubles: list[Array] = []
     for pole in modes.poles:
         response = np.exp(pole * elapsed)
-        parts = [response.real, response.imag] if pole.imag else [response.real]
-        singles += parts
-        doubles += [elapsed * part for part in parts]
+        singles += [response.real, response.imag] if pole.imag else [response.real]
     integrals = [elapsed**k / factorial(k) for k in range(modes.origin.size)]
-    rows = np.column_stack(singles + doubles + integrals)
-    derivatives = rows @ modes.instruments[:, : rows.shape[1]].T
-    place, place_theta, place_free = 0, 0, 0
-    for term in terms:
-        if term.order:
-            by_theta[:, place_theta : place_theta + term.poles] = derivatives[:, place : place + term.poles]
-            place += term.poles
-            by_free[:, place_free : place_free + term.order] = derivatives[:, place : place + term.order]
-            place += term.order
-        place_theta += term.size
-        place_free += term.order
-    return rows @ modes.output[0, : rows.shape[1]], by_theta, by_free
+    rows = np.column_stack([*singles, *(elapsed * single for single in singles), *integrals])
+    maps = modes.maps[:, : rows.shape[1]]
+    derivatives[:, places] = rows @ maps[: len(places)].T
+    return rows @ maps[-1], by_theta, by_free

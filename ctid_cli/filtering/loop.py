@@ -108,17 +108,18 @@ def _closed_loop(plant: SampledModel, law: SampledModel, r: Array, v: Array, bef
     """Compiled body of :func:`simulate_loop`; ``before`` is the share of r that the controller sees, 1 or 0."""
     F, g, c, direct, shift = plant
     A, B, C, D, _ = law
+    n, m = g.size, B.size
     u, x = np.empty(r.size), np.empty(r.size)
-    z, z_next = np.zeros(g.size), np.zeros(g.size)
-    s, s_next = np.zeros(B.size), np.zeros(B.size)
+    z, z_next = np.zeros(n), np.zeros(n)
+    s, s_next = np.zeros(m), np.zeros(m)
     for k in range(r.size):
         # x without the input that arrives now, and what the controller's state and the reference put out.
         free = 0.0
-        for i in range(z.size):
+        for i in range(n):
             free += c[i] * z[i]
         error = before * r[k] - v[k]
         held = (1.0 - before) * r[k]
-        for i in range(s.size):
+        for i in range(m):
             held += C[i] * s[i]
         if shift == 0:
             # The input acts on the output that it is made from: solve for it.
@@ -131,14 +132,14 @@ def _closed_loop(plant: SampledModel, law: SampledModel, r: Array, v: Array, bef
             u[k] = held + D * (error - x[k])
         # Both step on with what they have seen at this sample.
         error -= x[k]
-        for i in range(z.size):
+        for i in range(n):
             total = g[i] * arriving
-            for j in range(z.size):
+            for j in range(n):
                 total += F[i, j] * z[j]
             z_next[i] = total
-        for i in range(s.size):
+        for i in range(m):
             total = B[i] * error
-            for j in range(s.size):
+            for j in range(m):
                 total += A[i, j] * s[j]
             s_next[i] = total
         z, z_next = z_next, z
@@ -146,34 +147,19 @@ def _closed_loop(plant: SampledModel, law: SampledModel, r: Array, v: Array, bef
     return u, x
 
 
-def loop_state_space(
-    model: AdditiveModel | TransferFunction, controller: Controller, interval: float, enters: Enters = "controller"
-) -> tuple[Array, Array, Array, Array]:
-    r"""State-space form of the closed loop from ``(r, v)`` to ``(u, x)``."""
-    require_choice("enters", enters, get_args(Enters))
+def loop_radius(model: AdditiveModel | TransferFunction, controller: Controller, interval: float) -> float:
+    """Largest magnitude of the poles of the sampled loop: it is stable below 1."""
+    from scipy.linalg import block_diag  # slow to import
+
     sampled = sampled_model(model, interval)
     discrete = _realised(controller)
     _require_solvable(sampled, discrete)
     A, B, C, D = sampled.state_space()
     Ac, Bc, Cc, Dc = discrete.state_space()
-    n, m = len(A), len(Ac)
-    # The controller sees inner - x and puts out Cc s + Dc (inner - x), to which outer is added.
-    before = float(enters == "controller")
-    inner, outer = np.array([[before, -1.0]]), np.array([[1.0 - before, 0.0]])
-    divisor = 1.0 + Dc * D
-    u_state = np.hstack((-Dc @ C, Cc)) / divisor
-    u_input = (Dc @ inner + outer) / divisor
-    x_state = np.hstack((C, np.zeros((1, m)))) + D @ u_state
-    x_input = D @ u_input
-    dynamics = np.vstack((np.hstack((A, np.zeros((n, m)))), np.hstack((np.zeros((m, n)), Ac))))
-    dynamics += np.vstack((B @ u_state, -Bc @ x_state))
-    inputs = np.vstack((B @ u_input, Bc @ (inner - x_input)))
-    return dynamics, inputs, np.vstack((u_state, x_state)), np.vstack((u_input, x_input))
-
-
-def loop_radius(model: AdditiveModel | TransferFunction, controller: Controller, interval: float) -> float:
-    """Largest magnitude of the poles of the sampled loop: it is stable below 1."""
-    dynamics = loop_state_space(model, controller, interval)[0]
+    # Without reference and noise u = Cc s - Dc x and x = C z + D u.
+    u = np.hstack((-Dc @ C, Cc)) / (1.0 + Dc * D)
+    x = np.hstack((C, np.zeros((1, len(Ac))))) + D @ u
+    dynamics = block_diag(A, Ac) + np.vstack((B @ u, -Bc @ x))
     return float(np.abs(np.linalg.eigvals(dynamics)).max(initial=0.0))
 
 

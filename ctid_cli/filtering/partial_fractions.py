@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ctid_cli.arrays import ComplexArray
+from ctid_cli.arrays import Array, ComplexArray
 
 #: Partial fractions are used while they amplify rounding by less than this; beyond, poles count as repeated.
 MODAL_CONDITION_LIMIT = 1e4
@@ -60,3 +60,13 @@ def modal_condition(roots: ComplexArray, slopes: ComplexArray, curvatures: Compl
             return np.inf
         worst = max(worst, spread / peak)
     return worst
+
+
+@njit(cache=True, nogil=True)
+def add_mode(mapping: Array, row: int, column: int, paired: bool, weight: complex) -> None:
+    """Add ``Re(weight z)`` of a mode, twice for a pair, to a row of a map."""
+    if paired:
+        mapping[row, column] += 2.0 * weight.real
+        mapping[row, column + 1] -= 2.0 * weight.imag
+    else:
+        mapping[row, column] += weight.real

@@ -38,6 +38,16 @@ def scaled_roots(denominator: Array) -> tuple[float, ComplexArray]:
 
 
 @njit(cache=True, nogil=True)
+def horner(coefficients: Array, point: complex) -> tuple[complex, complex]:
+    """Value and derivative of a polynomial."""
+    value, slope = 0.0j, 0.0j
+    for k in range(coefficients.size):
+        slope = slope * point + value
+        value = value * point + coefficients[k]
+    return value, slope
+
+
+@njit(cache=True, nogil=True)
 def polynomial_roots(coefficients: Array) -> ComplexArray:
     """Roots of a monic real polynomial, fastest first and conjugates side by side."""
     n = coefficients.size - 1
@@ -73,10 +83,7 @@ def polynomial_roots(coefficients: Array) -> ComplexArray:
             if j != i:
                 gap = min(gap, abs(raw[j] - raw[i]))
         for _ in range(3):
-            value, slope = complex(1.0, 0.0), complex(0.0, 0.0)
-            for k in range(1, n + 1):
-                slope = slope * raw[i] + value
-                value = value * raw[i] + coefficients[k]
+            value, slope = horner(coefficients, raw[i])
             if not abs(value) < 1e-3 * gap * abs(slope):
                 break
             raw[i] -= value / slope
@@ -101,10 +108,7 @@ def _simultaneous_roots(coefficients: Array, roots: ComplexArray) -> bool:
         settled = True
         for i in range(n):
             # A and A' by Horner; the step -A/(A' - A sum 1/(root - other)) takes the other roots out of A.
-            value, slope = complex(1.0, 0.0), complex(0.0, 0.0)
-            for k in range(1, n + 1):
-                slope = slope * roots[i] + value
-                value = value * roots[i] + coefficients[k]
+            value, slope = horner(coefficients, roots[i])
             if value == 0.0:
                 continue
             repulsion = 0.0j

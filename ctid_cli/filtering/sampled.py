@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
-from ctid_cli.errors import DataError
 from ctid_cli.filtering.exponential import held_step
 from ctid_cli.filtering.filter_data import plain_array, split_delay
 from ctid_cli.filtering.realisation import chain, scaled_roots
-from ctid_cli.filtering.simulate import simulate
+from ctid_cli.filtering.simulate import feedthrough, simulate
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_positive
@@ -67,18 +66,13 @@ def sampled_model(model: AdditiveModel | TransferFunction, interval: float) -> S
 
 def _part(part: TransferFunction, interval: float, fraction: float) -> tuple[Array, Array, Array, float]:
     """One-interval map of an undelayed transfer function, read out a fraction of the interval after each sample."""
-    if part.relative_degree < 0:
-        raise DataError("a model with more zeros than poles has no response to a jump")
     n = part.order
-    numerator = np.concatenate((np.zeros(part.relative_degree), part.numerator))
-    direct = float(numerator[0])
+    direct, strictly_proper = feedthrough(part)
     if not n:
         return np.zeros((0, 0)), np.zeros(0), np.zeros(0), direct
-    a = plain_array(part.denominator)
-    w0, roots = scaled_roots(a)
+    w0, roots = scaled_roots(plain_array(part.denominator))
     dynamics, gain, powers = chain(roots)
-    strictly_proper = (numerator - direct * a)[1:] / w0 ** np.arange(1, n + 1)
-    output = strictly_proper[::-1] @ powers
+    output = (strictly_proper / w0 ** np.arange(1, n + 1))[::-1] @ powers
     transition, from_input, _ = held_step(dynamics, gain, interval * w0)
     if fraction:
         part_way, from_held, _ = held_step(dynamics, gain, fraction * interval * w0)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.chain_pass import irregular_chain_pass, regular_chain_pass
-from ctid_cli.filtering.exponential import held_step
+from ctid_cli.filtering.exponential import held_readout, held_step
 from ctid_cli.filtering.filter_data import FilterData, in_unit, plain_array, split_delay
 from ctid_cli.filtering.realisation import chain, scaled_roots
 from ctid_cli.filtering.row_sink import RowSink
@@ -57,13 +57,9 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
         raise DataError("the instants of a simulation must be finite numbers that increase strictly")
     if t.size == 0:
         return t
-    if model.relative_degree < 0:
-        raise DataError("a model with more zeros than poles has no response to a jump")
+    direct, strictly_proper = feedthrough(model)
     if model.order == 0:
-        return np.asarray(model.numerator[0] * signal.at(t - model.delay))
-    numerator = np.concatenate([np.zeros(model.relative_degree), model.numerator])
-    direct = numerator[0]
-    strictly_proper = (numerator - direct * model.denominator)[1:]
+        return np.asarray(direct * signal.at(t - model.delay))
     interval = regular_interval(t)
     on_grid = (
         interval is not None and signal.t.size == t.size and bool(np.abs(signal.t - t).max() <= REGULARITY * interval)
@@ -85,6 +81,15 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
     return x
 
 
+def feedthrough(model: TransferFunction) -> tuple[float, Array]:
+    """What of its input a model passes on at once, and the numerator of the rest, in n coefficients."""
+    if model.relative_degree < 0:
+        raise DataError("a model with more zeros than poles has no response to a jump")
+    numerator = np.concatenate([np.zeros(model.relative_degree), model.numerator])
+    direct = float(numerator[0])
+    return direct, (numerator - direct * model.denominator)[1:]
+
+
 @njit(cache=True, nogil=True)
 def _response(a: Array, b: Array, delay: float, data: FilterData) -> Array:
     """Compiled body of :func:`simulate`: no output is filtered and no row kept; ``b`` has n entries."""
@@ -103,16 +108,10 @@ def _response(a: Array, b: Array, delay: float, data: FilterData) -> Array:
         return sink.output
     shift, fraction = split_delay(delay, data.interval)
     # x at the instant that arrives now, from the states and the held input at the break before it.
+    arrived = held_readout(dynamics, gain, data.interval * w0, fraction)
     readout = np.zeros(n + 2)
-    if fraction > 0.0:
-        part = held_step(dynamics, gain, fraction * data.interval * w0)
-        for i in range(n):
-            for j in range(n):
-                readout[j] += output_map[i] * part.transition[i, j]
-            readout[n] += output_map[i] * part.from_value[i]
-            readout[n + 1] += output_map[i] * part.from_change[i] * fraction
-    else:
-        for i in range(n):
-            readout[i] = output_map[i]
+    for i in range(n):
+        for j in range(n + 2):
+            readout[j] += output_map[i] * arrived[i, j]
     regular_chain_pass(held_step(dynamics, gain, data.interval * w0), readout, shift, 0, data, sink)
     return sink.output

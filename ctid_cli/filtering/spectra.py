@@ -20,6 +20,7 @@ from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.errors import DataError
+from ctid_cli.filtering.exponential import place
 from ctid_cli.filtering.filter_data import plain_array
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.signals.held import HeldSignal
@@ -206,9 +207,7 @@ def _partial_sums(times: Array, jumps: Array, marks: IntArray, base: float, coun
     for r in range(marks.size):
         _add_jumps(times, jumps, done, marks[r], base, phases, total)
         done = marks[r]
-        for k in range(count):
-            sums[r, 0, k] = total[0, k]
-            sums[r, 1, k] = total[1, k]
+        place(sums[r], 0, 0, total)
     return sums
 
 
@@ -256,14 +255,10 @@ def _window_spectrum(held: _HeldSpectrum, delay: float, gain: Array) -> ComplexA
     spectrum[0] = (total_right - total_left) / duration
     if count == 0:
         return spectrum
-    phases, total, early = np.zeros((2, count)), np.zeros((2, count)), np.zeros((2, count))
+    phases = np.zeros((2, count))
     # D: kept sums up to the nearest marks, completed break by break.
     row, upper = _last_at(marks, left + 1), _last_at(marks, right + 1)
-    for k in range(count):
-        total[0, k] = sums[upper, 0, k]
-        total[1, k] = sums[upper, 1, k]
-        early[0, k] = sums[row, 0, k]
-        early[1, k] = sums[row, 1, k]
+    total, early = sums[upper, :, :count].copy(), sums[row, :, :count].copy()
     _add_jumps(times, jumps, marks[upper], right + 1, base, phases, total)
     _add_jumps(times, jumps, marks[row], left + 1, base, phases, early)
     _phases(base * delay, count, phases[0], phases[1])

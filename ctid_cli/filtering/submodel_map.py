@@ -9,8 +9,8 @@ from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.filtering.filter_data import plain_array
-from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT, modal_condition, pole_slopes
-from ctid_cli.filtering.realisation import scaled_roots
+from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT, add_mode, modal_condition, pole_slopes
+from ctid_cli.filtering.realisation import horner, scaled_roots
 
 
 @njit(cache=True, nogil=True)
@@ -37,16 +37,6 @@ def _product(left: Array, right: Array, count: int) -> Array:
                 total += left[k] * right[q - k]
         series[q] = total
     return series
-
-
-@njit(cache=True, nogil=True)
-def _add_mode(mapping: Array, row: int, column: int, paired: bool, weight: complex) -> None:
-    """Add ``Re(weight z)`` of a mode, twice for a pair, to a row of a map."""
-    if paired:
-        mapping[row, column] += 2.0 * weight.real
-        mapping[row, column + 1] -= 2.0 * weight.imag
-    else:
-        mapping[row, column] += weight.real
 
 
 class RowLayout(NamedTuple):
@@ -87,12 +77,8 @@ class PooledModes(NamedTuple):
     direct: float
     direct_owner: int
     layout: RowLayout
-    #: psi from the rows of the pass, shape (p, q).
-    instruments: Array
-    #: phi from the rows of the pass, shape (p, q).
-    regressors: Array
-    #: Model output driven by z from the rows of the pass, shape (1, q).
-    output: Array
+    #: psi, phi and the model output driven by z, stacked, from the rows of the pass, shape (2 p + 1, q).
+    maps: Array
 
 
 class _Part(NamedTuple):
@@ -103,26 +89,22 @@ class _Part(NamedTuple):
     #: Coefficient of the highest power of A.
     highest: float
     integrators: int
+    #: First rows of psi, and by how much those of phi lie below them.
     first_a: int
     first_b: int
+    phi: int
 
 
 @njit(cache=True, nogil=True)
 def _row_layout(degrees: IntArray, closed: bool) -> RowLayout:
     n, integrals = degrees[:, 0].sum(), degrees[:, 2].sum()
-    extra = 3 * n + integrals + 2
-    if closed:
-        return RowLayout(
-            n,
-            integrals,
-            2 * n + integrals,
-            extra - 1,
-            extra,
-            extra + n,
-            extra + n + integrals,
-            extra + n + integrals + 1,
-        )
-    return RowLayout(n, integrals, 2 * n + integrals, extra - 1, 0, 2 * n, 2 * n + integrals, extra)
+    error = 3 * n + integrals + 1
+    # In open loop the rows of z and w are those of the measured input too, and what follows them is shared.
+    u_modes = error + 1 if closed else 0
+    u_integrals = u_modes + (n if closed else 2 * n)
+    u_value = u_integrals + integrals
+    width = max(error, u_value) + 1
+    return RowLayout(n, integrals, 2 * n + integrals, error, u_modes, u_integrals, u_value, width)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -131,16 +113,13 @@ def _map_pole(part: _Part, pole: complex, slope: complex, curvature: complex, ro
 
     ``slope`` is A' and ``curvature`` A''/A' there; ``row`` is the row of the mode among those of z.
     """
-    layout = modes.layout
+    layout, maps, phi = modes.layout, modes.maps, part.phi
     own, zeros = part.a.size, part.b.size - 1
     paired = pole.imag > 0.0
     squared = slope * slope
-    numerator, numerator_slope = complex(0.0, 0.0), complex(0.0, 0.0)
-    for k in range(zeros, -1, -1):
-        numerator_slope = numerator_slope * pole + numerator
-        numerator = numerator * pole + part.b[k]
+    numerator, numerator_slope = horner(part.b[::-1], pole)
     reciprocal = 1.0 / pole**part.integrators
-    _add_mode(modes.output, 0, row, paired, numerator * reciprocal / slope)
+    add_mode(maps, 2 * phi, row, paired, numerator * reciprocal / slope)
     power = reciprocal  # p^(k - l)
     for k in range(max(own, zeros) + 1):
         if 1 <= k <= own:
@@ -148,14 +127,14 @@ def _map_pole(part: _Part, pole: complex, slope: complex, curvature: complex, ro
             a_row = part.first_a + k - 1
             f = power * numerator
             f_slope = power * (numerator_slope + (k - part.integrators) * numerator / pole)
-            _add_mode(modes.instruments, a_row, layout.modes + row, paired, -f / squared)
-            _add_mode(modes.instruments, a_row, row, paired, -(f_slope - f * curvature) / squared)
+            add_mode(maps, a_row, layout.modes + row, paired, -f / squared)
+            add_mode(maps, a_row, row, paired, -(f_slope - f * curvature) / squared)
             # phi_a = -p^k/A of what the others leave of the output.
-            _add_mode(modes.regressors, a_row, layout.value + 1 + row, paired, -(power / reciprocal / slope))
+            add_mode(maps, phi + a_row, layout.value + 1 + row, paired, -(power / reciprocal / slope))
         if k <= zeros:
             # psi_b and phi_b = p^k/(p^l A) of v and of u.
-            _add_mode(modes.instruments, part.first_b + k, row, paired, power / slope)
-            _add_mode(modes.regressors, part.first_b + k, layout.u_modes + row, paired, power / slope)
+            add_mode(maps, part.first_b + k, row, paired, power / slope)
+            add_mode(maps, phi + part.first_b + k, layout.u_modes + row, paired, power / slope)
         power *= pole
     return numerator * reciprocal / slope * (2.0 if paired else 1.0)
 
@@ -163,20 +142,20 @@ def _map_pole(part: _Part, pole: complex, slope: complex, curvature: complex, ro
 @njit(cache=True, nogil=True, error_model="numpy")
 def _map_origin(part: _Part, modes: PooledModes) -> None:
     """Write the partial fractions at the origin: Taylor coefficients of ``1/A``, ``B/A`` and ``B/A^2`` there."""
-    layout, integrators = modes.layout, part.integrators
+    layout, maps, phi, integrators = modes.layout, modes.maps, part.phi, part.integrators
     single = _taylor_of_reciprocal(part.a, integrators)
     model = _product(part.b, single, integrators)
     sensitivity = _product(model, single, integrators)
     for order in range(integrators):  # the weight of 1/p^(order + 1)
         column = 2 * layout.modes + order
         modes.origin[order] = model[integrators - 1 - order]
-        modes.output[0, column] += modes.origin[order]
+        maps[2 * phi, column] += modes.origin[order]
         for k in range(integrators - order):
             if 1 <= k <= part.a.size:
-                modes.instruments[part.first_a + k - 1, column] -= sensitivity[integrators - 1 - order - k]
+                maps[part.first_a + k - 1, column] -= sensitivity[integrators - 1 - order - k]
             if k < part.b.size:
-                modes.instruments[part.first_b + k, column] += single[integrators - 1 - order - k]
-                modes.regressors[part.first_b + k, layout.u_integrals + order] += single[integrators - 1 - order - k]
+                maps[part.first_b + k, column] += single[integrators - 1 - order - k]
+                maps[phi + part.first_b + k, layout.u_integrals + order] += single[integrators - 1 - order - k]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -185,25 +164,26 @@ def _map_direct(part: _Part, direct: float, first: int, last: int, modes: Pooled
 
     The modes of the submodel have the rows ``first … last - 1`` among those of z.
     """
-    layout, own, zeros = modes.layout, part.a.size, part.b.size - 1
+    layout, maps, phi = modes.layout, modes.maps, part.phi
+    own, zeros = part.a.size, part.b.size - 1
     biproper = zeros == own + part.integrators
     if biproper:
-        modes.output[0, layout.value] += direct
-        modes.instruments[part.first_b + zeros, layout.value] += 1.0 / part.highest
-        modes.regressors[part.first_b + zeros, layout.u_value] += 1.0 / part.highest
+        maps[2 * phi, layout.value] += direct
+        maps[part.first_b + zeros, layout.value] += 1.0 / part.highest
+        maps[phi + part.first_b + zeros, layout.u_value] += 1.0 / part.highest
     if own == 0:
         return
     # What the others leave of the output is the error and the submodel's own output, -1/a_n of it here.
     row = part.first_a + own - 1
     if biproper:
-        modes.instruments[row, layout.value] -= direct / part.highest
-        modes.regressors[row, layout.u_value] -= direct / part.highest
-    modes.regressors[row, layout.error] -= 1.0 / part.highest
+        maps[row, layout.value] -= direct / part.highest
+        maps[phi + row, layout.u_value] -= direct / part.highest
+    maps[phi + row, layout.error] -= 1.0 / part.highest
     for j in range(first, last):
-        modes.regressors[row, layout.u_modes + j] -= modes.output[0, j] / part.highest
+        maps[phi + row, layout.u_modes + j] -= maps[2 * phi, j] / part.highest
     if part.integrators > 0:
         for order in range(layout.integrals):
-            modes.regressors[row, layout.u_integrals + order] -= modes.origin[order] / part.highest
+            maps[phi + row, layout.u_integrals + order] -= modes.origin[order] / part.highest
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -213,10 +193,9 @@ def pooled_modes(theta: Array, degrees: IntArray, closed: bool) -> PooledModes:
     n = layout.modes
     poles, residues, owner = np.zeros(n, np.complex128), np.zeros(n, np.complex128), np.zeros(n, np.int64)
     origin, origin_owner, direct, direct_owner, condition = np.zeros(layout.integrals), 0, 0.0, 0, 1.0
-    instruments, regressors = np.zeros((theta.size, layout.width)), np.zeros((theta.size, layout.width))
-    output = np.zeros((1, layout.width))
+    maps = np.zeros((2 * theta.size + 1, layout.width))
     # The arrays are filled in place; the numbers behind them follow at the end.
-    modes = PooledModes(1.0, poles, owner, residues, origin, 0, 0.0, 0, layout, instruments, regressors, output)
+    modes = PooledModes(1.0, poles, owner, residues, origin, 0, 0.0, 0, layout, maps)
     mode, row, offset = 0, 0, 0
     for i in range(degrees.shape[0]):
         own, zeros, integrators = degrees[i, 0], degrees[i, 1], degrees[i, 2]
@@ -226,7 +205,7 @@ def pooled_modes(theta: Array, degrees: IntArray, closed: bool) -> PooledModes:
         if highest == 0.0:
             condition = np.inf  # theta has lost a pole
             break
-        part = _Part(a, b, highest, integrators, offset, first_b)
+        part = _Part(a, b, highest, integrators, offset, first_b, theta.size)
         # The same denominator monic and in falling powers, p^n first.
         monic = np.ones(own + 1)
         for k in range(own):
@@ -257,26 +236,14 @@ def pooled_modes(theta: Array, degrees: IntArray, closed: bool) -> PooledModes:
             direct, direct_owner = own_direct, i
         _map_direct(part, own_direct, first_row, row, modes)
         offset = first_b + zeros + 1
-    return PooledModes(
-        condition,
-        poles[:mode].copy(),
-        owner[:mode].copy(),
-        residues[:mode].copy(),
-        origin,
-        origin_owner,
-        direct,
-        direct_owner,
-        layout,
-        instruments,
-        regressors,
-        output,
-    )
+    poles, owner, residues = poles[:mode].copy(), owner[:mode].copy(), residues[:mode].copy()
+    return PooledModes(condition, poles, owner, residues, origin, origin_owner, direct, direct_owner, layout, maps)
 
 
-def simple_modes(theta: Array, degrees: IntArray, closed: bool) -> PooledModes | None:
+def simple_modes(theta: Array, degrees: IntArray) -> PooledModes | None:
     """Partial fractions where they are well conditioned."""
     try:
-        modes = pooled_modes(plain_array(theta), degrees, closed)
+        modes = pooled_modes(plain_array(theta), degrees, False)
     except (ZeroDivisionError, np.linalg.LinAlgError):
         return None
     return modes if modes.condition < MODAL_CONDITION_LIMIT else None

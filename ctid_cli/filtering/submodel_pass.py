@@ -15,7 +15,6 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray, IntArray
-from ctid_cli.filtering.exponential import place
 from ctid_cli.filtering.filter_data import FilterData, split_delay
 from ctid_cli.filtering.modal_pass import all_weights, first_rows
 from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT
@@ -81,13 +80,8 @@ def _submodel_pass(
     poles, layout, block = modes.poles, modes.layout, sink.block
     first = first_rows(poles)
     closed = loop.reference.size > 0
-    clock = Clock(
-        data.interval,
-        shift,
-        fraction,
-        all_weights(poles, data.interval),
-        all_weights(poles, data.interval * fraction),
-    )
+    whole, part = all_weights(poles, data.interval), all_weights(poles, data.interval * fraction)
+    clock = Clock(data.interval, shift, fraction, whole, part)
     v = np.zeros(data.y.size if closed else 0)
     # The rows of psi, driven by v, and those of phi and the model output, driven by u: in open loop the same.
     foh = data.input_foh and not closed
@@ -170,13 +164,8 @@ def filtered_submodels(
     """
     modes = pooled_modes(theta, degrees, loop.reference.size > 0)
     layout, submodels = modes.layout, degrees.shape[0]
-    # psi, phi and the model output, stacked.
-    maps = np.zeros((2 * theta.size + 1, layout.width))
     sink = row_sink(layout.width, data.use, want_rows)
     if modes.condition < MODAL_CONDITION_LIMIT:
-        place(maps, 0, 0, modes.instruments)
-        place(maps, theta.size, 0, modes.regressors)
-        place(maps, 2 * theta.size, 0, modes.output)
         shift, fraction = split_delay(delay, data.interval)
         states = np.zeros((modes.poles.size, 4), np.complex128)
         # A periodic input comes already late by whole intervals, and begins in its steady state.
@@ -184,4 +173,4 @@ def filtered_submodels(
             shift = 0
             states = _periodic_states(modes, submodels, loop, fraction, data)
         _submodel_pass(modes, submodels, loop, shift, fraction, data, states, sink)
-    return modes.condition, layout.error, maps, sink.rows if want_rows else sink.gram
+    return modes.condition, layout.error, modes.maps, sink.rows if want_rows else sink.gram

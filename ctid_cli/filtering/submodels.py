@@ -94,10 +94,10 @@ class SubmodelFilter:
         # What overflows is found by the sums not being finite.
         with np.errstate(all="ignore"):
             moments = self._moments(theta)
-        if moments is None:
+        if moments is None or not np.isfinite(moments.squared_error):
             return None
         finite = np.isfinite(moments.hessian).all() and np.isfinite(moments.instrument_regressor).all()
-        return moments if finite and np.isfinite(moments.squared_error) else None
+        return moments if finite else None
 
     def _moments(self, theta: Array) -> SubmodelMoments | None:
         """Second moments that need not be finite: of the pass, or of the rows where these are made in parts."""
@@ -204,9 +204,6 @@ class SubmodelFilter:
     def _submodel_output(self, data: FilterData, part: Submodel) -> Array:
         """Output of one submodel."""
         direct, a, b = _split_direct(part)
-        if a.size == 1:
-            value = standard_rows(data, np.array([1.0, 1.0]), np.zeros(1), self.delay)[:, 1]
-            return direct * value
         n = a.size - 1
         rows = standard_rows(data, a, b, self.delay)
         return np.asarray(rows[:, :n] @ _rising(b, n) + direct * rows[:, n])
@@ -217,11 +214,11 @@ class SubmodelFilter:
         n, order_at_origin = term.poles, term.integrators
         highest = float(part.denominator[0])
         columns = np.empty((data.count, term.size))
-        if a.size == 1:
-            columns[:, 0] = standard_rows(data, np.array([1.0, 1.0]), np.zeros(1), self.delay)[:, 1]
-            return columns
         whole = n + order_at_origin
         rows = standard_rows(data, a, b, self.delay)
+        if whole == 0:
+            columns[:, 0] = rows[:, 1]
+            return columns
         # p^k/(p^l A) u for k = 0 … n + l, the highest by the equation of the filter.
         driven = _with_highest(rows[:, :whole], rows[:, whole], a)
         columns[:, n:] = driven[:, : term.zeros + 1] / highest
@@ -248,7 +245,10 @@ def _split_direct(part: Submodel) -> tuple[float, Array, Array]:
     if b.size < a.size:
         return 0.0, a, b
     direct = float(b[0])
-    return direct, a, np.asarray((b - direct * a)[1:]) if a.size > 1 else np.zeros(1)
+    if a.size == 1:
+        # A filter needs a pole: any will do where nothing passes through it.
+        return direct, np.ones(2), np.zeros(1)
+    return direct, a, np.asarray((b - direct * a)[1:])
 
 
 def _rising(b: Array, count: int) -> Array:
