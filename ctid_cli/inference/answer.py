@@ -73,16 +73,16 @@ class Answer:
     #: Frequency below which 95 % of the answer lies [rad/s]; the Nyquist frequency where no answer is seen.
     bandwidth: float
     #: Highest frequency at which output and input are coherent [rad/s]; nan where they are nowhere.
-    visible_up_to: float
-    explained: float
+    visible_up_to: float = math.nan
+    explained: float = math.nan
     #: Frequencies between which 95 % of the power of the input lies [rad/s].
-    input_band: tuple[float, float]
-    delay: DelayHint | None
+    input_band: tuple[float, float] = (math.nan, math.nan)
+    delay: DelayHint | None = None
     #: Time after which the input repeats itself [s]; nan where it does not.
-    period: float
+    period: float = math.nan
     #: Greatest answer of the input to the output, that is at negative lags, over the standard deviation of what chance
     #: gives [-]; nan where it cannot be told. Feedback shows here.
-    before: float
+    before: float = math.nan
 
 
 def output_bandwidth(record: Record) -> float:
@@ -102,11 +102,10 @@ def analyse_answer(record: Record, moves: InputMoves | None = None) -> Answer:
     moves = moves or input_moves(record)
     grid = regular_grid(record)
     nyquist = math.pi / grid.interval
-    nothing = Answer(nyquist, math.nan, math.nan, (math.nan, math.nan), None, math.nan, math.nan)
     if moves.kind == "constant" or grid.u.size < 8 or not np.any(grid.y):
-        return nothing
+        return Answer(nyquist)
     if moves.kind == "steps":
-        return _after_a_step(record, moves, nothing)
+        return _after_a_step(record, moves, nyquist)
     alignments = _peaks(np.abs(_cross_correlation(grid.u, grid.y, grid.u.size // 2)[grid.u.size // 2 :]))
     spectra = [_Spectra.of(grid, shift, bins) for shift in alignments for bins in BINS]
     best = max(spectra, key=lambda s: s.explained)
@@ -346,7 +345,7 @@ def _first_of_run(above: BoolArray, k: int, pause: int) -> int:
         k = max(0, k - pause) + int(earlier[0])
 
 
-def _after_a_step(record: Record, moves: InputMoves, nothing: Answer) -> Answer:
+def _after_a_step(record: Record, moves: InputMoves, nyquist: float) -> Answer:
     """Answer to the first step of an input that moves seldom."""
     t, y = record.t[record.valid], record.y[record.valid]
     begin = float(moves.changes[0])
@@ -355,7 +354,7 @@ def _after_a_step(record: Record, moves: InputMoves, nothing: Answer) -> Answer:
     after = (t > begin) & (t <= end)
     t, moved = t[after] - begin, np.abs(y[after] - np.median(rest))
     if moved.size < 8:
-        return nothing
+        return Answer(nyquist)
     steps = np.abs(np.diff(y))
     noise = 1.4826 * float(np.median(steps)) / math.sqrt(2)
     quantum = float(steps[steps > 0].min()) if np.any(steps > 0) else 0.0
@@ -364,7 +363,7 @@ def _after_a_step(record: Record, moves: InputMoves, nothing: Answer) -> Answer:
     beyond = moved > threshold
     onset = np.flatnonzero(beyond[:-2] & beyond[1:-1] & beyond[2:])
     if not onset.size:
-        return nothing
+        return Answer(nyquist)
     first = int(onset[0])
     doubled = first + int(np.argmax(moved[first:] > 2 * threshold))
     # Traced back along a parabola through the two, twice as far: the level at rest is not known exactly.
@@ -372,7 +371,5 @@ def _after_a_step(record: Record, moves: InputMoves, nothing: Answer) -> Answer:
     early = max(0.0, float(before - 2 * (t[doubled] - t[first]) / (math.sqrt(2) - 1)))
     settled = float(np.median(moved[-max(3, moved.size // 20) :]))
     rise = float(t[int(np.argmax(moved > 0.632 * settled))] - t[first])
-    nyquist = nothing.bandwidth
     bandwidth = min(FIRST_ORDER / rise, nyquist) if rise > 0 else nyquist
-    delay = DelayHint(early, float(t[first]), float(moved.max() / threshold))
-    return Answer(bandwidth, math.nan, math.nan, (math.nan, math.nan), delay, math.nan, math.nan)
+    return Answer(bandwidth, delay=DelayHint(early, float(t[first]), float(moved.max() / threshold)))

@@ -59,20 +59,16 @@ def limiting_accuracy(
         controller, enters = DiscreteController([0.0], [1.0]), "input"
     loop = _in_loop(sensitivity_system(model, interval, zeros), controller, enters)
     if loop.radius >= 1.0:
-        raise DataError(
-            "the system, or its loop, is not stable: there is no limit for long records; its sampled poles reach the "
-            f"magnitude {loop.radius:.6g}, and must stay below 1"
-        )
+        wrong = "the system, or its loop, is not stable: there is no limit for long records"
+        raise DataError(f"{wrong}; its sampled poles reach the magnitude {loop.radius:.6g}, and must stay below 1")
     # What drives the instruments besides the reference: the noise, where they come from the input itself.
     gain = float(np.ravel(noise_filter[0])[0] / np.ravel(noise_filter[1])[0])
     fed_back = float(np.sqrt(innovation_variance)) * abs(gain) if instruments == "open_loop" else 0.0
     deviations = [standard_deviation, fed_back]
     found = unit_inverse(_covariance(loop, deviations)[1:, 1:])
     if found is None:
-        raise DataError(
-            "the parameters are not determined, even by endless data: some of them have no effect of their own on the "
-            "output, as where a pole cancels a zero or a gain is zero"
-        )
+        wrong = "the parameters are not determined, even by endless data"
+        raise DataError(f"{wrong}: some have no effect of their own, as where a pole cancels a zero or a gain is zero")
     inverse, scale = found
     # H(q) psi is psi driven by inputs filtered by H, one filter for each.
     filters = DiscreteSystem(*(np.asarray(np.kron(np.eye(2), part), dtype=float) for part in _filter(noise_filter)))
@@ -88,16 +84,12 @@ def require_uncorrelated_input(
     noise_filter: tuple[ArrayLike, ArrayLike],
 ) -> None:
     """Refuse instruments made from the input of a loop if they are correlated with the noise at the same sample."""
-    if any(np.size(part) > 1 for part in noise_filter):
-        raise DataError(
-            "the noise is coloured, so in closed loop the input is correlated with it and instruments from it are "
-            "biased; ask for closed_loop instruments"
-        )
-    if sampled_model(model, interval).state_space()[3].any() and controller.direct != 0.0:
-        raise DataError(
-            "model and controller both react at once, so the input is correlated with the noise at the same sample and "
-            "instruments from it are biased; ask for closed_loop instruments"
-        )
+    why = "the noise is coloured" if any(np.size(part) > 1 for part in noise_filter) else ""
+    if not why and sampled_model(model, interval).state_space()[3].any() and controller.direct != 0.0:
+        why = "model and controller both react at once"
+    if why:
+        biased = "the input is correlated with the noise and instruments from it are biased"
+        raise DataError(f"{why}, so {biased}; ask for closed_loop instruments")
 
 
 def output_variance(model: AdditiveModel | TransferFunction, interval: float, input_deviation: float) -> float:

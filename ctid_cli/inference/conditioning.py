@@ -53,10 +53,8 @@ def _large_errors(theta: Array, errors: Array, names: Sequence[str]) -> Iterator
     for name, value, error in zip(names, theta, errors, strict=True):
         if re.fullmatch(r"[ab]\d+|delay", name) and error > LARGE_STANDARD_ERROR * abs(value):
             times = f"{error / abs(value):.2g} times its value" if value else "its value being zero"
-            yield (
-                f"{name} = {value:.3g} has a standard error of {error:.3g}, {times}: these data do not determine it, "
-                "not even its sign; a simpler model may do."
-            )
+            start = f"{name} = {value:.3g} has a standard error of {error:.3g}, {times}"
+            yield f"{start}: these data do not determine it, not even its sign; a simpler model may do."
 
 
 def _correlated(correlation: Array, names: Sequence[str]) -> Iterator[str]:

@@ -96,7 +96,5 @@ def cramer_rao_bound(
     data = filter_data(record, start)
     moments = second_moments(data, model.denominator, model.numerator, model.delay)
     # N - p and the sum of squares are chosen so that their ratio is the known variance.
-    count = data.count
-    return white_noise_covariance(
-        structure.hessian(moments), noise_standard_deviation**2 * (count - structure.size), count
-    )
+    squared_error = noise_standard_deviation**2 * (data.count - structure.size)
+    return white_noise_covariance(structure.hessian(moments), squared_error, data.count)

@@ -8,7 +8,6 @@ from typing import Literal
 import numpy as np
 
 from ctid_cli.arrays import Array, IntArray
-from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
 #: An input with at most this many changes gives single answers in time and no averages over frequency.
@@ -40,7 +39,10 @@ def input_moves(record: Record) -> InputMoves:
     A measured input counts as moving between levels when nine samples in ten lie in a few narrow heaps; its
     changes are then those between heaps. An input known at the instants of the output only is taken to change there.
     """
-    t, u = _within(record.input, record.t[0], record.t[-1])
+    first, signal = record.t[0], record.input
+    inside = (signal.t > first) & (signal.t <= record.t[-1])
+    # The value that the record begins with counts too.
+    t, u = np.append(first, signal.t[inside]), np.append(signal.at([first]), signal.values[inside])
     spread = float(np.ptp(u))
     if spread <= 1e-9 * float(np.abs(u).max()):
         return InputMoves("constant", (float(u[0]),), np.empty(0), np.nan)
@@ -58,12 +60,6 @@ def input_moves(record: Record) -> InputMoves:
     hold = float(np.diff(changes).min()) if changes.size > 1 else np.nan
     levels = tuple(float(value) for value in values) if values.size <= FEW_LEVELS else ()
     return InputMoves("steps" if changes.size <= FEW_CHANGES else "levels", levels, changes, hold, noisy)
-
-
-def _within(signal: HeldSignal, first: float, last: float) -> tuple[Array, Array]:
-    """Breaks of the signal during the record, the value that it begins with included."""
-    inside = (signal.t > first) & (signal.t <= last)
-    return np.append(first, signal.t[inside]), np.append(signal.at([first]), signal.values[inside])
 
 
 def _changes(label: IntArray) -> int:

@@ -10,18 +10,10 @@ class Status(Enum):
 
     CONVERGED = "The iterations converged to a minimum of the output-error cost."
     LEAST_SQUARES = "A one-shot least-squares estimate: biased by output noise; use it as a start, not as a result."
-    MAX_ITERATIONS = (
-        "The iterations stopped at max_iterations before reaching the tolerance; raise max_iterations, or start closer."
-    )
-    STALLED = (
-        "No step lowers the cost although the tolerance is not reached; the model may have too many parameters "
-        "for these data, or the tolerance may be below what rounding allows."
-    )
+    MAX_ITERATIONS = "The iterations stopped at max_iterations before the tolerance; raise it, or start closer."
+    STALLED = "No step lowers the cost; too many parameters for these data, or a tolerance below what rounding allows."
     DELAY_AT_BOUND = "The delay stopped at one of its bounds; widen delay_bounds, or start the delay elsewhere."
-    SINGULAR = (
-        "The equations became singular: the data do not determine all parameters; "
-        "use fewer poles or zeros, or an input that excites the system more."
-    )
+    SINGULAR = "The equations became singular: the data do not determine all parameters; use fewer poles or zeros."
     DIVERGED = "The iterations diverged; use variant 'guarded', another svf_cutoff, or a start closer to the solution."
 
     @property

@@ -153,8 +153,8 @@ def _verdict(again: Repeated, what: str) -> str:
         return f"Computed once more: the same {what} to the last digit."
     if again.difference <= AGREEMENT:
         return f"Computed once more: the same {what}, up to {again.difference:.1e} of their size."
-    text = f"Computed once more: {what} differ by up to {again.difference:.1e} of their size. "
-    return text + "Another version of the code or another processor computed the stored ones."
+    why = "Another version of the code or another processor computed the stored ones."
+    return f"Computed once more: {what} differ by up to {again.difference:.1e} of their size. {why}"
 
 
 def _history(again: Repeated) -> str:

@@ -149,11 +149,11 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
 
 def _record_line(measurement: Measurement, used: int, units: Units) -> str:
     record = measurement.record
-    text = f"{record.name}: {count(record.n_samples, 'sample')}"
-    text += "" if used == record.n_samples else f" ({used} used)"
-    text += f" from {record.t[0]:.6g} to {record.t[-1]:.6g} {units.time}, "
-    text += "regular clock" if record.interval is not None else "irregular clock"
-    return f"{text}; input {measurement.input} [{units.input}], output {measurement.output} [{units.output}]"
+    part = "" if used == record.n_samples else f" ({used} used)"
+    clock = "regular clock" if record.interval is not None else "irregular clock"
+    span = f"{part} from {record.t[0]:.6g} to {record.t[-1]:.6g} {units.time}, {clock}"
+    columns = f"input {measurement.input} [{units.input}], output {measurement.output} [{units.output}]"
+    return f"{record.name}: {count(record.n_samples, 'sample')}{span}; {columns}"
 
 
 def _offset(result: Identification, units: Units) -> str:

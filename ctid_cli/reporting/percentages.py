@@ -57,7 +57,8 @@ def experiment_rows(
     """Cells of one experiment: every combination of swept fields, estimator and start that was planned."""
     manifest = results.manifest
     down, across = results.swept("data_cells"), results.swept("estimators")
-    constant = _constant(results, fields)
+    fields = fields or ({} if is_of_signal(manifest) else ALWAYS)
+    constant = {name: lookup(results.settings, path) for name, path in fields.items()}
     # Several sets of initial parameters are told apart by their names, as initial delays are by their values.
     given = {label for label, delay in manifest["starts"].items() if delay is None and label != "none"}
     by = ["cell", "estimator", *across, "start"]
@@ -80,12 +81,6 @@ def experiment_rows(
                 | measured.get(place, lacking)
             )
     return rows
-
-
-def _constant(results: Results, fields: Mapping[str, str] | None) -> Row:
-    """Settings that are the same in all rows of an experiment."""
-    fields = fields or ({} if is_of_signal(results.manifest) else ALWAYS)
-    return {name: lookup(results.settings, path) for name, path in fields.items()}
 
 
 def study_rows(study: Study, table: StudyTable, found: Mapping[str, Results]) -> list[Row]:

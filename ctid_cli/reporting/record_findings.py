@@ -32,30 +32,9 @@ def check_record_quality(
     is fitted later; a hint is not an estimate.
     """
     found = record_check.examine(record, ENOUGH_ORDER)
-    findings = _Words(found, found.report, _Units(time_unit, input_unit, output_unit)).findings()
+    findings = _Words(found, found.report, time_unit, input_unit, output_unit).findings()
     worst_first = sorted(findings, key=lambda finding: -record_check.LEVELS.index(finding.level))
     return replace(found.report, findings=tuple(worst_first))
-
-
-@dataclass(frozen=True)
-class _Units:
-    """Numbers with their units, three or four digits."""
-
-    time: str
-    input: str
-    output: str
-
-    def t(self, x: float) -> str:
-        return f"{_digits(x, 4)} {self.time}"
-
-    def u(self, x: float) -> str:
-        return f"{_digits(x, 4)} {self.input}".rstrip()
-
-    def y(self, x: float) -> str:
-        return f"{_digits(x, 3)} {self.output}".rstrip()
-
-    def w(self, x: float) -> str:
-        return f"{_digits(x, 3)} rad/{self.time}"
 
 
 def _digits(x: float, digits: int) -> str:
@@ -69,7 +48,23 @@ class _Words:
 
     found: Examined
     r: RecordReport
-    unit: _Units
+    time: str
+    input: str
+    output: str
+
+    # Numbers with their units, three or four digits.
+
+    def t(self, x: float) -> str:
+        return f"{_digits(x, 4)} {self.time}"
+
+    def u(self, x: float) -> str:
+        return f"{_digits(x, 4)} {self.input}".rstrip()
+
+    def y(self, x: float) -> str:
+        return f"{_digits(x, 3)} {self.output}".rstrip()
+
+    def w(self, x: float) -> str:
+        return f"{_digits(x, 3)} rad/{self.time}"
 
     def findings(self) -> Iterator[Finding]:
         yield from self._clock()
@@ -88,12 +83,12 @@ class _Words:
         return self.r.input_kind in ("constant", "steps")
 
     def _clock(self) -> Iterator[Finding]:
-        r, unit = self.r, self.unit
+        r = self.r
         present = r.n_samples - r.n_masked
         if present < FEW_SAMPLES:
             yield Finding("warning", "samples", f"Only {present} output samples: expect large, rough standard errors.")
-        every = f"one sample every {unit.t(r.interval)}."
-        spread = f"{unit.t(r.interval_min)} to {unit.t(r.interval_max)}, median {unit.t(r.interval)}"
+        every = f"one sample every {self.t(r.interval)}."
+        spread = f"{self.t(r.interval_min)} to {self.t(r.interval_max)}, median {self.t(r.interval)}"
         if r.regular:
             yield Finding("ok", "sampling", f"The clock is regular, {every}")
         elif r.gaps and r.interval_deviation < 1e-6 * r.interval:
@@ -106,11 +101,11 @@ class _Words:
             yield Finding("note", "sampling", text)
 
     def _missing(self) -> Iterator[Finding]:
-        r, unit = self.r, self.unit
+        r = self.r
         if r.gaps:
             longest = max(r.gaps, key=lambda gap: gap.length)
             many = f"{len(r.gaps)} gaps" if len(r.gaps) > 1 else "A gap"
-            where = f"the longest of {unit.t(longest.length)} after t = {unit.t(longest.start)}"
+            where = f"the longest of {self.t(longest.length)} after t = {self.t(longest.start)}"
             held = "" if r.input_kind == "constant" else " The input is held across them: make sure that it was."
             text = f"{many} longer than {record_check.LONG_INTERVAL:g} median intervals, {where}.{held}"
             yield Finding("warning", "gaps", text)
@@ -120,11 +115,11 @@ class _Words:
             yield Finding("warning" if share > 0.2 else "note", "missing", text)
 
     def _input(self) -> Finding:
-        r, unit = self.r, self.unit
+        r = self.r
         if r.input_kind == "constant" and r.input_low == 0.0:
             return Finding("problem", "input", "The input is zero throughout: no model can be found from it.")
         if r.input_kind == "constant":
-            text = f"The input is constant at {unit.u(r.input_low)}: it shows no answer. Record changes; if it was "
+            text = f"The input is constant at {self.u(r.input_low)}: it shows no answer. Record changes; if it was "
             return Finding(
                 "problem", "input", f"{text}switched on at the first sample, add a line with its value before."
             )
@@ -137,36 +132,36 @@ class _Words:
             if r.excitation_order >= record_check.HIGHEST_ORDER
             else f"{r.excitation_order}"
         )
-        power = f"95 % of its power lies from {_digits(r.input_band[0], 2)} to {unit.w(r.input_band[1])}"
+        power = f"95 % of its power lies from {_digits(r.input_band[0], 2)} to {self.w(r.input_band[1])}"
         if r.excitation_order < ENOUGH_ORDER:
             text = f"The input is persistently exciting of order {order} only, enough for as many parameters; {power}."
             return Finding("warning", "input", f"{text} Add frequencies, or switch at random.")
         return Finding("ok", "input", f"{self._movement()} It is persistently exciting of order {order}; {power}.")
 
     def _movement(self) -> str:
-        r, unit = self.r, self.unit
+        r = self.r
         if r.input_kind == "continuous":
-            return f"The input moves continuously between {unit.u(r.input_low)} and {unit.u(r.input_high)}."
-        where = f"many levels from {unit.u(r.input_low)} to {unit.u(r.input_high)}"
+            return f"The input moves continuously between {self.u(r.input_low)} and {self.u(r.input_high)}."
+        where = f"many levels from {self.u(r.input_low)} to {self.u(r.input_high)}"
         if 0 < len(r.input_levels) <= 4:
             levels = listed(f"{level:.4g}" for level in r.input_levels)
-            where = f"{'about ' if self.found.moves.noisy else ''}{levels} {unit.input}".rstrip()
-        hold = f"holds for {unit.t(r.shortest_hold)} or longer"
+            where = f"{'about ' if self.found.moves.noisy else ''}{levels} {self.input}".rstrip()
+        hold = f"holds for {self.t(r.shortest_hold)} or longer"
         return f"The input switches {r.input_changes} times between {where} and {hold}."
 
     def _output(self) -> Iterator[Finding]:
-        r, unit = self.r, self.unit
+        r = self.r
         if r.input_kind == "continuous" and self.found.record.input.hold != "foh":
             text = "The input was not held: if it moves between the samples, straight lines (--hold foh) fit better."
             yield Finding("note", "hold", text)
         if not r.output_deviation > 1e-9 * abs(r.output_mean):
             yield Finding(
-                "problem", "output", f"The output is constant at {unit.y(r.output_mean)}: it does not answer."
+                "problem", "output", f"The output is constant at {self.y(r.output_mean)}: it does not answer."
             )
         if r.suggested_offset != "none" and r.output_deviation != 0:
-            about = f"The output varies by {unit.y(r.output_deviation)} about {unit.y(r.output_mean)}"
+            about = f"The output varies by {self.y(r.output_deviation)} about {self.y(r.output_mean)}"
             if r.input_kind != "constant":
-                about += f", the input by {unit.u(r.input_deviation)} about {unit.u(r.input_mean)}"
+                about += f", the input by {self.u(r.input_deviation)} about {self.u(r.input_mean)}"
             cure = "estimate it (--offset estimate); the mean is no operating point here"
             if r.suggested_offset == "remove":
                 cure = "subtract the means (--offset remove) or estimate the offset (--offset estimate)"
@@ -176,14 +171,14 @@ class _Words:
             if significance >= record_check.SIGNIFICANT and abs(drift) >= 0.3 * r.output_deviation:
                 cure = "Unless the input drifts too, remove the trend or use a part without it (--from, --to)."
                 text = (
-                    f"The output drifts by {unit.y(drift)} over the record ({significance:.2g} standard errors). {cure}"
+                    f"The output drifts by {self.y(drift)} over the record ({significance:.2g} standard errors). {cure}"
                 )
                 yield Finding("warning", "trend", text)
 
     def _faults(self) -> Iterator[Finding]:
-        r, unit = self.r, self.unit
+        r = self.r
         if r.outliers:
-            where = ", ".join(unit.t(t) for t in r.outliers[:3]) + (", ..." if len(r.outliers) > 3 else "")
+            where = ", ".join(self.t(t) for t in r.outliers[:3]) + (", ..." if len(r.outliers) > 3 else "")
             lie = "1 output sample lies" if len(r.outliers) == 1 else f"{len(r.outliers)} output samples lie"
             text = f"{lie} far from the neighbours (t = {where}); leave faults of the sensor empty."
             yield Finding("warning", "outliers", text)
@@ -192,8 +187,8 @@ class _Words:
             yield Finding("warning", "saturation", f"{many}, as at a limit of the sensor; leave those fields empty.")
         if math.isfinite(r.output_quantum):
             share = r.output_quantum / r.output_deviation
-            steps = f"in steps of {unit.y(r.output_quantum)}, {100 * share:.2g} % of its standard deviation"
-            text = f"The output was recorded {steps}, like a noise of {unit.y(r.output_quantum / math.sqrt(12))}."
+            steps = f"in steps of {self.y(r.output_quantum)}, {100 * share:.2g} % of its standard deviation"
+            text = f"The output was recorded {steps}, like a noise of {self.y(r.output_quantum / math.sqrt(12))}."
             yield Finding("warning" if share > 0.1 else "note", "resolution", text)
 
     def _answer(self) -> Iterator[Finding]:
@@ -216,12 +211,12 @@ class _Words:
 
     def _speed(self) -> Iterator[Finding]:
         """Whether the clock is fast enough for the answer, and the record long enough."""
-        r, unit = self.r, self.unit
+        r = self.r
         if not (r.explained > 0 or (r.input_kind == "steps" and self.found.answer.delay is not None)):
             return
         per_period, spans = 2 * math.pi / (r.output_bandwidth * r.interval), r.output_bandwidth * r.duration
-        resolved = f"the clock resolves {unit.w(r.nyquist)} ({per_period:.3g} samples in the shortest period)"
-        text = f"95 % of the answer lies below {unit.w(r.output_bandwidth)}; {resolved}."
+        resolved = f"the clock resolves {self.w(r.nyquist)} ({per_period:.3g} samples in the shortest period)"
+        text = f"95 % of the answer lies below {self.w(r.output_bandwidth)}; {resolved}."
         if per_period < FEW_PER_PERIOD:
             text += " What happens between the samples rests on the assumed hold of the input. Sample faster."
             yield Finding("warning", "clock", text)
@@ -238,7 +233,7 @@ class _Words:
         r, before, delay = self.r, self.found.answer.before, self.found.answer.delay
         own_times = not np.array_equal(self.found.record.input.t, self.found.record.t)
         if r.interval_deviation > JITTER * r.interval and r.input_kind in ("levels", "steps") and not own_times:
-            late = f"late by {self.unit.t(r.interval / 2)} on average, and the delay too short by as much"
+            late = f"late by {self.t(r.interval / 2)} on average, and the delay too short by as much"
             text = f"The input is known at irregular instants only: its changes seem {late}. Record when it changes."
             yield Finding("warning", "edges", text)
         if before > 8 and delay is not None and before >= 0.2 * delay.strength:
@@ -247,15 +242,15 @@ class _Words:
             yield Finding("warning", "feedback", f"The input seems to follow the output: {shown}. {biased}")
 
     def _delay(self) -> Iterator[Finding]:
-        r, unit = self.r, self.unit
+        r = self.r
         if self.found.answer.delay is not None:
             low, high = r.suggested_delay or (0.0, math.nan)
-            late = unit.t(r.delay_late)
-            when = f"between {unit.t(r.delay_early)} and {late} after" if r.delay_early > 0 else f"within {late} of"
-            search = f"search it from {low:g} to {unit.t(high)} (--delay {low:g}:{high:g})"
+            late = self.t(r.delay_late)
+            when = f"between {self.t(r.delay_early)} and {late} after" if r.delay_early > 0 else f"within {late} of"
+            search = f"search it from {low:g} to {self.t(high)} (--delay {low:g}:{high:g})"
             text = f"The output begins to answer {when} a change of the input, slow dynamics included; {search}."
             if math.isfinite(r.input_period):
-                text += f" The input repeats itself every {unit.t(r.input_period)}: delays that far apart look alike."
+                text += f" The input repeats itself every {self.t(r.input_period)}: delays that far apart look alike."
             wide = r.delay_late - r.delay_early > 0.5 * r.delay_late and r.input_kind == "steps"
             yield Finding("note" if wide else "ok", "delay", text)
         elif r.input_kind != "constant" and (r.explained > 0 or r.input_kind == "steps"):
@@ -263,7 +258,7 @@ class _Words:
             yield Finding("note", "delay", text)
 
     def _start(self) -> Iterator[Finding]:
-        first, cure = f"during the first {self.unit.t(self.r.delay_early)}", "(--initial-state estimate)"
+        first, cure = f"during the first {self.t(self.r.delay_early)}", "(--initial-state estimate)"
         if self.r.starts == "moving":
             text = f"The output moves {first}, before it can answer: estimate the initial state {cure}."
             yield Finding("warning", "start", text)

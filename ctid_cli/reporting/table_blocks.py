@@ -74,14 +74,13 @@ def study_blocks(
     header = ["sampling", *map(setting_title, labels), "method"]
     stacked = style != "md" and len(delays) > 1
     body = (_stacked if stacked else _flat)(header, list(groups.values()), delays, labels)
-    foot = f"{RULE} {TIME}; of several cells, the least to the greatest."
-    foot += f" Published: {study.published_data_sets} data sets, {study.source}."
+    published = f"Published: {study.published_data_sets} data sets, {study.source}."
+    foot = f"{RULE} {TIME}; of several cells, the least to the greatest. {published}"
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    without = {row["method"] for row in rows if row["initial_delay"] is None}
-    startless = [name for name in methods if name in without]
+    startless = list(dict.fromkeys(row["method"] for row in rows if row["initial_delay"] is None))
     if startless:
-        foot += f" {listed(startless)} {'was' if len(startless) == 1 else 'were'} given no initial delay: one estimate "
-        foot += "per data set, shown under every initial delay."
+        shown = "one estimate per data set, shown under every initial delay"
+        foot += f" {listed(startless)} {'was' if len(startless) == 1 else 'were'} given no initial delay: {shown}."
     legend = "; ".join(f"{name}: {study.methods[name]}" for name in methods if name in study.methods) + "."
     return [
         [f"### Table {table.number}. {table.title}", f"Counted: {study.success}."],
@@ -103,7 +102,8 @@ def _stacked(header: list[str], groups: list[list[Row]], delays: list[Any], labe
         if last and last[:-1] != names[:-1]:
             body.append([""] * len(header))
         last, run, ours = names, any(row["n"] for row in group), _across(group, delays)
-        lines: dict[str, Callable[[Row], str]] = {f"n = {_sizes(group)}" if run else NOT_RUN: _percent_or_dash}
+        first = f"n = {_sizes(group)}" if run else NOT_RUN
+        lines: dict[str, Callable[[Row], str]] = {first: lambda row: percent_text(row) if row["n"] else "-"}
         lines |= {"95 %": _whole_interval} if run else {}
         lines |= {"published": _published} if any(row["published_percent"] is not None for row in group) else {}
         lines |= {"time": time_text} if run else {}
@@ -111,10 +111,6 @@ def _stacked(header: list[str], groups: list[list[Row]], delays: list[Any], labe
             body.append([*shown, title, *("" if row is None else text(row) for row in ours)])
             shown = [""] * len(names)
     return Table(header, body, "l" * (len(labels) + 3) + "r" * len(delays))
-
-
-def _percent_or_dash(row: Row) -> str:
-    return percent_text(row) if row["n"] else "-"
 
 
 def _flat(header: list[str], groups: list[list[Row]], delays: list[Any], labels: list[str]) -> Table:
@@ -250,12 +246,14 @@ def frequency_blocks(results: Results, rows: Sequence[Row]) -> Blocks:
         ]
         for row in rows
     ]
-    foot = f"{RULE} settling: median over the data sets of the time until the slowest tone is in the band to stay [s], "
-    foot += "from the start and after the last step of a frequency; - is never, or unknown. rms: median over the data "
-    foot += "sets of the root-mean-square error of each tone over the window [rad/s]. "
-    foot += "alarms: false ones, in all data sets together. " if "false_alarms" in measures else ""
+    settling = (
+        "settling: time until the slowest tone is in the band to stay [s], from the start and after the last step"
+    )
+    rms = "rms: root-mean-square error of each tone over the window [rad/s]; medians over the data sets"
+    alarms = " alarms: false ones, in all data sets together." if "false_alarms" in measures else ""
+    foot = f"{RULE} {settling}; - is never, or unknown. {rms}.{alarms}"
     table = Table(header, body, "l" * (len(keys) + 1) + "r" * (len(measures) + 4))
-    return [_heading(results), [table], [f"{foot}{TIME}."]]
+    return [_heading(results), [table], [f"{foot} {TIME}."]]
 
 
 def record_blocks(results: Results) -> Blocks:

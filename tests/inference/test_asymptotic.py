@@ -218,7 +218,7 @@ def test_a_reaction_at_once_of_the_model_is_solved_for():
     gain = AdditiveModel([Submodel([2.0], [1.0])])
     accuracy = limiting_accuracy(gain, INTERVAL, DiscreteController([0.25], [1.0]), **CLOSED)
     assert accuracy.covariance.item() == pytest.approx(0.01 * (1.5 / 0.25) ** 2)
-    with pytest.raises(DataError, match="correlated with the noise at the same sample"):
+    with pytest.raises(DataError, match="react at once, so the input is correlated with the noise"):
         require_uncorrelated_input(gain, INTERVAL, DiscreteController([0.25], [1.0]), WHITE)
     with pytest.raises(DataError, match="no solution"):
         limiting_accuracy(gain, INTERVAL, DiscreteController([-0.5], [1.0]), **CLOSED)
@@ -294,5 +294,5 @@ def test_refusals_say_why():
     silent = AdditiveModel([Submodel([0.0], [0.25, 0.25, 1.0])])
     cancelling = TransferFunction([1.0, 1.0], [1.0, 3.0, 2.0])
     for model in (silent, cancelling):
-        with pytest.raises(DataError, match="no effect of their own on the output"):
+        with pytest.raises(DataError, match="some have no effect of their own"):
             limiting_accuracy(model, INTERVAL, **OPEN)

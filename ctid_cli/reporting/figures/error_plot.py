@@ -76,6 +76,7 @@ def errors_svg(rows: Sequence[Row], frequencies: tuple[float, float], errors: tu
     """Frequencies and errors over time."""
 
     def draw(figure: Figure) -> None:
+        from matplotlib.lines import Line2D
         from matplotlib.ticker import MaxNLocator
 
         columns = len(rows[0].groups)
@@ -95,7 +96,9 @@ def errors_svg(rows: Sequence[Row], frequencies: tuple[float, float], errors: tu
             axes.set(xlabel="time [s]", xlim=(0.0, rows[0].duration))
             axes.xaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 1.5, 2, 3, 5, 10]))
             place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (-0.03, -0.27), "frameon": False}
-            axes.legend(handles=_handles(group.curves), handlelength=2.8, borderpad=0.0, labelspacing=0.35, **place)
+            lines = zip(group.curves, LOOKS, strict=False)
+            handles = [Line2D([], [], **look | FIRM, label=curve.label) for curve, look in lines]
+            axes.legend(handles=handles, handlelength=2.8, borderpad=0.0, labelspacing=0.35, **place)
         figure.legend(handles=_common_handles(rows), loc="outside lower center", ncols=2, frameon=False)
         figure.suptitle(title)
 
@@ -121,12 +124,6 @@ def _draw_errors(axes: Any, curves: Sequence[Curve], row: Row) -> None:
 def _draw_line(axes: Any, curve: Curve, values: Array, look: dict[str, Any]) -> None:
     axes.plot(curve.t, values, **look | FAINT)
     axes.plot(curve.t, np.where(curve.valid, values, np.nan), **look | FIRM)
-
-
-def _handles(curves: Sequence[Curve]) -> list[Any]:
-    from matplotlib.lines import Line2D
-
-    return [Line2D([], [], **look | FIRM, label=curve.label) for curve, look in zip(curves, LOOKS, strict=False)]
 
 
 def _common_handles(rows: Sequence[Row]) -> list[Any]:
