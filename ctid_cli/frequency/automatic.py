@@ -126,30 +126,32 @@ def choose_settings(
         require_positive("window", window, "s")
     _refuse_unusable(samples, tones)
     peaks = find_peaks(samples, interval, tones)
+    seconds = f"{samples.size * interval:.4g} s"
     if peaks.omega.size == 0:
-        raise DataError(
-            f"no tone stands out of the spectrum of {samples.size * interval:.4g} s: noise, fast-moving tones, fewer "
-            "than two periods, or too many gaps; use a longer record, or another part of it"
-        )
+        raise DataError(f"no tone stands out of {seconds}; use a longer record, with fewer gaps or steadier tones")
     offset = _offset(samples, float(peaks.amplitudes[:tones][-1]))
     bridge = int(BRIDGED * 2.0 * np.pi / (peaks.omega[:tones].max() * interval))
     gaps = bool((~np.isfinite(samples)).any())
     chosen = method or ("nonlinear_least_squares" if gaps else "esprit")
-    band = _choose_band(samples, interval, tones, peaks, chosen, bridge, gaps)
+    band = _choose_band(samples.size * interval, interval, tones, peaks, chosen, bridge, gaps)
     thinned = band.decimation.apply(samples - offset)
     thin = interval * band.decimation.factor
     if method is None and gaps and np.isfinite(thinned).all():
         chosen = "esprit"
     if np.isfinite(thinned).sum() < SAMPLES_PER_TONE * tones:
-        raise DataError(
-            f"the record is too short or has too many gaps: {samples.size * interval:.4g} s are hardly more than "
-            f"the {band.decimation.weights.size * interval:.4g} s of the filter before the estimator; use a longer one"
-        )
+        filtered = f"{band.decimation.weights.size * interval:.4g} s of filter"
+        raise DataError(f"the record is too short or has too many gaps: {seconds} for {filtered}; use a longer one")
     batch = chosen in BATCH
     length, sentence = _choose_window(thinned, thin, tones, band, chosen if batch else "esprit", window)
     options, how = _options(chosen, band, tones, thin, length * thin)
     estimator = resolve("frequency_estimator", chosen)(tones=band.expected.size, **options)
-    reasons = [*_preparation(peaks, tones, offset, bridge * interval if gaps else 0.0), *band.sentences]
+    found = _hertz(peaks.omega[:tones])
+    reasons = [f"Strongest tones: {found} (median spectrum of segments of {peaks.segment:.4g} s)."]
+    if offset:
+        reasons.append(f"The mean, {offset:.4g}, is subtracted.")
+    if gaps and bridge:
+        reasons.append(f"Gaps of up to {bridge * interval:.3g} s are bridged by straight lines.")
+    reasons += band.sentences
     if method is None:
         reasons.append(f"Method: {chosen}: {WHY[chosen]}.")
     if how:
@@ -159,49 +161,28 @@ def choose_settings(
     return Settings(estimator, tones, band.expected, offset, band.decimation, thin, length, tuple(reasons), warnings)
 
 
-def _listed(frequencies: Array) -> str:
-    return ", ".join(f"{frequency:.5g}" for frequency in frequencies)
-
-
-def _preparation(peaks: Peaks, tones: int, offset: float, bridged: float) -> Iterator[str]:
-    shown = np.sort(peaks.omega[:tones]) / (2.0 * np.pi)
-    which = "The strongest tone" if shown.size == 1 else f"The {shown.size} strongest tones"
-    yield f"{which} for most of the record: {_listed(shown)} Hz (median spectrum of segments of {peaks.segment:.4g} s)."
-    if offset:
-        yield f"The mean, {offset:.4g}, is subtracted."
-    if bridged:
-        yield f"Gaps of up to {bridged:.3g} s are bridged by straight lines."
+def _hertz(omega: Array) -> str:
+    return ", ".join(f"{frequency:.5g}" for frequency in np.sort(omega) / (2.0 * np.pi)) + " Hz"
 
 
 def _refuse_unusable(samples: Array, tones: int) -> None:
     present = samples[np.isfinite(samples)]
     if present.size < SAMPLES_PER_TONE * tones:
-        raise DataError(
-            f"{present.size} samples are present, too few for {tones} tones: {SAMPLES_PER_TONE * tones} are needed"
-        )
-    low, high = float(present.min()), float(present.max())
-    if high - low <= CONSTANT * max(abs(low), abs(high)):
-        what = "zero" if high == low == 0.0 else f"constant ({low:.6g})"
-        raise DataError(f"the signal is {what} throughout: it has no tones")
-    largest = max(abs(low), abs(high))
+        raise DataError(f"{present.size} samples are too few for {tones} tones, which need {SAMPLES_PER_TONE * tones}")
+    low, high, largest = present.min(), present.max(), np.abs(present).max()
+    if high - low <= CONSTANT * largest:
+        raise DataError(f"the signal is constant ({low:.6g}): it has no tones")
     if not SMALLEST_SAMPLE <= largest <= LARGEST_SAMPLE:
-        raise DataError(
-            f"the largest sample is {largest:.3g}, whose square leaves the range of numbers; use another unit"
-        )
+        raise DataError(f"the square of the largest sample, {largest:.3g}, is no normal number; use another unit")
 
 
 def _doubts(peaks: Peaks, tones: int, interval: float) -> Iterator[str]:
     if peaks.omega.size < tones:
-        yield (
-            f"Only {peaks.omega.size} of {tones} tones stand out of the spectrum; the others may be noise, or tones "
-            f"closer than {peaks.resolution / (2 * np.pi):.4g} Hz: use fewer tones or a longer record."
-        )
-    highest = float(peaks.omega[:tones].max())
-    if highest > SUSPICIOUS * np.pi / interval:
-        yield (
-            f"The tone at {highest / (2 * np.pi):.6g} Hz is close to the Nyquist frequency, {0.5 / interval:.6g} Hz: "
-            "it may be the image of a tone above it. A record with a shorter sampling interval would tell."
-        )
+        closer = f"closer than {peaks.resolution / (2 * np.pi):.4g} Hz"
+        yield f"Only {peaks.omega.size} of {tones} tones stand out: use fewer, or a longer record if they are {closer}."
+    highest, nyquist = float(peaks.omega[:tones].max()) / (2 * np.pi), 0.5 / interval
+    if highest > SUSPICIOUS * nyquist:
+        yield f"The tone at {highest:.6g} Hz may be the image of one above the Nyquist frequency, {nyquist:.6g} Hz."
 
 
 def _offset(samples: Array, weakest: float) -> float:
@@ -213,61 +194,50 @@ def _offset(samples: Array, weakest: float) -> float:
 
 
 def _choose_band(
-    samples: Array, interval: float, tones: int, peaks: Peaks, kind: str, bridge: int, gaps: bool
+    duration: float, interval: float, tones: int, peaks: Peaks, kind: str, bridge: int, gaps: bool
 ) -> _Band:
-    wanted = peaks.omega[:tones]
+    omega, wanted = peaks.omega, peaks.omega[:tones]
     low, top = float(wanted.min()), float(wanted.max())
     weakest = float(peaks.amplitudes[:tones][-1])
     if wanted.size < tones:
         top += peaks.resolution
     top = min(top, np.pi / interval / PASS)
-    loud = peaks.amplitudes[tones:] > HARMLESS * weakest
-    others, loudness = peaks.omega[tones:][loud], peaks.amplitudes[tones:][loud]
-
     per_period, most_spares = SAMPLING.get(kind, DELAYING)
     factor = max(1, int(2.0 * np.pi / (per_period * top * interval)))
     pass_edge = PASS * top
     stop_edge = min(2.0 * np.pi / (factor * interval) - pass_edge, np.pi / interval)
-    above = others[others >= STOP * top]
-    if above.size:
-        stop_edge = min(stop_edge, float(above.min()))
-    sentences = []
-    weights = np.ones(1)
+    # Whatever disturbs and is not kept away by a filter is estimated too.
+    disturbing = peaks.amplitudes > HARMLESS * weakest
+    disturbing[:tones] = False
+    above = disturbing & (omega >= STOP * top)
+    stop_edge = float(np.min(omega[above], initial=stop_edge))
+    sentences, weights = [], np.ones(1)
     unfiltered = gaps and kind == "nonlinear_least_squares" and factor <= MOST_UNTHINNED
     if unfiltered:
         factor = 1
-    elif (factor > 1 or above.size) and stop_edge > pass_edge:
+    elif (factor > 1 or above.any()) and stop_edge > pass_edge:
         weights = low_pass(pass_edge, stop_edge, STOP_BAND, interval)
-        sentences.append(
-            f"A low-pass keeps what is below {pass_edge / (2.0 * np.pi):.4g} Hz and stops what is above "
-            f"{stop_edge / (2.0 * np.pi):.4g} Hz; it is {weights.size * interval:.3g} s long."
-        )
+        edges = f"below {pass_edge / (2.0 * np.pi):.4g} Hz and stops what is above {stop_edge / (2.0 * np.pi):.4g} Hz"
+        sentences.append(f"A low-pass of {weights.size * interval:.3g} s keeps what is {edges}.")
         if factor > 1:
             sentences[-1] += f" One of {factor} samples is kept, every {factor * interval:.4g} s."
-        others, loudness = others[others < STOP * top], loudness[others < STOP * top]
+        disturbing &= ~above
     high_pass = 2.0 * np.pi * (LOW_STOP_BAND - 7.95) / (2.285 * 2.0 * np.pi * (LOW_PASS - LOW_STOP) * low)
-    below = others <= LOW_PASS * low
-    if not unfiltered and below.any() and high_pass < HIGH_PASS_SHARE * samples.size * interval:
+    below = disturbing & (omega <= LOW_PASS * low)
+    if not unfiltered and below.any() and high_pass < HIGH_PASS_SHARE * duration:
         weights = without_low(weights, LOW_STOP * low, LOW_PASS * low, LOW_STOP_BAND, interval)
-        sentences.append(
-            f"A high-pass keeps away what is below {LOW_STOP * low / (2.0 * np.pi):.4g} Hz; "
-            f"it is {high_pass:.3g} s long."
-        )
-        reached = others <= LOW_STOP * low
-        others, loudness = others[~reached], loudness[~reached]
-    spares = others[: min(most_spares, MOST_TONES - tones)]
+        edge = f"{LOW_STOP * low / (2.0 * np.pi):.4g} Hz"
+        sentences.append(f"A high-pass of {high_pass:.3g} s keeps away what is below {edge}.")
+        disturbing &= omega > LOW_STOP * low
+    spares = np.flatnonzero(disturbing)[: min(most_spares, MOST_TONES - tones)]
     if spares.size:
-        hertz = _listed(np.sort(spares) / (2.0 * np.pi))
-        sentences.append(f"Estimated too, since they disturb, but not shown: tones at {hertz} Hz.")
+        sentences.append(f"Estimated too, since they disturb, but not shown: tones at {_hertz(omega[spares])}.")
     missing = tones - wanted.size
     # Tones that the spectrum does not tell apart are somewhere beside the strongest one.
-    guessed = peaks.omega[0] + peaks.resolution / (missing + 1.0) * np.arange(1, missing + 1)
-    return _Band(
-        np.concatenate((wanted, guessed, spares)),
-        np.concatenate((peaks.amplitudes[:tones], np.full(missing, weakest), loudness[: spares.size])),
-        Decimation(weights, factor, bridge),
-        sentences,
-    )
+    guessed = omega[0] + peaks.resolution / (missing + 1.0) * np.arange(1, missing + 1)
+    expected = np.concatenate((wanted, guessed, omega[spares]))
+    amplitudes = np.concatenate((peaks.amplitudes[:tones], np.full(missing, weakest), peaks.amplitudes[spares]))
+    return _Band(expected, amplitudes, Decimation(weights, factor, bridge), sentences)
 
 
 def _choose_window(
@@ -275,13 +245,12 @@ def _choose_window(
 ) -> tuple[int, str]:
     """Samples in a window, and why."""
     count = band.expected.size
-    duration = thinned.size * thin
     least = WINDOW_SAMPLES_PER_TONE * count
     if window is not None:
         length = round(min(window / thin, thinned.size + 1.0))
         if not least <= length <= thinned.size:
             raise ValueError(
-                f"window must be between {least * thin:.4g} s ({count} tones) and {duration:.4g} s, not {window:g}."
+                f"window must be from {least * thin:.4g} s to {thinned.size * thin:.4g} s, not {window:g}."
             )
         return length, f"Windows of {length * thin:.4g} s, as asked for."
     closest = _closest(band.expected, tones, thin)
@@ -306,10 +275,7 @@ def _choose_window(
             break
         length *= 2
     periods = best * thin * float(band.expected[:tones].min()) / (2.0 * np.pi)
-    if best_share >= CERTAIN_SHARE:
-        why = "the shortest tried in which the frequencies are certain"
-    else:
-        why = f"the best tried, though the frequencies are certain in only {100 * best_share:.0f} % of them"
+    why = f"the frequencies are certain in {100 * best_share:.0f} % of those tried"
     return best, f"Windows of {best * thin:.4g} s, {periods:.3g} periods of the lowest tone: {why}."
 
 
@@ -326,26 +292,19 @@ def _options(kind: str, band: _Band, wanted: int, thin: float, window: float) ->
     if kind in BATCH:
         return {}, ""
     expected = np.sort(band.expected)
-    start = {"initial_frequencies": tuple(expected)}
+    start: dict[str, Any] = {"initial_frequencies": tuple(expected)}
     low, top = float(expected[0]), float(expected[-1])
     if kind == "adaptive_observer":
         ratio = min(1.2, (0.5 / (low * thin)) ** (1.0 / max(1, 2 * expected.size - 1)))
         rate = min(0.1 * low, 3.0 / window)
-        return start | {
-            "pole": low,
-            "ratio": max(1.0, ratio),
-            "rate": rate,
-            "hold": 2.0 * np.pi / low,
-            "smallest_gap": 0.3 * float(np.diff(expected, prepend=0.0).min()),
-            "lowest_frequency": 0.1 * low,
-            "highest_frequency": 2.0 * top,
-        }, f"Slowest pole {low:.4g} rad/s, adaptation rate {rate:.4g} 1/s; it starts from the spectrum's frequencies."
+        gap = 0.3 * float(np.diff(expected, prepend=0.0).min())
+        start |= {"pole": low, "ratio": max(1.0, ratio), "rate": rate, "hold": 2.0 * np.pi / low, "smallest_gap": gap}
+        start |= {"lowest_frequency": 0.1 * low, "highest_frequency": 2.0 * top}
+        return start, f"Slowest pole {low:.4g} rad/s, adaptation rate {rate:.4g} 1/s, from the spectrum's frequencies."
     if kind == "filter_regression":
         pole = float(np.sqrt(low * top))
-        told = (
-            f"Filter pole {pole:.4g} rad/s, the middle of the tones; data older than {window / 2:.4g} s are forgotten."
-        )
-        return start | {"pole": pole, "forgetting": 2.0 / window, "hold": 0.5 * window}, told
+        start |= {"pole": pole, "forgetting": 2.0 / window, "hold": 0.5 * window}
+        return start, f"Filter pole {pole:.4g} rad/s; data older than {window / 2:.4g} s are forgotten."
     h = _best_delay(band.expected, band.amplitudes, wanted, thin)
     common = {"h": h, "prefilter": PREFILTER_DELAYS * h}
     told = f"Delay h = {h:.4g} s ({h * top:.3g} rad of the highest tone), prefilter {PREFILTER_DELAYS * h:.4g} s"
@@ -357,10 +316,8 @@ def _options(kind: str, band: _Band, wanted: int, thin: float, window: float) ->
     if kind == "drem_window":
         return common | {"memory": window}, f"{told}, window {window:.4g} s."
     rate = 5.0 / window
-    return common | start | {
-        "epsilon": float(square**-0.5),
-        "gamma": rate,
-    }, f"{told}, gain for a rate of {rate:.4g} 1/s."
+    options = common | start | {"epsilon": float(square**-0.5), "gamma": rate}
+    return options, f"{told}, gain for a rate of {rate:.4g} 1/s."
 
 
 def _best_delay(omega: Array, amplitudes: Array, wanted: int, thin: float) -> float:

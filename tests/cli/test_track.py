@@ -37,7 +37,7 @@ def test_names_of_the_methods(ctid):
 def test_table_track_and_figure(ctid, record, tmp_path):
     out = tmp_path / "new"
     text = ctid("track", record, "--tones", 2, "--out", out).stdout
-    for part in ("record.csv: 3000 samples", "frequency [Hz]", "strongest tones", "Windows of", "track.svg"):
+    for part in ("record.csv: 3000 samples", "frequency [Hz]", "Strongest tones", "Windows of", "track.svg"):
         assert part in text
     frame = pd.read_csv(out / "track.csv")
     valid = frame[frame["valid"] == 1]
