@@ -12,10 +12,10 @@ from ctid_cli.arrays import Array, IntArray
 from ctid_cli.errors import OptionError
 from ctid_cli.frequency.decoding import flag_uncertain
 from ctid_cli.frequency.flags import GAP, OUT_OF_BOUNDS, STARTING, UNDETERMINED
-from ctid_cli.frequency.inputs import MOST_TONES, one_for_each, samples_in
+from ctid_cli.frequency.inputs import samples_in
 from ctid_cli.frequency.moments import factorise, substitute
 from ctid_cli.frequency.tracking import OnlineEstimator, Output, Recursion
-from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
+from ctid_cli.signals.checks import require_not_negative, require_positive
 
 #: Ridge of the Gauss-Newton matrix, as a fraction of its trace.
 RIDGE = 1e-4
@@ -98,7 +98,6 @@ class AdaptiveObserver(OnlineEstimator):
 
     kind: ClassVar[str] = "adaptive_observer"
 
-    tones: int
     initial_frequencies: tuple[float, ...]
     pole: float = 2.0
     ratio: float = 1.2
@@ -109,7 +108,7 @@ class AdaptiveObserver(OnlineEstimator):
     highest_frequency: float = 8.0
 
     def __post_init__(self) -> None:
-        require_integer("tones", self.tones, 1, MOST_TONES)
+        super().__post_init__()
         for name in ("pole", "smallest_gap", "lowest_frequency", "highest_frequency"):
             require_positive(name, getattr(self, name), "rad/s")
         require_positive("ratio", self.ratio, "-")
@@ -118,34 +117,24 @@ class AdaptiveObserver(OnlineEstimator):
         if self.ratio < 1.0:
             raise OptionError("ratio", f"ratio must be 1 or more, not {self.ratio!r}.")
         if self.highest_frequency < self.lowest_frequency + (self.tones - 1) * self.smallest_gap:
-            raise OptionError(
-                "highest_frequency",
-                f"{self.tones} frequencies, {self.smallest_gap:g} rad/s apart, do not fit between "
-                f"{self.lowest_frequency:g} and {self.highest_frequency:g} rad/s.",
-            )
-        initial = one_for_each("initial_frequencies", self.initial_frequencies, self.tones, "rad/s")
-        object.__setattr__(self, "initial_frequencies", initial)
+            bounds = f"between {self.lowest_frequency:g} and {self.highest_frequency:g} rad/s"
+            apart = f"{self.tones} frequencies, {self.smallest_gap:g} rad/s apart,"
+            raise OptionError("highest_frequency", f"{apart} do not fit {bounds}.")
+        self._keep_one_for_each("initial_frequencies", "rad/s")
         edges = np.concatenate(([self.lowest_frequency - self.smallest_gap], self.initial_frequencies))
         if (np.diff(edges) < self.smallest_gap - 1e-12).any() or edges[-1] > self.highest_frequency:
-            raise OptionError(
-                "initial_frequencies",
-                f"initial_frequencies must rise from lowest_frequency to highest_frequency in steps of at least "
-                f"smallest_gap, not {self.initial_frequencies!r}.",
-            )
+            rising = "must rise from lowest_frequency to highest_frequency in steps of at least smallest_gap"
+            raise OptionError("initial_frequencies", f"initial_frequencies {rising}, not {self.initial_frequencies!r}.")
 
     def _recursion(self, interval: float) -> Recursion:
         n = self.tones
         poles: Array = self.pole * self.ratio ** np.arange(2 * n, dtype=float)
         if poles[-1] * interval > 1.0:
-            raise OptionError(
-                "pole",
-                f"the fastest pole of the observer, {poles[-1]:g} rad/s, needs a sampling interval below "
-                f"{1.0 / poles[-1]:g} s, not {interval:g} s.",
-            )
+            fastest = f"the fastest pole of the observer, {poles[-1]:g} rad/s,"
+            raise OptionError("pole", f"{fastest} needs a sampling interval below {1.0 / poles[-1]:g} s.")
         if self.rate * interval >= 1.0:
-            raise OptionError(
-                "rate", f"rate = {self.rate:g} 1/s needs a sampling interval below {1.0 / self.rate:g} s."
-            )
+            needed = f"a sampling interval below {1.0 / self.rate:g} s"
+            raise OptionError("rate", f"rate = {self.rate:g} 1/s needs {needed}.")
         limits = (float(self.smallest_gap), float(self.lowest_frequency), float(self.highest_frequency))
         settings = Adaptation(interval, poles, float(self.rate), samples_in(self.hold, interval), *limits)
         initial = np.asarray(self.initial_frequencies, dtype=float)

@@ -137,10 +137,8 @@ def fit_amplitudes(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[Arr
         raise DataError(f"{count} samples cannot determine {unknowns} amplitudes; use a longer record.")
     coefficients, _, _, singular_values = np.linalg.lstsq(design, y, rcond=None)
     if singular_values[-1] < SINGULAR * singular_values[0]:
-        raise DataError(
-            "the samples cannot tell the sinusoids apart: two frequencies are too close to each other, "
-            "or one of them to zero or to a multiple of the sampling frequency, for so short a record."
-        )
+        close = "too close to each other, to zero or to a multiple of the sampling frequency for so short a record"
+        raise DataError(f"the samples cannot tell the sinusoids apart: frequencies are {close}.")
     return design, coefficients, y - design @ coefficients
 
 

@@ -244,28 +244,22 @@ def _choose_window(
     thinned: Array, thin: float, tones: int, band: _Band, kind: str, window: float | None
 ) -> tuple[int, str]:
     """Samples in a window, and why."""
-    count = band.expected.size
-    least = WINDOW_SAMPLES_PER_TONE * count
+    least = WINDOW_SAMPLES_PER_TONE * band.expected.size
     if window is not None:
         length = round(min(window / thin, thinned.size + 1.0))
         if not least <= length <= thinned.size:
-            raise ValueError(
-                f"window must be from {least * thin:.4g} s to {thinned.size * thin:.4g} s, not {window:g}."
-            )
+            allowed = f"from {least * thin:.4g} s to {thinned.size * thin:.4g} s"
+            raise ValueError(f"window must be {allowed}, not {window:g}.")
         return length, f"Windows of {length * thin:.4g} s, as asked for."
     closest = _closest(band.expected, tones, thin)
-    lowest = closest >= float(band.expected[:tones].min()) * (1.0 - 1e-12)
-    of_what = f"{BEATS:g} {'periods of the lowest tone' if lowest else 'beats of the closest tones'}"
     length = max(least, int(np.ceil(BEATS * 2.0 * np.pi / (closest * thin))))
+    lengths = [length << k for k in range(DOUBLINGS + 1) if length << k <= LARGEST_SHARE * thinned.size]
     if length >= LARGEST_SHARE * thinned.size:
-        if length >= thinned.size:
-            length, of_what = thinned.size, "the whole record"
-        return length, f"Windows of {length * thin:.4g} s, {of_what}: there is no room for longer ones."
-    estimator = resolve("frequency_estimator", kind)(tones=count)
+        length = min(length, thinned.size)
+        return length, f"Windows of {length * thin:.4g} s: there is no room for longer ones."
+    estimator = resolve("frequency_estimator", kind)(tones=band.expected.size)
     best, best_share = length, -1.0
-    for _ in range(DOUBLINGS + 1):
-        if length > LARGEST_SHARE * thinned.size:
-            break
+    for length in lengths:
         firsts = np.linspace(0, thinned.size - length, TRIALS).astype(int)
         parts = [thinned[first : first + length] for first in firsts]
         share = float(np.mean([not estimate_window(estimator, y, thin, band.expected, tones).flags for y in parts]))
@@ -273,7 +267,6 @@ def _choose_window(
             best, best_share = length, share
         if share >= CERTAIN_SHARE:
             break
-        length *= 2
     periods = best * thin * float(band.expected[:tones].min()) / (2.0 * np.pi)
     why = f"the frequencies are certain in {100 * best_share:.0f} % of those tried"
     return best, f"Windows of {best * thin:.4g} s, {periods:.3g} periods of the lowest tone: {why}."
@@ -325,16 +318,15 @@ def _best_delay(omega: Array, amplitudes: Array, wanted: int, thin: float) -> fl
     longest = max(1, int(np.pi / (PASS * float(omega.max()) * thin)))
     others = ~np.eye(omega.size, dtype=bool)
     apart = np.where(others, np.abs(omega[:, None] - omega), omega)
-    best, largest = thin, -1.0
-    for h in thin * np.arange(1, longest + 1):
+
+    def least_moved(h: float) -> float:
         cosines = np.cos(omega * h)
         # Slope of prod_j (c - c_j) over w_i, at w_i.
         distances = np.where(others, 2.0 * np.abs(cosines[:, None] - cosines), 1.0)
         slopes = h * np.sin(omega * h) * distances.prod(axis=1)
-        worst = float((amplitudes * slopes * apart.min(axis=1))[:wanted].min())
-        if worst > largest:
-            best, largest = float(h), worst
-    return best
+        return float((amplitudes * slopes * apart.min(axis=1))[:wanted].min())
+
+    return float(max(thin * np.arange(1, longest + 1), key=least_moved))
 
 
 def _best_spacing(omega: Array, amplitudes: Array, h: float, thin: float) -> tuple[float, float]:
@@ -344,11 +336,12 @@ def _best_spacing(omega: Array, amplitudes: Array, h: float, thin: float) -> tup
     factor = 2.0 ** (n * n) * np.prod([c[i] - c[j] for i in range(n) for j in range(i + 1, n)])
     # Phases spread evenly over all their combinations.
     phases = 2.0 * np.pi * np.mod(np.outer(np.arange(1, 401), np.sqrt([2, 3, 5, 7, 11, 13, 17, 19][:n])), 1.0)
-    best = (thin, 0.0)
-    for spacing in np.unique(np.maximum(1, np.round(np.linspace(0.3, 2.0, 18) * h / thin))) * thin:
+
+    def mean_square(spacing: float) -> float:
         rows = np.arange(n)[:, None] * spacing * omega
         parts = amplitudes * np.sin(phases[:, None, :] - rows)
-        square = float(np.mean((factor * np.linalg.det(parts)) ** 2))
-        if square > best[1]:
-            best = (float(spacing), square)
-    return best
+        return float(np.mean((factor * np.linalg.det(parts)) ** 2))
+
+    spacings = np.unique(np.maximum(1, np.round(np.linspace(0.3, 2.0, 18) * h / thin))) * thin
+    best = float(max(spacings, key=mean_square))
+    return best, mean_square(best)

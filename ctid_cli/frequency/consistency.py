@@ -13,8 +13,7 @@ from numba import njit
 
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.flags import INCONSISTENT
-from ctid_cli.frequency.moments import accumulate_row, factorise, least_squares, squared_residual
-from ctid_cli.frequency.regression import form_row
+from ctid_cli.frequency.moments import factorise, least_squares, squared_residual
 
 #: The second delay is near this fraction of the first, as far from every simple ratio as can be.
 GOLDEN_FRACTION = (np.sqrt(5.0) - 1.0) / 2.0
@@ -33,10 +32,6 @@ USUAL_SPANS = 20
 #: therefore, and so much more is needed to contradict an estimate.
 SINKING = 50.0
 CONTRADICTION_RATIO = 300.0
-#: Verdicts are given, and rows at the second delay looked at, so many times in a delay h, but at most so many samples
-#: apart.
-VERDICTS_PER_DELAY = 64
-MOST_BETWEEN = 8
 #: Added to the unit diagonal of the scaled second moments, so that the best fit exists even if it is not unique.
 REGULARISATION = 1e-10
 
@@ -48,11 +43,6 @@ def second_lag(lag: int) -> int:
     wanted = GOLDEN_FRACTION * lag
     near = range(max(1, round(wanted) - SEARCHED), min(lag, round(wanted) + SEARCHED + 1))
     return min((m for m in near if gcd(m, lag) == 1), key=lambda m: abs(m - wanted))
-
-
-def samples_between_verdicts(lag: int) -> int:
-    """How often an estimate is judged."""
-    return max(1, min(lag // VERDICTS_PER_DELAY, MOST_BETWEEN))
 
 
 @njit(cache=True, nogil=True)
@@ -75,15 +65,6 @@ def contradicts(row: Array, theta: Array, levels: Array, fast: float, slow: floa
         usual = max(min(SINKING * slow, fast), 1.0 / levels[0])
     levels[2] += usual * (levels[1] - levels[2])
     return bool(levels[1] > CONTRADICTION_RATIO * levels[2] + ROUNDING_FLOOR * levels[3])
-
-
-@njit(cache=True, nogil=True, forceinline=True)
-def observe_second_delay(
-    history: Array, newest: int, lag: int, table: Array, row: Array, gram: Array, keep: float
-) -> None:
-    """Take the row at the second delay into account."""
-    if lag > 0 and form_row(history, newest, lag, table, row):
-        accumulate_row(row, gram, keep)
 
 
 @njit(cache=True, nogil=True)

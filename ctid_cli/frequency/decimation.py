@@ -52,14 +52,12 @@ def low_pass(pass_edge: float, stop_edge: float, attenuation: float, interval: f
 
     Sine cardinal times Kaiser's window: ``L = (attenuation - 7.95)/(2.285 (stop_edge - pass_edge) interval)``.
     """
+    from scipy.signal import kaiser_beta  # slow to import, needed only here
+
     half = int(np.ceil((attenuation - 7.95) / (2.285 * (stop_edge - pass_edge) * interval) / 2.0))
-    if attenuation > 50.0:
-        beta = 0.1102 * (attenuation - 8.7)
-    else:
-        beta = 0.5842 * (attenuation - 21.0) ** 0.4 + 0.07886 * (attenuation - 21.0)
     places = np.arange(-half, half + 1)
     edge = 0.5 * (pass_edge + stop_edge) * interval / np.pi
-    weights = np.sinc(edge * places) * np.kaiser(2 * half + 1, beta)
+    weights = np.sinc(edge * places) * np.kaiser(2 * half + 1, kaiser_beta(attenuation))
     return np.asarray(weights / weights.sum())
 
 

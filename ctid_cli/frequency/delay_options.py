@@ -9,13 +9,17 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
-from ctid_cli.frequency.consistency import samples_between_verdicts, second_lag
-from ctid_cli.frequency.inputs import MOST_TONES, require_bounds
+from ctid_cli.frequency.consistency import second_lag
+from ctid_cli.frequency.inputs import require_bounds
 from ctid_cli.frequency.prefilter import impulse_response
 from ctid_cli.frequency.regression import delay_table, whole_delay
 from ctid_cli.frequency.tracking import OnlineEstimator
-from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
+from ctid_cli.signals.checks import require_not_negative, require_positive
 
+#: Verdicts are given, and rows at the second delay looked at, so many times in a delay h, but at most so many samples
+#: apart.
+VERDICTS_PER_DELAY = 64
+MOST_BETWEEN = 8
 #: A delay that rounding to whole sampling intervals changes by a larger fraction is worth a note.
 NOTEWORTHY_ROUNDING = 0.01
 #: An estimate is valid after this many rows for each tone, and after this fraction of n h: before, the rows are too few
@@ -48,7 +52,6 @@ class DelayClock(NamedTuple):
 class DelayRegression(OnlineEstimator):
     """Options of an estimator on the delay regression."""
 
-    tones: int
     h: float
     prefilter: float = 0.0
     difference: float = 0.0
@@ -56,7 +59,7 @@ class DelayRegression(OnlineEstimator):
     highest_frequency: float | None = None
 
     def __post_init__(self) -> None:
-        require_integer("tones", self.tones, 1, MOST_TONES)
+        super().__post_init__()
         require_positive("h", self.h, "s")
         require_not_negative("prefilter", self.prefilter, "s")
         require_not_negative("difference", self.difference, "s")
@@ -67,6 +70,7 @@ class DelayRegression(OnlineEstimator):
         """The regression at a sampling interval."""
         lag = whole_delay("h", self.h, interval)
         delay, second = lag * interval, second_lag(lag)
+        every = max(1, min(lag // VERDICTS_PER_DELAY, MOST_BETWEEN))
         return DelayClock(
             delay_table(self.tones),
             float(interval),
@@ -76,7 +80,7 @@ class DelayRegression(OnlineEstimator):
             second * interval,
             float(np.cos(self._highest(delay) * delay)),
             float(np.cos(self.lowest_frequency * delay)),
-            samples_between_verdicts(lag),
+            every,
         )
 
     def _weights(self, interval: float) -> Array:
@@ -90,10 +94,15 @@ class DelayRegression(OnlineEstimator):
         """What the sampling interval makes of the delay."""
         if abs(clock.delay - self.h) <= NOTEWORTHY_ROUNDING * self.h:
             return ()
-        return (
-            f"h = {self.h:g} s is no whole number of sampling intervals of {clock.interval:g} s; "
-            f"{clock.delay:g} s is used.",
-        )
+        whole = f"no whole number of sampling intervals of {clock.interval:g} s"
+        return (f"h = {self.h:g} s is {whole}; {clock.delay:g} s is used.",)
+
+    def _require_samples(self, memory: float, samples: float, interval: float) -> None:
+        """Refuse a memory [s] of fewer samples than an estimate needs."""
+        needed = ROWS_PER_TONE * self.tones
+        if samples < needed:
+            few = f"{samples:.3g} samples of {interval:g} s, fewer than the {needed} that {self.tones} tones need."
+            raise OptionError("memory", f"memory = {memory:g} s holds {few}")
 
     def _rows_before_valid(self, clock: DelayClock) -> int:
         """Rows that must have arrived before an estimate can be valid."""
@@ -104,10 +113,8 @@ class DelayRegression(OnlineEstimator):
         unique = np.pi / delay
         highest = unique if self.highest_frequency is None else float(self.highest_frequency)
         if highest > unique * (1.0 + 1e-12):
-            raise OptionError(
-                "h",
-                f"with h = {delay:g} s, frequencies above pi/h = {unique:g} rad/s are seen as lower ones, but "
-                f"highest_frequency is {highest:g} rad/s; use an h below {np.pi / highest:g} s.",
-            )
+            seen = f"frequencies above pi/h = {unique:g} rad/s are seen as lower ones"
+            asked = f"highest_frequency is {highest:g} rad/s; use an h below {np.pi / highest:g} s."
+            raise OptionError("h", f"with h = {delay:g} s, {seen}, but {asked}")
         require_bounds(self.lowest_frequency, highest)
         return min(highest, unique)

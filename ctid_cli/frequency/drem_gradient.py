@@ -10,7 +10,6 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array
-from ctid_cli.frequency.inputs import one_for_each
 from ctid_cli.frequency.mixing import MIXING_ROUNDING, MixingOptions, back_end
 from ctid_cli.frequency.regression import theta_of
 from ctid_cli.frequency.tracking import Recursion
@@ -110,11 +109,10 @@ class DremGradient(MixingOptions):
         super().__post_init__()
         require_positive("epsilon", self.epsilon, "-")
         if isinstance(self.gamma, Sequence):
-            object.__setattr__(self, "gamma", one_for_each("gamma", self.gamma, self.tones, "-"))
+            self._keep_one_for_each("gamma", "-")
         else:
             require_positive("gamma", self.gamma, "-")
-        initial = one_for_each("initial_frequencies", self.initial_frequencies, self.tones, "rad/s")
-        object.__setattr__(self, "initial_frequencies", initial)
+        self._keep_one_for_each("initial_frequencies", "rad/s")
         if self.power != "literal":
             require_integer("power", self.power, 1)
 

@@ -9,8 +9,6 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array, IntArray
-from ctid_cli.errors import OptionError
-from ctid_cli.frequency.delay_options import ROWS_PER_TONE
 from ctid_cli.frequency.mixing import MIXING_ROUNDING, MixingOptions, back_end
 from ctid_cli.frequency.regression import whole_delay
 from ctid_cli.frequency.tracking import Recursion
@@ -84,12 +82,7 @@ class DremWindow(MixingOptions):
     def _recursion(self, interval: float) -> Recursion:
         n, clock = self.tones, self._clock(interval)
         length = whole_delay("memory", self.memory, interval)
-        if length < ROWS_PER_TONE * n:
-            raise OptionError(
-                "memory",
-                f"memory = {self.memory:g} s holds {length} samples of {interval:g} s, fewer than the "
-                f"{ROWS_PER_TONE * n} that {n} tones need.",
-            )
+        self._require_samples(self.memory, length, interval)
         size = 2 * n + 3
         back = Window(np.zeros((length, size)), np.zeros(size), np.zeros(size), np.zeros(1, np.int64))
         return self._mixed(clock, back, np.full(n, np.nan), most_rows=length)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,9 +12,9 @@ from numpy.typing import ArrayLike
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.frequency.amplitudes import estimate_of, frequency_errors, present_samples
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.inputs import MOST_TONES, require_bounds
+from ctid_cli.frequency.inputs import require_bounds
 from ctid_cli.frequency.tracking import BatchEstimator, FrequencyEstimate
-from ctid_cli.signals.checks import require_integer, require_not_negative
+from ctid_cli.signals.checks import require_not_negative
 
 #: Rows of the Hankel matrix as a fraction of the samples, and the largest number of them.
 ROWS_FRACTION = 0.4
@@ -67,13 +68,12 @@ class Esprit(BatchEstimator):
 
     kind: ClassVar[str] = "esprit"
 
-    tones: int
     averaging: float = 0.0
     lowest_frequency: float = 0.0
     highest_frequency: float | None = None
 
     def __post_init__(self) -> None:
-        require_integer("tones", self.tones, 1, MOST_TONES)
+        super().__post_init__()
         require_not_negative("averaging", self.averaging, "s")
         require_bounds(self.lowest_frequency, self.highest_frequency)
 
@@ -107,36 +107,27 @@ class Esprit(BatchEstimator):
         highest = np.pi / (block * interval)
         if self.highest_frequency is not None:
             if self.highest_frequency > highest * (1.0 + 1e-12):
-                raise OptionError(
-                    "averaging",
-                    f"averages over {block * interval:g} s show frequencies up to {highest:g} rad/s, but "
-                    f"highest_frequency is {self.highest_frequency:g} rad/s; use an averaging below "
-                    f"{np.pi / self.highest_frequency:g} s.",
-                )
+                shown = f"averages over {block * interval:g} s show frequencies up to {highest:g} rad/s"
+                asked = f"highest_frequency is {self.highest_frequency:g} rad/s"
+                remedy = f"use an averaging below {np.pi / self.highest_frequency:g} s."
+                raise OptionError("averaging", f"{shown}, but {asked}; {remedy}")
             highest = self.highest_frequency
         averages = count // block
         rows = min(int(ROWS_FRACTION * averages), MOST_ROWS)
         if rows < 2 * self.tones + 1:
-            raise DataError(
-                f"{averages} samples, after the averaging, are too few for {self.tones} tones; use a longer record "
-                "or a shorter averaging.",
-                "averaging",
-            )
+            few = f"{averages} samples, after the averaging, are too few for {self.tones} tones"
+            raise DataError(f"{few}; use a longer record or a shorter averaging.", "averaging")
         if averages > MOST_AVERAGES:
-            raise DataError(
-                f"{averages:,} samples are more than the {MOST_AVERAGES:,} that ESPRIT takes; use an averaging of at "
-                f"least {count / MOST_AVERAGES * interval:.2g} s, or a part of the record.",
-                "averaging",
-            )
+            many = f"{averages:,} samples are more than the {MOST_AVERAGES:,} that ESPRIT takes"
+            least = f"{count / MOST_AVERAGES * interval:.2g} s"
+            raise DataError(f"{many}; use an averaging of at least {least}, or a part of the record.", "averaging")
         return block, rows, highest
 
     def estimate(self, samples: ArrayLike, interval: float) -> FrequencyEstimate:
         """Rotation of the signal space of the averaged record, which must have no gaps."""
         y, t = present_samples(samples, interval)
         if y.size < np.asarray(samples).size:
-            raise DataError(
-                "ESPRIT needs a record without missing samples; nonlinear_least_squares takes one with gaps."
-            )
+            raise DataError("ESPRIT takes no record with missing samples; nonlinear_least_squares does.")
         n = self.tones
         block, rows, highest = self.blocks(y.size, interval)
         averages = y[: y.size // block * block].reshape(-1, block).mean(axis=1)
@@ -156,9 +147,8 @@ class Esprit(BatchEstimator):
         bounded = np.clip(omega, self.lowest_frequency, highest)
         if (bounded != omega).any():
             flags |= Flag.OUT_OF_BOUNDS
-        try:
+        uncertainty = np.full(n, np.nan)
+        # Where the samples determine no amplitudes, the estimate below says so.
+        with suppress(DataError):
             uncertainty = frequency_errors(y, t, bounded, bias=False)[1]
-        except DataError:
-            uncertainty = np.full(n, np.nan)
-            flags |= Flag.UNDETERMINED
         return estimate_of(y, t, bounded, uncertainty, flags, bias=False)

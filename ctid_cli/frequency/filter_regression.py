@@ -14,10 +14,10 @@ from ctid_cli.errors import OptionError
 from ctid_cli.filtering.exponential import held_step
 from ctid_cli.frequency.decoding import Decoding, bounded_roots, decoding_memory, flag_uncertain, root_sensitivities
 from ctid_cli.frequency.flags import GAP, STARTING, UNDETERMINED
-from ctid_cli.frequency.inputs import MOST_TONES, one_for_each, require_bounds, samples_in
+from ctid_cli.frequency.inputs import require_bounds, samples_in
 from ctid_cli.frequency.moments import accumulate_row, factorise, least_squares, moment_uncertainty, squared_residual
 from ctid_cli.frequency.tracking import OnlineEstimator, Output, Recursion
-from ctid_cli.signals.checks import require_choice, require_integer, require_not_negative, require_positive
+from ctid_cli.signals.checks import require_choice, require_not_negative, require_positive
 
 Algorithm = Literal["least_squares", "gradient"]
 
@@ -112,7 +112,6 @@ class FilterRegression(OnlineEstimator):
 
     kind: ClassVar[str] = "filter_regression"
 
-    tones: int
     pole: float
     forgetting: float = 0.5
     algorithm: Algorithm = "least_squares"
@@ -123,34 +122,27 @@ class FilterRegression(OnlineEstimator):
     highest_frequency: float | None = None
 
     def __post_init__(self) -> None:
-        require_integer("tones", self.tones, 1, MOST_TONES)
+        super().__post_init__()
         require_positive("pole", self.pole, "rad/s")
         require_positive("forgetting", self.forgetting, "1/s")
         require_choice("algorithm", self.algorithm, get_args(Algorithm))
         require_not_negative("hold", self.hold, "s")
         require_bounds(self.lowest_frequency, self.highest_frequency)
         for name, unit in (("gains", "-"), ("initial_frequencies", "rad/s")):
-            object.__setattr__(self, name, one_for_each(name, getattr(self, name), self.tones, unit))
+            self._keep_one_for_each(name, unit)
 
     def _recursion(self, interval: float) -> Recursion:
         n = self.tones
         order = 2 * n
         if self.pole * interval > np.pi:
-            raise OptionError(
-                "pole",
-                f"pole = {self.pole:g} rad/s is beyond what samples every {interval:g} s can show; "
-                f"use one below {np.pi / interval:g} rad/s.",
-            )
+            beyond = f"pole = {self.pole:g} rad/s is beyond what samples every {interval:g} s can show"
+            raise OptionError("pole", f"{beyond}; use one below {np.pi / interval:g} rad/s.")
         dynamics = self.pole * (np.eye(order, k=-1) - np.eye(order))
         gain = np.zeros(order)
         gain[0] = self.pole
-        initial = self.initial_frequencies
-        if initial is None:
-            initial = tuple(self.pole * np.arange(1, n + 1) / n)
-        coefficients = np.poly(np.asarray(initial, dtype=float) ** 2)[1:]
-        gains = np.empty(0)
-        if self.algorithm == "gradient":
-            gains = interval * np.asarray(self.gains if self.gains is not None else np.ones(n), dtype=float)
+        initial = np.asarray(self.initial_frequencies or self.pole * np.arange(1, n + 1) / n, dtype=float)
+        coefficients = np.poly(initial**2)[1:]
+        gains = interval * np.asarray(self.gains or np.ones(n)) if self.algorithm == "gradient" else np.empty(0)
         settings = Filter(
             held_step(dynamics, gain, interval),
             derivative_rows(n, self.pole),
@@ -165,7 +157,7 @@ class FilterRegression(OnlineEstimator):
             float(self.lowest_frequency) ** 2,
             np.inf if self.highest_frequency is None else float(self.highest_frequency) ** 2,
         )
-        estimate = np.array([coefficients, np.sort(np.asarray(initial, dtype=float)), np.full(n, np.nan)])
+        estimate = np.array([coefficients, np.sort(initial), np.full(n, np.nan)])
         counters = np.array([0, 0, 0, UNDETERMINED], np.int64)
         state = Chain(np.zeros(order + 1), np.zeros((n + 1, n + 1)), estimate, counters)
         return Recursion(advance_filter, (settings,), (state,))

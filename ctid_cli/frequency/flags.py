@@ -38,21 +38,14 @@ MEANINGS: dict[Flag, str] = {
     Flag.STARTING: "Too few samples have arrived since the start or since the last restart.",
     Flag.GAP: "A sample that the estimate needs at this instant is missing or not finite.",
     Flag.CHANGED: "The signal changed: the estimate is held until all samples from before have left the delays.",
-    Flag.UNDETERMINED: (
-        "The samples do not determine as many frequencies as asked for: the signal is zero, constant or has fewer "
-        "tones, or two of its tones look alike at this delay; use fewer tones."
-    ),
+    Flag.UNDETERMINED: "The signal has fewer tones, or two that look alike at this delay; use fewer tones.",
     Flag.UNCERTAIN: (
-        "The equations hold so badly or determine so little that a frequency may be wrong by a tenth of itself or of "
-        "the distance to the next one; the signal has noise, a bias or more tones than the model: "
+        "Noise, a bias or another tone may move a frequency by a tenth of itself or of the distance to the next one; "
         "use a prefilter, more tones or a longer record."
     ),
     Flag.COMPLEX_ROOTS: "The estimated parameters belong to no set of real frequencies.",
     Flag.OUT_OF_BOUNDS: "A frequency beyond lowest_frequency or highest_frequency was put on the bound.",
-    Flag.INCONSISTENT: (
-        "The frequencies do not explain the signal at a second delay: a tone above pi/h is seen as another one "
-        "(use a smaller h), or the estimate is still inexact or lags behind a change."
-    ),
+    Flag.INCONSISTENT: "The signal at a second delay has other frequencies: above pi/h (use a smaller h), or new ones.",
     Flag.NOT_CONVERGED: "The iterations did not converge; start closer, or use a longer record.",
 }
 

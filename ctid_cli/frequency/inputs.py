@@ -1,8 +1,6 @@
-"""What every estimator checks: options with one number for each tone, bounds of frequencies, and samples."""
+"""What every estimator checks: bounds of frequencies, and samples."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,18 +15,6 @@ MOST_TONES = 8
 LARGEST_SAMPLE = 1e30
 
 
-def one_for_each(name: str, values: Sequence[float] | None, count: int, unit: str) -> tuple[float, ...] | None:
-    """Check an option that holds one positive number for each tone."""
-    if values is None:
-        return None
-    numbers = tuple(float(value) for value in values)
-    if len(numbers) != count:
-        raise OptionError(name, f"{name} must hold one number for each of the {count} tones, not {values!r}.")
-    for number in numbers:
-        require_positive(name, number, unit)
-    return numbers
-
-
 def samples_in(duration: float, interval: float) -> int:
     """Sampling intervals nearest to a time, however long it is."""
     return round(min(duration / interval, float(1 << 62)))
@@ -41,19 +27,16 @@ def require_bounds(lowest: float, highest: float | None) -> None:
         return
     require_positive("highest_frequency", highest, "rad/s")
     if lowest >= highest:
-        raise OptionError(
-            "lowest_frequency",
-            f"lowest_frequency ({lowest:g} rad/s) must be below highest_frequency ({highest:g} rad/s).",
-        )
+        order = f"lowest_frequency ({lowest:g} rad/s) must be below highest_frequency ({highest:g} rad/s)."
+        raise OptionError("lowest_frequency", order)
 
 
 def series_of(samples: ArrayLike) -> Array:
     """One series of real numbers, with NaN for whatever counts as missing."""
     values = np.asarray(samples)
     if values.ndim != 1 or values.dtype.kind not in "fiu":
-        raise DataError(
-            f"the samples must be one series of real numbers, not of shape {values.shape} and type {values.dtype}."
-        )
+        found = f"shape {values.shape} and type {values.dtype}"
+        raise DataError(f"the samples must be one series of real numbers, not of {found}.")
     values = values.astype(np.float64)
     with np.errstate(invalid="ignore"):
         return np.where(np.abs(values) <= LARGEST_SAMPLE, values, np.nan)

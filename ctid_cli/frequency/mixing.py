@@ -15,13 +15,7 @@ from numba import njit
 from numba.extending import overload
 
 from ctid_cli.arrays import Array, IntArray
-from ctid_cli.frequency.consistency import (
-    DETECTOR_SPAN,
-    USUAL_SPANS,
-    check_consistency,
-    contradicts,
-    observe_second_delay,
-)
+from ctid_cli.frequency.consistency import DETECTOR_SPAN, USUAL_SPANS, check_consistency, contradicts
 from ctid_cli.frequency.decoding import (
     Decoding,
     cosine_sensitivities,
@@ -33,6 +27,7 @@ from ctid_cli.frequency.decoding import (
 )
 from ctid_cli.frequency.delay_options import DelayClock, DelayRegression
 from ctid_cli.frequency.flags import GAP, STARTING, UNCERTAIN, UNDETERMINED
+from ctid_cli.frequency.moments import accumulate_row
 from ctid_cli.frequency.regression import following, form_row, minor_plan, mix_rows, whole_delay
 from ctid_cli.frequency.tracking import Output, Recursion
 from ctid_cli.signals.checks import require_integer, require_positive
@@ -148,26 +143,24 @@ def back_end(state: type, absorbing: Callable[..., Any], weighing: Callable[...,
 
 @njit(cache=True, nogil=True, forceinline=True)
 def judge_mixed(
-    theta: Array,
+    front: Front,
     omega: Array,
     relative: float,
     span: float,
     elapsed: float,
     clock: DelayClock,
-    check: Array,
     errors: Array,
     memory: Decoding,
-    possible_errors: Array,
 ) -> int:
     """What may be wrong with the frequencies, and the flags that follow."""
     # theta is wrong by at most its errors, and by rounding in Delta and Psi; the decoding multiplies both.
     cosine_sensitivities(memory.roots, clock.delay, memory.slopes, memory.sensitivities)
-    propagate(memory.sensitivities, errors, possible_errors)
+    propagate(memory.sensitivities, errors, front.possible_errors)
     for i in range(omega.size):
-        errors[i] = (1.0 + abs(theta[i])) * relative
+        errors[i] = (1.0 + abs(front.theta[i])) * relative
     propagate(memory.sensitivities, errors, memory.rounding)
-    flag = flag_uncertain(omega, possible_errors, memory.rounding, span, elapsed)
-    return flag | check_consistency(check, omega, clock.second_delay, NEGLIGIBLE)
+    flag = flag_uncertain(omega, front.possible_errors, memory.rounding, span, elapsed)
+    return flag | check_consistency(front.check, omega, clock.second_delay, NEGLIGIBLE)
 
 
 @njit(cache=True, nogil=True)
@@ -192,8 +185,9 @@ def advance_mixed(
         counters[ROW] = following(counters[ROW], rows.shape[0])
         history[counters[PLACE]] = samples[k]
         # The second delay comes first: it leaves its own row behind.
-        if counters[PLACE] % clock.every == 0:
-            observe_second_delay(history, counters[PLACE], clock.second_lag, table, row, check, keep)
+        checked = counters[PLACE] % clock.every == 0 and clock.second_lag > 0
+        if checked and form_row(history, counters[PLACE], clock.second_lag, table, row):
+            accumulate_row(row, check, keep)
         form_row(history, counters[PLACE], clock.lag, table, row)
         for i in range(n + 1):
             rows[counters[ROW], i] = row[i]
@@ -224,9 +218,7 @@ def advance_mixed(
             if doubts[SINCE_VERDICT] == 0 or contradicted:
                 relative, remembered = weigh(tuning, back, theta, errors)
                 span, elapsed = (reach + remembered) * clock.interval, (reach + counters[USED]) * clock.interval
-                verdict = judge_mixed(
-                    theta, omega, relative, span, elapsed, clock, check, errors, memory, possible_errors
-                )
+                verdict = judge_mixed(front, omega, relative, span, elapsed, clock, errors, memory)
                 if verdict & UNCERTAIN or contradicted:
                     verdict |= UNCERTAIN
                     if started:

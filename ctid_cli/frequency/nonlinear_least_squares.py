@@ -12,7 +12,6 @@ from ctid_cli.errors import DataError, OptionError
 from ctid_cli.frequency.amplitudes import estimate_of, frequency_errors, present_samples
 from ctid_cli.frequency.esprit import Esprit
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.inputs import MOST_TONES, one_for_each
 from ctid_cli.frequency.tracking import BatchEstimator, FrequencyEstimate
 from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
 
@@ -61,7 +60,6 @@ class NonlinearLeastSquares(BatchEstimator):
 
     kind: ClassVar[str] = "nonlinear_least_squares"
 
-    tones: int
     initial_frequencies: tuple[float, ...] | None = None
     averaging: float = 0.0
     bias: bool = False
@@ -69,17 +67,14 @@ class NonlinearLeastSquares(BatchEstimator):
     tolerance: float = 1e-8
 
     def __post_init__(self) -> None:
-        require_integer("tones", self.tones, 1, MOST_TONES)
+        super().__post_init__()
         require_not_negative("averaging", self.averaging, "s")
         require_integer("max_iterations", self.max_iterations, 1)
         require_positive("tolerance", self.tolerance, "rad")
-        initial = one_for_each("initial_frequencies", self.initial_frequencies, self.tones, "rad/s")
-        if initial is not None and len(set(initial)) < len(initial):
-            raise OptionError(
-                "initial_frequencies",
-                f"initial_frequencies must differ from each other, not {self.initial_frequencies!r}.",
-            )
-        object.__setattr__(self, "initial_frequencies", initial)
+        self._keep_one_for_each("initial_frequencies", "rad/s")
+        initial = self.initial_frequencies or ()
+        if len(set(initial)) < len(initial):
+            raise OptionError("initial_frequencies", f"initial_frequencies must differ, not {initial!r}.")
 
     def estimate(self, samples: ArrayLike, interval: float) -> FrequencyEstimate:
         """Gauss-Newton steps from the given frequencies, or from those of ESPRIT if no sample is missing."""

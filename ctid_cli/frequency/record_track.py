@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.arrays import Array
 from ctid_cli.frequency.automatic import Settings
 from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.frequency.windows import WindowEstimate, amplitudes_of, estimate_window, wanted_tones
 
 #: Rows of a track if nobody says how many.
@@ -25,27 +25,13 @@ PIECE = 50_000
 
 
 @dataclass(frozen=True, eq=False)
-class RecordTrack:
-    """Frequencies and amplitudes over time."""
+class RecordTrack(FrequencyTrack):
+    """Frequencies, at the newest sample of an online estimate or in the middle of a window, with amplitudes."""
 
-    #: Instants since the first sample of the record [s]: the newest sample of an online estimate, the middle of the
-    #: window of a batch estimate, shape (N,).
-    t: Array
-    #: Frequencies [rad/s], ascending; NaN where there is no estimate, shape (N, n).
-    omega: Array
     #: Amplitudes [signal unit]; NaN where they are not determined, shape (N, n).
     amplitudes: Array
-    #: Bit field of :class:`~ctid_cli.frequency.flags.Flag`, shape (N,).
-    flags: NDArray[np.uint16]
-    #: Error that the misfit could make in its worst direction [rad/s]; NaN if unknown, shape (N, n).
-    uncertainty: Array
     #: Time from one row to the next [s].
     every: float
-
-    @property
-    def valid(self) -> BoolArray:
-        """Rows without any flag, shape (N,)."""
-        return np.asarray(self.flags == 0)
 
 
 def track_record(
@@ -81,9 +67,9 @@ def track_record(
     return RecordTrack(
         t,
         omega,
-        amplitudes,
         np.array([int(found.flags) for _, found, _ in rows], np.uint16),
         np.array([found.uncertainty for _, found, _ in rows]),
+        amplitudes,
         step * thin,
     )
 

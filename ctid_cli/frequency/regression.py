@@ -42,10 +42,8 @@ def whole_delay(name: str, delay: float, interval: float) -> int:
     """Sampling intervals nearest to a delay."""
     require_positive("interval", interval, "s")
     if delay / interval > LONGEST_DELAY:
-        raise OptionError(
-            name,
-            f"{name} = {delay:g} s is more than {LONGEST_DELAY:,} sampling intervals of {interval:g} s; thin them.",
-        )
+        longest = f"{LONGEST_DELAY:,} sampling intervals of {interval:g} s"
+        raise OptionError(name, f"{name} = {delay:g} s is more than {longest}; thin them.")
     count = round(delay / interval)
     if count < 1:
         raise OptionError(name, f"{name} = {delay:g} s is shorter than half a sampling interval of {interval:g} s.")

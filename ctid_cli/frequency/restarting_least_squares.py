@@ -9,14 +9,7 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array, IntArray
-from ctid_cli.errors import OptionError
-from ctid_cli.frequency.consistency import (
-    ALARM_RATIO,
-    DETECTOR_SPAN,
-    ROUNDING_FLOOR,
-    check_consistency,
-    observe_second_delay,
-)
+from ctid_cli.frequency.consistency import ALARM_RATIO, DETECTOR_SPAN, ROUNDING_FLOOR, check_consistency
 from ctid_cli.frequency.decoding import (
     FIRST_PERIODS,
     Decoding,
@@ -28,13 +21,7 @@ from ctid_cli.frequency.decoding import (
 )
 from ctid_cli.frequency.delay_options import ROWS_PER_TONE, DelayClock, DelayRegression
 from ctid_cli.frequency.flags import CHANGED, GAP, STARTING, UNDETERMINED
-from ctid_cli.frequency.moments import (
-    accumulate_row,
-    factorise,
-    least_squares,
-    moment_uncertainty,
-    squared_residual,
-)
+from ctid_cli.frequency.moments import accumulate_row, factorise, least_squares, moment_uncertainty, squared_residual
 from ctid_cli.frequency.regression import following, form_row
 from ctid_cli.frequency.tracking import Output, Recursion
 from ctid_cli.signals.checks import require_choice, require_positive
@@ -98,7 +85,6 @@ class Fit(NamedTuple):
 class Workspace(NamedTuple):
     """Memory for one sample."""
 
-    row: Array
     gram: Array
     factor: Array
     scales: Array
@@ -182,21 +168,16 @@ class RestartingLeastSquares(DelayRegression):
         n, clock, weights = self.tones, self._clock(interval), self._weights(interval)
         length = weights.size - 1
         memory = DEFAULT_MEMORY * clock.delay if self.memory is None else self.memory
-        needed = ROWS_PER_TONE * n
-        if memory < needed * interval:
-            raise OptionError(
-                "memory",
-                f"memory = {memory:g} s holds fewer than the {needed} samples of {interval:g} s that {n} tones need.",
-            )
-        arming = round(ARMING_SPAN * clock.lag)
+        self._require_samples(memory, memory / interval, interval)
+        arming = max(round(ARMING_SPAN * clock.lag), 2 * ROWS_PER_TONE * n)
         whitener = np.empty((0, 0))
         if self.solution == "total_least_squares":
             covariance = noise_covariance(clock.table, weights, clock.lag)
             whitener = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(covariance)))
         settings = Restarting(
             max(1, round(DETECTOR_SPAN * clock.lag)),
-            max(arming, ARMING_PREFILTERS * length, 2 * needed),
-            max(arming, MIXED_PREFILTERS * length, 2 * needed),
+            max(arming, ARMING_PREFILTERS * length),
+            max(arming, MIXED_PREFILTERS * length),
             self._rows_before_valid(clock),
             length + 2 * n * clock.lag + 1,
             memory / interval,
@@ -340,7 +321,7 @@ def advance_restarting(samples: Array, output: Output, clock: DelayClock, settin
     """Least squares with alarm, flush, restart and comparison with the newer data alone."""
     n = output.omega.shape[1]
     row, gram, factor, scales = np.empty(n + 1), np.empty((n + 1, n + 1)), np.empty((n, n)), np.empty(n)
-    work = Workspace(row, gram, factor, scales, np.empty((3, n)), decoding_memory(n))
+    work = Workspace(gram, factor, scales, np.empty((3, n)), decoding_memory(n))
     # Arrays are taken out of their tuples once: in the loop, each would cost two counts of its references.
     omegas, uncertainty, flags = output
     history, newer, older, check, estimate, levels, counters = fit
@@ -378,8 +359,9 @@ def advance_restarting(samples: Array, output: Output, clock: DelayClock, settin
             levels[NEWER] = keep * levels[NEWER] + 1.0
             accumulate_row(row, newer, keep)
             # The row itself is not needed any more: the one at the second delay takes its place.
-            if counters[PLACE] % clock.every == 0:
-                observe_second_delay(history, counters[PLACE], clock.second_lag, table, row, check, keep**clock.every)
+            checked = counters[PLACE] % clock.every == 0 and clock.second_lag > 0
+            if checked and form_row(history, counters[PLACE], clock.second_lag, table, row):
+                accumulate_row(row, check, keep**clock.every)
             # A second change while the delays were flushed leaves rows of two signals.
             mixed = False
             if counters[ROWS] >= counters[NEXT]:

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.errors import DataError
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.inputs import LARGEST_SAMPLE, series_of
+from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES, series_of
 from ctid_cli.frequency.prefilter import convolve, fast_convolve
-from ctid_cli.signals.checks import require_positive
+from ctid_cli.signals.checks import require_integer, require_positive
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +72,8 @@ class FrequencyTrack:
     uncertainty: Array
 
     def __repr__(self) -> str:
-        tones = self.omega.shape[1]
-        return (
-            f"FrequencyTrack({self.t.size} rows of {tones} frequencies, {np.mean(self.flags == 0):.3g} of them valid)"
-        )
+        rows = f"{self.t.size} rows of {self.omega.shape[1]} frequencies"
+        return f"FrequencyTrack({rows}, {np.mean(self.flags == 0):.3g} of them valid)"
 
     @property
     def valid(self) -> BoolArray:
@@ -117,12 +115,41 @@ class Recursion(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-class BatchEstimator(ABC):
-    """Options of an estimator that takes whole records."""
+@dataclass(frozen=True, kw_only=True)
+class FrequencyEstimator(ABC):
+    """Options of an estimator of frequencies."""
 
     kind: ClassVar[str]
-    online: ClassVar[bool] = False
+    online: ClassVar[bool]
+
     tones: int
+
+    def __post_init__(self) -> None:
+        require_integer("tones", self.tones, 1, MOST_TONES)
+
+    def _keep_one_for_each(self, name: str, unit: str) -> None:
+        """Check an option that holds one positive number for each tone, and keep it as a tuple."""
+        values = getattr(self, name)
+        if values is None:
+            return
+        numbers = tuple(float(value) for value in values)
+        if len(numbers) != self.tones:
+            raise OptionError(name, f"{name} must hold one number for each of the {self.tones} tones, not {values!r}.")
+        for number in numbers:
+            require_positive(name, number, unit)
+        object.__setattr__(self, name, numbers)
+
+
+class BatchEstimator(FrequencyEstimator):
+    """Options of an estimator that takes whole records.
+
+    Parameters
+    ----------
+    tones : int
+        Number of sinusoids n, 1 to 8.
+    """
+
+    online: ClassVar[bool] = False
 
     @abstractmethod
     def estimate(self, samples: ArrayLike, interval: float) -> FrequencyEstimate:
@@ -149,12 +176,10 @@ class BatchEstimator(ABC):
         """
 
 
-class OnlineEstimator(ABC):
+class OnlineEstimator(FrequencyEstimator):
     """Options of an estimator that takes sample after sample."""
 
-    kind: ClassVar[str]
     online: ClassVar[bool] = True
-    tones: int
 
     @abstractmethod
     def _recursion(self, interval: float) -> Recursion:
@@ -310,7 +335,7 @@ class Tracker:
 def _fingerprint(options: OnlineEstimator, interval: float) -> bytes:
     """Digest of everything that gives a state its meaning."""
     values = []
-    for item in fields(options):  # type: ignore[arg-type]
+    for item in fields(options):
         value = getattr(options, item.name)
         # The same number may come as an integer or as a float.
         values.append((item.name, float(value) if isinstance(value, Real) else value))

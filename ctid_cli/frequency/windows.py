@@ -21,13 +21,9 @@ NEAR = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class WindowEstimate:
-    """Frequencies of one window."""
+class WindowEstimate(FrequencyEstimate):
+    """Frequencies of one window; NaN where there is no estimate."""
 
-    #: Frequencies, ascending, and what may be wrong with them [rad/s]; NaN where there is no estimate, shape (n,).
-    omega: Array
-    uncertainty: Array
-    flags: Flag
     #: Frequencies of all tones that were estimated [rad/s]: those wanted, and those that only share their band, shape
     #: (m,).
     everything: Array
@@ -38,8 +34,8 @@ def estimate_window(estimator: Any, samples: Array, interval: float, expected: A
     none = np.full(wanted, np.nan)
     missing = ~np.isfinite(samples)
     if missing.any() and (not isinstance(estimator, NonlinearLeastSquares) or missing.mean() > MOST_MISSING):
-        return WindowEstimate(none, none, Flag.GAP, np.empty(0))
-    result = WindowEstimate(none, none, Flag.UNDETERMINED, np.empty(0))
+        return WindowEstimate(none, Flag.GAP, none, np.empty(0))
+    result = WindowEstimate(none, Flag.UNDETERMINED, none, np.empty(0))
     # A tone that only shares the band need not be there in every window.
     for count in range(estimator.tones, wanted - 1, -1):
         fewer = replace(estimator, tones=count)
@@ -59,7 +55,7 @@ def wanted_tones(found: FrequencyEstimate, expected: Array, wanted: int) -> Wind
     """Keep the tones that are wanted."""
     omega, uncertainty = found.omega, found.uncertainty
     if omega.size == wanted or not np.isfinite(omega).all():
-        return WindowEstimate(omega[:wanted], uncertainty[:wanted], found.flags, omega)
+        return WindowEstimate(omega[:wanted], found.flags, uncertainty[:wanted], omega)
     kept = np.sort(belonging(omega, expected, wanted))
     flags = found.flags & ~(Flag.UNCERTAIN | Flag.COMPLEX_ROOTS | Flag.OUT_OF_BOUNDS)
     # The room of a wanted tone is that between the wanted ones.
@@ -67,7 +63,7 @@ def wanted_tones(found: FrequencyEstimate, expected: Array, wanted: int) -> Wind
     room = np.minimum(apart, np.append(apart[1:], np.inf))
     if not (uncertainty[kept] <= CERTAIN_FRACTION * room).all():
         flags |= Flag.UNCERTAIN
-    return WindowEstimate(omega[kept], uncertainty[kept], flags, omega)
+    return WindowEstimate(omega[kept], flags, uncertainty[kept], omega)
 
 
 def belonging(found: Array, expected: Array, wanted: int) -> IndexArray:

@@ -54,10 +54,8 @@ def figure_3(results: Results) -> bytes:
 
 def figure_4(results: Results) -> bytes:
     """A step of both frequencies, with the phase as printed, and with one that goes on."""
-    rows = [
-        _row(results, "phase jumps", phase_at_steps="jump"),
-        _row(results, "phase goes on", phase_at_steps="continuous"),
-    ]
+    readings = {"jump": "phase jumps", "continuous": "phase goes on"}
+    rows = [_row(results, title, phase_at_steps=reading) for reading, title in readings.items()]
     title = r"Section VI-C: both frequencies step at 30 s, no noise"
     return errors_svg(rows, (1.4, 4.2), (1e-17, 20.0), title)
 
@@ -66,38 +64,30 @@ def _row(results: Results, title: str = "", *, reference: bool = False, **swept:
     """Stored tracks of the first data set, with the truth."""
     plan = build_plan(spec_from_canonical(dict(results.settings)))
     cell = next(cell for cell in plan.data_cells if cell.swept.items() >= swept.items())
-    rows = {row["estimator"]: row for row in results.rows if row["replicate"] == 0 and row["cell"] == cell.hash}
-    source = cell.source
-    tracks = read_tracks(results.folder)
+    first = [row for row in results.rows if row["replicate"] == 0 and row["cell"] == cell.hash]
+    ids = {row["estimator"]: row["id"] for row in first}
+    source, tracks = cell.source, read_tracks(results.folder)
     groups = []
     for name, members in GROUPS.items():
         curves = []
-        for estimator, label in members.items():
-            if estimator not in rows:
-                continue
-            track = tracks.get(rows[estimator]["id"])
+        for estimator in (member for member in members if member in ids):
+            track = tracks.get(ids[estimator])
             if track is None:
-                raise UsageError(
-                    f"the results of {results.experiment} hold no frequencies over time of {estimator!r}; run "
-                    "its specification with tracks.runs of 1 or more"
-                )
+                nothing = f"the results of {results.experiment} hold no frequencies over time of {estimator!r}"
+                raise UsageError(f"{nothing}; run its specification with tracks.runs of 1 or more")
             every = max(1, round(DRAWN_INTERVAL / float(track["t"][1] - track["t"][0])))
             t = np.asarray(track["t"][::every])
             true = source.signal.frequencies_at(t)
-            curves.append(Curve(label, t, track["omega"][::every], true, track["flags"][::every] == 0))
+            curves.append(Curve(members[estimator], t, track["omega"][::every], true, track["flags"][::every] == 0))
         groups.append(Group(name, curves))
     options = next(part.estimator.options for part in plan.estimators if part.name == "finite_time")
-    return Row(
-        title,
-        groups,
-        source.sampling.samples * source.sampling.interval,
-        options.tones * (2 * options.h + options.d),
-        _whole_record_error(results, options.tones) if reference else None,
-    )
+    exact_from = options.tones * (2 * options.h + options.d)
+    whole = _whole_record_error(results) if reference else None
+    return Row(title, groups, source.sampling.samples * source.sampling.interval, exact_from, whole)
 
 
-def _whole_record_error(results: Results, tones: int) -> float:
+def _whole_record_error(results: Results) -> float:
     """Root-mean-square error of nonlinear least squares over all data sets, of the worse tone [rad/s]."""
     found = [row["measures"] for row in results.rows if row["estimator"] == "nonlinear_least_squares"]
-    errors = np.array([[measures[f"rms_{k + 1}"] for k in range(tones)] for measures in found])
+    errors = np.array([[measures["rms_1"], measures["rms_2"]] for measures in found])
     return float(np.sqrt(np.mean(errors**2, axis=0)).max())

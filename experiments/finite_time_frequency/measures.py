@@ -58,9 +58,15 @@ def followed(results: Results) -> Iterator[tuple[Row, list[tuple[SignalSource, F
             yield common, stored
 
 
-def measured(rows: list[Row]) -> list[Row]:
-    """Measures of the estimates that did not fail."""
-    return [row["measures"] for row in rows if row["measures"]]
+def measured(results: Results) -> Iterator[tuple[Row, list[Row]]]:
+    """The same with the measures of the estimates that did not fail."""
+    for common, rows in grouped(results):
+        yield common, [row["measures"] for row in rows if row["measures"]]
+
+
+def valid_share(found: list[Row]) -> float:
+    """Mean share of valid estimates [%]."""
+    return float(np.mean([measures["valid_share"] for measures in found]))
 
 
 def by_tone(found: list[Row], name: str) -> Array:
@@ -109,19 +115,16 @@ def settling(results: Results) -> Iterator[Row]:
 
 def residuals(results: Results) -> Iterator[Row]:
     """Root-mean-square errors and mean errors over the window of each specification."""
-    for common, rows in grouped(results):
-        found = measured(rows)
+    for common, found in measured(results):
         rms, bias = np.median(by_tone(found, "rms"), axis=0), np.mean(by_tone(found, "bias"), axis=0)
-        share = float(np.mean([measures["valid_share"] for measures in found]))
         for k in range(rms.size):
             own = {"tone": k + 1, "data_sets": len(found), "rms": float(rms[k]), "bias": float(bias[k])}
-            yield {**common, **own, "valid_share": share}
+            yield {**common, **own, "valid_share": valid_share(found)}
 
 
 def recovery(results: Results) -> Iterator[Row]:
     """Times from the step until the errors of both tones are in the band to stay."""
-    for common, rows in grouped(results):
-        found = measured(rows)
+    for common, found in measured(results):
         late = by_tone(found, "settling_after_step")
         times = np.where(np.isnan(late), np.inf, late).max(axis=1)
         alarms = [measures["false_alarms"] for measures in found if measures.get("false_alarms") is not None]
@@ -143,13 +146,12 @@ def efficiency(results: Results) -> Iterator[Row]:
     truth = source.signal.frequencies_at(np.zeros(1))[0]
     sigma = float(source.disturbance.half_width / np.sqrt(3.0))
     bound = cramer_rao(truth, source.sampling.samples, source.sampling.interval, sigma)
-    for common, rows in grouped(results):
-        found = measured(rows)
-        share = float(np.mean([measures["valid_share"] for measures in found]))
+    for common, found in measured(results):
+        del common["reading"]
         for k, e in enumerate((by_tone(found, "omega") - truth).T):
             rmse, deviation = float(np.sqrt(np.mean(e**2))), float(np.std(e, ddof=1))
             yield {
-                **{name: value for name, value in common.items() if name != "reading"},
+                **common,
                 "tone": k + 1,
                 "data_sets": e.size,
                 "bound": float(bound[k]),
@@ -159,7 +161,7 @@ def efficiency(results: Results) -> Iterator[Row]:
                 "bias": float(np.mean(e)),
                 "bias_error": deviation / np.sqrt(e.size),
                 "deviation": deviation,
-                "valid_share": share,
+                "valid_share": valid_share(found),
             }
 
 

@@ -30,19 +30,16 @@ def tables(found: StudyResults) -> str:
     for name, title in TITLES.items():
         if name in found:
             parts += [f"### {title}", *paper_tables(found[name])]
-    for name, write in (
-        ("recovery", recovery_table),
-        ("recovery-in-noise", noisy_recovery_table),
-        ("efficiency", efficiency_table),
-    ):
+    beyond = {"recovery": recovery_table, "recovery-in-noise": noisy_recovery_table, "efficiency": efficiency_table}
+    for name, write in beyond.items():
         parts += write(found[name]) if name in found else []
     parts += ["### The formulas as they are printed", as_printed.table()]
     return "\n\n".join(parts) + "\n"
 
 
-def table(header: list[str], rows: list[list[str]], left: int = 1) -> str:
+def table(header: list[str], rows: list[list[str]]) -> str:
     """A table whose first column holds names."""
-    return Table(header, rows, "l" * left + "r" * (len(header) - left)).draw("md")
+    return Table(header, rows, "l".ljust(len(header), "r")).draw("md")
 
 
 def named(estimator: str) -> str:
@@ -78,19 +75,15 @@ def paper_tables(results: Results) -> list[str]:
         times = by_estimator(settled, reading=reading)
         rows = []
         for estimator, tones in by_estimator(left, reading=reading).items():
-            cells, wrong = settling_cells({row["piece"]: row for row in times.get(estimator, [])}, pieces)
-            errors = [number(tone["rms"], 2) for tone in tones]
-            rows.append([named(estimator), *cells, *errors, number(tones[0]["valid_share"], 3), wrong])
+            found = {row["piece"]: row for row in times.get(estimator, [])}
+            cells, wrong = ["-"] * (len(pieces) * len(BANDS)), None
+            if found:
+                cells = [time(found[piece][f"within_{band:g}"]) for piece in pieces for band in BANDS]
+                wrong = found[pieces[0]]["valid_but_off_by_0.05"]
+            cells += [number(tone["rms"], 2) for tone in tones]
+            rows.append([named(estimator), *cells, number(tones[0]["valid_share"], 3), number(wrong, 3)])
         written += [after.get(reading, "") + explained, table(header, rows)]
     return written
-
-
-def settling_cells(found: dict[str, Any], pieces: list[str]) -> tuple[list[str], str]:
-    """When an estimator has settled in each piece and band, and how long it was wrong and called valid."""
-    if not found:
-        return ["-"] * (len(pieces) * len(BANDS)), "-"
-    cells = [time(found[piece][f"within_{band:g}"]) for piece in pieces for band in BANDS]
-    return cells, number(next(iter(found.values()))["valid_but_off_by_0.05"], 3)
 
 
 def recovery_table(results: Results) -> list[str]:

@@ -126,7 +126,7 @@ def test_impossible_frequencies_are_refused(omega):
 @pytest.mark.parametrize(
     ("samples", "message"),
     [
-        (np.append(np.ones(500), np.nan), "ESPRIT needs a record without missing samples"),
+        (np.append(np.ones(500), np.nan), "ESPRIT takes no record with missing samples"),
         (np.ones(8), "8 samples, after the averaging, are too few for 2 tones"),
         (np.full(100, np.nan), "no finite sample"),
     ],

@@ -253,7 +253,7 @@ def test_impossible_options_are_refused(options, message):
 
 
 def test_options_that_the_clock_cannot_meet_are_refused():
-    with pytest.raises(ValueError, match=r"memory = 0.05 s holds fewer than the 8 samples"):
+    with pytest.raises(ValueError, match=r"memory = 0.05 s holds 5 samples of 0.01 s, fewer than the 8"):
         tracker(memory=0.05)
     with pytest.raises(ValueError, match=r"difference = 0.001 s is shorter than half a sampling interval"):
         tracker(difference=0.001)

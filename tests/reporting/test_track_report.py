@@ -31,7 +31,7 @@ def make_track(flags=None):
     flags = np.zeros(ROWS, np.uint16) if flags is None else flags
     omega = 2 * np.pi * HERTZ
     omega[(flags & int(Flag.GAP)) > 0] = np.nan
-    return RecordTrack(0.1 * np.arange(ROWS), omega, np.full((ROWS, 2), [2.0, 0.5]), flags, 0.1 * omega, 0.1)
+    return RecordTrack(0.1 * np.arange(ROWS), omega, flags, 0.1 * omega, np.full((ROWS, 2), [2.0, 0.5]), 0.1)
 
 
 @pytest.fixture(scope="module")
@@ -120,16 +120,16 @@ def test_words_of_flags():
 def test_figure(tones):
     flags = some_invalid()
     omega = 2 * np.pi * np.outer(1.0 + 0.01 * np.sin(np.arange(ROWS)), 10.0 * np.arange(1, tones + 1))
-    track = RecordTrack(0.1 * np.arange(ROWS), omega, 1.0 / omega, flags, omega, 0.1)
+    track = RecordTrack(0.1 * np.arange(ROWS), omega, flags, omega, 1.0 / omega, 0.1)
     one, two = (track_svg(track, 0.0, "Pa", "title") for _ in range(2))
     assert one == two
     assert one.startswith(b"<?xml")
     assert b"#e4e4e4" in one  # the shade of what is not valid
-    plain = RecordTrack(track.t, omega, 1.0 / omega, np.zeros(ROWS, np.uint16), omega, 0.1)
+    plain = RecordTrack(track.t, omega, np.zeros(ROWS, np.uint16), omega, 1.0 / omega, 0.1)
     assert b"#e4e4e4" not in track_svg(plain, 0.0, None, "title")
 
 
 def test_figure_without_anything_valid():
     nothing = np.full((3, 2), np.nan)
-    track = RecordTrack(np.arange(3.0), nothing, nothing, np.full(3, 2, np.uint16), nothing, 1.0)
+    track = RecordTrack(np.arange(3.0), nothing, np.full(3, 2, np.uint16), nothing, nothing, 1.0)
     assert track_svg(track, 0.0, None, "title").startswith(b"<?xml")
