@@ -109,13 +109,9 @@ def fit_sinusoids(samples: ArrayLike, interval: float, omega: ArrayLike, *, bias
     _, coefficients, residual = fit_amplitudes(y, t - middle, frequencies, bias=bias)
     n = frequencies.size
     phases = np.arctan2(coefficients[n : 2 * n], coefficients[:n]) - frequencies * middle
-    return Sinusoids(
-        frequencies,
-        np.hypot(coefficients[:n], coefficients[n : 2 * n]),
-        np.pi - np.mod(np.pi - phases, 2.0 * np.pi),
-        float(coefficients[2 * n]) if bias else 0.0,
-        float(np.sqrt(np.mean(residual**2))),
-    )
+    phases = np.pi - np.mod(np.pi - phases, 2.0 * np.pi)
+    amplitudes, constant = np.hypot(coefficients[:n], coefficients[n : 2 * n]), float(coefficients[2 * n :].sum())
+    return Sinusoids(frequencies, amplitudes, phases, constant, float(np.sqrt(np.mean(residual**2))))
 
 
 def present_samples(samples: ArrayLike, interval: float) -> tuple[Array, Array]:

@@ -251,7 +251,11 @@ def _choose_window(
             allowed = f"from {least * thin:.4g} s to {thinned.size * thin:.4g} s"
             raise ValueError(f"window must be {allowed}, not {window:g}.")
         return length, f"Windows of {length * thin:.4g} s, as asked for."
-    closest = _closest(band.expected, tones, thin)
+    # Smallest distance of a wanted tone from any other, from zero, and from its own image above Nyquist [rad/s].
+    wanted = band.expected[:tones]
+    distance = np.abs(wanted[:, None] - np.concatenate(([0.0], band.expected)))
+    distance[np.arange(tones), 1 + np.arange(tones)] = np.inf
+    closest = float(min(distance.min(), 2.0 * (np.pi / thin - wanted.max())))
     length = max(least, int(np.ceil(BEATS * 2.0 * np.pi / (closest * thin))))
     lengths = [length << k for k in range(DOUBLINGS + 1) if length << k <= LARGEST_SHARE * thinned.size]
     if length >= LARGEST_SHARE * thinned.size:
@@ -267,17 +271,9 @@ def _choose_window(
             best, best_share = length, share
         if share >= CERTAIN_SHARE:
             break
-    periods = best * thin * float(band.expected[:tones].min()) / (2.0 * np.pi)
+    periods = best * thin * float(wanted.min()) / (2.0 * np.pi)
     why = f"the frequencies are certain in {100 * best_share:.0f} % of those tried"
     return best, f"Windows of {best * thin:.4g} s, {periods:.3g} periods of the lowest tone: {why}."
-
-
-def _closest(expected: Array, tones: int, thin: float) -> float:
-    """Smallest distance of a wanted tone from any other, from zero, and from its own image above Nyquist [rad/s]."""
-    marks = np.concatenate(([0.0], expected))
-    distance = np.abs(expected[:tones, None] - marks)
-    distance[np.arange(tones), 1 + np.arange(tones)] = np.inf
-    return float(min(distance.min(), 2.0 * (np.pi / thin - expected[:tones].max())))
 
 
 def _options(kind: str, band: _Band, wanted: int, thin: float, window: float) -> tuple[dict[str, Any], str]:

@@ -168,17 +168,10 @@ def bounded_roots(
 
 @njit(cache=True, nogil=True)
 def decode(
-    theta: Array,
-    delay: float,
-    bottom: float,
-    top: float,
-    polynomial: Array,
-    quotient: Array,
-    roots: Array,
-    omega: Array,
+    theta: Array, delay: float, bottom: float, top: float, work: Array, quotient: Array, roots: Array, omega: Array
 ) -> int:
     """Frequencies that belong to the parameters of the delay regression, ascending; flags what was wrong."""
-    flags = bounded_roots(theta, bottom, top, polynomial, quotient, roots)
+    flags = bounded_roots(theta, bottom, top, work, quotient, roots)
     # The largest cosine is that of the lowest frequency.
     for i in range(theta.size):
         omega[i] = np.arccos(roots[i]) / delay

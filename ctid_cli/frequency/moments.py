@@ -89,14 +89,7 @@ def least_squares(gram: Array, factor: Array, scales: Array, theta: Array) -> No
 
 @njit(cache=True, nogil=True)
 def moment_uncertainty(
-    gram: Array,
-    factor: Array,
-    scales: Array,
-    misfit: float,
-    theta: Array,
-    sensitivities: Array,
-    uncertainty: Array,
-    rounding: Array,
+    gram: Array, factor: Array, scales: Array, misfit: float, theta: Array, slopes: Array, error: Array, rounding: Array
 ) -> None:
     r"""Error that the misfit of the equations would make if all of it lay in the worst direction.
 
@@ -113,12 +106,12 @@ def moment_uncertainty(
     direction = np.empty(n)
     for i in range(n):
         for k in range(n):
-            direction[k] = sensitivities[i, k] / scales[k]
+            direction[k] = slopes[i, k] / scales[k]
         # G^-1 g with g the sensitivities of this frequency, both in the scaled columns of the factor.
         substitute(factor, direction)
         square, length = 0.0, 0.0
         for k in range(n):
-            square += direction[k] * sensitivities[i, k] / scales[k]
+            square += direction[k] * slopes[i, k] / scales[k]
             length += abs(direction[k])
-        uncertainty[i] = np.sqrt(max(square, 0.0) * max(misfit, ROUNDING * size * size))
+        error[i] = np.sqrt(max(square, 0.0) * max(misfit, ROUNDING * size * size))
         rounding[i] = ROUNDING * size * length

@@ -85,9 +85,8 @@ class NonlinearLeastSquares(BatchEstimator):
         flags = Flag(0)
         if self.initial_frequencies is None:
             # A constant would take the place of a tone.
-            start = Esprit(tones=n, averaging=self.averaging).estimate(
-                np.asarray(samples, dtype=float) - (y.mean() if self.bias else 0.0), interval
-            )
+            centred = np.asarray(samples, dtype=float) - (y.mean() if self.bias else 0.0)
+            start = Esprit(tones=n, averaging=self.averaging).estimate(centred, interval)
             omega = start.omega
             flags |= start.flags & Flag.UNDETERMINED
         else:

@@ -57,6 +57,8 @@ def track_record(
         for place, found, part in follow(thinned, settings, step, on_progress or (lambda done, total: None))
     ]
     omega = np.array([found.omega for _, found, _ in rows])
+    flags = np.array([int(found.flags) for _, found, _ in rows], np.uint16)
+    uncertainty = np.array([found.uncertainty for _, found, _ in rows])
     with np.errstate(invalid="ignore"):
         gain = settings.decimation.gain(omega.ravel(), interval).reshape(omega.shape)
         amplitudes = np.where(gain > 0.0, np.array([row[2] for row in rows]) / np.where(gain > 0.0, gain, 1.0), np.nan)
@@ -64,14 +66,7 @@ def track_record(
     t = np.array([place for place, _, _ in rows]) * thin + settings.lag * interval
     if settings.estimator.online:
         t += settings.lag * interval
-    return RecordTrack(
-        t,
-        omega,
-        np.array([int(found.flags) for _, found, _ in rows], np.uint16),
-        np.array([found.uncertainty for _, found, _ in rows]),
-        amplitudes,
-        step * thin,
-    )
+    return RecordTrack(t, omega, flags, uncertainty, amplitudes, step * thin)
 
 
 _Follow = Iterator[tuple[float, WindowEstimate, Array]]

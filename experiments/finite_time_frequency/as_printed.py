@@ -35,11 +35,8 @@ def table() -> str:
 
 def rows() -> Iterator[list[str]]:
     """Lines of the table."""
-    yield from epsilon()
-    yield from start()
-    yield from sign()
-    yield from excitation()
-    yield from delay()
+    for part in (epsilon, start, sign, excitation, delay):
+        yield from part()
 
 
 def options(name: str, estimator: str = "finite_time", **changes: Any) -> Any:
