@@ -145,13 +145,7 @@ def choose_settings(
     length, sentence = _choose_window(thinned, thin, tones, band, chosen if batch else "esprit", window)
     options, how = _options(chosen, band, tones, thin, length * thin)
     estimator = resolve("frequency_estimator", chosen)(tones=band.expected.size, **options)
-    found = _hertz(peaks.omega[:tones])
-    reasons = [f"Strongest tones: {found} (median spectrum of segments of {peaks.segment:.4g} s)."]
-    if offset:
-        reasons.append(f"The mean, {offset:.4g}, is subtracted.")
-    if gaps and bridge:
-        reasons.append(f"Gaps of up to {bridge * interval:.3g} s are bridged by straight lines.")
-    reasons += band.sentences
+    reasons = [*_preparation(peaks, tones, offset, bridge * interval if gaps else 0.0), *band.sentences]
     if method is None:
         reasons.append(f"Method: {chosen}: {WHY[chosen]}.")
     if how:
@@ -163,6 +157,15 @@ def choose_settings(
 
 def _hertz(omega: Array) -> str:
     return ", ".join(f"{frequency:.5g}" for frequency in np.sort(omega) / (2.0 * np.pi)) + " Hz"
+
+
+def _preparation(peaks: Peaks, tones: int, offset: float, bridged: float) -> Iterator[str]:
+    found = _hertz(peaks.omega[:tones])
+    yield f"Strongest tones: {found} (median spectrum of segments of {peaks.segment:.4g} s)."
+    if offset:
+        yield f"The mean, {offset:.4g}, is subtracted."
+    if bridged:
+        yield f"Gaps of up to {bridged:.3g} s are bridged by straight lines."
 
 
 def _refuse_unusable(samples: Array, tones: int) -> None:

@@ -75,15 +75,19 @@ def paper_tables(results: Results) -> list[str]:
         times = by_estimator(settled, reading=reading)
         rows = []
         for estimator, tones in by_estimator(left, reading=reading).items():
-            found = {row["piece"]: row for row in times.get(estimator, [])}
-            cells, wrong = ["-"] * (len(pieces) * len(BANDS)), None
-            if found:
-                cells = [time(found[piece][f"within_{band:g}"]) for piece in pieces for band in BANDS]
-                wrong = found[pieces[0]]["valid_but_off_by_0.05"]
+            cells, wrong = settling_cells({row["piece"]: row for row in times.get(estimator, [])}, pieces)
             cells += [number(tone["rms"], 2) for tone in tones]
-            rows.append([named(estimator), *cells, number(tones[0]["valid_share"], 3), number(wrong, 3)])
+            rows.append([named(estimator), *cells, number(tones[0]["valid_share"], 3), wrong])
         written += [after.get(reading, "") + explained, table(header, rows)]
     return written
+
+
+def settling_cells(found: dict[str, Any], pieces: list[str]) -> tuple[list[str], str]:
+    """When an estimator has settled in each piece and band, and how long it was wrong and called valid."""
+    if not found:
+        return ["-"] * (len(pieces) * len(BANDS)), "-"
+    cells = [time(found[piece][f"within_{band:g}"]) for piece in pieces for band in BANDS]
+    return cells, number(found[pieces[0]]["valid_but_off_by_0.05"], 3)
 
 
 def recovery_table(results: Results) -> list[str]:
