@@ -244,12 +244,15 @@ class _NumeratorFit:
         theta[_numerator_places(self.terms)] = found.gains
         return AdditiveModel.from_theta(theta, self.terms, self.delay), found
 
+    def _without_poles(self) -> list[Term]:
+        """What stands beside the modes: the integrators, and a direct feedthrough."""
+        integrators = sum(term.integrators for term in self.terms)
+        found = [Term(0, integrators - 1, integrators)] if integrators else []
+        return [*found, Term(0, 0)] if any(term.zeros == term.order for term in self.terms) else found
+
     def reduced(self, poles: Sequence[complex], count: int) -> list[complex]:
         """The poles without which the output error would rise most, in all ``count``, conjugates counted."""
-        kept, integrators = list(poles), sum(term.integrators for term in self.terms)
-        # What stands beside the modes: the integrators, and a direct feedthrough.
-        others = [Term(0, integrators - 1, integrators)] if integrators else []
-        others += [Term(0, 0)] if any(term.zeros == term.order for term in self.terms) else []
+        kept, others = list(poles), self._without_poles()
         terms = [Term(2, 1) if pole.imag else Term(1, 0) for pole in kept] + others
         groups = [[pole] for pole in kept] + [[] for _ in others]
         responses = _responses(self.data, groups, terms, self.delay)

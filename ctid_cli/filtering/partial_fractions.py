@@ -62,7 +62,7 @@ def modal_condition(roots: ComplexArray, slopes: ComplexArray, curvatures: Compl
     return worst
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def add_mode(mapping: Array, row: int, column: int, paired: bool, weight: complex) -> None:
     """Add ``Re(weight z)`` of a mode, twice for a pair, to a row of a map."""
     if paired:

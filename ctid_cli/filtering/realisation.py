@@ -37,7 +37,7 @@ def scaled_roots(denominator: Array) -> tuple[float, ComplexArray]:
     return w0, polynomial_roots(scaled)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def horner(coefficients: Array, point: complex) -> tuple[complex, complex]:
     """Value and derivative of a polynomial."""
     value, slope = 0.0j, 0.0j
@@ -83,7 +83,10 @@ def polynomial_roots(coefficients: Array) -> ComplexArray:
             if j != i:
                 gap = min(gap, abs(raw[j] - raw[i]))
         for _ in range(3):
-            value, slope = horner(coefficients, raw[i])
+            value, slope = complex(1.0, 0.0), complex(0.0, 0.0)
+            for k in range(1, n + 1):
+                slope = slope * raw[i] + value
+                value = value * raw[i] + coefficients[k]
             if not abs(value) < 1e-3 * gap * abs(slope):
                 break
             raw[i] -= value / slope
@@ -108,7 +111,10 @@ def _simultaneous_roots(coefficients: Array, roots: ComplexArray) -> bool:
         settled = True
         for i in range(n):
             # A and A' by Horner; the step -A/(A' - A sum 1/(root - other)) takes the other roots out of A.
-            value, slope = horner(coefficients, roots[i])
+            value, slope = complex(1.0, 0.0), complex(0.0, 0.0)
+            for k in range(1, n + 1):
+                slope = slope * roots[i] + value
+                value = value * roots[i] + coefficients[k]
             if value == 0.0:
                 continue
             repulsion = 0.0j

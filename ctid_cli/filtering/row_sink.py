@@ -79,7 +79,7 @@ def emit(sink: RowSink, filled: int, written: int) -> int:
     return written + filled
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def row_filled(sink: RowSink, filled: int, written: int) -> tuple[int, int]:
     """Count one more column of the block, and empty it if it is full: the columns filled and the rows written."""
     if filled + 1 < BLOCK:
