@@ -19,7 +19,7 @@ from numba import njit
 from ctid_cli.arrays import Array
 from ctid_cli.filtering.exponential import HeldStep, exponential_minus_identity, place, row_norm
 from ctid_cli.filtering.filter_data import FilterData, clock_slack
-from ctid_cli.filtering.row_sink import RowSink, finish, row_filled
+from ctid_cli.filtering.row_sink import BLOCK, RowSink, emit, finish
 
 #: Digits per level and Taylor degree of the transitions on an irregular clock.
 BASE = 16
@@ -74,7 +74,10 @@ def regular_chain_pass(
             for i in range(ny):
                 block[nz + 2 + i, filled] = w[i]
             block[nz + 2 + ny, filled] = y[k] - x
-            filled, written = row_filled(sink, filled, written)
+            filled += 1
+            if filled == BLOCK:
+                written = emit(sink, filled, written)
+                filled = 0
         if output.size:
             output[k] = x
         # Read first, then step on: row k holds the states at sample k.
@@ -218,7 +221,10 @@ def irregular_chain_pass(
             for i in range(ny):
                 block[nz + 1 + i, filled] = filtered[i]
             block[nz + 1 + ny, filled] = y[k] - x
-            filled, written = row_filled(sink, filled, written)
+            filled += 1
+            if filled == BLOCK:
+                written = emit(sink, filled, written)
+                filled = 0
         if output.size:
             output[k] = x
         # w, driven by the samples themselves: held, or joined by straight lines.

@@ -15,7 +15,7 @@ from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.filtering.filter_data import FilterData, clock_slack, split_delay
-from ctid_cli.filtering.row_sink import RowSink, finish, row_filled
+from ctid_cli.filtering.row_sink import BLOCK, RowSink, emit, finish
 
 #: Below this |pole * step| the functions of a held step are summed as series, 1/(k + 2)! for k = 0 … 10; above it the
 #: closed forms lose less than 1/SMALL_STEP^3 of the rounding error.
@@ -64,7 +64,12 @@ def step_weights(pole: complex, step: float) -> StepWeights:
     decay, value, slope = _step_functions(x)
     square = step * step
     return StepWeights(
-        decay, step * decay, step * (1.0 + x * value), step * value, square * (value + x * slope), square * slope
+        decay,
+        step * decay,
+        step * (1.0 + x * value),
+        step * value,
+        square * (value + x * slope),
+        square * slope,
     )
 
 
@@ -187,7 +192,10 @@ def modal_pass(poles: ComplexArray, residues: ComplexArray, delay: float, data: 
             for i in range(modes):
                 row = put(block, row, filled, e[i], poles[i].imag != 0.0)
             block[row, filled] = y[k] - x
-            filled, written = row_filled(sink, filled, written)
+            filled += 1
+            if filled == BLOCK:
+                written = emit(sink, filled, written)
+                filled = 0
         if k + 1 < t.size:
             change = y[k + 1] - y[k] if y_foh else 0.0
             for i in range(modes):

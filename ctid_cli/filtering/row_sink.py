@@ -79,14 +79,6 @@ def emit(sink: RowSink, filled: int, written: int) -> int:
     return written + filled
 
 
-@njit(cache=True, nogil=True, forceinline=True)
-def row_filled(sink: RowSink, filled: int, written: int) -> tuple[int, int]:
-    """Count one more column of the block, and empty it if it is full: the columns filled and the rows written."""
-    if filled + 1 < BLOCK:
-        return filled + 1, written
-    return 0, emit(sink, BLOCK, written)
-
-
 @njit(cache=True, nogil=True)
 def finish(sink: RowSink, filled: int, written: int) -> None:
     """Empty the last block, and complete the moments, of which only the upper triangle was summed."""
