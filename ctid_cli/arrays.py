@@ -1,7 +1,5 @@
 """Names for the arrays that travel through the package."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

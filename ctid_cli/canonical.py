@@ -1,7 +1,5 @@
 """Plain data, as JSON can hold it, and the identity of what it describes."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """The errors that a user can meet, each with the exit code that the command line answers with."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

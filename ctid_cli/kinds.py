@@ -3,8 +3,6 @@
 Names lead to classes of every floor, so that nothing is imported before it is asked for.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import Any
 

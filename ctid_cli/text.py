@@ -1,7 +1,5 @@
 """How messages are put together, on every floor: enumerations, paragraphs, hints at names that are nearly right."""
 
-from __future__ import annotations
-
 import difflib
 import textwrap
 from collections.abc import Iterable

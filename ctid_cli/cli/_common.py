@@ -1,7 +1,5 @@
 """What all commands share: the results option, and how errors reach the user."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import json

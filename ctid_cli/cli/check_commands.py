@@ -1,7 +1,5 @@
 """``ctid check``: a command of its own for a FILE, and a group of further checks beside it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """``ctid fit``."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from functools import partial

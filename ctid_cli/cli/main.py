@@ -1,7 +1,5 @@
 """The ``ctid`` command: registers one function per command and nothing else."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

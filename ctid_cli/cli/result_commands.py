@@ -1,7 +1,5 @@
 """The commands that read results: ``ctid status``, ``table``, ``show``, ``export`` and ``figure``."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated, Literal

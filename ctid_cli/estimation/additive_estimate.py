@@ -1,7 +1,5 @@
 """From a start to an estimate of a sum of submodels with its covariance: what additive SRIVC and CLSRIVC share."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 

@@ -1,7 +1,5 @@
 """Compile every kernel once, so that no later process has to."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable
 from contextlib import suppress

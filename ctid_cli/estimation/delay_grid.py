@@ -1,7 +1,5 @@
 """A global search over the delay: a coarse grid behind a narrow low-pass filter, finer ones behind wider filters."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Protocol
 

@@ -6,8 +6,6 @@ cost minimised over the coefficients has the gradient ``g = eps_tau' eps`` and t
 of, filtered or not, samples or spectra, is the business of the *cost*.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol

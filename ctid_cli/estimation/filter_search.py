@@ -1,7 +1,5 @@
 """Useful redundancy over the delay: solver paths on the costs of several low-pass filters, ranked by their mean."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Output-error costs of low-pass-filtered data as functions of the delay, for searches that evaluate many of them."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace

@@ -12,8 +12,6 @@ that is a NamedTuple of arrays and numbers therefore runs compiled as a whole: n
 experiments, run the same text interpreted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Protocol

@@ -1,7 +1,5 @@
 """Measured records laid out for estimation: means, state before the record, and what is refused."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple

@@ -6,8 +6,6 @@ r"""Output-error cost with everything a measured record brings: delay, initial s
 C are the initial state, whatever happened before. C and the offset c belong to one experiment each, the rest is common.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Gauss-Newton on everything at once, from a minimum of the profile, and what may be asked of the estimate later."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Search over the delay of measured records: behind filters from coarse to fine, or on every sample."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """Useful redundancy: out of the local minima of one cost along the paths of others that share its global minimum."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

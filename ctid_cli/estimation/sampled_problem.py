@@ -1,7 +1,5 @@
 """The estimation problem of a single transfer function on the samples of one record."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

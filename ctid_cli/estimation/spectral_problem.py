@@ -10,8 +10,6 @@ projected out at every parameter vector, so that a record may start and end in m
 Parseval, the mean square over the window of the output error behind the filter L.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

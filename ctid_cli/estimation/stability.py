@@ -1,7 +1,5 @@
 """Stability of polynomials, and the reflection of unstable ones."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

@@ -1,7 +1,5 @@
 """Global estimation from measured records: a one-dimensional search over the delay, then Gauss-Newton on everything."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar

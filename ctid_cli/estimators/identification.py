@@ -1,7 +1,5 @@
 """A fit to measured records with everything that tells whether to believe it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

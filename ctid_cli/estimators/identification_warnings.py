@@ -1,7 +1,5 @@
 """What the user should know before using a model that was fitted to measured records, in sentences."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Simplified refined instrumental variables for continuous-time models (SRIVC) at a known delay."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 

@@ -1,7 +1,5 @@
 """Least squares with a state-variable filter."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

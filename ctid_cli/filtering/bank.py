@@ -16,8 +16,6 @@ rows                  signal
 Every refined instrumental variable step, cost, gradient and Hessian is a function of their second moments.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -9,8 +9,6 @@ The input state is advanced on the input's own breaks and only *read out* at ``t
 not depend on the delay, and on a regular clock the read-out is one constant map that need not be applied per sample.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Exact one-step maps of a linear system under a held input."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A record as the compiled passes take it: one named tuple of plain arrays."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

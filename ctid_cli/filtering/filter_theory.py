@@ -13,8 +13,6 @@ Equation numbers are those of Ha, Welsh and Alamir, "Useful redundancy in parame
 continuous-time models" (arXiv:1703.09344).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

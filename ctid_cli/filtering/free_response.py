@@ -7,8 +7,6 @@ The free response of submodel i after the first sample is that of ``C_i / (p^l A
           \frac{\partial x}{\partial a_k} = -\frac{p^k C_i}{p^l A_i^2}\delta .
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import factorial
 

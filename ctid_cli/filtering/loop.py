@@ -5,8 +5,6 @@ output is ``y = x + v``, and x is the response of the model to the held input u.
 instants.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple, get_args
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Butterworth low-pass filtering of a whole record, input and output alike."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

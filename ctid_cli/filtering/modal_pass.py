@@ -5,8 +5,6 @@ The standard rows are sums of partial fractions: the pass advances, for one pole
 ``[z(t_k - tau), w(t_k - tau), u(t_k - tau), e(t_k), y_k - x_k]``, real and imaginary part of a mode as two rows.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

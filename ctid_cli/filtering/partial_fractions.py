@@ -1,7 +1,5 @@
 """Partial fractions over simple poles, and how much rounding they amplify."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

@@ -6,8 +6,6 @@ and because a slow section only ever integrates what a faster one has settled, n
 of the poles. Everything runs in the polynomial's own time unit ``1/w0``, ``w0 = |a_n|^(1/n)``.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

@@ -1,7 +1,5 @@
 """Where the compiled passes put their rows: written out, or summed to second moments."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The sampled equivalent of a model behind a zero-order hold, and the response of a sum of submodels to any input."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Exact response of a transfer function to a held input, at any instants."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike

@@ -11,8 +11,6 @@ up to one real polynomial for the states at both ends of the window.
 By Parseval the mean square of v over the window is ``|V(0)|^2 + 2 sum_k |V(w_k)|^2``.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

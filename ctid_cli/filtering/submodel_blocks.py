@@ -3,8 +3,6 @@
 Recursions run along contiguous memory with their state in registers.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Partial fractions of a sum of submodels: psi and phi as maps of the rows of the compiled pass."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -9,8 +9,6 @@ within the pass, and a further ``z_u = 1/(s - p) u`` of the measured input makes
 Everything is done block by block, mode by mode, see :mod:`ctid_cli.filtering.submodel_blocks`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

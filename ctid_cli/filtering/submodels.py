@@ -12,8 +12,6 @@ own noise-free loop (González, Classens, Rojas, Welsh and Oomen, *Identificatio
 open and closed loop*, equations (10), (20), (29) and (31)).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

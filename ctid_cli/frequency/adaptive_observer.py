@@ -1,7 +1,5 @@
 """Frequencies from an adaptive observer: a comparator, derived, not the published algorithm."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 

@@ -1,7 +1,5 @@
 """Amplitudes, phases and bias by linear regression, once the frequencies are known."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Settings for the frequencies of a recorded signal, chosen from the record alone, with the reasons."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

@@ -4,8 +4,6 @@ With the delay h alone, a frequency w and all its aliases ``2 pi k/h - w``, ``2 
 second delay, a whole number of sampling intervals that shares no divisor with the first, they are not.
 """
 
-from __future__ import annotations
-
 from math import gcd
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fewer samples of a record, without what they could not show: band filters and the gaps before them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ r"""From the parameters of the delay regression to frequencies, and how far an e
 theta belongs to sinusoids at all. Noise can move a pair of roots off the real axis, or a root out of the interval.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

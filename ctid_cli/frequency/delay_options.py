@@ -1,7 +1,5 @@
 """Options that all estimators on the delay regression share, and what they mean at a sampling interval."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

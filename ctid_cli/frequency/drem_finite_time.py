@@ -1,7 +1,5 @@
 """Finite-time estimation of frequencies by dynamic regressor extension and mixing (DREM)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

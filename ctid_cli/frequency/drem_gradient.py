@@ -1,7 +1,5 @@
 """Gradient estimation of frequencies after dynamic regressor extension and mixing (DREM)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple

@@ -1,7 +1,5 @@
 """Frequencies from the mixed regressions (DREM) of a sliding window: finite time after every change of the signal."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 

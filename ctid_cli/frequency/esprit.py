@@ -1,7 +1,5 @@
 """Frequencies of a whole record by ESPRIT: estimation of signal parameters via rotational invariance techniques."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """Frequencies from a regression on filtered derivatives: a comparator, derived, not the published algorithm."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import comb
 from typing import ClassVar, Literal, NamedTuple, get_args

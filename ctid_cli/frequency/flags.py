@@ -1,7 +1,5 @@
 """Why an estimate must not be trusted, one bit for each reason."""
 
-from __future__ import annotations
-
 from enum import IntFlag
 
 #: Frequencies are called certain while the error that the misfit of the equations can make stays below this fraction of

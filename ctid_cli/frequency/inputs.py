@@ -1,7 +1,5 @@
 """What every estimator checks: bounds of frequencies, and samples."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -4,8 +4,6 @@ A sample goes through the delays into a row of the regression, n rows into the s
 ``Psi_k = Delta theta_k``, those into a back end, which estimates theta, and theta into frequencies and flags.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple

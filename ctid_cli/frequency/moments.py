@@ -1,7 +1,5 @@
 """Least squares from accumulated second moments, and how certain its result is."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

@@ -1,7 +1,5 @@
 """Frequencies of a whole record by nonlinear least squares: maximum likelihood in white Gaussian noise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

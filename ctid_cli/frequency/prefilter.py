@@ -1,7 +1,5 @@
 """Finite impulse responses in front of an estimator: they keep every sinusoid, and an exact estimate exact."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

@@ -1,7 +1,5 @@
 """Frequencies over time of a recorded signal, by any of the estimators."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 

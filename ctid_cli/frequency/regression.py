@@ -9,8 +9,6 @@ Dynamic regressor extension and mixing (DREM) stacks the regression at n instant
 adjugate of the regressor matrix: ``Psi_k = Delta theta_k`` with one determinant Delta for all k.
 """
 
-from __future__ import annotations
-
 from math import comb
 
 import numpy as np

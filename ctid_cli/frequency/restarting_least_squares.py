@@ -1,7 +1,5 @@
 """Frequencies by least squares on the delay regression, restarted when the signal changes: the recommended tracker."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple, get_args
 

@@ -1,7 +1,5 @@
 """The tones that stand out of a record's spectrum: where to look before anything is estimated."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

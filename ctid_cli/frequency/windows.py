@@ -1,7 +1,5 @@
 """Batch estimators over windows of a record."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

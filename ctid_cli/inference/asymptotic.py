@@ -1,7 +1,5 @@
 """Accuracy that refined instrumental variables reach on long records, known before any data are taken."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Literal
 

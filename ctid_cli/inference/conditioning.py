@@ -1,7 +1,5 @@
 """What an ill-conditioned covariance means, in words."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 

@@ -1,7 +1,5 @@
 """Asymptotic covariance of an output-error estimate with white residuals."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ctid_cli.arrays import Array

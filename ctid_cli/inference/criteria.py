@@ -1,7 +1,5 @@
 """Criteria for choosing between models fitted to the same samples."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

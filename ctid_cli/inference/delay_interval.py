@@ -1,7 +1,5 @@
 """Confidence interval of the delay from the profile of the cost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Poles, time constants, frequencies, damping and gain of estimated models, with their standard errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

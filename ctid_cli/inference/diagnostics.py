@@ -1,7 +1,5 @@
 """How well a simulated output follows a measured one."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,7 +1,5 @@
 """What sensors and recorders do to an output: outliers, limits, and coarse steps."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

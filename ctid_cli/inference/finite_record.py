@@ -1,7 +1,5 @@
 """Accuracy on a record of given length, from the sensitivities that its own input brings about."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

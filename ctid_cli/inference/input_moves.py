@@ -1,7 +1,5 @@
 """How the input of a record moves: constant, in a few steps, between levels, or continuously."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

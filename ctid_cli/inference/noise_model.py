@@ -1,7 +1,5 @@
 """Autoregressive model of stationary output noise, from residuals on a regular clock."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

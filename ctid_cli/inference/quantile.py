@@ -1,7 +1,5 @@
 """The quantile of the normal distribution on which intervals of estimates rest."""
 
-from __future__ import annotations
-
 from scipy.special import ndtri
 
 

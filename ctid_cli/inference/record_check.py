@@ -1,7 +1,5 @@
 """What a record is worth for identification, in numbers."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal

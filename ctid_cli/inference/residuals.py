@@ -1,7 +1,5 @@
 """Tests of the residuals: whether they are white, and whether they still depend on the input."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

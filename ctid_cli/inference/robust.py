@@ -1,7 +1,5 @@
 """Covariance of an output-error estimate whose residuals are coloured: the sandwich."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

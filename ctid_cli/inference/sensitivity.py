@@ -6,8 +6,6 @@ With ``theta = (a_1 … a_n, b_0 … b_m)`` and the delay last, the derivatives 
           \partial x/\partial\tau = -p\,x.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

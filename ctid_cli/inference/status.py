@@ -1,7 +1,5 @@
 """How an estimation ended, in a sentence for the user."""
 
-from __future__ import annotations
-
 from enum import Enum
 
 

@@ -7,8 +7,6 @@ A fraction with the distinct poles ``p_k``, l of its poles at the origin, and th
 A submodel collects some of these terms over their common denominator, whose constant term then is 1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice

@@ -1,7 +1,5 @@
 """Rational transfer functions in the Laplace variable, with a pure delay."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 

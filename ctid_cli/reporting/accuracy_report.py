@@ -1,7 +1,5 @@
 """What ``ctid check accuracy`` says: standard errors that the estimators of an experiment can reach."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The tables that are committed beside the program, and what made them."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Iterable, Mapping

@@ -1,7 +1,5 @@
 """What ``ctid table --check`` answers: do fresh percentages agree with committed tables and with the paper?"""
 
-from __future__ import annotations
-
 import json
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping, Sequence

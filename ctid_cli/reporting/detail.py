@@ -1,7 +1,5 @@
 """What ``ctid show`` answers: one estimate in full, what it was computed from, and the same once more."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

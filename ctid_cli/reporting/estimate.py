@@ -1,7 +1,5 @@
 """One estimate: its parameters with their uncertainty, and as a row of an export."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import nan

@@ -1,7 +1,5 @@
 """How accurate an estimator of a simulated experiment can be, by theory, by which formula, and in the long run."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What ``ctid check filters`` says of a filter set: whether it leads from every delay error to zero, and how."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from ctid_cli.filtering.filter_set import FilterCheck, FilterSet, sufficient_number_of_filters

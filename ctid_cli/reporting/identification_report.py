@@ -1,7 +1,5 @@
 """What ``ctid fit`` answers: a fit to measured records as text and as an object for JSON."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any

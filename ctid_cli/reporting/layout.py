@@ -1,7 +1,5 @@
 """How answers look: aligned text or Markdown, and how numbers are written in it."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

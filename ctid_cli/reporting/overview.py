@@ -1,7 +1,5 @@
 """What ``ctid status`` answers: how much of an experiment is done, and what went wrong."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict

@@ -17,8 +17,6 @@ Attributes of ``ParameterErrors``
   square of the standard errors over the standard deviation of the estimates.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass

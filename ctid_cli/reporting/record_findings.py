@@ -1,7 +1,5 @@
 """What a user should know of a record before any model is fitted, in sentences."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

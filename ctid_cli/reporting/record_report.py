@@ -1,7 +1,5 @@
 """What ``ctid check`` says of a record: findings in words, then the numbers they rest on."""
 
-from __future__ import annotations
-
 import math
 import shlex
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Results of experiments, read back from the folder that ``ctid run`` wrote them to."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from collections.abc import Collection, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Published studies: their tables, and which experiments fill them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache

@@ -1,7 +1,5 @@
 """Tables as blocks of a report: published ones with our percentages in them, and those of an experiment."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """What ``ctid table`` answers: published tables and experiments by name."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What ``ctid track`` answers: frequencies of a recorded signal as text, as an object for JSON, and as a file."""
 
-from __future__ import annotations
-
 import io
 import math
 from dataclasses import asdict

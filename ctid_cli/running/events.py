@@ -1,7 +1,5 @@
 """What a run reports while it goes on; whoever started it decides how to show it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

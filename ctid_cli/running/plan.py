@@ -1,7 +1,5 @@
 """From a specification to the data sets and estimates that it asks for."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -8,8 +8,6 @@ repeated alone; a job that kills its worker again is split into single estimates
 ``CRASHED``.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import queue

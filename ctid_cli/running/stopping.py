@@ -1,7 +1,5 @@
 """Requests to stop: an interrupt (Ctrl-C), a termination signal, or an event set by the caller."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -1,7 +1,5 @@
 """Worker processes: how they are set up, and how they end with their parent."""
 
-from __future__ import annotations
-
 import ctypes
 import faulthandler
 import os

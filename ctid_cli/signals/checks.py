@@ -3,8 +3,6 @@
 The sentence begins with the name of the option, or with a label that says more.
 """
 
-from __future__ import annotations
-
 import math
 from numbers import Integral, Real
 

@@ -1,7 +1,5 @@
 """Records from comma-separated files, with errors that name the line."""
 
-from __future__ import annotations
-
 import os
 import re
 import warnings

@@ -1,7 +1,5 @@
 """Inputs: each is a frozen dataclass of options that generates a held signal."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass

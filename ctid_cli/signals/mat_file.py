@@ -1,7 +1,5 @@
 """Columns from MATLAB files that hold plain arrays."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from collections.abc import Iterator, Mapping

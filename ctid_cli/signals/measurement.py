@@ -1,7 +1,5 @@
 """A measured record as it is: which columns it comes from, their units, and what was assumed in reading it."""
 
-from __future__ import annotations
-
 import itertools
 import os
 from collections.abc import Mapping

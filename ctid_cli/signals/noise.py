@@ -1,7 +1,5 @@
 """What is added to the output: white noise, and white innovations through a rational filter."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar

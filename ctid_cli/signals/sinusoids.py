@@ -1,7 +1,5 @@
 """Sums of sinusoids whose frequencies and amplitudes may step, and what disturbs them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, Literal, cast, get_args
 

@@ -1,7 +1,5 @@
 """Random streams that depend on what they are for and on the replicate, and on nothing else."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

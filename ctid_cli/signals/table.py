@@ -1,7 +1,5 @@
 """Named columns of numbers, wherever they come from, and the checks that make a record of three of them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass

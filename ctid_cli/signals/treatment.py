@@ -1,7 +1,5 @@
 """How the signals of a record are treated: the words that commands, specifications and options have in common."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 #: The input between its samples: held, or straight lines.

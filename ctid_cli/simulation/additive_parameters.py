@@ -1,7 +1,5 @@
 """Estimates in the parameters of submodels, whichever form they were estimated in."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

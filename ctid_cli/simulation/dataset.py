@@ -1,7 +1,5 @@
 """Data sets: the record that estimators are given, and what is known besides."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import os

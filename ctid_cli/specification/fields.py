@@ -1,7 +1,5 @@
 """Types of the values in a specification: numbers, lists to sweep, and what may be written in several ways."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Union

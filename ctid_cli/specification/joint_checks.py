@@ -1,7 +1,5 @@
 """What is wrong with a specification although every section is right by itself, and what is unwise in it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace

@@ -1,7 +1,5 @@
 """From a YAML file to a checked specification; everything that is wrong with it is reported at once."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any

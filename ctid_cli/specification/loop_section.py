@@ -1,7 +1,5 @@
 """The section for what closes a loop around the system."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Annotated, ClassVar
 

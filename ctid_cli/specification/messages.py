@@ -1,7 +1,5 @@
 """What is wrong with a value, in sentences: the one table from pydantic's errors to our own."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """What the docstring of an option dataclass or section says about each option: the source of schema, help, messages."""
 
-from __future__ import annotations
-
 import inspect
 import re
 from functools import cache

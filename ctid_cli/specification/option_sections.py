@@ -1,7 +1,5 @@
 """Sections whose ``kind`` selects an option dataclass of the floors below."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 from ctid_cli.specification.sections import Kinds, Section

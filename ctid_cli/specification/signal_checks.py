@@ -1,7 +1,5 @@
 """What is wrong with an experiment on a signal although every section is right by itself, and what is unwise in it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from functools import partial

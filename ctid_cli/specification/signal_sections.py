@@ -1,7 +1,5 @@
 """Sections of experiments on the frequencies of a signal: the signal, its disturbance, and what is stored of tracks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Annotated, ClassVar, Literal
 

@@ -4,8 +4,6 @@ Its canonical form has every default filled in and no trace of how the file was 
 identity of data and estimators.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path

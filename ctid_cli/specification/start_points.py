@@ -1,7 +1,5 @@
 """Where estimates start: what a start is called, and what it is on a data set."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import Literal, cast

@@ -1,7 +1,5 @@
 """The section for where estimators start: at an initial delay, or at initial parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 

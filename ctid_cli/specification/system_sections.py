@@ -1,7 +1,5 @@
 """Sections for the system to simulate: one fraction, or a sum of submodels."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Annotated, ClassVar
 

@@ -4,8 +4,6 @@ A column that is added here, and given a value where estimates are made, appears
 stored before, it is missing.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass

@@ -4,8 +4,6 @@
 results), ``timings.csv`` and ``provenance/`` (times, hosts, versions).
 """
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

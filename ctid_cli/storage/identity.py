@@ -11,8 +11,6 @@ in use. Only imports from `COMPUTING_FLOORS` are followed: what lies above them 
 there that turn a specification into options, and options into data sets and estimates, are named in `PATH`.
 """
 
-from __future__ import annotations
-
 import ast
 import ctypes
 import dataclasses

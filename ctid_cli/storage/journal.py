@@ -5,8 +5,6 @@ synchronisation). The file holds every estimate ever computed in the folder, als
 and one line for each run with everything that does not belong among the results: times, host, command.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

@@ -5,8 +5,6 @@ specification that made them, also by later versions that read specifications di
 a row of the table of estimates holds.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What is worth knowing about a run that does not belong among its results: command, host, versions."""
 
-from __future__ import annotations
-
 import os
 import platform
 import sys

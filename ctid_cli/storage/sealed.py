@@ -4,8 +4,6 @@ The bytes of the file depend on the results alone: rows are in the order of the 
 are not in it. It is made in memory, written beside the old one, synchronised, renamed, read back and compared.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The studies that are shipped with the program, one folder each with its ``study.yaml``, and their figures by name."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Claims of a study: what must hold of its results, with the number that decides."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ They are computed from the published specifications with fewer and shorter recor
 ``ctid run`` would, and must agree with those that were committed.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator, Mapping

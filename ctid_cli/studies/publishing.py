@@ -1,7 +1,5 @@
 """What is published of a study: tables, figures, claims, and the environment that made them, from one commit."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

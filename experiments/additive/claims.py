@@ -1,7 +1,5 @@
 """What must hold of the study's results: theory for long records, and the claims of the paper."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

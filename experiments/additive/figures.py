@@ -4,8 +4,6 @@ Numbers are those of González, Classens, Rojas, Welsh and Oomen, "Identificatio
 Open and Closed-loop" (arXiv:2401.01263). Figures 2 and 6 are computed from the specifications; the others show results.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray

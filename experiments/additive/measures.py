@@ -1,7 +1,5 @@
 """What the tables and the claims of the study share: errors, their ratios, and which standard errors are misused."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cache
 from typing import Any

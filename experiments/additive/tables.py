@@ -1,7 +1,5 @@
 """What is published of the study: all errors as numbers, and the tables that a reader wants to see."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What is published of the study: how often the intervals of each row cover, by parameter and formula."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

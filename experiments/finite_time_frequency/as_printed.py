@@ -1,7 +1,5 @@
 """What becomes of the four experiments, A to D, if the formulas of the paper are taken as they are printed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any

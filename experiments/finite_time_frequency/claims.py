@@ -1,7 +1,5 @@
 """What must hold of the study's results: the claims of the paper, and what is claimed beyond it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

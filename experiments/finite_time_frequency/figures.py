@@ -5,8 +5,6 @@ multi-sinusoidal signals in finite-time" (2020). Two of its four estimators are 
 their place is derived, and every figure says so.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

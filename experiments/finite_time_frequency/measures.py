@@ -1,7 +1,5 @@
 """What the stored runs of the study say: settling times, recovery after a step, errors against the Cramer-Rao bound."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """What is published of the study: everything that was measured as numbers, and the tables for a reader."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from ctid_cli.reporting.layout import Table, number

@@ -1,7 +1,5 @@
 """What must hold of the study's results."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from ctid_cli.reporting.comparison import compare

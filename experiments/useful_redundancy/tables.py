@@ -1,7 +1,5 @@
 """What is published of the study: its four tables, and every data set on which a method failed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

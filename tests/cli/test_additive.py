@@ -118,7 +118,7 @@ def test_validate_counts_the_work(ctid, tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "place"),
     [
-        ("kp: 0.0115", "kp: 0.575", ":7:3: loop.controller: the loop of the true system"),
+        ("kp: 0.0115", "kp: 0.575", ":7:3: loop.controller: the loop with"),
         ("variance: 0.01", "snr_db: 10", ":10:69: noise.snr_db: in a loop the noise feeds back"),
         ("[0.25, 0.25, 1]", "[0.25, -0.25, 1]", ":5:7: system.additive[1]: the submodel is unstable"),
         ("poles: 4", "poles: 5", ":14:23: starts.parameters[0]: the start has 4 poles"),
