@@ -198,7 +198,7 @@ def mse_ratio(one: Sequence[ParameterEstimates], other: Sequence[ParameterEstima
     if not one or [(g.experiment, g.samples) for g in one] != [(g.experiment, g.samples) for g in other]:
         raise ValueError("a ratio needs estimates of one experiment at the same numbers of samples")
 
-    def squares(group: ParameterEstimates) -> pd.Series[float]:
+    def squares(group: ParameterEstimates) -> "pd.Series[float]":
         if parameter not in group.names:
             raise UsageError(f"the system has no parameter {parameter!r}; it has {', '.join(group.names)}")
         k = group.names.index(parameter)

@@ -143,7 +143,7 @@ BROKEN = {
     "success that is always true": ("0.01", "0", 18, 33, "success.delay_relative_error", "above 0"),
     "relative error of no delay": ("delay: 8.0", "delay: 0", 18, 33, "success.delay_relative_error", "above zero"),
     "estimator twice": (
-        "starts:", "  one: {kind: svf, poles: 2, zeros: 0}\nstarts:", 16, 3, "estimators.one", "on line 10 and on line"
+        "starts:", "  one: {kind: svf, poles: 2, zeros: 0}\nstarts:", 16, 3, "estimators.one", "first on line 10"
     ),
     "estimator name": ("  one:", "  o ne:", 10, 3, "estimators.o ne", "letters, digits"),
     "tab": ("    poles: 2", "\tpoles: 2", 12, 1, "", "indent with spaces"),
