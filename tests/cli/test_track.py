@@ -137,7 +137,8 @@ def test_mistakes_are_one_sentence(ctid, tmp_path, t, y, options, message):
 def test_rows_farther_apart_than_the_record_is_long_are_one(ctid, record, tmp_path, method, every):
     done = ctid("track", record, "--tones", 2, "--every", every, "--method", method, "--out", tmp_path)
     assert len(pd.read_csv(tmp_path / "track.csv")) == 1
-    assert not done.stderr
+    # A slow machine may be told how far the record has been read.
+    assert {line.split(": ")[0] for line in done.stderr.splitlines()} <= {record.name}
 
 
 def test_many_single_samples_may_be_missing(ctid, tmp_path):
