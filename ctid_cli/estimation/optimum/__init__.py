@@ -1,0 +1,1 @@
+"""The least output error over a stated set of models."""

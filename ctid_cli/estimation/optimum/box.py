@@ -1,0 +1,220 @@
+r"""The stated set of admissible models, and the coordinates in which it is searched.
+
+Poles have magnitudes between the reciprocal of the record's length and ten over its interval; pairs a damping of .001
+at least and, on a regular clock, no more than the Nyquist frequency for an imaginary part: beyond it samples cannot
+tell a fast oscillation from a slow decay. The delay lies between its bounds. Without such a set an optimum need not
+exist: with a free initial state an undamped or a very slow pole fits noise, ever better.
+
+A pair has the coordinates ln w and ln zeta, which pass a damping of 1 smoothly; so two real poles near each other are a
+section too. Real poles further apart, or at a bound of the set, have ln p each, and a pair at the Nyquist frequency has
+the logarithms of its real and imaginary part: in these coordinates the set is a box wherever its border is met.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctid_cli.arrays import Array, BoolArray, ComplexArray
+from ctid_cli.estimation.optimum.chain import polynomial
+from ctid_cli.estimation.optimum.triangle import Delay
+from ctid_cli.filtering.filter_data import FilterData
+
+#: Fastest pole times the sampling interval, slowest times the record's length, least damping of a pair.
+FASTEST, SLOWEST, LEAST_DAMPING = 10.0, 1.0, 1e-3
+#: Real poles whose ratio is below this share a section.
+NEAR = 4.0
+#: A coordinate this close to a bound is at it.
+TOUCH = 1e-9
+
+
+@dataclass(frozen=True)
+class Box:
+    """Bounds of the poles [rad/s], of their damping [-] and of the delay [s]."""
+
+    slowest: float
+    fastest: float
+    #: Greatest imaginary part [rad/s].
+    nyquist: float = np.inf
+    delays: tuple[float, float] = (0.0, 0.0)
+    #: Sampling interval [s] where the cost has kinks at whole intervals of delay, else 0.
+    cell: float = 0.0
+    #: Delay [s] that counts as a step of one, a quarter period of what the output holds.
+    quarter: float = 1.0
+    least_damping: float = LEAST_DAMPING
+
+    @property
+    def delay_free(self) -> bool:
+        """Whether the delay is searched."""
+        return self.delays[0] < self.delays[1]
+
+    def __str__(self) -> str:
+        nyquist = f", imaginary parts up to {self.nyquist:.4g} rad/s" if np.isfinite(self.nyquist) else ""
+        return (
+            f"poles from {self.slowest:.4g} to {self.fastest:.4g} rad/s{nyquist}, damping of pairs at least "
+            f"{self.least_damping:g}, delay from {self.delays[0]:g} to {self.delays[1]:g} s"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """Sections, fastest first, and a delay."""
+
+    speed: Array
+    #: Damping of a pair; -1 marks a real pole.
+    damping: Array
+    #: Whether the imaginary part of a pair is at its bound.
+    edge: BoolArray
+    delay: Delay
+
+    @property
+    def poles(self) -> ComplexArray:
+        """Poles [rad/s], shape (n,)."""
+        found: list[complex] = []
+        for w, zeta in zip(self.speed.tolist(), self.damping.tolist(), strict=True):
+            if zeta < 0:
+                found.append(complex(-w))
+            elif zeta < 1:
+                found += [w * complex(-zeta, sign * np.sqrt(1 - zeta * zeta)) for sign in (1, -1)]
+            else:
+                # The product of both is w^2: the slow one without cancellation.
+                fast = w * (zeta + np.sqrt(zeta * zeta - 1))
+                found += [complex(-fast), complex(-w * w / fast)]
+        return np.array(found, dtype=complex)
+
+    @property
+    def denominator(self) -> Array:
+        """Monic polynomial, descending powers."""
+        return polynomial(self.speed, self.damping)
+
+    def jacobian(self) -> Array:
+        """Derivatives of ``ln w, ln zeta`` (or ln p) of all sections to the coordinates, block diagonal."""
+        n = np.where(self.damping < 0, 1, 2).sum()
+        result, k = np.eye(n), 0
+        for zeta, edge in zip(self.damping.tolist(), self.edge.tolist(), strict=True):
+            if edge:
+                swing = 1 - zeta * zeta
+                result[k : k + 2, k : k + 2] = [[1 - swing, swing], [swing, -swing]]
+            k += 1 if zeta < 0 else 2
+        return result
+
+    def shifted(self, step: Array) -> tuple[Array, Array]:
+        """Speeds and dampings a step away in the coordinates of the poles."""
+        speed, damping, k = self.speed.copy(), self.damping.copy(), 0
+        for i, (w, zeta, edge) in enumerate(
+            zip(self.speed.tolist(), self.damping.tolist(), self.edge.tolist(), strict=True)
+        ):
+            if zeta < 0:
+                speed[i] = w * np.exp(step[k])
+                k += 1
+                continue
+            first, second = np.exp(step[k : k + 2])
+            if edge:
+                real, imaginary = zeta * w * first, np.sqrt(1 - zeta * zeta) * w * second
+                speed[i] = np.hypot(real, imaginary)
+                damping[i] = real / speed[i]
+            else:
+                speed[i], damping[i] = w * first, zeta * second
+            k += 2
+        return speed, damping
+
+
+def box_of(data: FilterData, delays: tuple[float, float]) -> Box:
+    """The set that a record admits."""
+    used = data.t[data.use]
+    steps = np.diff(data.t)
+    length, interval = float(used[-1] - used[0]), float(np.median(steps))
+    # Root mean square frequency of the output, from its differences.
+    power = float(np.sum((data.y[1:] - data.y.mean()) ** 2 * steps))
+    rate = np.sqrt(float(np.sum(np.diff(data.y) ** 2 / steps)) / power) if power > 0 else 0.0
+    quarter = min(0.5 * np.pi / rate if rate > 0 else length, delays[1] - delays[0])
+    nyquist = np.pi / interval if data.interval > 0 else np.inf
+    return Box(SLOWEST / length, FASTEST / interval, nyquist, delays, data.interval, max(quarter, interval))
+
+
+def admissible(poles: ComplexArray, box: Box) -> ComplexArray:
+    """Poles moved to the nearest admissible ones, conjugates kept together."""
+    size = np.clip(np.abs(poles), box.slowest, box.fastest)
+    real = poles.imag == 0
+    damping = np.maximum(-poles.real / np.maximum(np.abs(poles), 1e-300), box.least_damping)
+    swing = size * np.sqrt(np.maximum(1 - damping**2, 0.0))
+    # At the greatest imaginary part the real part stays.
+    over = swing > box.nyquist
+    swing = np.where(over, box.nyquist, swing)
+    decay = np.where(over, np.maximum(size * damping, box.nyquist * box.least_damping), size * damping)
+    return np.where(real, -size + 0j, -decay + 1j * swing * np.sign(poles.imag))
+
+
+def point_of(poles: ComplexArray, delay: float, box: Box, cell: int | None = None) -> Point:
+    """Admissible sections with given poles."""
+    moved = admissible(np.asarray(poles, dtype=complex), box)
+    units = [
+        (abs(p), float(-p.real / abs(p)), bool(p.imag >= box.nyquist * (1 - TOUCH))) for p in moved[moved.imag > 0]
+    ]
+    reals = sorted((-moved[moved.imag == 0].real).tolist())
+    # The nearest real poles first; one at a bound stays alone, so that it can be frozen there.
+    while len(reals) > 1:
+        ratios = [
+            b / a if a > box.slowest * (1 + TOUCH) and b < box.fastest * (1 - TOUCH) else np.inf
+            for a, b in zip(reals, reals[1:], strict=False)
+        ]
+        k = int(np.argmin(ratios))
+        if ratios[k] > NEAR:
+            break
+        a, b = reals[k], reals[k + 1]
+        units.append((float(np.sqrt(a * b)), float(0.5 * (a + b) / np.sqrt(a * b)), False))
+        del reals[k : k + 2]
+    units += [(p, -1.0, False) for p in reals]
+    units.sort(key=lambda unit: -unit[0])
+    low, high = box.delays
+    tau = float(np.clip(delay, low, high))
+    if cell is None:
+        cell = int(np.floor(tau / box.cell)) if box.delay_free and box.cell > 0 else -1
+    return Point(
+        np.array([unit[0] for unit in units]),
+        np.array([unit[1] for unit in units]),
+        np.array([unit[2] for unit in units]),
+        Delay(tau, cell),
+    )
+
+
+def moved_by(point: Point, step: Array, box: Box) -> Point:
+    """The point a step away, the delay in quarter periods last, moved back to the set where it leaves it."""
+    speed, damping = point.shifted(step)
+    poles = Point(speed, damping, point.edge, point.delay).poles
+    tau = point.delay.seconds + (step[-1] * box.quarter if box.delay_free else 0.0)
+    if point.delay.cell < 0:
+        return point_of(poles, tau, box)
+    # In its own cell as long as it does not leave it; at a sample the cell tells which side is meant.
+    low, high = point.delay.cell * box.cell, (point.delay.cell + 1) * box.cell
+    for edge in (low, high):
+        if abs(tau - edge) < TOUCH * box.cell:
+            tau = edge
+    return point_of(poles, tau, box, point.delay.cell if low <= tau <= high else None)
+
+
+def frozen(point: Point, gradient: Array, box: Box) -> BoolArray:
+    """Coordinates at a bound whose gradient points outward; for the delay the bounds of its cell count."""
+    at_low: list[bool] = []
+    at_high: list[bool] = []
+    for w, zeta, edge in zip(point.speed.tolist(), point.damping.tolist(), point.edge.tolist(), strict=True):
+        slow, fast = w <= box.slowest * (1 + TOUCH), w >= box.fastest * (1 - TOUCH)
+        undamped = 0 <= zeta <= box.least_damping * (1 + TOUCH)
+        if zeta < 0:
+            at_low.append(slow)
+            at_high.append(fast)
+        elif edge:
+            at_low += [undamped, False]
+            at_high += [False, True]
+        else:
+            at_low += [slow, undamped]
+            at_high += [fast, False]
+    if box.delay_free:
+        edges = box.delays
+        if point.delay.cell >= 0:
+            edges = max(edges[0], point.delay.cell * box.cell), min(edges[1], (point.delay.cell + 1) * box.cell)
+        slack = TOUCH * (edges[1] - edges[0])
+        at_low.append(point.delay.seconds <= edges[0] + slack)
+        at_high.append(point.delay.seconds >= edges[1] - slack)
+    return (np.array(at_low) & (gradient > 0)) | (np.array(at_high) & (gradient < 0))

@@ -1,0 +1,116 @@
+"""The best output-error model of a record within the stated set, and how far that may be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctid_cli.arrays import Array
+from ctid_cli.estimation.optimum.box import Box, box_of, point_of
+from ctid_cli.estimation.optimum.chain import numerators
+from ctid_cli.estimation.optimum.search import Ending, Judged
+from ctid_cli.estimation.optimum.starts import SAME, Nest, random_points
+from ctid_cli.filtering.filter_data import FilterData
+from ctid_cli.models.transfer_function import TransferFunction
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """What is estimated beside the coefficients, and where the searches start."""
+
+    #: Least and greatest delay [s]; two equal numbers are a known delay.
+    delays: tuple[float, float] = (0.0, 0.0)
+    free_response: bool = False
+    offset: bool = False
+    #: Period [s] of a record that repeats for ever, else 0.
+    period: float = 0.0
+    #: Denominators and delays [s] that other estimators have found.
+    starts: Sequence[tuple[ArrayLike, float]] = ()
+    #: Further starts at random; by default ten and ten for each pole.
+    random_starts: int | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """The least output error that was found."""
+
+    #: Coefficients in descending powers, the denominator monic.
+    numerator: Array
+    denominator: Array
+    delay: float
+    #: Coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers; empty without one.
+    free_response: Array
+    offset: float
+    squared_error: float
+    ending: Ending
+    #: Fall of the squared error that Newton's step promises, as a fraction of it.
+    promise: float
+    #: Poles of the structure that have run to infinity, where a smaller model has the least squared error.
+    poles_at_infinity: int
+    #: Whether the delay sits in a kink of the cost, at a sample.
+    pinned: bool
+    tried: int
+    agree: int
+    evaluations: int
+    box: Box = field(repr=False)
+
+    @property
+    def model(self) -> TransferFunction:
+        """The model."""
+        return TransferFunction(self.numerator, self.denominator, self.delay)
+
+
+def best_output_error(
+    data: FilterData, poles: int, zeros: int, options: SearchOptions = SearchOptions()  # noqa: B008  # frozen
+) -> Optimum:
+    """Least sum of squared output errors of a structure and of all that it contains."""
+    box = box_of(data, options.delays)
+    nest = Nest(data, box, options.free_response, options.offset, options.period)
+    nest.optima(poles, zeros)
+    points = [point_of(np.roots(np.asarray(a, dtype=float)), delay, box) for a, delay in options.starts]
+    count = 10 + 10 * poles if options.random_starts is None else options.random_starts
+    points += random_points(poles, box, count, np.random.default_rng(options.seed))
+    nest.refine(poles, zeros, points)
+    best: Judged | None = None
+    lost = 0
+    for missing in range(poles - max(zeros, 1) + 1):
+        descent = nest.descent(zeros)
+        found = descent.settle(nest.optima(poles - missing, zeros)[0])
+        nest.evaluations += descent.evaluations
+        if best is None or found.local.squared_error < best.local.squared_error * (1 - 1e-9):
+            best, lost = found, missing
+    assert best is not None
+    least = best.local.squared_error
+    ends = np.array(nest.ends(poles - lost, zeros))
+    agree = int(np.count_nonzero(ends <= max(least, float(ends.min())) * (1 + SAME) + nest.descent(zeros).floor))
+    return _optimum(best, lost, ends.size, agree, nest)
+
+
+def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Optimum:
+    """The model in coefficients of polynomials."""
+    point, projected = best.local.point, best.local.projected
+    a = point.denominator
+    over = numerators(point.speed, point.damping)
+    b = projected.output @ over
+    if projected.direct:
+        b = np.concatenate(([0.0], b)) + projected.direct * a
+    return Optimum(
+        numerator=np.trim_zeros(b, "f") if b.any() else np.zeros(1),
+        denominator=a,
+        delay=point.delay.seconds,
+        free_response=projected.free @ over if nest.free_response else np.zeros(0),
+        offset=projected.offset,
+        squared_error=best.local.squared_error,
+        ending=best.ending,
+        promise=best.promise,
+        poles_at_infinity=lost,
+        pinned=best.pinned,
+        tried=tried,
+        agree=agree,
+        evaluations=nest.evaluations,
+        box=nest.box,
+    )

@@ -1,0 +1,139 @@
+"""Where searches start: from the optima of the smaller models, from given estimates, and at random."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.estimation.optimum.box import Box, Point, point_of
+from ctid_cli.estimation.optimum.projection import Problem
+from ctid_cli.estimation.optimum.search import Descent, Local
+from ctid_cli.filtering.filter_data import FilterData
+
+#: Poles tried beside those of a smaller model, and how many of them are refined.
+FREQUENCIES, DAMPINGS, REFINED = 24, (0.05, 0.3, 0.9), 2
+#: Optima kept of each structure, and how far the best of what is not yet one may lie above and still be refined.
+KEPT = 3
+#: Squared errors that differ by less than this fraction are those of one minimum.
+SAME = 1e-6
+#: Starts whose poles differ by less than this in logarithms are one.
+APART = 0.7
+#: Most delays of a profile.
+MOST_DELAYS = 100
+
+
+class Nest:
+    """The optima of a structure and of all that it contains, each found from those below it."""
+
+    def __init__(self, data: FilterData, box: Box, free_response: bool, offset: bool, period: float) -> None:
+        self.data, self.box = data, box
+        self.free_response, self.offset, self.period = free_response, offset, period
+        self.evaluations = 0
+        self._found: dict[tuple[int, int], list[Local]] = {}
+        self._ends: dict[tuple[int, int], list[float]] = {}
+
+    def descent(self, zeros: int) -> Descent:
+        """Searches with a numerator of that degree."""
+        return Descent(Problem(self.data, zeros, self.free_response, self.offset, self.period), self.box)
+
+    def optima(self, poles: int, zeros: int) -> list[Local]:
+        """The lowest minima of a structure that are known, the lowest first."""
+        key = poles, zeros
+        if key not in self._found:
+            self._found[key], self._ends[key] = [], []
+            self.refine(poles, zeros, self._from_below(poles, zeros))
+        return self._found[key]
+
+    def ends(self, poles: int, zeros: int) -> list[float]:
+        """Squared errors at which the searches for a structure have ended."""
+        return self._ends[poles, zeros]
+
+    def refine(self, poles: int, zeros: int, points: Iterable[Point]) -> None:
+        """Search from points, and keep the lowest minima."""
+        descent, kept = self.descent(zeros), self._found[poles, zeros]
+        for point in points:
+            local = descent.descend(point)
+            self._ends[poles, zeros].append(local.squared_error)
+            kept.append(local)
+        kept.sort(key=lambda local: local.squared_error)
+        distinct: list[Local] = []
+        for local in kept:
+            if not distinct or local.squared_error > distinct[-1].squared_error * (1 + SAME):
+                distinct.append(local)
+        self._found[poles, zeros] = distinct[:KEPT]
+        self.evaluations += descent.evaluations
+
+    def _from_below(self, poles: int, zeros: int) -> list[Point]:
+        """Starts from smaller models, and along the delay."""
+        if poles == 1:
+            smaller = [] if zeros == 0 else [(1, zeros - 1)]
+            seeds = [local.point for n, m in smaller for local in self.optima(n, m)]
+            if not seeds:
+                middle = 0.5 * (self.box.delays[0] + self.box.delays[1])
+                return self._along_delay(zeros, self._extended(zeros, [(np.zeros(0, dtype=complex), middle)], 1))
+            return seeds
+        descent = self.descent(zeros)
+        points: list[Point] = []
+        for n, m, added in ((poles, zeros - 1, 0), (poles - 1, zeros - 1, 1), (poles - 1, zeros, 1), (poles - 2, zeros - 2, 2)):
+            if n < 1 or m < 0 or m > n:
+                continue
+            seeds = [(local.point.poles, local.point.delay.seconds) for local in self.optima(n, m)]
+            if added == 0:
+                points += [point_of(roots, delay, self.box) for roots, delay in seeds]
+            else:
+                points += self._extended(zeros, seeds[:1], added)
+        ranked = sorted(points, key=lambda point: descent.value(point).squared_error)
+        self.evaluations += descent.evaluations
+        return self._along_delay(zeros, ranked)
+
+    def _extended(self, zeros: int, seeds: Sequence[tuple[ComplexArray, float]], added: int) -> list[Point]:
+        """The best few of all poles, or pairs, added to given ones, by elimination alone."""
+        descent = self.descent(zeros)
+        found: list[tuple[float, Array, Point]] = []
+        for roots, delay in seeds:
+            for w in np.geomspace(self.box.slowest, self.box.fastest, FREQUENCIES + 2)[1:-1].tolist():
+                for zeta in DAMPINGS if added == 2 else (1.0,):
+                    pole = w * complex(-zeta, np.sqrt(1 - zeta * zeta))
+                    new = [pole, pole.conjugate()] if added == 2 else [complex(-w)]
+                    point = point_of(np.concatenate((roots, new)), delay, self.box)
+                    where = np.array([np.log(w), np.log(zeta)])
+                    found.append((descent.value(point).squared_error, where, point))
+        self.evaluations += descent.evaluations
+        chosen: list[tuple[Array, Point]] = []
+        for _, where, point in sorted(found, key=lambda entry: entry[0]):
+            if len(chosen) < REFINED and all(np.abs(where - other).max() > APART for other, _ in chosen):
+                chosen.append((where, point))
+        return [point for _, point in chosen]
+
+    def _along_delay(self, zeros: int, points: list[Point]) -> list[Point]:
+        """Further starts at the minima of the profile over the delay, for the poles of the best start."""
+        low, high = self.box.delays
+        if low == high or not points:
+            return points
+        spacing = max(self.box.cell or 0.25 * self.box.quarter, (high - low) / MOST_DELAYS)
+        count = int(np.ceil((high - low) / spacing))
+        delays = low + (high - low) * (np.arange(count) + 0.5) / count
+        descent = self.descent(zeros)
+        best = points[0]
+        trials = [point_of(best.poles, delay, self.box) for delay in delays.tolist()]
+        errors = np.array([descent.value(trial).squared_error for trial in trials])
+        self.evaluations += descent.evaluations
+        padded = np.concatenate(([np.inf], errors, [np.inf]))
+        minima = np.flatnonzero((errors <= padded[:-2]) & (errors < padded[2:]))
+        lowest = minima[np.argsort(errors[minima])[:KEPT]]
+        return points + [trials[k] for k in lowest.tolist()]
+
+
+def random_points(poles: int, box: Box, count: int, rng: np.random.Generator) -> list[Point]:
+    """Starts drawn uniformly from the set: logarithms of frequencies and dampings, delays."""
+    points = []
+    for _ in range(count):
+        pairs = int(rng.integers(0, poles // 2 + 1))
+        w = np.exp(rng.uniform(np.log(box.slowest), np.log(box.fastest), poles - pairs))
+        zeta = np.exp(rng.uniform(np.log(box.least_damping), 0.0, pairs))
+        upper = w[:pairs] * (-zeta + 1j * np.sqrt(1 - zeta**2))
+        roots = np.concatenate((upper, upper.conj(), -w[pairs:]))
+        points.append(point_of(roots, float(rng.uniform(*box.delays)), box))
+    return points
