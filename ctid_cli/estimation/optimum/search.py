@@ -11,10 +11,11 @@ from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.estimation.optimum.box import TOUCH, Box, Point, frozen, moved_by
 from ctid_cli.estimation.optimum.projection import Problem, Projected, project, slopes
 
-#: Fall of the squared error that Newton's step may promise, as a fraction of it, at a minimum; the search aims deeper.
-CONVERGED, AIM = 1e-8, 1e-12
+#: Fall of the squared error that Newton's step may promise, as a fraction of it, at a minimum; what Newton's steps aim
+#: at, and where a descent leaves the rest to them.
+CONVERGED, AIM, NEAR = 1e-8, 1e-12, 1e-8
 #: Residuals of this fraction of the output are rounding, for which no relative fall means anything.
-ROUNDING = 1e-12
+ROUNDING = 1e-10
 #: Steps of a descent, consecutive rejections, and steps of Newton's method at its end.
 MOST_STEPS, MOST_REJECTIONS, MOST_NEWTON = 60, 12, 15
 #: Step of the differences of the gradient; eigenvalues below this fraction of the largest have no sign.
@@ -119,7 +120,7 @@ class Descent:
             scale = np.maximum(scale, _lengths(here))
             unit = scale[free]
             scaled, slope = curvature / np.outer(unit, unit), gradient / unit
-            if not free.any() or _promise(scaled, slope)[0] <= AIM * max(here.squared_error, self.floor):
+            if not free.any() or _promise(scaled, slope)[0] <= NEAR * max(here.squared_error, self.floor):
                 break
             step = np.zeros(free.size)
             for _ in range(MOST_REJECTIONS):

@@ -13,7 +13,7 @@ from ctid_cli.estimation.optimum.search import Descent, Local
 from ctid_cli.filtering.filter_data import FilterData
 
 #: Poles tried beside those of a smaller model, and how many of them are refined.
-FREQUENCIES, DAMPINGS, REFINED = 24, (0.05, 0.3, 0.9), 2
+FREQUENCIES, DAMPINGS, REFINED = 24, (0.05, 0.3, 0.9), 3
 #: Optima kept of each structure, and how far the best of what is not yet one may lie above and still be refined.
 KEPT = 3
 #: Squared errors that differ by less than this fraction are those of one minimum.
@@ -33,6 +33,7 @@ class Nest:
         self.evaluations = 0
         self._found: dict[tuple[int, int], list[Local]] = {}
         self._ends: dict[tuple[int, int], list[float]] = {}
+        self._spines: dict[int, Local] = {}
 
     def descent(self, zeros: int) -> Descent:
         """Searches with a numerator of that degree."""
@@ -45,6 +46,24 @@ class Nest:
             self._found[key], self._ends[key] = [], []
             self.refine(poles, zeros, self._from_below(poles, zeros))
         return self._found[key]
+
+    def _spine(self, poles: int) -> Local:
+        """A minimum with one zero less than poles, by adding both: with a free numerator every added pole helps."""
+        if poles not in self._spines:
+            points = [] if poles > 1 else self._alone(0)
+            for added in range(1, min(poles - 1, 2) + 1):
+                before = self._spine(poles - added).point
+                points += self._extended(poles - 1, [(before.poles, before.delay.seconds)], added)
+            points = self._along_delay(poles - 1, points)
+            descent = self.descent(poles - 1)
+            self._spines[poles] = min(map(descent.descend, points), key=lambda local: local.squared_error)
+            self.evaluations += descent.evaluations
+        return self._spines[poles]
+
+    def _alone(self, zeros: int) -> list[Point]:
+        """The best single poles."""
+        middle = 0.5 * (self.box.delays[0] + self.box.delays[1])
+        return self._extended(zeros, [(np.zeros(0, dtype=complex), middle)], 1)
 
     def ends(self, poles: int, zeros: int) -> list[float]:
         """Squared errors at which the searches for a structure have ended."""
@@ -67,16 +86,16 @@ class Nest:
 
     def _from_below(self, poles: int, zeros: int) -> list[Point]:
         """Starts from smaller models, and along the delay."""
-        if poles == 1:
-            smaller = [] if zeros == 0 else [(1, zeros - 1)]
-            seeds = [local.point for n, m in smaller for local in self.optima(n, m)]
-            if not seeds:
-                middle = 0.5 * (self.box.delays[0] + self.box.delays[1])
-                return self._along_delay(zeros, self._extended(zeros, [(np.zeros(0, dtype=complex), middle)], 1))
-            return seeds
         descent = self.descent(zeros)
-        points: list[Point] = []
-        for n, m, added in ((poles, zeros - 1, 0), (poles - 1, zeros - 1, 1), (poles - 1, zeros, 1), (poles - 2, zeros - 2, 2)):
+        points: list[Point] = [self._spine(poles).point]
+        below = (
+            (poles, zeros - 1, 0),
+            (poles - 1, zeros - 1, 1),
+            (poles - 1, zeros, 1),
+            (poles - 2, zeros - 2, 2),
+            (poles - 2, zeros, 2),
+        )
+        for n, m, added in below:
             if n < 1 or m < 0 or m > n:
                 continue
             seeds = [(local.point.poles, local.point.delay.seconds) for local in self.optima(n, m)]
