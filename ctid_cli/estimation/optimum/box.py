@@ -13,6 +13,7 @@ the logarithms of its real and imaginary part: in these coordinates the set is a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -157,7 +158,7 @@ def point_of(poles: ComplexArray, delay: float, box: Box, cell: int | None = Non
     while len(reals) > 1:
         ratios = [
             b / a if a > box.slowest * (1 + TOUCH) and b < box.fastest * (1 - TOUCH) else np.inf
-            for a, b in zip(reals, reals[1:], strict=False)
+            for a, b in pairwise(reals)
         ]
         k = int(np.argmin(ratios))
         if ratios[k] > NEAR:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -18,8 +19,14 @@ CONVERGED, AIM, NEAR = 1e-8, 1e-12, 1e-8
 ROUNDING = 1e-10
 #: Steps of a descent, consecutive rejections, and steps of Newton's method at its end.
 MOST_STEPS, MOST_REJECTIONS, MOST_NEWTON = 60, 12, 15
+#: Places that differ by less than this fraction in poles, dampings and squared error are on the way to one minimum.
+CLOSE = 0.01
 #: Step of the differences of the gradient; eigenvalues below this fraction of the largest have no sign.
 DIFFERENCE, FLAT = 1e-4, 1e-9
+#: Least way to the border of the set that a ridge has, in logarithms: a factor of two.
+RIDGE = float(np.log(2.0))
+#: Least first step along negative curvature.
+SADDLE = 0.1
 
 
 class Ending(Enum):
@@ -108,13 +115,19 @@ class Descent:
         across = self.local(other, here.projected)
         return across if across.gradient[-1] * side < 0 else here
 
-    def descend(self, start: Point, steps: int = MOST_STEPS) -> Local:
-        """Levenberg-Marquardt steps: Moré's scaling, Nielsen's damping, held coordinates frozen."""
+    def descend(self, start: Point, known: Sequence[Local] = ()) -> Local:
+        """Levenberg-Marquardt steps: Moré's scaling, Nielsen's damping, held coordinates frozen.
+
+        A search that comes close to a minimum that is known ends there.
+        """
         here = self.local(start)
         damping, factor, slow = 1e-3, 2.0, 0
         scale = np.zeros(here.gradient.size)
-        for _ in range(steps):
+        for _ in range(MOST_STEPS):
             here = self._faced(here)
+            for other in known:
+                if _alike(here, other, self.box):
+                    return other
             free = ~frozen(here.point, here.gradient, self.box)
             gradient, curvature = here.gradient[free], here.curvature[np.ix_(free, free)]
             scale = np.maximum(scale, _lengths(here))
@@ -126,16 +139,15 @@ class Descent:
             for _ in range(MOST_REJECTIONS):
                 step[free] = -np.linalg.solve(scaled + damping * np.eye(unit.size), slope) / unit
                 step /= max(1.0, float(np.abs(step).max()))
-                trial = moved_by(here.point, step, self.box)
-                found = self.value(trial)
-                fall = here.squared_error - found.squared_error
-                along = step[free]
-                promised = -float(2.0 * along @ gradient + along @ curvature @ along)
-                if fall > 0:
+                lower = self._lower(here, self._whole_and_to_edge(here.point, step))
+                if lower is not None:
                     break
                 damping, factor = damping * factor, factor * 2.0
             else:
                 break
+            along, trial, found = lower[0][free], *lower[1:]
+            fall = here.squared_error - found.squared_error
+            promised = -float(2.0 * along @ gradient + along @ curvature @ along)
             damping *= max(1.0 / 3.0, 1.0 - (2.0 * fall / promised - 1.0) ** 3) if promised > 0 else 1.0
             damping, factor = max(damping, 1e-12), 2.0
             slow = slow + 1 if fall < 1e-9 * here.squared_error else 0
@@ -168,9 +180,12 @@ class Descent:
 
     def settle(self, here: Local) -> Judged:
         """Newton's steps to the minimum itself, along negative curvature where there is any, and its kind."""
+        kinked = False
         for _ in range(MOST_NEWTON):
             here = self._faced(here)
             free = ~frozen(here.point, here.gradient, self.box)
+            if kinked:
+                free[-1] = False
             if not free.any():
                 return self._judged(here, free, 0.0, None)
             curvature = self.hessian(here)[np.ix_(free, free)]
@@ -179,35 +194,52 @@ class Descent:
             promise, values, vectors = _promise(scaled, slope)
             promise /= max(here.squared_error, self.floor)
             saddle = bool(values[0] < -FLAT * values[-1])
+            modes = values, vectors / unit[:, None]
             if not saddle and promise <= AIM:
-                return self._judged(here, free, promise, (values, vectors / unit[:, None]))
-            following = self._newton(here, free, unit, slope, values, vectors)
-            if following is None:
-                promise = np.inf if saddle else promise
-                return self._judged(here, free, promise, (values, vectors / unit[:, None]))
-            here = following
-        return self._judged(here, free, promise, (values, vectors / unit[:, None]))
+                return self._judged(here, free, promise, modes)
+            step = np.zeros(free.size)
+            step[free] = _newton_step(values, vectors, slope) / unit
+            length = float(np.abs(step).max())
+            # At a saddle the gradient says nothing about how far to go.
+            step *= (min(max(length, SADDLE), 1.0) if saddle else min(length, 1.0)) / max(length, 1e-300)
+            lower = None
+            for length in 0.4 ** np.arange(MOST_REJECTIONS):
+                whole = self._whole_and_to_edge(here.point, length * step)
+                lower = lower or self._lower(here, [*whole, -length * step] if saddle else whole)
+            if lower is not None:
+                here = self.local(*lower[1:])
+            elif free[-1] and self._in_a_kink(here, float(abs(step[-1]))):
+                kinked = True
+            else:
+                return self._judged(here, free, np.inf if saddle else promise, modes)
+        return self._judged(here, free, np.inf if saddle else promise, modes)
 
-    def _newton(
-        self, here: Local, free: BoolArray, unit: Array, slope: Array, values: Array, vectors: Array
-    ) -> Local | None:
-        """A step of Newton's method that lowers the squared error, or none."""
-        along = vectors.T @ slope
-        flat = FLAT * max(float(np.abs(values).max()), 1e-300)
-        parts = -along / np.maximum(np.abs(values), flat)
-        if values[0] < -flat:
-            parts[0] = -np.copysign(max(abs(parts[0]), np.sqrt(float(unit.max()))), along[0])
-        step = np.zeros(free.size)
-        step[free] = vectors @ parts / unit
-        step /= max(1.0, float(np.abs(step).max()))
-        for _ in range(MOST_REJECTIONS):
-            for sign in (1.0, -1.0) if values[0] < -flat else (1.0,):
-                trial = moved_by(here.point, sign * step, self.box)
-                found = self.value(trial)
-                if found.squared_error < here.squared_error:
-                    return self.local(trial, found)
-            step *= 0.4
+    def _lower(self, here: Local, steps: Sequence[Array]) -> tuple[Array, Point, Projected] | None:
+        """The first of several steps that lowers the squared error, with where it leads."""
+        for step in steps:
+            trial = moved_by(here.point, step, self.box)
+            found = self.value(trial)
+            if found.squared_error < here.squared_error:
+                return step, trial, found
         return None
+
+    def _whole_and_to_edge(self, point: Point, step: Array) -> list[Array]:
+        """A step, and where it crosses a sample its part up to there: a minimum may be in the kink itself."""
+        cell, tau = self.box.cell, point.delay.seconds
+        if point.delay.cell < 0 or step[-1] == 0.0:
+            return [step]
+        way = (point.delay.cell + (step[-1] > 0)) * cell - tau
+        part = way / (step[-1] * self.box.quarter)
+        return [step, part * step] if 0.0 < part < 1.0 else [step]
+
+    def _in_a_kink(self, here: Local, reach: float) -> bool:
+        """Whether the squared error rises on both sides of the delay, on a clock where any of them may be a kink."""
+        if not self.box.delay_free or here.point.delay.cell >= 0 or not reach > 0:
+            return False
+        step = np.zeros(here.gradient.size)
+        step[-1] = reach
+        ends = [self.local(moved_by(here.point, sign * step, self.box)).gradient[-1] for sign in (-1.0, 1.0)]
+        return bool(ends[0] <= 0 <= ends[1])
 
     def _judged(self, here: Local, free: BoolArray, promise: float, modes: tuple[Array, Array] | None) -> Judged:
         held = ~free
@@ -224,27 +256,63 @@ class Descent:
         return Judged(here, ending, promise, held, pinned)
 
     def _on_ridge(self, here: Local, free: BoolArray, values: Array, vectors: Array) -> bool:
-        """Whether the squared error moves by less than its variance as far as the set reaches."""
+        """Whether the squared error moves by less than the residual's variance as far as the set reaches.
+
+        The border must be a factor of two away: next to it a direction is short, not flat.
+        """
         variance = here.squared_error / max(self.count - free.size - self.problem.zeros - 1, 1)
         direction = np.zeros(free.size)
         direction[free] = vectors[:, 0] / np.abs(vectors[:, 0]).max()
-        # Twice the half squared error that the curvature promises for a step of one.
-        if values[0] / np.abs(vectors[:, 0]).max() ** 2 > variance or here.squared_error <= self.floor:
+        # What the curvature promises over a factor of two.
+        expected = values[0] * (RIDGE / np.abs(vectors[:, 0]).max()) ** 2
+        if expected > 4.0 * variance or here.squared_error <= self.floor:
             return False
         for sign in (1.0, -1.0):
-            last, length = here.point, 1.0
-            while True:
+            last = moved_by(here.point, 0.9 * sign * RIDGE * direction, self.box)
+            for length in RIDGE * 2.0 ** np.arange(8):
                 trial = moved_by(here.point, sign * length * direction, self.box)
+                if _same(trial, last):
+                    # At the border of the set.
+                    if length > RIDGE:
+                        return True
+                    break
                 if abs(self.value(trial).squared_error - here.squared_error) >= variance:
                     break
-                if trial.speed.size == last.speed.size and np.allclose(trial.speed, last.speed, rtol=1e-9) and (
-                    trial.delay.seconds == last.delay.seconds
-                ):
-                    return True
-                last, length = trial, 2.0 * length
-                if length > 64:
-                    return True
+                last = trial
         return False
+
+
+def _same(one: Point, other: Point) -> bool:
+    """Whether two points are one, up to rounding."""
+    return (
+        one.speed.size == other.speed.size
+        and np.allclose(one.speed, other.speed, rtol=1e-9)
+        and one.delay.seconds == other.delay.seconds
+    )
+
+
+def _alike(here: Local, other: Local, box: Box) -> bool:
+    """Whether two places are so close that one minimum must be meant."""
+    if not np.array_equal(here.point.damping < 0, other.point.damping < 0):
+        return False
+    away = np.concatenate((here.point.speed / other.point.speed - 1, here.point.damping / other.point.damping - 1))
+    later = (here.point.delay.seconds - other.point.delay.seconds) / box.quarter
+    return bool(
+        max(float(np.abs(away).max()), abs(later)) < CLOSE
+        and here.squared_error < (1 + CLOSE) * other.squared_error
+        and here.point.delay.cell == other.point.delay.cell
+    )
+
+
+def _newton_step(values: Array, vectors: Array, gradient: Array) -> Array:
+    """``-H^-1 g`` with the eigenvalues of H made positive; along a negative one a step of one at least."""
+    along = vectors.T @ gradient
+    flat = FLAT * max(float(np.abs(values).max()), 1e-300)
+    parts = -along / np.maximum(np.abs(values), flat)
+    if values[0] < -flat:
+        parts[0] = -np.copysign(max(abs(parts[0]), 1.0), along[0])
+    step: Array = vectors @ parts
+    return step
 
 
 def _lengths(here: Local) -> Array:

@@ -43,7 +43,6 @@ class Nest:
         """The lowest minima of a structure that are known, the lowest first."""
         key = poles, zeros
         if key not in self._found:
-            self._found[key], self._ends[key] = [], []
             self.refine(poles, zeros, self._from_below(poles, zeros))
         return self._found[key]
 
@@ -71,10 +70,11 @@ class Nest:
 
     def refine(self, poles: int, zeros: int, points: Iterable[Point]) -> None:
         """Search from points, and keep the lowest minima."""
-        descent, kept = self.descent(zeros), self._found[poles, zeros]
+        descent, kept = self.descent(zeros), self._found.setdefault((poles, zeros), [])
+        ends = self._ends.setdefault((poles, zeros), [])
         for point in points:
-            local = descent.descend(point)
-            self._ends[poles, zeros].append(local.squared_error)
+            local = descent.descend(point, kept)
+            ends.append(local.squared_error)
             kept.append(local)
         kept.sort(key=lambda local: local.squared_error)
         distinct: list[Local] = []
@@ -86,26 +86,26 @@ class Nest:
 
     def _from_below(self, poles: int, zeros: int) -> list[Point]:
         """Starts from smaller models, and along the delay."""
+        first, others = [self._spine(poles).point], []
+        if zeros > 0:
+            first.append(self.optima(poles, zeros - 1)[0].point)
+        if poles > 1 and zeros > 0:
+            # Contained in this structure whatever the added pole is, as is the one before.
+            contained = self._grown(poles - 1, zeros - 1, zeros, 1)
+            first, others = first + contained[:1], contained[1:]
+        for n, m in ((poles - 1, zeros), (poles - 2, zeros - 2), (poles - 2, zeros)):
+            if 0 <= m <= n and n > 0:
+                others += self._grown(n, m, zeros, poles - n)
         descent = self.descent(zeros)
-        points: list[Point] = [self._spine(poles).point]
-        below = (
-            (poles, zeros - 1, 0),
-            (poles - 1, zeros - 1, 1),
-            (poles - 1, zeros, 1),
-            (poles - 2, zeros - 2, 2),
-            (poles - 2, zeros, 2),
-        )
-        for n, m, added in below:
-            if n < 1 or m < 0 or m > n:
-                continue
-            seeds = [(local.point.poles, local.point.delay.seconds) for local in self.optima(n, m)]
-            if added == 0:
-                points += [point_of(roots, delay, self.box) for roots, delay in seeds]
-            else:
-                points += self._extended(zeros, seeds[:1], added)
-        ranked = sorted(points, key=lambda point: descent.value(point).squared_error)
+        others.sort(key=lambda point: descent.value(point).squared_error)
+        first.sort(key=lambda point: descent.value(point).squared_error)
         self.evaluations += descent.evaluations
-        return self._along_delay(zeros, ranked)
+        return self._along_delay(zeros, first + others[:REFINED])
+
+    def _grown(self, poles: int, zeros: int, new_zeros: int, added: int) -> list[Point]:
+        """The best of a smaller structure with poles added, for another numerator."""
+        point = self.optima(poles, zeros)[0].point
+        return self._extended(new_zeros, [(point.poles, point.delay.seconds)], added)
 
     def _extended(self, zeros: int, seeds: Sequence[tuple[ComplexArray, float]], added: int) -> list[Point]:
         """The best few of all poles, or pairs, added to given ones, by elimination alone."""

@@ -1,8 +1,8 @@
 r"""One pass over a record: the states at every used sample, reduced by orthogonal transformations to a triangle.
 
-With Z the rows ``[z, u, change of u, free response, 1, y]`` of all used samples, ``Z = Q R``: whatever is asked of linear
-maps of these rows (projections, residuals, sums of squares) is asked of the same maps of R, without squaring the
-condition as second moments would, and in memory that does not grow with the record.
+With Z the rows ``[z, u, change of u, free response, 1, y]`` of all used samples, ``Z = Q R``: whatever is asked of
+linear maps of these rows (projections, residuals, sums of squares) is asked of the same maps of R. Second moments would
+square the condition; this costs little more, so that one route serves the search and its end.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from numba import njit
 
 from ctid_cli.arrays import Array
 from ctid_cli.filtering.chain_pass import _step as irregular_step
+from ctid_cli.filtering.chain_pass import _Transitions as Transitions
 from ctid_cli.filtering.chain_pass import _transitions as transitions
 from ctid_cli.filtering.exponential import exponential_minus_identity, held_step
 from ctid_cli.filtering.filter_data import FilterData, clock_slack, split_delay
@@ -58,19 +59,21 @@ def _advance(transition: Array, z: Array, following: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _states_at_breaks(dynamics: Array, gain: Array, data: FilterData, period: float) -> Array:
+def _table(dynamics: Array, gain: Array, data: FilterData, longest: float) -> Transitions:
+    """Transitions over any step up to the longest, or next to nothing on a regular clock."""
+    if data.interval > 0.0:
+        return transitions(np.zeros((0, 0)), np.zeros(0), 0.0)
+    return transitions(dynamics, gain, longest)
+
+
+@njit(cache=True, nogil=True)
+def _states_at_breaks(dynamics: Array, gain: Array, data: FilterData, period: float, table: Transitions) -> Array:
     """States at every break of the input: from rest, or those of the input repeated for ever, shape (M, n)."""
     n, breaks = gain.size, data.tu.size
     u, tu = data.u, data.tu
     regular = data.interval > 0.0
     states = np.zeros((breaks + 1, n))
     step = held_step(dynamics, gain, data.interval)
-    longest = 0.0
-    for j in range(breaks - 1):
-        longest = max(longest, tu[j + 1] - tu[j])
-    if period > 0.0:
-        longest = max(longest, tu[0] + period - tu[breaks - 1])
-    table = transitions(dynamics, gain, 0.0 if regular else longest)
     full, work = np.zeros(n + 2), np.zeros(n + 2)
     # Twice for a periodic input: once from rest to the end of the period, where x_N is left over, and once more from
     # x0 = x_N + Phi^N x0. With X = Phi^N - I, which the exponential gives without cancellation, X x0 = -x_N.
@@ -108,7 +111,7 @@ def _free_states(chain: ChainState, data: FilterData) -> Array:
     for k in range(data.t.size - 1):
         longest = max(longest, data.t[k + 1] - data.t[k])
     regular = data.interval > 0.0
-    table = transitions(chain.free_dynamics, np.zeros(n), 0.0 if regular else longest)
+    table = _table(chain.free_dynamics, np.zeros(n), data, longest)
     now, following = np.zeros(n + 2), np.zeros(n + 2)
     row = 0
     for k in range(data.t.size):
@@ -168,7 +171,6 @@ def triangle_of(chain: ChainState, delay: Delay, data: FilterData, period: float
     q = n + free + 4
     triangle, block = np.zeros((q, q)), np.zeros((q, BLOCK))
     tu, u, breaks = data.tu, data.u, data.tu.size
-    states = _states_at_breaks(chain.dynamics, chain.gain, data, period)
     alone = _free_states(chain, data)
     regular = data.interval > 0.0
     shift, slack, longest = 0, 0.0, 0.0
@@ -179,7 +181,8 @@ def triangle_of(chain: ChainState, delay: Delay, data: FilterData, period: float
         for j in range(breaks - 1):
             longest = max(longest, tu[j + 1] - tu[j])
         longest = max(longest, data.t[-1] - delay.seconds - tu[-1], period)
-    table = transitions(chain.dynamics, chain.gain, longest)
+    table = _table(chain.dynamics, chain.gain, data, longest)
+    states = _states_at_breaks(chain.dynamics, chain.gain, data, period, table)
     now, work = np.zeros(n + 2), np.zeros(n + 2)
     filled, row, j = 0, 0, -1
     for k in range(data.t.size):

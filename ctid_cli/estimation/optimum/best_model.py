@@ -29,9 +29,16 @@ class SearchOptions:
     period: float = 0.0
     #: Denominators and delays [s] that other estimators have found.
     starts: Sequence[tuple[ArrayLike, float]] = ()
-    #: Further starts at random; by default ten and ten for each pole.
+    #: Whether the smaller models that the structure contains are fitted too: their optima are starts, and the least of
+    #: all is returned, so that the cost never rises with the structure. Without them only the given starts are refined.
+    nested: bool = True
+    #: Further starts at random; by default ten and ten for each pole, and none where smaller models are left out.
     random_starts: int | None = None
     seed: int = 0
+
+
+#: Nothing but the coefficients, from rest.
+PLAIN = SearchOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,20 +71,27 @@ class Optimum:
         return TransferFunction(self.numerator, self.denominator, self.delay)
 
 
-def best_output_error(
-    data: FilterData, poles: int, zeros: int, options: SearchOptions = SearchOptions()  # noqa: B008  # frozen
-) -> Optimum:
-    """Least sum of squared output errors of a structure and of all that it contains."""
+def best_output_error(data: FilterData, poles: int, zeros: int, options: SearchOptions = PLAIN) -> Optimum:
+    """Least sum of squared output errors of a structure and of all that it contains.
+
+    As many zeros as poles need a known delay. The free response begins at the first used sample.
+    """
+    if options.period > 0.0:
+        data = _one_period(data, options.period)
     box = box_of(data, options.delays)
     nest = Nest(data, box, options.free_response, options.offset, options.period)
-    nest.optima(poles, zeros)
-    points = [point_of(np.roots(np.asarray(a, dtype=float)), delay, box) for a, delay in options.starts]
-    count = 10 + 10 * poles if options.random_starts is None else options.random_starts
+    points = [point_of(np.roots(np.asarray(a, dtype=float)).astype(complex), tau, box) for a, tau in options.starts]
+    count = options.random_starts
+    if count is None:
+        count = 10 + 10 * poles if options.nested else 0
     points += random_points(poles, box, count, np.random.default_rng(options.seed))
+    if options.nested or not points:
+        nest.optima(poles, zeros)
     nest.refine(poles, zeros, points)
     best: Judged | None = None
     lost = 0
-    for missing in range(poles - max(zeros, 1) + 1):
+    # With a pole at infinity a model of one pole less, whatever its zeros, is in the closure of the structure.
+    for missing in range(poles - max(zeros, 1) + 1 if options.nested else 1):
         descent = nest.descent(zeros)
         found = descent.settle(nest.optima(poles - missing, zeros)[0])
         nest.evaluations += descent.evaluations
@@ -88,6 +102,15 @@ def best_output_error(
     ends = np.array(nest.ends(poles - lost, zeros))
     agree = int(np.count_nonzero(ends <= max(least, float(ends.min())) * (1 + SAME) + nest.descent(zeros).floor))
     return _optimum(best, lost, ends.size, agree, nest)
+
+
+def _one_period(data: FilterData, period: float) -> FilterData:
+    """The record with the breaks of its input within one period."""
+    within = data.tu < data.tu[0] + period * (1 - 1e-9)
+    if within.all():
+        return data
+    # A regular pass takes a break for each sample.
+    return data._replace(tu=data.tu[within].copy(), u=data.u[within].copy(), interval=0.0)
 
 
 def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Optimum:

@@ -1,0 +1,134 @@
+"""Variable projection against dense matrices, and its derivatives against differences."""
+
+import numpy as np
+import pytest
+
+from ctid_cli.estimation.optimum.box import Box, point_of
+from ctid_cli.estimation.optimum.chain import chain_dynamics, logarithmic_slopes, numerators
+from ctid_cli.estimation.optimum.projection import Problem, project, slopes
+from ctid_cli.estimation.optimum.triangle import Delay
+from ctid_cli.filtering.filter_data import filter_data
+from ctid_cli.signals.record import Record
+from tests.estimation.optimum.dense import squared_error
+from tests.estimation.optimum.systems import MODEL, record_of
+
+#: A point beside the model that the records are of.
+SPEED, DAMPING = np.array([4.0, 2.2, 0.4]), np.array([-1.0, 0.3, -1.0])
+POLES = np.array([-4.0, 2.2 * complex(-0.3, np.sqrt(0.91)), 2.2 * complex(-0.3, -np.sqrt(0.91)), -0.4])
+DENOMINATOR = np.poly(POLES).real
+CASES = [
+    {},
+    {"hold": "foh"},
+    {"regular": False},
+    {"regular": False, "hold": "foh"},
+]
+TREATMENTS = [
+    {},
+    {"offset": True},
+    {"free_response": True},
+    {"free_response": True, "offset": True},
+    {"periodic": True},
+    {"periodic": True, "offset": True},
+]
+
+
+def problem_of(record, zeros, free_response=False, offset=False, periodic=False):
+    period = float(record.t[-1] - record.t[0] + 0.5) if periodic else 0.0
+    return Problem(filter_data(record), zeros, free_response, offset, period)
+
+
+@pytest.mark.parametrize("treatment", TREATMENTS, ids=str)
+@pytest.mark.parametrize("case", CASES, ids=str)
+@pytest.mark.parametrize(("zeros", "delay"), [(0, 0.0), (2, 0.37), (3, 1.0), (4, 0.0)])
+def test_projection_is_that_of_dense_matrices(case, treatment, zeros, delay):
+    record = record_of(MODEL, np.random.default_rng(1), noise=0.1, offset=0.3, **case)
+    problem = problem_of(record, zeros, **treatment)
+    found = project(problem, SPEED, DAMPING, Delay(delay, -1)).squared_error
+    dense = squared_error(record, DENOMINATOR, zeros, delay, problem.free_response, problem.offset, problem.period)
+    np.testing.assert_allclose(found, dense, rtol=1e-8)
+
+
+@pytest.mark.parametrize("treatment", TREATMENTS, ids=str)
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_gradient_is_that_of_differences(case, treatment):
+    record = record_of(MODEL, np.random.default_rng(2), noise=0.1, offset=0.3, **case)
+    problem, delay = problem_of(record, 2, **treatment), Delay(0.37, -1)
+
+    def value(step):
+        speed, damping = SPEED.copy(), DAMPING.copy()
+        speed *= np.exp([step[0], step[1], step[3]])
+        damping[1] *= np.exp(step[2])
+        return project(problem, speed, damping, Delay(0.37 + step[4], -1)).squared_error
+
+    found = slopes(problem, SPEED, DAMPING, delay, project(problem, SPEED, DAMPING, delay), True)
+    steps = 1e-5 * np.eye(5)
+    differences = [(value(step) - value(-step)) / 4e-5 for step in steps]
+    np.testing.assert_allclose(found.gradient, differences, rtol=0, atol=1e-7 * np.abs(found.gradient).max())
+    assert found.squared_error == pytest.approx(value(np.zeros(5)), rel=1e-10)
+
+
+def test_curvature_is_that_of_the_gradient_where_residuals_vanish():
+    # Kaufman's J'J is the Hessian without residuals.
+    record = record_of(MODEL, np.random.default_rng(3))
+    problem = problem_of(record, 1)
+    point = point_of(MODEL.poles, MODEL.delay, Box(0.01, 20.0))
+    delay = Delay(MODEL.delay, -1)
+
+    def gradient(step):
+        speed, damping = point.shifted(step)
+        here = project(problem, speed, damping, delay)
+        return slopes(problem, speed, damping, delay, here, False).gradient
+
+    curvature = slopes(
+        problem, point.speed, point.damping, delay, project(problem, point.speed, point.damping, delay), False
+    )
+    differences = np.array([(gradient(step) - gradient(-step)) / 2e-4 for step in 1e-4 * np.eye(3)])
+    np.testing.assert_allclose(curvature.curvature, differences, rtol=0, atol=1e-6 * curvature.curvature.max())
+
+
+@pytest.mark.parametrize("cell", [3, 4])
+def test_a_sample_belongs_to_the_cells_on_both_sides(cell):
+    # The squared error is continuous there; its slope is that of each side.
+    record = record_of(MODEL, np.random.default_rng(4), noise=0.1)
+    problem = problem_of(record, 3)
+    at, side = Delay(2.0, cell), 1.0 if cell == 4 else -1.0
+    here = project(problem, SPEED, DAMPING, at)
+    assert here.squared_error == pytest.approx(project(problem, SPEED, DAMPING, Delay(2.0, -1)).squared_error)
+    beyond = [project(problem, SPEED, DAMPING, Delay(2.0 + side * step, -1)).squared_error for step in (1e-5, 2e-5)]
+    slope = side * (4 * beyond[0] - beyond[1] - 3 * here.squared_error) / 4e-5
+    assert slopes(problem, SPEED, DAMPING, at, here, True).gradient[-1] == pytest.approx(slope, rel=1e-5)
+
+
+def test_masked_samples_do_not_count():
+    record = record_of(MODEL, np.random.default_rng(5), noise=0.1)
+    y = record.y.copy()
+    y[[0, 1, 17, 18, 240]] = np.nan
+    masked = Record(record.t, y, record.input)
+    found = project(problem_of(masked, 2, True, True), SPEED, DAMPING, Delay(0.37, -1)).squared_error
+    np.testing.assert_allclose(found, squared_error(masked, DENOMINATOR, 2, 0.37, True, True), rtol=1e-8)
+
+
+def test_double_poles_are_no_special_case():
+    # Two real sections meet, and a section passes a damping of 1.
+    record = record_of(MODEL, np.random.default_rng(6), noise=0.1)
+    problem = problem_of(record, 2)
+    apart = project(problem, np.array([2.0, 2.0, 0.5]), -np.ones(3), Delay(0.0, -1)).squared_error
+    together = project(problem, np.array([2.0, 0.5]), np.array([1.0, -1.0]), Delay(0.0, -1)).squared_error
+    assert together == pytest.approx(apart, rel=1e-10)
+    below, above = (
+        project(problem, np.array([2.0, 0.5]), np.array([1.0 + d, -1.0]), Delay(0.0, -1)).squared_error
+        for d in (-1e-6, 1e-6)
+    )
+    assert below + above == pytest.approx(2 * together, rel=1e-10)
+
+
+def test_states_and_slopes_have_the_transfer_functions_that_they_claim():
+    F, g = chain_dynamics(SPEED, DAMPING)
+    rows, slopes_of = numerators(SPEED, DAMPING), logarithmic_slopes(SPEED, DAMPING, F)
+    for s in (0.3j, 1.0 + 2.0j, 5.0j):
+        states = np.linalg.solve(s * np.eye(4) - F, g)
+        np.testing.assert_allclose(states, [np.polyval(row, s) for row in rows] / np.polyval(DENOMINATOR, s))
+        # d ln A: p/(s + p), and (2 zeta w s + 2 w^2, 2 zeta w s)/(s^2 + 2 zeta w s + w^2).
+        middle = s * s + 1.32 * s + 4.84
+        expected = [4 / (s + 4), (1.32 * s + 9.68) / middle, 1.32 * s / middle, 0.4 / (s + 0.4)]
+        np.testing.assert_allclose(slopes_of @ states, expected)
