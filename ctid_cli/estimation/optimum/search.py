@@ -25,8 +25,8 @@ CLOSE = 0.01
 DIFFERENCE, FLAT = 1e-4, 1e-9
 #: Least way to the border of the set that a ridge has, in logarithms: a factor of two.
 RIDGE = float(np.log(2.0))
-#: Least first step along negative curvature.
-SADDLE = 0.1
+#: Least first step along negative curvature, and longest one over which second derivatives are kept.
+SADDLE, SHORT = 0.1, 0.01
 
 
 class Ending(Enum):
@@ -181,6 +181,7 @@ class Descent:
     def settle(self, here: Local) -> Judged:
         """Newton's steps to the minimum itself, along negative curvature where there is any, and its kind."""
         kinked = False
+        second: Array | None = None
         for _ in range(MOST_NEWTON):
             here = self._faced(here)
             free = ~frozen(here.point, here.gradient, self.box)
@@ -188,7 +189,9 @@ class Descent:
                 free[-1] = False
             if not free.any():
                 return self._judged(here, free, 0.0, None)
-            curvature = self.hessian(here)[np.ix_(free, free)]
+            fresh = second is None
+            second = self.hessian(here) if second is None else second
+            curvature = second[np.ix_(free, free)]
             unit = _lengths(here)[free]
             scaled, slope = curvature / np.outer(unit, unit), here.gradient[free] / unit
             promise, values, vectors = _promise(scaled, slope)
@@ -207,7 +210,13 @@ class Descent:
                 whole = self._whole_and_to_edge(here.point, length * step)
                 lower = lower or self._lower(here, [*whole, -length * step] if saddle else whole)
             if lower is not None:
+                # After a short step the second derivatives are still good enough to tell that it was the last.
+                same = np.array_equal(lower[1].damping < 0, here.point.damping < 0)
+                short = float(np.abs(lower[0]).max()) < SHORT
                 here = self.local(*lower[1:])
+                second = second if fresh and same and short else None
+            elif not fresh:
+                second = None
             elif free[-1] and self._in_a_kink(here, float(abs(step[-1]))):
                 kinked = True
             else:
