@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.optimum.box import Box, box_of, point_of
 from ctid_cli.estimation.optimum.chain import numerators
+from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import Ending, Judged
 from ctid_cli.estimation.optimum.starts import SAME, Nest, random_points
 from ctid_cli.filtering.filter_data import FilterData
@@ -25,8 +26,8 @@ class SearchOptions:
     delays: tuple[float, float] = (0.0, 0.0)
     free_response: bool = False
     offset: bool = False
-    #: Period [s] of a record that repeats for ever, else 0.
-    period: float = 0.0
+    #: Period [s] of each record that repeats for ever, 0 for another; by default none repeats.
+    periods: Sequence[float] = ()
     #: Denominators and delays [s] that other estimators have found.
     starts: Sequence[tuple[ArrayLike, float]] = ()
     #: Whether the smaller models that the structure contains are fitted too: their optima are starts, and the least of
@@ -49,9 +50,9 @@ class Optimum:
     numerator: Array
     denominator: Array
     delay: float
-    #: Coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers; empty without one.
-    free_response: Array
-    offset: float
+    #: Of each record, coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers (zeros without one), and offset.
+    free_responses: Array
+    offsets: Array
     squared_error: float
     ending: Ending
     #: Fall of the squared error that Newton's step promises, as a fraction of it.
@@ -71,15 +72,13 @@ class Optimum:
         return TransferFunction(self.numerator, self.denominator, self.delay)
 
 
-def best_output_error(data: FilterData, poles: int, zeros: int, options: SearchOptions = PLAIN) -> Optimum:
+def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, options: SearchOptions = PLAIN) -> Optimum:
     """Least sum of squared output errors of a structure and of all that it contains.
 
-    As many zeros as poles need a known delay. The free response begins at the first used sample.
+    As many zeros as poles need a known delay. Free responses begin at the first used sample of each record.
     """
-    if options.period > 0.0:
-        data = _one_period(data, options.period)
-    box = box_of(data, options.delays)
-    nest = Nest(data, box, options.free_response, options.offset, options.period)
+    problem, box = problem_of(records, zeros, options), box_of(records, options.delays)
+    nest = Nest(problem, box)
     points = [point_of(np.roots(np.asarray(a, dtype=float)).astype(complex), tau, box) for a, tau in options.starts]
     count = options.random_starts
     if count is None:
@@ -91,7 +90,8 @@ def best_output_error(data: FilterData, poles: int, zeros: int, options: SearchO
     best: Judged | None = None
     lost = 0
     # With a pole at infinity a model of one pole less, whatever its zeros, is in the closure of the structure.
-    for missing in range(poles - max(zeros, 1) + 1 if options.nested else 1):
+    fewest = max(zeros + int(box.delay_free), 1)
+    for missing in range(poles - fewest + 1 if options.nested else 1):
         descent = nest.descent(zeros)
         found = descent.settle(nest.optima(poles - missing, zeros)[0])
         nest.evaluations += descent.evaluations
@@ -102,6 +102,13 @@ def best_output_error(data: FilterData, poles: int, zeros: int, options: SearchO
     ends = np.array(nest.ends(poles - lost, zeros))
     agree = int(np.count_nonzero(ends <= max(least, float(ends.min())) * (1 + SAME) + nest.descent(zeros).floor))
     return _optimum(best, lost, ends.size, agree, nest)
+
+
+def problem_of(records: Sequence[FilterData], zeros: int, options: SearchOptions) -> Problem:
+    """The records and what is eliminated with them."""
+    periods = tuple(options.periods) or (0.0,) * len(records)
+    data = tuple(_one_period(*pair) if pair[1] else pair[0] for pair in zip(records, periods, strict=True))
+    return Problem(data, zeros, options.free_response, options.offset, periods)
 
 
 def _one_period(data: FilterData, period: float) -> FilterData:
@@ -125,8 +132,8 @@ def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Opt
         numerator=np.trim_zeros(b, "f") if b.any() else np.zeros(1),
         denominator=a,
         delay=point.delay.seconds,
-        free_response=projected.free @ over if nest.free_response else np.zeros(0),
-        offset=projected.offset,
+        free_responses=projected.free @ over,
+        offsets=projected.offset,
         squared_error=best.local.squared_error,
         ending=best.ending,
         promise=best.promise,

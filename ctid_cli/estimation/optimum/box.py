@@ -12,6 +12,7 @@ the logarithms of its real and imaginary part: in these coordinates the set is a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -49,13 +50,6 @@ class Box:
     def delay_free(self) -> bool:
         """Whether the delay is searched."""
         return self.delays[0] < self.delays[1]
-
-    def __str__(self) -> str:
-        nyquist = f", imaginary parts up to {self.nyquist:.4g} rad/s" if np.isfinite(self.nyquist) else ""
-        return (
-            f"poles from {self.slowest:.4g} to {self.fastest:.4g} rad/s{nyquist}, damping of pairs at least "
-            f"{self.least_damping:g}, delay from {self.delays[0]:g} to {self.delays[1]:g} s"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,17 +115,22 @@ class Point:
         return speed, damping
 
 
-def box_of(data: FilterData, delays: tuple[float, float]) -> Box:
-    """The set that a record admits."""
-    used = data.t[data.use]
-    steps = np.diff(data.t)
-    length, interval = float(used[-1] - used[0]), float(np.median(steps))
-    # Root mean square frequency of the output, from its differences.
-    power = float(np.sum((data.y[1:] - data.y.mean()) ** 2 * steps))
-    rate = np.sqrt(float(np.sum(np.diff(data.y) ** 2 / steps)) / power) if power > 0 else 0.0
+def box_of(records: Sequence[FilterData], delays: tuple[float, float]) -> Box:
+    """The set that records admit."""
+    length, interval, rate, cells = 0.0, np.inf, 0.0, set()
+    for data in records:
+        used, steps = data.t[data.use], np.diff(data.t)
+        length, interval = max(length, float(used[-1] - used[0])), min(interval, float(np.median(steps)))
+        # Root mean square frequency of the output, from its differences.
+        power = float(np.sum((data.y[1:] - data.y.mean()) ** 2 * steps))
+        if power > 0:
+            rate = max(rate, float(np.sqrt(np.sum(np.diff(data.y) ** 2 / steps) / power)))
+        cells.add(data.interval)
     quarter = min(0.5 * np.pi / rate if rate > 0 else length, delays[1] - delays[0])
-    nyquist = np.pi / interval if data.interval > 0 else np.inf
-    return Box(SLOWEST / length, FASTEST / interval, nyquist, delays, data.interval, max(quarter, interval))
+    nyquist = np.pi / interval if min(cells) > 0 else np.inf
+    # Clocks of different intervals have their kinks all over the place.
+    cell = cells.pop() if len(cells) == 1 else 0.0
+    return Box(SLOWEST / length, FASTEST / interval, nyquist, delays, cell, max(quarter, interval))
 
 
 def admissible(poles: ComplexArray, box: Box) -> ComplexArray:

@@ -21,8 +21,7 @@ from numba import njit
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.optimum.chain import chain_dynamics, driven_chain, logarithmic_slopes
-from ctid_cli.estimation.optimum.triangle import ChainState, Delay, place_of, triangle_of
-from ctid_cli.filtering.exponential import held_step
+from ctid_cli.estimation.optimum.triangle import ChainState, Delay, rows_of
 from ctid_cli.filtering.filter_data import FilterData
 
 #: Singular values of the scaled columns below this fraction of the largest count as zero.
@@ -30,26 +29,27 @@ RANK_TOLERANCE = 1e-11
 
 
 class Problem(NamedTuple):
-    """A record, and what is eliminated with it."""
+    """Records, and what is eliminated with them."""
 
-    data: FilterData
+    records: tuple[FilterData, ...]
     #: Degree of the numerator.
     zeros: int
     free_response: bool
     offset: bool
-    #: Period [s] of a record that repeats for ever, else 0.
-    period: float
+    #: Period [s] of each record that repeats for ever, else 0.
+    periods: tuple[float, ...]
 
 
 class Projected(NamedTuple):
     """The least squares for given poles and delay."""
 
     squared_error: float
-    #: Weights of the states, of u itself, of the states of the free response, and the offset.
+    #: Weights of the states, and of u itself.
     output: Array
     direct: float
+    #: Weights of the states of the free response, and offset, of each record: shapes (K, n) and (K,).
     free: Array
-    offset: float
+    offset: Array
 
 
 class Slopes(NamedTuple):
@@ -62,41 +62,23 @@ class Slopes(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _readout(dynamics: Array, gain: Array, delay: Delay, data: FilterData) -> Array:
-    """Map from ``[z, u, change of u]`` of a triangle to ``[z, u]`` at the instants read, shape (n + 1, n + 2)."""
-    n = gain.size
-    readout = np.zeros((n + 1, n + 2))
-    fraction = place_of(delay, data.interval)[1] if data.interval > 0.0 else 0.0
-    part = held_step(dynamics, gain, fraction * data.interval)
-    for i in range(n):
-        for j in range(n):
-            readout[i, j] = part.transition[i, j]
-        # v and its change over the *part* of the interval.
-        readout[i, n], readout[i, n + 1] = part.from_value[i], part.from_change[i] * fraction
-    readout[n, n], readout[n, n + 1] = 1.0, fraction
-    return readout
-
-
-@njit(cache=True, nogil=True)
-def _columns(triangle: Array, readout: Array, n: int, problem: Problem) -> Array:
-    """The columns Phi in the coordinates of a triangle whose chains begin with the n states."""
-    m = problem.zeros
-    proper = min(m, n - 1) + 1
-    forced = readout.shape[0] - 1
-    width = proper + (1 if m == n else 0) + (n if problem.free_response else 0) + (1 if problem.offset else 0)
-    columns = np.zeros((triangle.shape[0], width))
-    internal = np.ascontiguousarray(triangle[:, : forced + 2])
-    for i in range(proper):
-        columns[:, i] = internal @ readout[n - proper + i]
-    place = proper
-    if m == n:
-        columns[:, place] = internal @ readout[forced]
-        place += 1
-    if problem.free_response:
-        columns[:, place : place + n] = triangle[:, forced + 2 : forced + 2 + n]
-        place += n
-    if problem.offset:
-        columns[:, place] = triangle[:, -2]
+def _columns(rows: Array, n: int, forced: int, zeros: int, free: bool, offset: bool) -> Array:
+    """The columns Phi from rows of all records whose chains, of ``forced`` states, begin with the n states."""
+    records, q = rows.shape[0], rows.shape[1]
+    proper = min(zeros, n - 1) + 1
+    shared = proper + (1 if zeros == n else 0)
+    own = (n if free else 0) + (1 if offset else 0)
+    columns = np.zeros((records * q, shared + records * own))
+    for k in range(records):
+        part = columns[k * q : (k + 1) * q]
+        part[:, :proper] = rows[k, :, n - proper : n]
+        if zeros == n:
+            part[:, proper] = rows[k, :, forced]
+        place = shared + k * own
+        if free:
+            part[:, place : place + n] = rows[k, :, forced + 1 : forced + 1 + n]
+        if offset:
+            part[:, place + own - 1] = rows[k, :, -2]
     return columns
 
 
@@ -115,65 +97,91 @@ def _factored(columns: Array) -> tuple[Array, Array, Array, Array]:
 
 
 @njit(cache=True, nogil=True)
-def project(problem: Problem, speed: Array, damping: Array, delay: Delay) -> Projected:
-    """Eliminate numerator, free response and offset for given sections, fastest first."""
-    F, g = chain_dynamics(speed, damping)
-    n = g.size
-    nothing = np.zeros(0)
-    chain = ChainState(F, g, F, g if problem.free_response else nothing)
-    triangle = triangle_of(chain, delay, problem.data, problem.period)
-    columns = _columns(triangle, _readout(F, g, delay, problem.data), n, problem)
-    lengths, left, values, right = _factored(columns)
-    y = np.ascontiguousarray(triangle[:, -1])
+def _eliminated(rows: Array, n: int, zeros: int, free_response: bool, offset: bool) -> Projected:
+    """Least squares of the last column of the rows on all that is eliminated."""
+    lengths, left, values, right = _factored(_columns(rows, n, n, zeros, free_response, offset))
+    y = np.ascontiguousarray(rows[:, :, -1]).ravel()
     along = left.T @ y
     residual = y - left @ along
     solution = (right.T @ (along / values)) / lengths
-    output, free, direct, offset = np.zeros(n), np.zeros(n), 0.0, 0.0
-    proper = min(problem.zeros, n - 1) + 1
+    records = rows.shape[0]
+    output, direct, free, offsets = np.zeros(n), 0.0, np.zeros((records, n)), np.zeros(records)
+    proper = min(zeros, n - 1) + 1
     output[n - proper :] = solution[:proper]
     place = proper
-    if problem.zeros == n:
+    if zeros == n:
         direct = solution[place]
         place += 1
-    if problem.free_response:
-        free[:] = solution[place : place + n]
-        place += n
-    if problem.offset:
-        offset = solution[place]
-    return Projected(np.dot(residual, residual), output, direct, free, offset)
+    for k in range(records):
+        if free_response:
+            free[k] = solution[place : place + n]
+            place += n
+        if offset:
+            offsets[k] = solution[place]
+            place += 1
+    return Projected(np.dot(residual, residual), output, direct, free, offsets)
+
+
+def project(problem: Problem, speed: Array, damping: Array, delay: Delay) -> Projected:
+    """Eliminate numerator, free responses and offsets for given sections, fastest first."""
+    F, g = chain_dynamics(speed, damping)
+    chain = ChainState(F, g, F, g if problem.free_response else np.zeros(0))
+    rows = np.stack(
+        [rows_of(chain, delay, data, period) for data, period in zip(problem.records, problem.periods, strict=True)]
+    )
+    found: Projected = _eliminated(rows, g.size, problem.zeros, problem.free_response, problem.offset)
+    return found
+
+
+def twice(F: Array, g: Array, weights: Projected, record: int, free_response: bool) -> ChainState:
+    """The chain with a second one driven by x = B/A u: dx/dalpha_j = -(d ln A/d alpha_j) x up to what Phi spans.
+
+    The free response ``C/A delta`` drives one too.
+    """
+    dynamics, gain = driven_chain(F, g, weights.output, weights.direct)
+    if not free_response:
+        return ChainState(dynamics, gain, dynamics, np.zeros(0))
+    return ChainState(dynamics, gain, *driven_chain(F, g, weights.free[record], 0.0))
 
 
 @njit(cache=True, nogil=True)
+def _kaufman(
+    rows: Array, F: Array, g: Array, projected: Projected, readings: Array, problem: tuple[int, bool, bool, bool]
+) -> Slopes:
+    """Gradient and J'J from the rows of a chain that drives a second one; readings of ``d ln A/d alpha`` from it."""
+    n = g.size
+    zeros, free_response, offset, delay_free = problem
+    _, left, _, _ = _factored(_columns(rows, n, 2 * n, zeros, free_response, offset))
+    y = np.ascontiguousarray(rows[:, :, -1]).ravel()
+    residual = y - left @ (left.T @ y)
+    psi = np.zeros((y.size, n + 1 if delay_free else n))
+    # dx/dtau = -x'(t - tau), x' = output (F z + g u).
+    rate = np.zeros(2 * n + 1)
+    rate[:n] = projected.output @ F
+    rate[2 * n] = np.dot(projected.output, g)
+    q = rows.shape[1]
+    for k in range(rows.shape[0]):
+        driven = np.ascontiguousarray(rows[k, :, n : 2 * n])
+        if free_response:
+            driven = driven + rows[k, :, 3 * n + 1 : 4 * n + 1]
+        psi[k * q : (k + 1) * q, :n] = -driven @ np.ascontiguousarray(readings.T)
+        if delay_free:
+            psi[k * q : (k + 1) * q, n] = -(np.ascontiguousarray(rows[k, :, : 2 * n + 1]) @ rate)
+    psi -= left @ (left.T @ psi)
+    return Slopes(np.dot(residual, residual), -(psi.T @ residual), psi.T @ psi)
+
+
 def slopes(
     problem: Problem, speed: Array, damping: Array, delay: Delay, projected: Projected, delay_free: bool
 ) -> Slopes:
     """Exact gradient, and Kaufman's J'J, at what :func:`project` gave for the same sections and delay."""
     F, g = chain_dynamics(speed, damping)
-    n = g.size
-    # A second chain driven by x = B/A u: dx/dalpha_j = -(d ln A/d alpha_j) x, up to what Phi spans itself. The free
-    # response C/A delta drives one too.
-    dynamics, gain = driven_chain(F, g, projected.output, projected.direct)
-    free_dynamics, free_start = dynamics, np.zeros(0)
-    if problem.free_response:
-        free_dynamics, free_start = driven_chain(F, g, projected.free, 0.0)
-    chain = ChainState(dynamics, gain, free_dynamics, free_start)
-    triangle = triangle_of(chain, delay, problem.data, problem.period)
-    readout = _readout(dynamics, gain, delay, problem.data)
-    _, left, _, _ = _factored(_columns(triangle, readout, n, problem))
-    y = np.ascontiguousarray(triangle[:, -1])
-    residual = y - left @ (left.T @ y)
-    size = n + 1 if delay_free else n
-    psi = np.zeros((triangle.shape[0], size))
-    internal = np.ascontiguousarray(triangle[:, : 2 * n + 2])
-    driven = internal @ np.ascontiguousarray(readout[n : 2 * n].T)
-    if problem.free_response:
-        driven += triangle[:, 3 * n + 2 : 4 * n + 2]
-    psi[:, :n] = -driven @ np.ascontiguousarray(logarithmic_slopes(speed, damping, F).T)
-    if delay_free:
-        # dx/dtau = -x'(t - tau), x' = output (F z + g u).
-        rate = np.zeros(2 * n + 1)
-        rate[:n] = projected.output @ F
-        rate[2 * n] = np.dot(projected.output, g)
-        psi[:, n] = -(internal @ (rate @ readout))
-    psi -= left @ (left.T @ psi)
-    return Slopes(np.dot(residual, residual), -(psi.T @ residual), psi.T @ psi)
+    rows = np.stack(
+        [
+            rows_of(twice(F, g, projected, k, problem.free_response), delay, data, period)
+            for k, (data, period) in enumerate(zip(problem.records, problem.periods, strict=True))
+        ]
+    )
+    free = problem.zeros, problem.free_response, problem.offset, delay_free
+    found: Slopes = _kaufman(rows, F, g, projected, logarithmic_slopes(speed, damping, F), free)
+    return found

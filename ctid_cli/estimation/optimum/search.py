@@ -73,20 +73,19 @@ class Judged:
 
 
 class Descent:
-    """Local searches on one record."""
+    """Local searches on records."""
 
     def __init__(self, problem: Problem, box: Box) -> None:
         self.problem, self.box = problem, box
         self.evaluations = 0
-        used = problem.data.y[problem.data.use]
+        used = np.concatenate([data.y_used for data in problem.records])
         self.count = used.size
         self.floor = ROUNDING**2 * float(used @ used)
 
     def value(self, point: Point) -> Projected:
         """Least squares for the poles and delay of a point."""
         self.evaluations += 1
-        found: Projected = project(self.problem, point.speed, point.damping, point.delay)
-        return found
+        return project(self.problem, point.speed, point.damping, point.delay)
 
     def local(self, point: Point, projected: Projected | None = None) -> Local:
         """Gradient and curvature at a point; the delay counts in quarter periods."""

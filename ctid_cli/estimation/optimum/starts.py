@@ -10,7 +10,6 @@ from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.estimation.optimum.box import Box, Point, point_of
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import Descent, Local
-from ctid_cli.filtering.filter_data import FilterData
 
 #: Poles tried beside those of a smaller model, and how many of them are refined.
 FREQUENCIES, DAMPINGS, REFINED = 24, (0.05, 0.3, 0.9), 3
@@ -27,9 +26,8 @@ MOST_DELAYS = 100
 class Nest:
     """The optima of a structure and of all that it contains, each found from those below it."""
 
-    def __init__(self, data: FilterData, box: Box, free_response: bool, offset: bool, period: float) -> None:
-        self.data, self.box = data, box
-        self.free_response, self.offset, self.period = free_response, offset, period
+    def __init__(self, problem: Problem, box: Box) -> None:
+        self.problem, self.box = problem, box
         self.evaluations = 0
         self._found: dict[tuple[int, int], list[Local]] = {}
         self._ends: dict[tuple[int, int], list[float]] = {}
@@ -37,7 +35,7 @@ class Nest:
 
     def descent(self, zeros: int) -> Descent:
         """Searches with a numerator of that degree."""
-        return Descent(Problem(self.data, zeros, self.free_response, self.offset, self.period), self.box)
+        return Descent(self.problem._replace(zeros=zeros), self.box)
 
     def optima(self, poles: int, zeros: int) -> list[Local]:
         """The lowest minima of a structure that are known, the lowest first."""

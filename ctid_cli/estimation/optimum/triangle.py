@@ -161,15 +161,35 @@ def absorb(triangle: Array, block: Array, count: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def triangle_of(chain: ChainState, delay: Delay, data: FilterData, period: float) -> Array:
-    """R of the rows ``[z, u, change of u, free response, 1, y]``.
+def _read(rows: Array, chain: ChainState, delay: Delay, interval: float) -> Array:
+    """``[z, u]`` at the instants read, from ``[z, u, change of u]`` at the breaks before them; the rest stays."""
+    n = chain.gain.size
+    readout = np.zeros((n + 1, n + 2))
+    fraction = place_of(delay, interval)[1] if interval > 0.0 else 0.0
+    part = held_step(chain.dynamics, chain.gain, fraction * interval)
+    for i in range(n):
+        for j in range(n):
+            readout[i, j] = part.transition[i, j]
+        # v and its change over the *part* of the interval.
+        readout[i, n], readout[i, n + 1] = part.from_value[i], part.from_change[i] * fraction
+    readout[n, n], readout[n, n + 1] = 1.0, fraction
+    result = np.empty((rows.shape[0], rows.shape[1] - 1))
+    result[:, : n + 1] = np.ascontiguousarray(rows[:, : n + 2]) @ np.ascontiguousarray(readout.T)
+    result[:, n + 1 :] = rows[:, n + 2 :]
+    return result
+
+
+@njit(cache=True, nogil=True)
+def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, whole: bool = False) -> Array:
+    """Rows ``[z, u, free response, 1, y]`` that have the second moments of those of all used samples, or these.
 
     On a regular clock z is left at the break before the instant that is read: the way from there is one map for all
-    rows. On any other it is read at ``t - tau`` itself, and the change of u is zero.
+    rows. On any other it is read at ``t - tau`` itself.
     """
     n, free = chain.gain.size, chain.free_start.size
     q = n + free + 4
     triangle, block = np.zeros((q, q)), np.zeros((q, BLOCK))
+    every = np.zeros((np.count_nonzero(data.use) if whole else 0, q))
     tu, u, breaks = data.tu, data.u, data.tu.size
     alone = _free_states(chain, data)
     regular = data.interval > 0.0
@@ -222,10 +242,12 @@ def triangle_of(chain: ChainState, delay: Delay, data: FilterData, period: float
         for i in range(free):
             block[n + 2 + i, filled] = alone[row, i]
         block[q - 2, filled], block[q - 1, filled] = 1.0, data.y[k]
+        if whole:
+            every[row] = block[:, filled]
         row += 1
         filled += 1
         if filled == BLOCK:
             absorb(triangle, block, filled)
             filled = 0
     absorb(triangle, block, filled)
-    return triangle
+    return _read(every if whole else triangle, chain, delay, data.interval)

@@ -22,12 +22,12 @@ def test_a_system_without_noise_is_found(n, m, delay, regular):
     model = random_model(rng, n, m, delay)
     record = record_of(model, rng, samples=400, regular=regular, offset=1.5)
     options = SearchOptions(delays=(0.0, 3.0) if delay else (0.0, 0.0), offset=True, random_starts=0)
-    found = best_output_error(filter_data(record), n, m, options)
+    found = best_output_error([filter_data(record)], n, m, options)
     assert found.ending.optimal
     assert 1 <= found.agree <= found.tried
     np.testing.assert_allclose(found.denominator, model.denominator, rtol=1e-6)
     np.testing.assert_allclose(found.numerator, model.numerator, rtol=1e-6)
-    np.testing.assert_allclose([found.delay, found.offset], [delay, 1.5], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose([found.delay, found.offsets[0]], [delay, 1.5], rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -36,7 +36,7 @@ def test_no_structure_is_worse_than_one_that_it_contains(seed):
     record = record_of(random_model(rng, 3, 1), rng, samples=120, noise=1.0)
     options = SearchOptions(free_response=bool(seed % 2), random_starts=0)
     least = {
-        (n, m): best_output_error(filter_data(record), n, m, options).squared_error
+        (n, m): best_output_error([filter_data(record)], n, m, options).squared_error
         for n in range(1, 5)
         for m in range(n)
     }
@@ -51,7 +51,7 @@ def test_a_superfluous_pole_runs_to_infinity():
     rng = np.random.default_rng(4)
     record = record_of(TransferFunction([0.8], [1.0, 0.8]), rng, noise=0.02)
     early = Record.from_arrays(record.t[:-1], record.input.values[:-1], record.y[1:])
-    one, two = (best_output_error(filter_data(early), n, 0, SearchOptions(random_starts=5)) for n in (1, 2))
+    one, two = (best_output_error([filter_data(early)], n, 0, SearchOptions(random_starts=5)) for n in (1, 2))
     assert two.poles_at_infinity == 1
     assert two.squared_error == pytest.approx(one.squared_error, rel=1e-9)
     assert two.denominator.size == 2
@@ -62,20 +62,22 @@ def test_the_model_has_the_squared_error_that_is_said():
     record = record_of(random_model(rng, 3, 2, 0.6), rng, noise=0.3, offset=2.0)
     data = filter_data(record, 2.0)
     options = SearchOptions(delays=(0.0, 2.0), free_response=True, offset=True, random_starts=0)
-    found = best_output_error(data, 2, 1, options)
+    found = best_output_error([data], 2, 1, options)
     # C/A of an impulse is C p/A of a step, with what jumps at once taken apart.
     used = data.t[data.use]
     free = simulate(
-        TransferFunction(np.append(found.free_response, 0.0), found.denominator), HeldSignal(used[:1], np.ones(1)), used
+        TransferFunction(np.append(found.free_responses[0], 0.0), found.denominator),
+        HeldSignal(used[:1], np.ones(1)),
+        used,
     )
-    x = simulate(found.model, record.input, record.t)[data.use] + free + found.offset
+    x = simulate(found.model, record.input, record.t)[data.use] + free + found.offsets[0]
     assert float(np.sum((data.y_used - x) ** 2)) == pytest.approx(found.squared_error, rel=1e-9)
 
 
 def test_a_biproper_model_has_a_direct_way_through():
     rng = np.random.default_rng(6)
     model = TransferFunction([0.5, 1.0, 2.0], [1.0, 0.9, 1.3])
-    found = best_output_error(filter_data(record_of(model, rng)), 2, 2, SearchOptions(random_starts=0))
+    found = best_output_error([filter_data(record_of(model, rng))], 2, 2, SearchOptions(random_starts=0))
     np.testing.assert_allclose(found.numerator, model.numerator, rtol=1e-6)
     np.testing.assert_allclose(found.denominator, model.denominator, rtol=1e-6)
 
@@ -90,8 +92,8 @@ def test_a_periodic_record_is_exact_for_a_lightly_damped_model():
     long = 0.5 * np.arange(periods * t.size)
     x = simulate(model, HeldSignal(long, np.tile(u, periods)), long)[-t.size :]
     record = Record.from_arrays(t, u, x + 0.01 * rng.standard_normal(t.size))
-    options = SearchOptions(delays=(0.0, 2.0), period=period, random_starts=5)
-    found = best_output_error(filter_data(record), 2, 0, options)
+    options = SearchOptions(delays=(0.0, 2.0), periods=(period,), random_starts=5)
+    found = best_output_error([filter_data(record)], 2, 0, options)
     assert found.ending is Ending.CONVERGED
     np.testing.assert_allclose(found.denominator, model.denominator, rtol=0.01, atol=1e-4)
     assert found.delay == pytest.approx(0.7, abs=0.02)
@@ -103,8 +105,8 @@ def test_given_starts_alone_are_refined_where_nothing_else_is_wanted():
     rng = np.random.default_rng(8)
     model = random_model(rng, 3, 1)
     data = filter_data(record_of(model, rng, noise=0.1))
-    everything = best_output_error(data, 3, 1, SearchOptions(random_starts=0))
-    alone = best_output_error(data, 3, 1, SearchOptions(starts=[(model.denominator, 0.0)], nested=False))
+    everything = best_output_error([data], 3, 1, SearchOptions(random_starts=0))
+    alone = best_output_error([data], 3, 1, SearchOptions(starts=[(model.denominator, 0.0)], nested=False))
     assert alone.squared_error == pytest.approx(everything.squared_error, rel=1e-9)
     assert (alone.tried, alone.agree) == (1, 1)
     assert alone.evaluations < everything.evaluations / 5

@@ -34,7 +34,7 @@ TREATMENTS = [
 
 def problem_of(record, zeros, free_response=False, offset=False, periodic=False):
     period = float(record.t[-1] - record.t[0] + 0.5) if periodic else 0.0
-    return Problem(filter_data(record), zeros, free_response, offset, period)
+    return Problem((filter_data(record),), zeros, free_response, offset, (period,))
 
 
 @pytest.mark.parametrize("treatment", TREATMENTS, ids=str)
@@ -44,7 +44,7 @@ def test_projection_is_that_of_dense_matrices(case, treatment, zeros, delay):
     record = record_of(MODEL, np.random.default_rng(1), noise=0.1, offset=0.3, **case)
     problem = problem_of(record, zeros, **treatment)
     found = project(problem, SPEED, DAMPING, Delay(delay, -1)).squared_error
-    dense = squared_error(record, DENOMINATOR, zeros, delay, problem.free_response, problem.offset, problem.period)
+    dense = squared_error(record, DENOMINATOR, zeros, delay, problem.free_response, problem.offset, problem.periods[0])
     np.testing.assert_allclose(found, dense, rtol=1e-8)
 
 

@@ -20,7 +20,7 @@ from tests.estimation.optimum.systems import MODEL, random_model, random_poles, 
 
 def descent_of(record, zeros, delays=(0.0, 0.0), *, free_response=False, offset=False):
     data = filter_data(record)
-    return Descent(Problem(data, zeros, free_response, offset, 0.0), box_of(data, delays))
+    return Descent(Problem((data,), zeros, free_response, offset, (0.0,)), box_of([data], delays))
 
 
 def settled(descent, poles, delay=0.0):
