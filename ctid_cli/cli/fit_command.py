@@ -45,7 +45,9 @@ def fit(
     bounds = _delay_bounds(delay)
     try:
         # Every sample: the profile that is drawn is then the cost whose minimum the estimate is.
-        options = DelayProfile(poles, zeros, bounds, initial_state=initial_state, offset=offset, search="samples")
+        options = DelayProfile(
+            poles, zeros, bounds, initial_state=initial_state, offset=offset, search="samples", nested=True
+        )
     except ValueError as error:
         raise UsageError(str(error)) from None
     read = partial(read_measurement, time=time, input=input, output=output, hold=hold)

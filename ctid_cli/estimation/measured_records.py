@@ -6,21 +6,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.arrays import BoolArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import check_greatest_delay, check_record, named
+from ctid_cli.estimation.optimum.best_model import SearchOptions, problem_of
+from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.output_error import Layout
 from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import InitialState, Offset
-
-#: Time constants after which a free response counts as gone (1e-12), and most periods that are prepended for it.
-SETTLING = 28.0
-MOST_PERIODS = 200
 
 
 class Treatment(NamedTuple):
@@ -62,7 +59,8 @@ class MeasuredRecords:
     @property
     def plain(self) -> bool:
         """Whether there is but one record and nothing of its own to be estimated."""
-        return self.layout.own == 0 and len(self.data) == 1 and self.structure.zeros < self.structure.poles
+        from_rest = self.layout.own == 0 and self.treatment.initial_state != "periodic"
+        return from_rest and len(self.data) == 1 and self.structure.zeros < self.structure.poles
 
     def _check_input(self, record: Record) -> None:
         """Refuse what an input cannot tell."""
@@ -77,15 +75,28 @@ class MeasuredRecords:
                 f"{constant}: only a free response tells anything; give a known delay and initial_state 'estimate'"
             )
 
-    def _lay_out(self, record: Record, periods: int = 0) -> FilterData:
-        """Filter data; ``periods`` copies of the record's input come before it, with masked outputs."""
+    def _lay_out(self, record: Record) -> FilterData:
+        # At rest the input before the record is known to be zero, whatever the delay, and that of a periodic record is
+        # known too; otherwise it is not known.
         treatment = self.treatment
-        if periods == 0:
-            # At rest the input before the record is known to be zero, whatever the delay; otherwise it is not known.
-            known_after = treatment.delay_bounds[1] if treatment.initial_state == "estimate" else 0.0
-            return filter_data(record, known_after, treatment.hold_output)
-        extended = _repeated(record, periods)
-        return filter_data(extended, record.t[0] - extended.input.t[0], treatment.hold_output)
+        known_after = treatment.delay_bounds[1] if treatment.initial_state == "estimate" else 0.0
+        return filter_data(record, known_after, treatment.hold_output)
+
+    @cached_property
+    def options(self) -> SearchOptions:
+        """What is estimated beside the coefficients."""
+        periodic = self.treatment.initial_state == "periodic"
+        return SearchOptions(
+            delays=self.treatment.delay_bounds,
+            free_response=self.layout.initial_state,
+            offset=self.layout.offset,
+            periods=[_period(record) for record in self.records] if periodic else (),
+        )
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The records and what is eliminated with them."""
+        return problem_of(self.data, self.structure.zeros, self.options)
 
     @cached_property
     def centred(self) -> FilterData:
@@ -94,20 +105,9 @@ class MeasuredRecords:
             return self.data[0]
         return self._lay_out(_without_means(self.records[0])[0])
 
-    def make_periodic(self, a: Array) -> None:
-        """Put enough periods before each record for the free response of a model (a_1 … a_n) to be gone."""
-        model = TransferFunction([1.0], np.concatenate(([1.0], a)))
-        slowest = float(np.abs(model.poles.real).min())
-        for k, record in enumerate(self.records):
-            period = _period(record)
-            periods = int(np.ceil(SETTLING / (slowest * period))) if slowest > 0 else MOST_PERIODS
-            self.data[k] = self._lay_out(record, min(max(periods, 1), MOST_PERIODS))
-
     def used(self) -> tuple[BoolArray, ...]:
-        """Which samples of each record enter the sums, without those of periods put before it."""
-        return tuple(
-            data.use[data.use.size - record.t.size :] for data, record in zip(self.data, self.records, strict=True)
-        )
+        """Which samples of each record enter the sums."""
+        return tuple(data.use for data in self.data)
 
 
 def _without_means(record: Record) -> tuple[Record, float, float]:
@@ -122,16 +122,3 @@ def _without_means(record: Record) -> tuple[Record, float, float]:
 def _period(record: Record) -> float:
     """Period of a record that repeats: its duration and one more interval."""
     return record.duration + (record.interval or float(np.median(np.diff(record.t))))
-
-
-def _repeated(record: Record, periods: int) -> Record:
-    """Record with copies of its input before it and no outputs there."""
-    period = _period(record)
-    shifts = period * np.arange(-periods, 1)
-    t = (record.t + shifts[:, None]).ravel()
-    y = np.concatenate([np.full(periods * record.n_samples, np.nan), record.y])
-    signal = record.input
-    inside = signal.t < signal.t[0] + period * (1 - 1e-9)
-    tu = (signal.t[inside] + shifts[:, None]).ravel()
-    u = np.tile(signal.values[inside], periods + 1)
-    return Record(t, y, HeldSignal(tu, u, signal.hold), name=record.name)

@@ -1,19 +1,21 @@
-"""Gauss-Newton on everything at once, from a minimum of the profile, and what may be asked of the estimate later."""
+"""The least output error of measured records from the minima of a profile, and what may be asked of it later."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.errors import DataError
-from ctid_cli.estimation.common import history_of
-from ctid_cli.estimation.delay_search import Minimum, bound_in_the_way
-from ctid_cli.estimation.iteration import GAUSS_NEWTON, HALVINGS, Iterated, Steps, iterate
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimation.output_error import OutputErrorProblem
-from ctid_cli.inference.fit import IterationRecord
-from ctid_cli.inference.status import Status
+from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error
+from ctid_cli.estimation.optimum.projection import Problem
+from ctid_cli.estimation.optimum.search import local_minimum
+from ctid_cli.estimation.output_error import Layout, sensitivities
+from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.models.transfer_function import TransferFunction
+
+#: Random starts of a search that fits the smaller models too, besides two for each pole.
+RANDOM_STARTS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,92 +33,58 @@ class AppliedModel:
 class Refinement:
     """The output-error cost of measured records, minimised over all parameters."""
 
-    def __init__(self, measured: MeasuredRecords, max_iterations: int, tolerance: float) -> None:
+    def __init__(self, measured: MeasuredRecords) -> None:
         self.measured = measured
         self.structure = measured.structure
-        self.layout = measured.layout
-        self.steps = Steps(max_iterations, tolerance, GAUSS_NEWTON, HALVINGS)
 
     @property
-    def problem(self) -> OutputErrorProblem:
-        """All parameters together."""
-        bounds = self.measured.treatment.delay_bounds
-        return OutputErrorProblem(self.measured.data, self.layout, bounds[0], bounds)
+    def problem(self) -> Problem:
+        """The records and what is eliminated with them."""
+        return self.measured.problem
 
-    def _at(self, delay: float) -> OutputErrorProblem:
-        """The same at a known delay."""
-        layout = replace(self.layout, structure=replace(self.structure, delay=False))
-        return OutputErrorProblem(self.measured.data, layout, delay)
+    def best(self, starts: Sequence[tuple[Array, float]], nested: bool) -> Optimum:
+        """The least output error from denominators and delays, and if nested of smaller models and at random too.
 
-    def from_minimum(self, minimum: Minimum) -> tuple[Iterated | None, list[IterationRecord]]:
-        """Gauss-Newton on all parameters from one local minimum of the profile."""
-        problem = self.problem
-        a = minimum.theta[: self.structure.poles]
-        theta = problem.linear_start(np.concatenate(([1.0], a)), minimum.delay)
-        result = None if theta is None else iterate(problem, theta, self.steps)
-        history = history_of("refine", problem, result)
-        if result is None or not self.structure.delay:
-            return result, history
-        return self._mind_the_bounds(problem, result), history
-
-    def _mind_the_bounds(self, problem: OutputErrorProblem, result: Iterated) -> Iterated:
-        """Move a delay that wants to leave its bounds onto the bound, and say so."""
-        place = self.structure.size - 1
-        reordered = np.r_[np.delete(np.arange(self.layout.size), place), place]
-        equations = result.equations
-        delay_last = equations._replace(
-            hessian=equations.hessian[np.ix_(reordered, reordered)],
-            instrument_error=equations.instrument_error[reordered],
+        A profile under an unknown initial state, an offset or a period has too few basins: smaller models help then.
+        """
+        poles = self.structure.poles
+        options = replace(
+            self.measured.options,
+            starts=starts,
+            nested=nested or not self.measured.plain,
+            fewer_poles=nested,
+            random_starts=RANDOM_STARTS + 2 * poles if nested else 0,
         )
-        bound = bound_in_the_way(delay_last, float(result.theta[place]), problem.bounds)
-        if bound is None:
-            return result
-        there = iterate(self._at(bound), np.delete(result.theta, place), self.steps)
-        if there is None or there.equations.squared_error > equations.squared_error:
-            return result
-        theta = np.insert(there.theta, place, bound)
-        iterations = result.iterations + there.iterations
-        return Iterated(theta, problem.equations(theta), Status.DELAY_AT_BOUND, iterations, result.path)
+        return best_output_error(self.measured.data, poles, self.structure.zeros, options)
 
-    def squared_error_at(self, theta: Array, delay: float) -> float:
-        """Least sum of squared output errors at a given delay, in the basin of an estimate."""
-        return self._least(self._at(delay), np.delete(theta, self.structure.size - 1))
+    def squared_error_at(self, model: TransferFunction, delay: float) -> float:
+        """Least sum of squared output errors at a given delay, in the basin of a model."""
+        return local_minimum(self.problem, model.poles, delay, (delay, delay)).squared_error
 
     def squared_error_with(
-        self, theta: Array, delay: float, *, initial_state: bool = False, offset: bool = False
+        self, model: TransferFunction, *, initial_state: bool = False, offset: bool = False
     ) -> float:
         """Least sum of squared output errors if an initial state or an offset were estimated too."""
-        layout = replace(
-            self.layout,
-            initial_state=self.layout.initial_state or initial_state,
-            offset=self.layout.offset or offset,
-        )
-        problem = OutputErrorProblem(self.measured.data, layout, delay, self.measured.treatment.delay_bounds)
-        shared = np.concatenate((theta[: self.structure.size], np.zeros(layout.size - self.structure.size)))
-        return self._least(problem, problem.with_best_own(shared))
-
-    def _least(self, problem: OutputErrorProblem, theta: Array | None) -> float:
-        """Squared error where the iteration ends; NaN where it cannot begin."""
-        result = None if theta is None else iterate(problem, theta, self.steps)
-        return float("nan") if result is None else result.equations.squared_error
+        problem = self.problem
+        more = problem._replace(free_response=problem.free_response or initial_state, offset=problem.offset or offset)
+        return local_minimum(more, model.poles, model.delay, self.measured.treatment.delay_bounds).squared_error
 
     def errors_of(self, model: TransferFunction) -> AppliedModel:
         """Errors of a given model on these records, each with its own best initial state and offset."""
-        measured = self.measured
-        if measured.treatment.initial_state == "periodic":
-            measured.make_periodic(model.denominator[1:])
-        problem = self._at(model.delay)
-        b = np.concatenate((np.zeros(self.structure.zeros + 1 - model.numerator.size), model.numerator))
-        own = np.zeros(problem.layout.size - problem.structure.size)
-        theta = problem.with_best_own(np.concatenate((model.denominator[1:], b, own)))
-        parts = None if theta is None else problem.sensitivities(theta)
-        if theta is None or parts is None:
-            raise DataError("the record does not determine the initial state and the offset of a given model")
-        states, offsets = self.own(problem, theta)
-        return AppliedModel(tuple(eps for _, eps in parts), measured.used(), states, offsets)
+        layout = self.layout_of(model.order, delay=False)
+        theta, residuals = layout.theta(model), []
+        for k, (psi, eps) in enumerate(sensitivities(self.problem, layout, theta, model.delay)):
+            own = slice(layout.first(k), layout.first(k) + layout.own)
+            theta[own] = np.linalg.lstsq(psi[:, own], eps)[0]
+            residuals.append(eps - psi[:, own] @ theta[own])
+        return AppliedModel(tuple(residuals), self.measured.used(), *self.own(layout, theta))
 
-    def own(self, problem: OutputErrorProblem, theta: Array) -> tuple[tuple[Array, ...], tuple[float, ...]]:
+    def layout_of(self, poles: int, delay: bool) -> Layout:
+        """Which numbers stand where for so many poles."""
+        return replace(self.measured.layout, structure=Structure(poles, self.structure.zeros, delay))
+
+    def own(self, layout: Layout, theta: Array) -> tuple[tuple[Array, ...], tuple[float, ...]]:
         """Initial states and offsets of the experiments, means that were subtracted included."""
-        own = [problem.own(theta, k) for k in range(len(self.measured.data))]
+        own = [layout.own_of(theta, k) for k in range(layout.experiments)]
         offsets = tuple(y0 + c for y0, (_, c) in zip(self.measured.offsets, own, strict=True))
         return tuple(state for state, _ in own), offsets

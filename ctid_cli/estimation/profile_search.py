@@ -10,9 +10,9 @@ from ctid_cli.arrays import Array
 from ctid_cli.estimation.delay_grid import costs_of, lowest_minima, scan, search_grid
 from ctid_cli.estimation.delay_search import Minimum, best_minimum
 from ctid_cli.estimation.filtered_costs import filtered_costs
-from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps, iterate
+from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimation.output_error import Layout, OutputErrorProblem
+from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.sampled_problem import at_known_delay, least_squares_start
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.sensitivity import Structure
@@ -24,6 +24,9 @@ MINIMA = 3
 #: How hard to work at each delay of the grid. Far from the true delay a pole may run to infinity, where no number of
 #: halvings helps. Gauss-Newton is a direction of descent also where the delay is wrong.
 GRID_EFFORT = Steps(max_iterations=15, tolerance=1e-2, rule=GAUSS_NEWTON, halvings=4)
+#: The same where an initial state, an offset, a period or several records are treated: the fall of the cost that a step
+#: must promise, as a fraction of it, and most steps.
+ROUGH = 1e-3, 15
 #: Delays on the grid: between these numbers, whatever the bandwidth asks for.
 FEWEST_DELAYS = 24
 MOST_DELAYS = 2000
@@ -87,15 +90,13 @@ class RecordsCost:
         if measured.plain:
             problem = at_known_delay(measured.data[0], self.coefficients)
             return best_minimum(problem, delay, starts, n, GRID_EFFORT)
-        layout = Layout(self.coefficients, len(measured.data), measured.layout.initial_state, measured.layout.offset)
-        output_error = OutputErrorProblem(measured.data, layout, delay)
         best: Minimum | None = None
         for start in starts:
-            theta = output_error.linear_start(np.concatenate(([1.0], start[:n])), delay)
-            result = None if theta is None else iterate(output_error, theta, GRID_EFFORT)
-            if result is not None and (best is None or result.equations.squared_error < best.squared_error):
-                coefficients = result.theta[: self.coefficients.size]
-                best = Minimum(np.append(coefficients, delay), result.equations.squared_error)
+            poles = np.roots(np.concatenate(([1.0], start[:n]))).astype(complex)
+            found = local_minimum(measured.problem, poles, delay, (delay, delay), *ROUGH)
+            if best is None or found.squared_error < best.squared_error:
+                theta = np.concatenate((found.point.denominator[1:], start[n:-1], [delay]))
+                best = Minimum(theta, found.squared_error)
         return best
 
 
@@ -160,10 +161,6 @@ def _search_samples(cost: RecordsCost) -> Found:
     costs = costs_of(found)
     if np.isnan(costs).all():
         return [], None
-    if measured.treatment.initial_state == "periodic":
-        least = found[int(np.nanargmin(costs))]
-        assert least is not None
-        measured.make_periodic(least.theta[: cost.coefficients.poles])
     count = sum(data.count for data in measured.data)
     chosen = lowest_minima(found, MINIMA)
     if delays.size == 1:

@@ -1,25 +1,34 @@
-"""Global estimation from measured records: a one-dimensional search over the delay, then Gauss-Newton on everything."""
+"""Global estimation from measured records: a one-dimensional search over the delay, then the least output error."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Estimator, Start, checked_bounds, covariance_of, quality
-from ctid_cli.estimation.iteration import Iterated
+from ctid_cli.estimation.iteration import Equations
 from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
+from ctid_cli.estimation.optimum.best_model import Optimum
+from ctid_cli.estimation.optimum.box import Box
+from ctid_cli.estimation.output_error import sensitivities
 from ctid_cli.estimation.profile_refinement import Refinement
 from ctid_cli.estimation.profile_search import Profile, ProfileSearch, search_delay
-from ctid_cli.inference.fit import Fit, IterationRecord
+from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
-from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import InitialState, Offset
+
+
+class Starts(NamedTuple):
+    """How many local searches were tried, and how many agree with the best of them."""
+
+    tried: int
+    agree: int
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -45,11 +54,11 @@ class MeasuredFit(Fit):
     count : int
         Number of samples used.
     iterations : int
-        Iterations of the refinement.
+        Evaluations of the cost and of its gradient in the refinement.
     condition_number : float
         Of the scaled ``sum psi psi'`` [-].
     history : tuple of IterationRecord
-        The accepted iterations of the refinement.
+        Empty.
     theta : ndarray, shape (p,)
         All free parameters, in the order of ``parameter_names``.
     initial_states : tuple of ndarray
@@ -66,6 +75,12 @@ class MeasuredFit(Fit):
         psi at the used samples of each experiment, shape (count, p).
     used : tuple of ndarray of bool
         Which samples of each record were used, shape (N,).
+    starts : Starts or None
+        How many local searches there were, and how many of them came to the estimate.
+    poles_at_infinity : int
+        How many of the poles asked for have run to infinity, so that the model has fewer.
+    box : Box or None
+        The set of admissible models in which the estimate is the best.
     """
 
     theta: Array = field(default_factory=lambda: np.zeros(0))
@@ -76,6 +91,9 @@ class MeasuredFit(Fit):
     residuals: tuple[Array, ...] = ()
     sensitivities: tuple[Array, ...] = ()
     used: tuple[BoolArray, ...] = ()
+    starts: Starts | None = None
+    poles_at_infinity: int = 0
+    box: Box | None = None
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -106,10 +124,9 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
         is looked at otherwise. The estimate itself always comes from every sample.
     svf_cutoff : float, optional
         Cut-off of the state-variable filter of the starts [rad/s]; by default from the bandwidth of the output.
-    max_iterations : int, default 100
-        Largest number of Gauss-Newton iterations from each local minimum.
-    tolerance : float, default 1e-8
-        Stop when a step changes the simulated output by less than this fraction of its rms value [-].
+    nested : bool, default False
+        Whether the smaller models that the structure contains are fitted too, and random starts drawn: slower, but the
+        cost then never rises with the number of poles or zeros. Else only the minima of the profile are refined.
     hold_output : {"foh", "zoh"}, default "foh"
         Interpolation of the measured output between samples; does not change the estimate.
 
@@ -125,6 +142,10 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
     ``search`` can be used, long grids are searched from coarse to fine: behind a filter of a third of that bandwidth
     three times fewer delays do, and the next level looks around the best of them only. The best local minima are
     refined jointly in all parameters on every sample, and the lowest is kept: no start has to be given.
+
+    Without bounds the least cost need not exist: with an undamped pole a free initial state fits noise, ever better.
+    Poles have magnitudes between the reciprocal of the record's length and ten over its sampling interval, and pairs a
+    damping of .001 at least; the status says whether the estimate lies at such a bound.
     """
 
     kind: ClassVar[str] = "delay_profile"
@@ -136,8 +157,7 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
     offset: Offset = "none"
     search: ProfileSearch = "time"
     svf_cutoff: float | None = None
-    max_iterations: int = 100
-    tolerance: float = 1e-8
+    nested: bool = False
     hold_output: Hold = "foh"
 
     def __post_init__(self) -> None:
@@ -157,39 +177,43 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
             Structure(self.poles, self.zeros, delay=low < high),
             Treatment(self.delay_bounds, self.initial_state, self.offset, self.hold_output),
         )
-        return Refinement(measured, self.max_iterations, self.tolerance)
+        return Refinement(measured)
 
     def _estimate(self, refinement: Refinement, start: Start | None) -> MeasuredFit:
         for minima, profile in search_delay(refinement.measured, self.search, self.svf_cutoff):
-            refined = [refinement.from_minimum(minimum) for minimum in minima]
-            found = [(result, history) for result, history in refined if result is not None]
-            if found:
-                best, history = min(found, key=lambda end: end[0].equations.squared_error)
-                return _fit(refinement, best, history, profile)
+            if minima:
+                a = [np.concatenate(([1.0], minimum.theta[: self.poles])) for minimum in minima]
+                starts = [(each, minimum.delay) for each, minimum in zip(a, minima, strict=True)]
+                return _fit(refinement, refinement.best(starts, self.nested), profile)
         raise DataError(Status.SINGULAR.value)
 
 
-def _fit(
-    refinement: Refinement, result: Iterated, history: list[IterationRecord], profile: Profile | None
-) -> MeasuredFit:
-    problem, measured = refinement.problem, refinement.measured
-    a, b, delay = problem.split(result.theta)
-    parts = problem.sensitivities(result.theta)
-    assert parts is not None
-    free = np.arange(problem.free)
-    if result.status is Status.DELAY_AT_BOUND:
-        free = np.delete(free, refinement.structure.size - 1)
-    covariance, status = covariance_of(result.equations, free, problem.samples, result.status)
-    outputs = np.concatenate([data.y_used - data.y_used.mean() for data in problem.data])
-    states, offsets = refinement.own(problem, result.theta)
+def _fit(refinement: Refinement, found: Optimum, profile: Profile | None) -> MeasuredFit:
+    problem, measured, model = refinement.problem, refinement.measured, found.model
+    layout = refinement.layout_of(model.order, refinement.structure.delay)
+    theta = layout.theta(model)
+    for k in range(layout.experiments):
+        state, first = found.free_responses[k] if layout.initial_state else (), layout.first(k)
+        theta[first : first + layout.own] = [*state, found.offsets[k]][: layout.own]
+    parts = sensitivities(problem, layout, theta, model.delay)
+    hessian = np.sum([psi.T @ psi for psi, _ in parts], axis=0)
+    gradient = np.sum([psi.T @ eps for psi, eps in parts], axis=0)
+    equations = Equations(hessian, gradient, hessian, sum(float(eps @ eps) for _, eps in parts), 0.0)
+    status = Status.DELAY_AT_BOUND if found.delay_at_bound else Status[found.ending.name]
+    free = np.arange(layout.size)
+    if found.delay_at_bound:
+        free = np.delete(free, layout.structure.size - 1)
+    count = sum(eps.size for _, eps in parts)
+    covariance, status = covariance_of(equations, free, count, status)
+    outputs = np.concatenate([data.y_used - data.y_used.mean() for data in problem.records])
+    states, offsets = refinement.own(layout, theta)
     return MeasuredFit(
-        model=TransferFunction(b, a, delay),
-        parameter_names=problem.layout.names,
+        model=model,
+        parameter_names=layout.names,
         covariance=covariance,
         status=status,
-        iterations=result.iterations,
-        history=tuple(history),
-        theta=result.theta,
+        iterations=found.evaluations,
+        theta=theta,
         initial_states=states,
         offsets=offsets,
         input_offsets=tuple(measured.input_offsets),
@@ -197,5 +221,8 @@ def _fit(
         residuals=tuple(eps for _, eps in parts),
         sensitivities=tuple(psi for psi, _ in parts),
         used=measured.used(),
-        **quality(result.equations, float(outputs @ outputs), problem.samples),
+        starts=Starts(found.tried, found.agree),
+        poles_at_infinity=found.poles_at_infinity,
+        box=found.box,
+        **quality(equations, float(outputs @ outputs), count),
     )

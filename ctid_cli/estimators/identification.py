@@ -148,7 +148,7 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
     if refinement.structure.delay and "delay" not in unclear:
         interval = _delay_interval(refinement, fit, covariance)
     judged = None if checked is None or validation is None else _validate(checked, fit, validation)
-    size = refinement.structure.size - int(refinement.structure.delay)
+    size = fit.model.order + options.zeros + 1
     coefficients = np.full((size, size), np.nan) if singular else covariance[:size, :size]
     return Identification(
         options=options,
@@ -236,13 +236,13 @@ def _free_block(fit: MeasuredFit) -> tuple[IndexArray, Array]:
 
 def _delay_interval(refinement: Refinement, fit: MeasuredFit, covariance: Array) -> DelayInterval | None:
     """Profile-likelihood interval of a free delay, None where estimate plus or minus two errors is as good."""
-    place = refinement.structure.size - 1
+    place = fit.parameter_names.index("delay")
     variance, white = float(covariance[place, place]), float(fit.covariance[place, place])
     error = float(np.sqrt(variance))
     if fit.status is Status.DELAY_AT_BOUND:
         variance, white, error = 1.0, 1.0, float("nan")  # no standard error to inflate by
     profile = CostOfDelay(
-        cache(lambda trial: refinement.squared_error_at(fit.theta, trial)),
+        cache(lambda trial: refinement.squared_error_at(fit.model, trial)),
         float(fit.theta[place]),
         fit.cost * fit.count,
         fit.count,
@@ -261,14 +261,14 @@ def _gains(options: DelayProfile, refinement: Refinement, fit: MeasuredFit) -> d
     squared_error = fit.cost * fit.count
 
     def gain(added: int, **treatment: bool) -> float:
-        lowered = refinement.squared_error_with(fit.theta, fit.model.delay, **treatment)
+        lowered = refinement.squared_error_with(fit.model, **treatment)
         share = 1.0 - lowered / squared_error if squared_error > 0 else 0.0
         evidence = -fit.count * np.log(max(1.0 - share, 1e-300)) - added * len(fit.residuals) * np.log(fit.count)
         return share if share > WORTHWHILE and evidence > DECISIVE else 0.0
 
     gains = {}
     if options.initial_state == "rest":
-        gains["initial_state"] = gain(options.poles, initial_state=True)
+        gains["initial_state"] = gain(fit.model.order, initial_state=True)
     if options.offset == "none":
         gains["offset"] = gain(1, offset=True)
     return {name: share for name, share in gains.items() if share}

@@ -14,10 +14,21 @@ from ctid_cli.inference.status import Status
 
 
 def of_status(fit: MeasuredFit) -> list[str]:
-    """How the search ended, where it did not end well."""
+    """How the search ended, where it did not end well, and poles that are not in the table."""
+    words = _of_lost_poles(fit.poles_at_infinity, fit.model.order)
     if fit.status is Status.DELAY_AT_BOUND and fit.model.delay == 0.0:
-        return ["The delay stopped at zero: this model needs none; take it as known (--delay 0), or use fewer poles."]
-    return [] if fit.status.succeeded else [fit.status.value]
+        return [
+            *words,
+            "The delay stopped at zero: this model needs none; take it as known (--delay 0), or use fewer poles.",
+        ]
+    return words if fit.status is Status.CONVERGED else [*words, fit.status.value]
+
+
+def _of_lost_poles(lost: int, left: int) -> list[str]:
+    if not lost:
+        return []
+    what = "1 pole runs" if lost == 1 else f"{lost} poles run"
+    return [f"{what} to infinity: more than {left} lower the cost no further, and the model has that many."]
 
 
 def of_conditioning(fit: MeasuredFit, covariance: Array, free: IndexArray, hessian: Array) -> list[str]:
@@ -28,7 +39,9 @@ def of_conditioning(fit: MeasuredFit, covariance: Array, free: IndexArray, hessi
         words.append(f"The delay has no standard error, {reason} and are too small if it is not.")
     names = [fit.parameter_names[k] for k in free]
     block = covariance[np.ix_(free, free)]
-    return [*words, *describe_conditioning(block, fit.theta[free], names, condition_number(hessian), hessian)]
+    found = describe_conditioning(block, fit.theta[free], names, condition_number(hessian), hessian)
+    # At a bound and along a ridge the status has said why, and one sentence is enough.
+    return [*words, *found[: 1 if fit.status in (Status.AT_BOUND, Status.RIDGE) else None]]
 
 
 def of_interval(interval: DelayInterval | None, options: DelayProfile) -> list[str]:

@@ -10,6 +10,14 @@ class Status(Enum):
     LEAST_SQUARES = "A one-shot least-squares estimate: biased by output noise; use it as a start, not as a result."
     MAX_ITERATIONS = "The iterations stopped at max_iterations before the tolerance; raise it, or start closer."
     STALLED = "No step lowers the cost; too many parameters for these data, or a tolerance below what rounding allows."
+    AT_BOUND = (
+        "The least output-error cost is at the border of the admissible models: a pole is as fast, as slow or as "
+        "little damped as may be; use fewer poles, or a record that shows more of it."
+    )
+    RIDGE = (
+        "The output-error cost is least and hardly changes along a line as far as models are admissible: the data do "
+        "not determine all parameters; use fewer poles or zeros."
+    )
     DELAY_AT_BOUND = "The delay stopped at one of its bounds; widen delay_bounds, or start the delay elsewhere."
     SINGULAR = "The equations became singular: the data do not determine all parameters; use fewer poles or zeros."
     DIVERGED = "The iterations diverged; use variant 'guarded', another svf_cutoff, or a start closer to the solution."
@@ -17,4 +25,4 @@ class Status(Enum):
     @property
     def succeeded(self) -> bool:
         """Whether the estimate may be used as it stands."""
-        return self in (Status.CONVERGED, Status.LEAST_SQUARES)
+        return self in (Status.CONVERGED, Status.AT_BOUND, Status.RIDGE, Status.LEAST_SQUARES)

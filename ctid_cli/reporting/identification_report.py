@@ -8,7 +8,9 @@ import numpy as np
 
 from ctid_cli.canonical import plain
 from ctid_cli.errors import DataError
+from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimators.identification import Identification, Validation
+from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
 from ctid_cli.reporting.layout import Table, count, number, picked
@@ -45,7 +47,7 @@ def common_units(measurements: Sequence[Measurement]) -> Units:
 
 def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:
     """Parameters with the units of the records."""
-    poles, zeros = result.options.poles, result.options.zeros
+    poles, zeros = result.fit.model.order, result.options.zeros
     return [replace(item, unit=units.of(item.name, poles, zeros)) for item in result.estimates]
 
 
@@ -76,6 +78,9 @@ def identification_object(
         **picked(fit, ("fit_percent", "r2", "cost")),
         "status": fit.status.name,
         "message": fit.status.value,
+        "starts": fit.starts and fit.starts._asdict(),
+        "poles_at_infinity": fit.poles_at_infinity,
+        "box": fit.box and _box_object(fit.box),
         "initial_state": {"treatment": options.initial_state, "values": fit.initial_states},
         "offset": {"treatment": options.offset, "output": fit.offsets, "input": fit.input_offsets},
         "modes": _modes(result, units),
@@ -138,11 +143,32 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
     row("FPE", f"{number(criteria.fpe)} ({units.output})^2 = cost (N + p) / (N - p)")
     row("YIC, R_T^2", f"{number(result.yic, 5)}, {number(result.r_t_squared, 6)}")
     row("condition number", number(fit.condition_number, 3))
+    if fit.starts is not None:
+        row("search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}")
+    if fit.box is not None and fit.status is Status.AT_BOUND:
+        row("admissible", _box_text(fit.box, units))
     for k, test in enumerate(result.tests, start=1):
         row("residuals" if len(measurements) == 1 else f"residuals {k}", test.sentence)
     # What the line of the residuals says need not be said again.
     told = tuple(test.sentence for test in result.tests)
     return "\n".join([*lines, *warning_lines(warning for warning in result.warnings if not warning.endswith(told))])
+
+
+def _box_object(box: Box) -> dict[str, Any]:
+    """The set of models in which the estimate is the best, null for what has no bound."""
+    return {
+        "poles": (box.slowest, box.fastest),
+        "imaginary_part": box.nyquist if np.isfinite(box.nyquist) else None,
+        "damping": box.least_damping,
+        "delay": box.delays,
+    }
+
+
+def _box_text(box: Box, units: Units) -> str:
+    rate = f"rad/{units.time}"
+    swing = f", imaginary parts up to {box.nyquist:.4g} {rate}" if np.isfinite(box.nyquist) else ""
+    poles = f"poles from {box.slowest:.4g} to {box.fastest:.4g} {rate}{swing}"
+    return f"{poles}; pairs with a damping of at least {box.least_damping:g}"
 
 
 def _record_line(measurement: Measurement, used: int, units: Units) -> str:
@@ -189,7 +215,7 @@ def _modes(result: Identification, units: Units) -> list[dict[str, float | None]
     """Natural frequency and damping of every real pole and every pair."""
     rows = {row.name: row.estimate for row in result.derived}
     modes: list[dict[str, float | None]] = []
-    for k in range(1, result.options.poles + 1):
+    for k in range(1, result.fit.model.order + 1):
         if f"damping_{k}" in rows:
             frequency, damping = rows[f"natural_frequency_{k}"], rows[f"damping_{k}"]
         elif f"pole_{k}" in rows:

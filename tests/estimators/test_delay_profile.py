@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.output_error import Layout, OutputErrorProblem
+from ctid_cli.estimation.optimum.projection import Problem
+from ctid_cli.estimation.output_error import Layout, sensitivities
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
@@ -47,15 +48,16 @@ def test_sensitivities_are_the_derivatives_of_the_output(structure, delay, irreg
     rng = np.random.default_rng(3)
     data = [filter_data(record_of(n=80, seed=k, noise=0.1, irregular=irregular), 1.0) for k in range(2)]
     layout = Layout(structure, 2, initial_state=True, offset=True)
-    problem = OutputErrorProblem(data, layout, delay)
+    problem = Problem(tuple(data), structure.zeros, True, True, (0.0, 0.0))
     n, m = structure.poles, structure.zeros
-    a = np.poly(-rng.uniform(0.5, 3.0, n))[1:]
+    a = np.poly([-0.8, -1.0 + 2.0j, -1.0 - 2.0j][-n:]).real[1:] if n > 1 else np.array([1.3])
     theta = np.concatenate((a, rng.standard_normal(m + 1), [delay] * structure.delay))
     theta = np.concatenate((theta, rng.standard_normal(layout.size - theta.size)))
-    parts = problem.sensitivities(theta)
+    parts = sensitivities(problem, layout, theta, delay)
     for k in range(layout.size):
         step = 1e-5 * max(abs(theta[k]), 1.0)
-        moved = [problem.sensitivities(theta + sign * step * np.eye(layout.size)[k]) for sign in (1, -1)]
+        ends = [theta + sign * step * np.eye(layout.size)[k] for sign in (1, -1)]
+        moved = [sensitivities(problem, layout, end, delay) for end in ends]
         for (psi, _), (_, above), (_, below) in zip(parts, *moved, strict=True):
             # The error falls where the simulated output rises.
             slope = (below - above) / (2 * step)
@@ -64,12 +66,10 @@ def test_sensitivities_are_the_derivatives_of_the_output(structure, delay, irreg
 
 def test_a_free_response_is_what_the_cut_off_past_leaves_behind():
     record = record_of(past=150)
-    data = filter_data(record, SYSTEM.delay)
-    layout = Layout(Structure(2, 0), initial_state=True)
-    problem = OutputErrorProblem([data], layout, SYSTEM.delay)
-    theta = problem.linear_start(SYSTEM.denominator, SYSTEM.delay)
-    assert problem.equations(theta).squared_error < 1e-18 * np.sum(data.y_used**2)
-    assert np.abs(theta[3:]).max() > 0.1
+    known = DelayProfile(2, 0, (SYSTEM.delay, SYSTEM.delay), initial_state="estimate")
+    applied = known.prepare(record).laid_out.errors_of(SYSTEM)
+    assert np.sum(applied.residuals[0] ** 2) < 1e-18 * np.sum(record.y**2)
+    assert np.abs(applied.initial_states[0]).max() > 0.1
 
 
 # --- what is estimated with the model --------------------------------------------------------------
@@ -146,17 +146,6 @@ def test_one_experiment_twice_gives_the_same_model_and_half_the_variance():
     expected = (n - 5) / (2 * n - 6)
     ratio = two.standard_errors["delay"] ** 2 / one.standard_errors["delay"] ** 2
     assert ratio == pytest.approx(expected, rel=1e-4)
-
-
-def test_moments_of_several_experiments_are_the_sums():
-    records = [record_of(seed=k, noise=0.1, n=200 + 50 * k, irregular=k == 1) for k in range(3)]
-    data = [filter_data(record, 1.0) for record in records]
-    theta = np.array([1.0, 3.0, 2.5, 0.5])
-    together = OutputErrorProblem(data, Layout(Structure(2, 0, delay=True), 3)).equations(theta)
-    apart = [OutputErrorProblem([item], Layout(Structure(2, 0, delay=True))).equations(theta) for item in data]
-    np.testing.assert_allclose(together.hessian, sum(item.hessian for item in apart), rtol=1e-12)
-    np.testing.assert_allclose(together.instrument_error, sum(item.instrument_error for item in apart), rtol=1e-12)
-    assert together.squared_error == pytest.approx(sum(item.squared_error for item in apart))
 
 
 # --- the search ------------------------------------------------------------------------------------
@@ -294,11 +283,11 @@ def test_squared_errors_around_the_estimate():
     prepared = options.prepare(record_of(noise=0.1, offset=0.4))
     fit = prepared.fit()
     lowest = fit.cost * fit.count
-    assert prepared.laid_out.squared_error_at(fit.theta, fit.model.delay) == pytest.approx(lowest)
+    assert prepared.laid_out.squared_error_at(fit.model, fit.model.delay) == pytest.approx(lowest)
     known = replace(options, delay_bounds=(0.6, 0.6)).fit(prepared.laid_out.measured.records)
-    assert prepared.laid_out.squared_error_at(fit.theta, 0.6) == pytest.approx(known.cost * known.count, rel=1e-6)
+    assert prepared.laid_out.squared_error_at(fit.model, 0.6) == pytest.approx(known.cost * known.count, rel=1e-6)
     better = replace(options, offset="estimate").fit(prepared.laid_out.measured.records)
-    assert prepared.laid_out.squared_error_with(fit.theta, fit.model.delay, offset=True) == pytest.approx(
+    assert prepared.laid_out.squared_error_with(fit.model, offset=True) == pytest.approx(
         better.cost * better.count, rel=1e-6
     )
 

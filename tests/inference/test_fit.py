@@ -88,6 +88,7 @@ def test_constant_or_missing_output_has_no_fit():
     assert np.isnan(r_squared([np.nan, np.nan], [1.0, 2.0]))
 
 
-def test_only_converged_and_one_shot_estimates_count_as_successes():
-    assert {status for status in Status if status.succeeded} == {Status.CONVERGED, Status.LEAST_SQUARES}
-    assert len({status.value for status in Status}) == len(Status) == 7
+def test_only_optimal_and_one_shot_estimates_count_as_successes():
+    best = {Status.CONVERGED, Status.AT_BOUND, Status.RIDGE, Status.LEAST_SQUARES}
+    assert {status for status in Status if status.succeeded} == best
+    assert len({status.value for status in Status}) == len(Status) == 9

@@ -1,7 +1,5 @@
 """The best output-error model of a record within the stated set, and how far that may be trusted."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -30,9 +28,11 @@ class SearchOptions:
     periods: Sequence[float] = ()
     #: Denominators and delays [s] that other estimators have found.
     starts: Sequence[tuple[ArrayLike, float]] = ()
-    #: Whether the smaller models that the structure contains are fitted too: their optima are starts, and the least of
-    #: all is returned, so that the cost never rises with the structure. Without them only the given starts are refined.
+    #: Whether the smaller models that the structure contains are fitted too: their optima are starts. Without them only
+    #: the given starts are refined.
     nested: bool = True
+    #: Whether the least of all is returned, so that the cost never rises with the structure, though with fewer poles.
+    fewer_poles: bool = True
     #: Further starts at random; by default ten and ten for each pole, and none where smaller models are left out.
     random_starts: int | None = None
     seed: int = 0
@@ -50,7 +50,8 @@ class Optimum:
     numerator: Array
     denominator: Array
     delay: float
-    #: Of each record, coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers (zeros without one), and offset.
+    #: Of each record, coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers, and offset;
+    #: zeros without them.
     free_responses: Array
     offsets: Array
     squared_error: float
@@ -59,6 +60,8 @@ class Optimum:
     promise: float
     #: Poles of the structure that have run to infinity, where a smaller model has the least squared error.
     poles_at_infinity: int
+    #: Whether the delay would leave its bounds.
+    delay_at_bound: bool
     #: Whether the delay sits in a kink of the cost, at a sample.
     pinned: bool
     tried: int
@@ -91,7 +94,7 @@ def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, opt
     lost = 0
     # With a pole at infinity a model of one pole less, whatever its zeros, is in the closure of the structure.
     fewest = max(zeros + int(box.delay_free), 1)
-    for missing in range(poles - fewest + 1 if options.nested else 1):
+    for missing in range(poles - fewest + 1 if options.nested and options.fewer_poles else 1):
         descent = nest.descent(zeros)
         found = descent.settle(nest.optima(poles - missing, zeros)[0])
         nest.evaluations += descent.evaluations
@@ -138,6 +141,7 @@ def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Opt
         ending=best.ending,
         promise=best.promise,
         poles_at_infinity=lost,
+        delay_at_bound=nest.box.delay_free and bool(best.held[-1]) and not best.pinned,
         pinned=best.pinned,
         tried=tried,
         agree=agree,

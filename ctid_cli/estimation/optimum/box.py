@@ -10,8 +10,6 @@ section too. Real poles further apart, or at a bound of the set, have ln p each,
 the logarithms of its real and imaginary part: in these coordinates the set is a box wherever its border is met.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -50,6 +48,10 @@ class Box:
     def delay_free(self) -> bool:
         """Whether the delay is searched."""
         return self.delays[0] < self.delays[1]
+
+
+#: No bounds at all.
+ANYWHERE = Box(0.0, np.inf, delays=(0.0, np.inf), least_damping=0.0)
 
 
 @dataclass(frozen=True, eq=False)

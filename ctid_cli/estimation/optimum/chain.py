@@ -6,8 +6,6 @@ the common denominator, a numerator of degree ``n-1-i``: the last m + 1 states s
 polynomial, no root and no partial fraction is ever formed. Real poles may meet and become a pair.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

@@ -12,8 +12,6 @@ L. Kaufman, "A variable projection method for solving separable nonlinear least 
 49-57. doi:10.1007/BF01932995
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -133,15 +131,15 @@ def project(problem: Problem, speed: Array, damping: Array, delay: Delay) -> Pro
     return found
 
 
-def twice(F: Array, g: Array, weights: Projected, record: int, free_response: bool) -> ChainState:
+def twice(F: Array, g: Array, output: Array, direct: float, free: Array | None) -> ChainState:
     """The chain with a second one driven by x = B/A u: dx/dalpha_j = -(d ln A/d alpha_j) x up to what Phi spans.
 
     The free response ``C/A delta`` drives one too.
     """
-    dynamics, gain = driven_chain(F, g, weights.output, weights.direct)
-    if not free_response:
+    dynamics, gain = driven_chain(F, g, output, direct)
+    if free is None:
         return ChainState(dynamics, gain, dynamics, np.zeros(0))
-    return ChainState(dynamics, gain, *driven_chain(F, g, weights.free[record], 0.0))
+    return ChainState(dynamics, gain, *driven_chain(F, g, free, 0.0))
 
 
 @njit(cache=True, nogil=True)
@@ -176,12 +174,10 @@ def slopes(
 ) -> Slopes:
     """Exact gradient, and Kaufman's J'J, at what :func:`project` gave for the same sections and delay."""
     F, g = chain_dynamics(speed, damping)
-    rows = np.stack(
-        [
-            rows_of(twice(F, g, projected, k, problem.free_response), delay, data, period)
-            for k, (data, period) in enumerate(zip(problem.records, problem.periods, strict=True))
-        ]
-    )
+    frees = projected.free if problem.free_response else [None] * len(problem.records)
+    chains = [twice(F, g, projected.output, projected.direct, free) for free in frees]
+    each = zip(chains, problem.records, problem.periods, strict=True)
+    rows = np.stack([rows_of(chain, delay, data, period) for chain, data, period in each])
     free = problem.zeros, problem.free_response, problem.offset, delay_free
     found: Slopes = _kaufman(rows, F, g, projected, logarithmic_slopes(speed, damping, F), free)
     return found

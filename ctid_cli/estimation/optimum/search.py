@@ -1,15 +1,14 @@
 """Descent to a local minimum of the projected squared error, and what kind of minimum it is."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.estimation.optimum.box import TOUCH, Box, Point, frozen, moved_by
+from ctid_cli.arrays import Array, BoolArray, ComplexArray
+from ctid_cli.estimation.optimum.box import TOUCH, Box, Point, box_of, frozen, moved_by, point_of
 from ctid_cli.estimation.optimum.projection import Problem, Projected, project, slopes
 
 #: Fall of the squared error that Newton's step may promise, as a fraction of it, at a minimum; what Newton's steps aim
@@ -23,6 +22,8 @@ MOST_STEPS, MOST_REJECTIONS, MOST_NEWTON = 60, 12, 15
 CLOSE = 0.01
 #: Step of the differences of the gradient; eigenvalues below this fraction of the largest have no sign.
 DIFFERENCE, FLAT = 1e-4, 1e-9
+#: Differences to one side will do where the least eigenvalue exceeds their error by this factor.
+SURE = 10.0
 #: Least way to the border of the set that a ridge has, in logarithms: a factor of two.
 RIDGE = float(np.log(2.0))
 #: Least first step along negative curvature, and longest one over which second derivatives are kept.
@@ -114,15 +115,17 @@ class Descent:
         across = self.local(other, here.projected)
         return across if across.gradient[-1] * side < 0 else here
 
-    def descend(self, start: Point, known: Sequence[Local] = ()) -> Local:
+    def descend(
+        self, start: Point, known: Sequence[Local] = (), near: float = NEAR, most_steps: int = MOST_STEPS
+    ) -> Local:
         """Levenberg-Marquardt steps: Moré's scaling, Nielsen's damping, held coordinates frozen.
 
-        A search that comes close to a minimum that is known ends there.
+        A search that comes close to a minimum that is known ends there, any where a step promises but ``near``.
         """
         here = self.local(start)
         damping, factor, slow = 1e-3, 2.0, 0
         scale = np.zeros(here.gradient.size)
-        for _ in range(MOST_STEPS):
+        for _ in range(most_steps):
             here = self._faced(here)
             for other in known:
                 if _alike(here, other, self.box):
@@ -132,7 +135,7 @@ class Descent:
             scale = np.maximum(scale, _lengths(here))
             unit = scale[free]
             scaled, slope = curvature / np.outer(unit, unit), gradient / unit
-            if not free.any() or _promise(scaled, slope)[0] <= NEAR * max(here.squared_error, self.floor):
+            if not free.any() or _promise(scaled, slope)[0] <= near * max(here.squared_error, self.floor):
                 break
             step = np.zeros(free.size)
             for _ in range(MOST_REJECTIONS):
@@ -160,22 +163,29 @@ class Descent:
         return here
 
     def hessian(self, here: Local) -> Array:
-        """Second derivatives of half the squared error, by differences of its exact gradient."""
+        """Second derivatives of half the squared error, by differences of its exact gradient.
+
+        To one side first: how far that is from symmetric tells its error, and whether the other side is needed.
+        """
         size = here.gradient.size
-        rows = np.zeros((size, size))
-        for i in range(size):
-            ends = []
-            small = DIFFERENCE
-            if self.box.cell > 0 and i == here.point.poles.size:
-                small = min(small, 0.1 * self.box.cell / self.box.quarter)
-            for side in (1.0, -1.0):
-                step = np.zeros(size)
-                step[i] = side * small
-                beyond = _unbounded(here.point, step, self.box)
+        steps = np.full(size, DIFFERENCE)
+        if self.box.delay_free and self.box.cell > 0:
+            steps[-1] = min(DIFFERENCE, 0.1 * self.box.cell / self.box.quarter)
+        rows, widths, unit = np.zeros((size, size)), np.zeros(size), _lengths(here)
+        for side in (1.0, -1.0):
+            for i in range(size):
                 # Across a sample the delay has other derivatives: stay in its cell.
-                ends.append((0.0, here.gradient) if beyond is None else (side, self.local(beyond).gradient))
-            rows[i] = (ends[0][1] - ends[1][1]) / (small * (ends[0][0] - ends[1][0]))
-        return 0.5 * (rows + rows.T)
+                beyond = _unbounded(here.point, side * steps[i] * np.eye(size)[i], self.box)
+                if beyond is not None:
+                    rows[i] += side * (self.local(beyond).gradient - here.gradient)
+                    widths[i] += steps[i]
+            if not (widths > 0).all():
+                continue
+            whole = rows / widths[:, None]
+            error = np.linalg.norm((whole - whole.T) / np.outer(unit, unit))
+            if np.linalg.eigvalsh(0.5 * (whole + whole.T) / np.outer(unit, unit))[0] > SURE * (error + DIFFERENCE):
+                break
+        return 0.5 * (whole + whole.T)
 
     def settle(self, here: Local) -> Judged:
         """Newton's steps to the minimum itself, along negative curvature where there is any, and its kind."""
@@ -288,6 +298,14 @@ class Descent:
                     break
                 last = trial
         return False
+
+
+def local_minimum(
+    problem: Problem, poles: ComplexArray, delay: float, delays: tuple[float, float], *effort: Any
+) -> Local:
+    """Descent from given poles and delay, which stays within its bounds."""
+    box = box_of(problem.records, delays)
+    return Descent(problem, box).descend(point_of(poles, delay, box), (), *effort)
 
 
 def _same(one: Point, other: Point) -> bool:

@@ -1,7 +1,5 @@
 """Where searches start: from the optima of the smaller models, from given estimates, and at random."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import numpy as np

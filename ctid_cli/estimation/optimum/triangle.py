@@ -5,8 +5,6 @@ linear maps of these rows (projections, residuals, sums of squares) is asked of 
 square the condition; this costs little more, so that one route serves the search and its end.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,0 +1,125 @@
+"""The estimate is the least output error of its structure and of all that it contains."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+
+from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.inference.status import Status
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
+from tests.estimation.optimum.dense import residual
+from tests.estimation.optimum.systems import random_model, record_of
+
+INTERVAL = 0.5
+
+
+def periodic_record(damping, noise=0.05, samples=100, seed=1):
+    """The last of many periods of a second-order system's answer."""
+    rng = np.random.default_rng(seed)
+    model = TransferFunction([0.6], [1.0, 2 * damping * 0.8, 0.64], 0.7)
+    u = np.repeat(rng.choice([-1.0, 1.0], samples // 2), 2)
+    periods = int(np.ceil(35.0 / (0.8 * damping * samples * INTERVAL))) + 1
+    t = INTERVAL * np.arange(periods * samples)
+    x = simulate(model, HeldSignal(t, np.tile(u, periods)), t)[-samples:]
+    return Record.from_arrays(t[:samples], u, x + noise * x.std() * rng.standard_normal(samples) + 3.0), model
+
+
+def in_motion(seed=2, samples=160):
+    """A record that begins in the middle of another, on an offset."""
+    rng = np.random.default_rng(seed)
+    model = TransferFunction([0.6], [1.0, 0.4, 0.64], 0.7)
+    whole = record_of(model, rng, samples=samples + 40, noise=0.1, offset=3.0)
+    return Record.from_arrays(whole.t[40:], whole.input.values[40:], whole.y[40:]), model
+
+
+@pytest.mark.parametrize(("damping", "seed"), [(0.3, 1), (0.001, 1), (0.001, 5)])
+def test_periodic_records_end_where_a_general_optimiser_does_on_dense_matrices(damping, seed):
+    record, model = periodic_record(damping, seed=seed)
+    fit = DelayProfile(2, 0, (0.0, 2.0), initial_state="periodic", offset="estimate").fit(record)
+    period = record.n_samples * INTERVAL
+    check(fit, model, lambda a, tau: residual(record, a, 0, tau, offset=True, period=period))
+    assert fit.status in (Status.CONVERGED, Status.AT_BOUND)
+    np.testing.assert_allclose(fit.model.denominator[2], model.denominator[2], rtol=0.05)
+
+
+def test_state_and_offset_end_where_a_general_optimiser_does_on_dense_matrices():
+    record, model = in_motion()
+    fit = DelayProfile(2, 0, (0.0, 2.0), initial_state="estimate", offset="estimate").fit(record)
+    assert fit.status is Status.CONVERGED
+    # What came before is not known, so that samples count from the greatest delay on.
+    y = np.where(record.t - record.t[0] < 2.0 - 1e-9, np.nan, record.y)
+    known = Record(record.t, y, record.input)
+    check(fit, model, lambda a, tau: residual(known, a, 0, tau, free_response=True, offset=True))
+
+
+def check(fit, model, residual_of):
+    """Compare with least squares from the truth in w, damping and delay, within the damping that is admissible."""
+
+    def errors(x):
+        w, zeta = np.exp(x[:2])
+        return residual_of(np.array([1.0, 2 * zeta * w, w * w]), x[2])
+
+    w = np.sqrt(model.denominator[2])
+    start = np.array([np.log(w), np.log(max(0.5 * model.denominator[1] / w, 1.1e-3)), model.delay])
+    bounds = [-np.inf, np.log(1e-3), 0.0], [np.inf, np.inf, 2.0]
+    found = least_squares(errors, start, bounds=bounds, x_scale="jac", xtol=1e-12, ftol=1e-14, gtol=1e-12)
+    squared_error = fit.cost * fit.count
+    # The model has the cost that is said, and no other is found by the other route.
+    a = fit.model.denominator
+    assert float(np.sum(residual_of(a, fit.model.delay) ** 2)) == pytest.approx(squared_error, rel=1e-7)
+    assert np.concatenate(fit.residuals) @ np.concatenate(fit.residuals) == pytest.approx(squared_error, rel=1e-9)
+    assert squared_error <= 2 * found.cost * (1 + 1e-6)
+
+
+@settings(max_examples=4)
+@given(
+    seed=st.integers(0, 1000),
+    initial_state=st.sampled_from(["rest", "estimate", "periodic"]),
+    offset=st.sampled_from(["none", "remove", "estimate"]),
+    delay=st.sampled_from([0.0, 1.5]),
+)
+def test_more_poles_or_zeros_never_cost_more(seed, initial_state, offset, delay):
+    rng = np.random.default_rng(seed)
+    record = record_of(random_model(rng, 3, 1), rng, samples=100, noise=1.0, offset=1.0)
+
+    def cost(n, m):
+        treatment = {"initial_state": initial_state, "offset": offset, "search": "samples", "nested": True}
+        return DelayProfile(n, m, (0.0, delay), **treatment).fit(record).cost
+
+    costs = {(n, m): cost(n, m) for n in (1, 2, 3) for m in range(n)}
+    for (n, m), least in costs.items():
+        for smaller in ((n - 1, m - 1), (n, m - 1), (n - 1, m)):
+            assert least <= costs.get(smaller, np.inf) * (1 + 1e-6)
+
+
+def test_several_records_are_fitted_together():
+    # Twice the same in pieces is the same, whatever each begins with.
+    record, _ = in_motion()
+    options = DelayProfile(2, 0, (0.7, 0.7), initial_state="estimate", offset="estimate")
+    other, _ = in_motion(seed=3)
+    both = options.fit([record, other])
+    apart = [options.prepare(one).laid_out.errors_of(both.model) for one in (record, other)]
+    for k, alone in enumerate(apart):
+        np.testing.assert_allclose(both.residuals[k], alone.residuals[0], atol=1e-7)
+    singles = [options.fit(one) for one in (record, other)]
+    assert both.cost * both.count >= sum(fit.cost * fit.count for fit in singles)
+    # At the least sum the derivatives of all records cancel.
+    shared = sum(psi[:, :3].T @ eps for psi, eps in zip(both.sensitivities, both.residuals, strict=True))
+    lengths = [np.linalg.norm(psi[:, :3], axis=0) for psi in both.sensitivities]
+    assert np.all(np.abs(shared) < 1e-6 * sum(lengths) * np.sqrt(both.cost * both.count))
+
+
+def test_poles_that_run_to_infinity_are_left_out_and_counted():
+    rng = np.random.default_rng(4)
+    record = record_of(TransferFunction([0.8], [1.0, 0.8]), rng, noise=0.02)
+    # What comes a sample too early cannot be helped by a lag.
+    early = Record.from_arrays(record.t[:-1], record.input.values[:-1], record.y[1:])
+    one, two = (DelayProfile(n, 0, (0.0, 0.0), nested=True).fit(early) for n in (1, 2))
+    assert (two.poles_at_infinity, two.parameter_names) == (1, ("a1", "b0"))
+    np.testing.assert_allclose(two.theta, one.theta, rtol=1e-6)
+    assert 1 <= two.starts.agree <= two.starts.tried
