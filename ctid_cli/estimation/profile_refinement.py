@@ -47,15 +47,22 @@ class Refinement:
 
         A profile under an unknown initial state, an offset or a period has too few basins: smaller models help then.
         """
-        poles = self.structure.poles
+        (poles, zeros), records = (self.structure.poles, self.structure.zeros), self.measured.data
+        random = RANDOM_STARTS + 2 * poles
         options = replace(
             self.measured.options,
             starts=starts,
             nested=nested or not self.measured.plain,
             fewer_poles=nested,
-            random_starts=RANDOM_STARTS + 2 * poles if nested else 0,
+            random_starts=random if nested else 0,
         )
-        return best_output_error(self.measured.data, poles, self.structure.zeros, options)
+        found = best_output_error(records, poles, zeros, options)
+        agreed = found.ending.optimal and (found.agree > 1 or found.tried == 1)
+        if agreed or options.nested:
+            return found
+        # Where the starts disagree others are asked.
+        starts = [(found.denominator, found.delay), *starts]
+        return best_output_error(records, poles, zeros, replace(options, starts=starts, random_starts=random))
 
     def squared_error_at(self, model: TransferFunction, delay: float) -> float:
         """Least sum of squared output errors at a given delay, in the basin of a model."""

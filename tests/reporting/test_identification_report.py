@@ -3,6 +3,7 @@
 import json
 import math
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ import pytest
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import identify
+from ctid_cli.estimators.identification_warnings import of_status
 from ctid_cli.filtering.simulate import simulate
+from ctid_cli.inference.status import Status
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.identification_plot import identification_svg
@@ -160,3 +163,21 @@ def test_the_figure_of_several_experiments_and_a_known_delay():
     assert b"<!-- experiment 3 of 4 -->" in figure
     assert b"experiment 4" not in figure
     assert b"known delay 0.73 ms" in figure
+
+
+def test_starts_bounds_and_poles_at_infinity_are_said(fitted):
+    result, files, _ = fitted
+    text, content = identification_text(result, files, UNITS), identification_object(result, files, UNITS)
+    starts = result.fit.starts
+    assert content["starts"] == {"tried": starts.tried, "agree": starts.agree}
+    assert "the best of " in text
+    assert ", reached " in text
+    assert content["box"]["poles"] == pytest.approx([1 / 79.9, 10 / 0.1])
+    assert content["box"]["delay"] == [0, 3]
+    assert content["poles_at_infinity"] == 0
+    # No bound is active, so that the text need not name any.
+    assert "admissible" not in text
+    lost = replace(result.fit, poles_at_infinity=2, status=Status.AT_BOUND)
+    text = identification_text(replace(result, fit=lost), files, UNITS)
+    assert "poles from 0.01252 to 100 rad/ms, imaginary parts up to 31.42 rad/ms" in text
+    assert of_status(lost)[0].startswith("2 poles run to infinity")

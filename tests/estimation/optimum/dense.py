@@ -16,8 +16,21 @@ def squared_error(*args, **options):
 
 def residual(record, denominator, zeros, delay=0.0, free_response=False, offset=False, period=0.0):
     """What least squares of the record on ``s^k/A u(t - tau)``, the free responses and a constant leaves."""
+    shared, own = columns_of(record, denominator, zeros, delay, free_response, offset, period)
+    return left_over(np.hstack((shared, own)), record.y[record.valid])
+
+
+def left_over(phi, y):
+    """What the columns of a matrix do not explain."""
+    phi = phi / np.linalg.norm(phi, axis=0)
+    return y - phi @ np.linalg.lstsq(phi, y, rcond=1e-12)[0]
+
+
+def columns_of(record, denominator, zeros, delay=0.0, free_response=False, offset=False, period=0.0):
+    """Columns that records have in common, and those of this one alone."""
     used = record.valid
-    columns = [_response(record, np.eye(zeros + 1)[k], denominator, delay, period) for k in range(zeros + 1)]
+    shared = [_response(record, np.eye(zeros + 1)[k], denominator, delay, period) for k in range(zeros + 1)]
+    columns = []
     if free_response:
         A = np.diag(np.ones(denominator.size - 2), -1)
         A[0] = -denominator[1:]
@@ -25,10 +38,8 @@ def residual(record, denominator, zeros, delay=0.0, free_response=False, offset=
         columns += list(np.array([expm(A * time)[:, 0] for time in elapsed]).T)
     if offset:
         columns.append(np.ones(record.t.size))
-    phi = np.column_stack(columns)[used]
-    phi /= np.linalg.norm(phi, axis=0)
-    y = record.y[used]
-    return y - phi @ np.linalg.lstsq(phi, y, rcond=1e-12)[0]
+    own = np.column_stack(columns) if columns else np.zeros((record.t.size, 0))
+    return np.column_stack(shared)[used], own[used]
 
 
 def _response(record, numerator, denominator, delay, period):

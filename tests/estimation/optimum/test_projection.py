@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from ctid_cli.estimation.optimum.box import Box, point_of
 from ctid_cli.estimation.optimum.chain import chain_dynamics, logarithmic_slopes, numerators
@@ -9,7 +10,7 @@ from ctid_cli.estimation.optimum.projection import Problem, project, slopes
 from ctid_cli.estimation.optimum.triangle import Delay
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.signals.record import Record
-from tests.estimation.optimum.dense import squared_error
+from tests.estimation.optimum.dense import columns_of, left_over, squared_error
 from tests.estimation.optimum.systems import MODEL, record_of
 
 #: A point beside the model that the records are of.
@@ -106,6 +107,22 @@ def test_masked_samples_do_not_count():
     masked = Record(record.t, y, record.input)
     found = project(problem_of(masked, 2, True, True), SPEED, DAMPING, Delay(0.37, -1)).squared_error
     np.testing.assert_allclose(found, squared_error(masked, DENOMINATOR, 2, 0.37, True, True), rtol=1e-8)
+
+
+@pytest.mark.parametrize(("free_response", "offset"), [(False, False), (True, False), (False, True), (True, True)])
+def test_records_share_the_numerator_and_have_their_own_state_and_offset(free_response, offset):
+    rng = np.random.default_rng(7)
+    records = [record_of(MODEL, rng, noise=0.1, offset=k, samples=100 + 40 * k, regular=k != 1) for k in range(3)]
+    problem = Problem(tuple(filter_data(record) for record in records), 2, free_response, offset, (0.0,) * 3)
+    delay = Delay(0.37, -1)
+    found = project(problem, SPEED, DAMPING, delay)
+    parts = [columns_of(record, DENOMINATOR, 2, 0.37, free_response, offset) for record in records]
+    phi = np.hstack((np.vstack([shared for shared, _ in parts]), block_diag(*[own for _, own in parts])))
+    left = left_over(phi, np.concatenate([record.y for record in records]))
+    assert found.squared_error == pytest.approx(left @ left, rel=1e-8)
+    found_slopes = slopes(problem, SPEED, DAMPING, delay, found, True)
+    ends = [project(problem, SPEED, DAMPING, Delay(0.37 + step, -1)).squared_error for step in (-1e-5, 1e-5)]
+    assert found_slopes.gradient[-1] == pytest.approx((ends[1] - ends[0]) / 4e-5, rel=1e-6)
 
 
 def test_double_poles_are_no_special_case():
