@@ -13,7 +13,7 @@ from ctid_cli.estimation.filtered_costs import filtered_costs
 from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.search import local_minimum
-from ctid_cli.estimation.sampled_problem import at_known_delay, least_squares_start
+from ctid_cli.estimation.sampled_problem import CUTOFFS, at_known_delay, least_squares_start
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.sensitivity import Structure
 
@@ -39,8 +39,6 @@ MOST_FIRST_DELAYS = 30
 MOST_LEVELS = 4
 LEVEL_ORDER = 10
 LEVEL_EFFORT = Steps(max_iterations=6, tolerance=2e-2, rule=GAUSS_NEWTON, halvings=3)
-#: Cut-offs of the state-variable filter that are tried, as multiples of the output's bandwidth.
-CUTOFFS = (0.2, 1.0, 5.0)
 
 
 @dataclass(frozen=True, eq=False)

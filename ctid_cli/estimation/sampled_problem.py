@@ -11,7 +11,12 @@ from ctid_cli.estimation.stability import reflect_unstable, with_stable_denomina
 from ctid_cli.filtering.bank import second_moments, standard_moments
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT
+from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.signals.record import Record
+
+#: Cut-offs of the state-variable filter that are tried where none is given, as multiples of the output's bandwidth.
+CUTOFFS = (1.0, 0.2, 5.0, 0.04)
 
 
 class SampledProblem(NamedTuple):
@@ -98,6 +103,14 @@ def sampled_equations(problem: SampledProblem, theta: Array) -> Equations:
 
 
 compiled_as(SampledProblem, sampled_equations)
+
+
+def cutoffs_of(record: Record, given: float | None) -> tuple[float, ...]:
+    """Cut-offs of the state-variable filter to start from [rad/s]: the one given, or several around the bandwidth."""
+    if given is not None:
+        return (given,)
+    bandwidth = output_bandwidth(record)
+    return tuple(multiple * bandwidth for multiple in CUTOFFS)
 
 
 def least_squares_start(

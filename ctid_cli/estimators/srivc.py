@@ -1,7 +1,7 @@
 """Simplified refined instrumental variables for continuous-time models (SRIVC) at a known delay."""
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from ctid_cli.estimation.additive_estimate import Covariance, estimate_submodels
 from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, check_record, finish, history_of
 from ctid_cli.estimation.iteration import RULES, StepRule, Steps, iterate
-from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, least_squares_start
+from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, cutoffs_of, least_squares_start
 from ctid_cli.estimation.stability import with_stable_denominator
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import filter_data
@@ -28,8 +28,15 @@ from ctid_cli.signals.record import Record
 SrivcVariant = Literal["auto", "guarded", "plain", "relaxed"]
 
 
+class Iteration(NamedTuple):
+    """What is iterated on, and the record, which gives it starts."""
+
+    problem: SampledProblem | AdditiveProblem
+    record: Record
+
+
 @dataclass(frozen=True)
-class Srivc(Estimator[SampledProblem | AdditiveProblem, Fit]):
+class Srivc(Estimator[Iteration, Fit]):
     """SRIVC: optimal instrumental variables for a transfer function with white output noise.
 
     Parameters
@@ -40,8 +47,9 @@ class Srivc(Estimator[SampledProblem | AdditiveProblem, Fit]):
         Degree of the numerator, below ``poles``.
     delay : float, default 0.0
         Known delay [s]; any real number of sampling intervals.
-    svf_cutoff : float, default 1.0
-        Cut-off of the state-variable filter of the start [rad/s], near the bandwidth of the system.
+    svf_cutoff : float, optional
+        Cut-off of the state-variable filter of the start [rad/s], near the bandwidth of the system. By default four
+        multiples of the output's bandwidth, from .04 to 5, are tried, and the estimate with the least cost is returned.
     max_iterations : int, default 50
         Largest number of iterations.
     tolerance : float, default 1e-6
@@ -94,7 +102,7 @@ class Srivc(Estimator[SampledProblem | AdditiveProblem, Fit]):
     poles: int
     zeros: int
     delay: float = 0.0
-    svf_cutoff: float = 1.0
+    svf_cutoff: float | None = None
     max_iterations: int = 50
     tolerance: float = 1e-6
     variant: SrivcVariant = "auto"
@@ -114,25 +122,33 @@ class Srivc(Estimator[SampledProblem | AdditiveProblem, Fit]):
             return "guarded" if self.instruments == "open_loop" else "relaxed"
         return self.variant
 
-    def _lay_out(self, record: Record) -> SampledProblem | AdditiveProblem:
+    def _lay_out(self, record: Record) -> Iteration:
         loop = loop_data(record, self.instruments)
         data = filter_data(record, self.delay, self.hold_output)
         structure = Structure(self.poles, self.zeros)
         check_record(record, data, structure.size)
         if self.step_rule == "relaxed" or self.instruments == "closed_loop":
             # In closed loop (CLSRIVC) and where steps are relaxed it is additive SRIVC with a single submodel.
-            return AdditiveProblem(data, (Term(self.poles, self.zeros),), self.delay, loop)
-        return at_known_delay(data, structure)
+            terms = (Term(self.poles, self.zeros),)
+            return Iteration(AdditiveProblem(data, terms, self.delay, loop), record)
+        return Iteration(at_known_delay(data, structure), record)
 
-    def _estimate(self, problem: SampledProblem | AdditiveProblem, start: Start | None) -> Fit:
+    def _estimate(self, iteration: Iteration, start: Start | None) -> Fit:
+        problem, record = iteration
         structure = Structure(self.poles, self.zeros)
         if start is not None and start.model is not None:
-            theta: Array | None = given_coefficients(start.model, structure, self.delay)
-        else:
-            refit = self.step_rule != "plain" or isinstance(problem, AdditiveProblem)
-            theta = least_squares_start(problem.data, structure, self.delay, self.svf_cutoff, refit)
-        if theta is None:
+            return self._from(problem, given_coefficients(start.model, structure, self.delay))
+        refit = self.step_rule != "plain" or isinstance(problem, AdditiveProblem)
+        cutoffs = cutoffs_of(record, self.svf_cutoff)
+        starts = (least_squares_start(problem.data, structure, self.delay, cutoff, refit) for cutoff in cutoffs)
+        fits = [self._from(problem, theta) for theta in starts if theta is not None]
+        if not fits:
             raise DataError(Status.SINGULAR.value)
+        return min(fits, key=lambda fit: (not fit.status.succeeded, np.nan_to_num(fit.cost, nan=np.inf)))
+
+    def _from(self, problem: SampledProblem | AdditiveProblem, theta: Array) -> Fit:
+        """Iterate from one start."""
+        structure = Structure(self.poles, self.zeros)
         steps = Steps(self.max_iterations, self.tolerance, RULES[self.step_rule])
         if isinstance(problem, AdditiveProblem):
             return self._as_submodel(problem, theta, structure, steps)

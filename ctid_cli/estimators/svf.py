@@ -1,11 +1,11 @@
 """Least squares with a state-variable filter."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Estimator, Start, check_proper, check_record, finish, history_entry
-from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, least_squares_start
+from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, cutoffs_of, least_squares_start
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.sensitivity import Structure
@@ -14,8 +14,15 @@ from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
 
+class Equation(NamedTuple):
+    """A filtered record, and the cut-off of the filter [rad/s]."""
+
+    problem: SampledProblem
+    svf_cutoff: float
+
+
 @dataclass(frozen=True)
-class Svf(Estimator[SampledProblem, Fit]):
+class Svf(Estimator[Equation, Fit]):
     """Least-squares estimate with the state-variable filter ``1/(p + svf_cutoff)^poles``.
 
     Parameters
@@ -26,8 +33,8 @@ class Svf(Estimator[SampledProblem, Fit]):
         Degree of the numerator, below ``poles``.
     delay : float, default 0.0
         Known delay [s].
-    svf_cutoff : float, default 1.0
-        Cut-off of the filter [rad/s], near the bandwidth of the system.
+    svf_cutoff : float, optional
+        Cut-off of the filter [rad/s], near the bandwidth of the system; by default the bandwidth of the output.
     hold_output : {"foh", "zoh"}, default "foh"
         Interpolation of the measured output between samples.
 
@@ -52,21 +59,22 @@ class Svf(Estimator[SampledProblem, Fit]):
     poles: int
     zeros: int
     delay: float = 0.0
-    svf_cutoff: float = 1.0
+    svf_cutoff: float | None = None
     hold_output: Hold = "foh"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_proper(self.poles, self.zeros)
 
-    def _lay_out(self, record: Record) -> SampledProblem:
+    def _lay_out(self, record: Record) -> Equation:
         data = filter_data(record, self.delay, self.hold_output)
         structure = Structure(self.poles, self.zeros)
         check_record(record, data, structure.size)
-        return at_known_delay(data, structure)
+        return Equation(at_known_delay(data, structure), cutoffs_of(record, self.svf_cutoff)[0])
 
-    def _estimate(self, problem: SampledProblem, start: Start | None) -> Fit:
-        theta = least_squares_start(problem.data, problem.structure, self.delay, self.svf_cutoff)
+    def _estimate(self, equation: Equation, start: Start | None) -> Fit:
+        problem = equation.problem
+        theta = least_squares_start(problem.data, problem.structure, self.delay, equation.svf_cutoff)
         if theta is None:
             raise DataError(Status.SINGULAR.value)
         squared_error = problem.equations(theta).squared_error

@@ -23,10 +23,12 @@ from ctid_cli.estimation.common import (
     initial_delay,
 )
 from ctid_cli.estimation.delay_search import LEAST_CURVATURE, Descent, Minimum, bound_in_the_way, delay_step, descend
+from ctid_cli.estimation.global_look import lower_elsewhere
 from ctid_cli.estimation.iteration import GUARDED, RULES, Iterated, Steps, Variant, iterate
-from ctid_cli.estimation.sampled_problem import SampledProblem, least_squares_start
+from ctid_cli.estimation.sampled_problem import SampledProblem, cutoffs_of, least_squares_start
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
+from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.status import Status
 from ctid_cli.signals.held import Hold
@@ -53,8 +55,9 @@ class TdSrivc(Estimator["Searches", Fit]):
     lowpass : Lowpass, optional
         Search on low-pass-filtered data first, which widens the region of convergence; then refine on the data as
         they are. None searches on the data as they are.
-    svf_cutoff : float, default 1.0
-        Cut-off of the state-variable filter of the start [rad/s], near the bandwidth of the system.
+    svf_cutoff : float, optional
+        Cut-off of the state-variable filter of the start [rad/s], near the bandwidth of the system. By default four
+        multiples of the output's bandwidth, from .04 to 5, are tried at the initial delay.
     max_iterations : int, default 50
         Largest number of Gauss-Newton iterations on the delay, in the search and in the refinement each.
     tolerance : float, default 1e-6
@@ -78,7 +81,8 @@ class TdSrivc(Estimator["Searches", Fit]):
 
     ``H = eps_tau' eps_tau - eps_tau' psi (psi' psi)^-1 psi' eps_tau``, step ``-(eps_tau' eps)/H``,
 
-    halved while it leaves the bounds or the cost does not fall.
+    halved while it leaves the bounds or the cost does not fall. Having converged, ``guarded`` looks at all delays
+    within the bounds with the denominator that it found: where the cost is lower elsewhere, the status is ``LOCAL``.
 
     References
     ----------
@@ -93,7 +97,7 @@ class TdSrivc(Estimator["Searches", Fit]):
     zeros: int
     delay_bounds: tuple[float, float]
     lowpass: Lowpass | None = None
-    svf_cutoff: float = 1.0
+    svf_cutoff: float | None = None
     max_iterations: int = 50
     tolerance: float = 1e-6
     variant: Variant = "guarded"
@@ -109,12 +113,12 @@ class TdSrivc(Estimator["Searches", Fit]):
         problem = self._problem(record)
         check_record(record, problem.data, problem.free)
         if self.lowpass is None:
-            return Searches(problem, problem)
+            return Searches(problem, problem, record)
         try:
             filtered = self.lowpass.apply(record)
         except ValueError as error:
             raise DataError(str(error)) from error
-        return Searches(self._problem(filtered), problem)
+        return Searches(self._problem(filtered), problem, record)
 
     def _problem(self, record: Record) -> SampledProblem:
         """Coefficients and delay together."""
@@ -124,12 +128,16 @@ class TdSrivc(Estimator["Searches", Fit]):
     def _estimate(self, searches: Searches, start: Start | None) -> Fit:
         delay = initial_delay(start, self.delay_bounds)
         history: list[IterationRecord] = []
-        found = self._descend(searches.first, delay, None, "search", history)
+        starts = cutoffs_of(searches.record, self.svf_cutoff)
+        found = self._descend(searches.first, delay, None, "search", history, starts)
         if found is None:
             raise DataError(Status.SINGULAR.value)
-        if self.lowpass is None:
-            return self._finish(searches.last, found, history)
-        return self._refine(searches.last, found, history)
+        end = self._finish if self.lowpass is None else self._refine
+        fit = end(searches.last, found, history)
+        if self.variant == "plain" or fit.status is Status.DELAY_AT_BOUND:
+            return fit
+        local = lower_elsewhere(searches.last, fit, output_bandwidth(searches.record))
+        return replace(fit, status=Status.LOCAL) if local else fit
 
     def _refine(self, problem: SampledProblem, found: Descent, history: list[IterationRecord]) -> Fit:
         """Go on from a delay and coefficients that a search on filtered data has found."""
@@ -139,10 +147,16 @@ class TdSrivc(Estimator["Searches", Fit]):
         return self._finish(problem, found, history)
 
     def _descend(
-        self, problem: SampledProblem, delay: float, theta: Array | None, stage: str, history: list[IterationRecord]
+        self,
+        problem: SampledProblem,
+        delay: float,
+        theta: Array | None,
+        stage: str,
+        history: list[IterationRecord],
+        svf_cutoffs: tuple[float, ...] = (),
     ) -> Descent | None:
         """Search from a delay; the accepted steps go to the history."""
-        cost = SrivcCost(self, problem)
+        cost = SrivcCost(self, problem, svf_cutoffs)
         effort: Any = {"max_iterations": self.max_iterations, "tolerance": cost.tolerance}
         found = descend(cost, delay, theta, self.delay_bounds, **effort)
         for k, step in enumerate(found.steps if found is not None else ()):
@@ -184,28 +198,34 @@ class Searches(NamedTuple):
 
     first: SampledProblem
     last: SampledProblem
+    record: Record
 
 
 class SrivcCost:
     """The cost of a record's samples as a function of the delay; SRIVC estimates the coefficients."""
 
-    def __init__(self, options: TdSrivc, problem: SampledProblem) -> None:
+    def __init__(self, options: TdSrivc, problem: SampledProblem, svf_cutoffs: tuple[float, ...]) -> None:
         self.options = options
+        self.svf_cutoffs = svf_cutoffs
         self.problem = problem._replace(free_delay=False)
         # The guarded variant ends with joint iterations: its search only has to find the basin.
         self.tolerance = options.tolerance if options.variant == "plain" else max(options.tolerance, SEARCH_TOLERANCE)
 
     def minimise(self, delay: float, theta: Array | None) -> Minimum | None:
-        """SRIVC at one delay, from given coefficients or from the least-squares start."""
-        options, problem = self.options, self.problem
-        if theta is None:
-            refit = options.variant == "guarded"
-            theta = least_squares_start(problem.data, problem.structure, delay, options.svf_cutoff, refit)
-            if theta is None:
-                return None
-        steps = Steps(INNER_ITERATIONS, self.tolerance, RULES[options.variant])
-        result = iterate(problem, np.append(theta[:-1], delay), steps)
-        if result is None:
+        """SRIVC at one delay, from given coefficients or from the least-squares starts."""
+        problem, refit = self.problem, self.options.variant == "guarded"
+        starts = (
+            [theta]
+            if theta is not None
+            else [
+                least_squares_start(problem.data, problem.structure, delay, cutoff, refit)
+                for cutoff in self.svf_cutoffs
+            ]
+        )
+        steps = Steps(INNER_ITERATIONS, self.tolerance, RULES[self.options.variant])
+        tried = (iterate(problem, np.append(start[:-1], delay), steps) for start in starts if start is not None)
+        results = [result for result in tried if result is not None]
+        if not results:
             return None
-        step = delay_step(result.equations, LEAST_CURVATURE, False)
-        return Minimum(result.theta, result.equations.squared_error, step)
+        best = min(results, key=lambda result: result.equations.squared_error)
+        return Minimum(best.theta, best.equations.squared_error, delay_step(best.equations, LEAST_CURVATURE, False))

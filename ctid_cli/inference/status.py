@@ -19,6 +19,7 @@ class Status(Enum):
         "not determine all parameters; use fewer poles or zeros."
     )
     DELAY_AT_BOUND = "The delay stopped at one of its bounds; widen delay_bounds, or start the delay elsewhere."
+    LOCAL = "A local minimum: at another delay within the bounds the cost is lower; start there, or use delay_profile."
     SINGULAR = "The equations became singular: the data do not determine all parameters; use fewer poles or zeros."
     DIVERGED = "The iterations diverged; use variant 'guarded', another svf_cutoff, or a start closer to the solution."
 

@@ -30,6 +30,16 @@ def test_noise_free_data_return_the_true_model(model, variant, regular):
     assert_same_model(fit.model, model, 1e-6)
 
 
+@pytest.mark.parametrize("replicate", range(6))
+def test_starts_from_the_record_reach_the_estimate_that_a_good_cutoff_gives(replicate):
+    # Two modes, a decade apart: a cut-off of 1 rad/s loses two thirds of such records.
+    record = make_record(CASE_2, seed=5, replicate=replicate, snr_db=10.0, n=2000)
+    found = Srivc(4, 1, delay=8.0).fit(record)
+    known = Srivc(**options(CASE_2)).fit(record)
+    assert found.status is Status.CONVERGED
+    assert found.cost <= known.cost * (1 + 1e-9)
+
+
 @pytest.mark.parametrize("hold_output", ["zoh", "foh"])
 def test_fine_sampling_makes_the_state_variable_filter_exact(hold_output):
     # Its only error without noise is the interpolation of the output: it falls with the interval.

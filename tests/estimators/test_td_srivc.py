@@ -55,6 +55,18 @@ def test_published_variant_returns_the_true_model_up_to_its_smallest_step(offset
     assert_same_model(fit.model, CASE_1, 1e-3)
 
 
+@pytest.mark.parametrize("start", [0.5, 2.0, 4.0, 6.0, 7.5, 8.5, 10.0, 12.0, 14.0])
+def test_a_local_minimum_is_called_one(start):
+    # From the right basin the estimate converges, from the others the cost at 8 s is seen to be lower.
+    record = make_record(seed=11, snr_db=10.0)
+    fit = TdSrivc(2, 0, (0.0, 15.0)).fit(record, Start(start))
+    if abs(start - 8.0) < 1.0:
+        assert fit.status is Status.CONVERGED
+        assert fit.model.delay == pytest.approx(8.0, abs=0.1)
+    else:
+        assert (fit.status is Status.LOCAL) == (abs(fit.model.delay - 8.0) > 0.1)
+
+
 @pytest.mark.parametrize("regular", [True, False])
 @pytest.mark.parametrize("model", [CASE_1, CASE_2])
 def test_delay_off_the_sampling_grid(model, regular):

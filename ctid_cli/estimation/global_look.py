@@ -1,0 +1,34 @@
+"""A cheap look over the whole range of delays after a local search."""
+
+import numpy as np
+
+from ctid_cli.estimation.delay_grid import lowest_minima
+from ctid_cli.estimation.delay_search import Minimum
+from ctid_cli.estimation.iteration import GUARDED, Steps, iterate, with_best
+from ctid_cli.estimation.sampled_problem import SampledProblem
+from ctid_cli.inference.fit import Fit
+
+#: Delays that are looked at: four to a period of the bandwidth, between these numbers.
+FEWEST_DELAYS, MOST_DELAYS = 24, 400
+#: Lowest minima of the look from which coefficients and delay are refined, and how hard.
+MINIMA = 3
+EFFORT = Steps(10, 1e-3, GUARDED)
+#: The cost counts as lower elsewhere where it is so by this fraction.
+LOWER = 1e-3
+
+
+def lower_elsewhere(problem: SampledProblem, fit: Fit, bandwidth: float) -> bool:
+    """Whether the cost is lower at another delay: the numerator alone is fitted there first, then all parameters."""
+    n, m = problem.poles, problem.zeros
+    held = problem._replace(free_delay=False)
+
+    def looked_at(delay: float) -> Minimum:
+        trial = with_best(held, np.concatenate((fit.model.denominator[1:], np.zeros(m + 1), [delay])), n, n + m + 1)
+        return Minimum(trial, held.equations(trial).squared_error)
+
+    wanted = int(np.ceil((problem.high - problem.low) * bandwidth / (0.5 * np.pi))) + 1
+    delays = np.linspace(problem.low, problem.high, min(max(wanted, FEWEST_DELAYS), MOST_DELAYS))
+    minima = lowest_minima([looked_at(delay) for delay in delays.tolist()], MINIMA)
+    refined = (iterate(problem, minimum.theta, EFFORT) for minimum in minima)
+    bound = (1.0 - LOWER) * fit.cost * fit.count
+    return any(found is not None and found.equations.squared_error < bound for found in refined)
