@@ -16,7 +16,7 @@ from ctid_cli.signals.treatment import InitialState, Offset
 @guarded
 def fit(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat), an experiment each.")],
-    poles: Annotated[int, typer.Option("--poles", help="Number of poles, 1 to 12.")],
+    poles: Annotated[int | None, typer.Option("--poles", help="Number of poles, 1 to 12; must be given.")] = None,
     zeros: Annotated[int, typer.Option("--zeros", help="Number of zeros, fewer than poles.")] = 0,
     delay: Annotated[str, typer.Option("--delay", metavar="LOW:HIGH|VALUE", help="Range or value [time unit].")] = "0",
     initial_state: Annotated[InitialState, typer.Option("--initial-state", help="State before the record.")] = "rest",
@@ -42,6 +42,8 @@ def fit(
     from ctid_cli.reporting.identification_report import common_units, identification_object, identification_text
     from ctid_cli.signals.measurement import read_measurement
 
+    if poles is None:
+        raise UsageError(f"--poles is missing; to see what the record allows and a first fit: ctid check {files[0]}")
     bounds = _delay_bounds(delay)
     try:
         # Every sample: the profile that is drawn is then the cost whose minimum the estimate is.

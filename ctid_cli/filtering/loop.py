@@ -171,5 +171,6 @@ def _require_solvable(plant: SampledModel, controller: DiscreteController) -> No
     gain = 0.0 if plant.shift else controller.direct * plant.direct
     if abs(1.0 + gain) <= NO_GAIN * max(1.0, abs(gain)):
         raise DataError(
-            "the loop has no solution: direct gains of -1 round it; change the controller's gain, or delay the model"
+            "the loop has no solution: model and controller both act at once, with gains whose product is -1; change "
+            "the gain of the controller, or give the model a delay or fewer zeros"
         )

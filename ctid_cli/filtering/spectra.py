@@ -91,7 +91,8 @@ def record_spectra(
     where = f"{record.name}: " if record.name else ""
     if inside.size < 2:
         raise DataError(
-            f"{where}fewer than two samples are left {start:g} s after the first input; take more, or a smaller delay"
+            f"{where}fewer than two samples are left {start:g} s after the first input; take a longer record, or a "
+            "smaller greatest delay"
         )
     last = float(inside[-1])
     highest = min(highest, np.pi / float(np.median(np.diff(inside))))

@@ -43,7 +43,10 @@ MEANINGS: dict[Flag, str] = {
     ),
     Flag.COMPLEX_ROOTS: "The estimated parameters belong to no set of real frequencies.",
     Flag.OUT_OF_BOUNDS: "A frequency beyond lowest_frequency or highest_frequency was put on the bound.",
-    Flag.INCONSISTENT: "The signal at a second delay has other frequencies: above pi/h (use a smaller h), or new ones.",
+    Flag.INCONSISTENT: (
+        "The frequencies do not explain the signal at a second delay: a tone above pi/h is seen as another one (use a "
+        "smaller h), or the estimate lags behind a change."
+    ),
     Flag.NOT_CONVERGED: "The iterations did not converge; start closer, or use a longer record.",
 }
 

@@ -41,7 +41,7 @@ def whole_delay(name: str, delay: float, interval: float) -> int:
     require_positive("interval", interval, "s")
     if delay / interval > LONGEST_DELAY:
         longest = f"{LONGEST_DELAY:,} sampling intervals of {interval:g} s"
-        raise OptionError(name, f"{name} = {delay:g} s is more than {longest}; thin them.")
+        raise OptionError(name, f"{name} = {delay:g} s is more than {longest}; keep fewer of the samples.")
     count = round(delay / interval)
     if count < 1:
         raise OptionError(name, f"{name} = {delay:g} s is shorter than half a sampling interval of {interval:g} s.")

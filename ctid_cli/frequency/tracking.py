@@ -312,7 +312,9 @@ class Tracker:
             (array.shape, array.dtype) == (own[name].shape, own[name].dtype) for name, array in arrays.items()
         )
         if not same or not np.array_equal(arrays.pop("fingerprint"), own["fingerprint"]):
-            raise DataError(f"this is not the state of {self.options!r} at {self.interval:g} s; restore it with those.")
+            own_place = f"{self.options!r} at a sampling interval of {self.interval:g} s"
+            how = "restore it with the options and the interval that it was saved with"
+            raise DataError(f"this is not the state of {own_place}; {how}.")
         for name, array in arrays.items():
             own[name][...] = array
 

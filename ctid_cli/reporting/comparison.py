@@ -283,6 +283,7 @@ def _power(cells: Sequence[Cell]) -> str:
         return "With so few data sets no difference could have been detected, however large."
     ends = " to ".join(dict.fromkeys(f"{end:.0f}" for end in (min(found), max(found))))
     text = f"A single cell that differs by {ends} percentage points is detected with {100 * POWER:g} % probability"
+    text += ", the reference taken as exact"
     blind = len(cells) - len(found)
     return f"{text}; in {count(blind, 'cell')} no difference could have been detected." if blind else f"{text}."
 

@@ -61,8 +61,7 @@ def detail_text(found: FoundEstimate, again: Repeated | None, out: Path) -> str:
     of_signal = "measures" in row
     blocks = [head, *(_measured(row) if of_signal else _fitted(found)), origin]
     if again is None:
-        every = "" if of_signal else " and see every iteration"
-        blocks.append([f"To make this data set and this estimate again{every}:", f"  {_redo_command(found, out)}"])
+        blocks.append(["To make this data set and this estimate again:", f"  {_redo_command(found, out)}"])
     else:
         blocks.append([_verdict(again, "frequencies" if of_signal else "parameters")])
         blocks += [[_history(again)]] if again.history else []

@@ -62,9 +62,9 @@ def experiment_rows(
     # Several sets of initial parameters are told apart by their names, as initial delays are by their values.
     given = {label for label, delay in manifest["starts"].items() if delay is None and label != "none"}
     by = ["cell", "estimator", *across, "start"]
-    counted = {tuple(group.pop(name) for name in by): group for group in results.summaries(by)}
+    counted = {tuple(map(group.pop, by)): group for group in results.summaries(by)}
     measured = _measured(results, by)
-    lacking = dict.fromkeys(name for found in measured.values() for name in found)
+    lacking = dict.fromkeys(itertools.chain(*measured.values()))
     rows = []
     for cell, estimator in itertools.product(manifest["data_cells"], manifest["estimators"]):
         own = {name: estimator["swept"].get(name) for name in across}

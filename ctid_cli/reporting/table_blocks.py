@@ -99,16 +99,21 @@ def _stacked(header: list[str], groups: list[list[Row]], delays: list[Any], labe
         shown = [name if last[: k + 1] != names[: k + 1] else "" for k, name in enumerate(names)]
         if last and last[:-1] != names[:-1]:
             body.append([""] * len(header))
-        last, run, ours = names, any(row["n"] for row in group), _across(group, delays)
-        first = f"n = {_sizes(group)}" if run else NOT_RUN
-        lines: dict[str, Callable[[Row], str]] = {first: lambda row: percent_text(row) if row["n"] else "-"}
-        lines |= {"95 %": _whole_interval} if run else {}
-        lines |= {"published": _published} if any(row["published_percent"] is not None for row in group) else {}
-        lines |= {"time": time_text} if run else {}
-        for title, text in lines.items():
+        last, ours = names, _across(group, delays)
+        for title, text in _lines(group).items():
             body.append([*shown, title, *("" if row is None else text(row) for row in ours)])
             shown = [""] * len(names)
     return Table(header, body, "l" * (len(labels) + 3) + "r" * len(delays))
+
+
+def _lines(group: list[Row]) -> dict[str, Callable[[Row], str]]:
+    """What is said of a method, line by line."""
+    run = any(row["n"] for row in group)
+    first = f"n = {_sizes(group)}" if run else NOT_RUN
+    lines: dict[str, Callable[[Row], str]] = {first: lambda row: percent_text(row) if row["n"] else "-"}
+    lines |= {"95 %": _whole_interval} if run else {}
+    lines |= {"published": _published} if any(row["published_percent"] is not None for row in group) else {}
+    return lines | ({"time": time_text} if run else {})
 
 
 def _flat(header: list[str], groups: list[list[Row]], delays: list[Any], labels: list[str]) -> Table:
@@ -203,26 +208,41 @@ def percentage_blocks(results: Results, rows: Sequence[Row]) -> Blocks:
         cells.setdefault(place, {})[", ".join([row["method"], *own])] = row
     titles = list(dict.fromkeys(title for line in cells.values() for title in line))
     blocks = [titles[k : k + GROUPS_PER_BLOCK] for k in range(0, len(titles), GROUPS_PER_BLOCK)]
-    tables: Blocks = [[_percentage_table(down, block, cells)] for block in blocks]
-    return [_heading(results), *tables, [f"{RULE} {TIME}."]]
+    judged = _judged(results)
+    tables: Blocks = [[_percentage_table(down, block, cells, judged)] for block in blocks]
+    return [_heading(results), *tables, [f"{RULE} {TIME}." if judged else f"{TIME}."]]
 
 
 def _percentage_table(
-    down: Sequence[str], titles: Sequence[str], cells: Mapping[tuple[Any, ...], Mapping[str, Row]]
+    down: Sequence[str], titles: Sequence[str], cells: Mapping[tuple[Any, ...], Mapping[str, Row]], judged: bool
 ) -> Table:
+    columns = [*_counts(judged), "time"]
     header = [*map(setting_title, down), "initial delay"]
-    header += [text for title in titles for text in (f"{title}: %", "95 %", "n", "time")]
+    header += [text for title in titles for text in (f"{title}: {columns[0]}", *columns[1:])]
+    empty = [""] * len(columns)
     body = [
         [*map(setting_text, down, place), delay_label(place[-1])]
-        + [text for title in titles for text in (_four(line[title]) if title in line else [""] * 4)]
+        + [text for title in titles for text in (_told(line[title], judged) if title in line else empty)]
         for place, line in cells.items()
         if not line.keys().isdisjoint(titles)
     ]
-    return Table(header, body, "l" * (len(down) + 1) + "rrrr" * len(titles))
+    return Table(header, body, "l" * (len(down) + 1) + "r" * len(columns) * len(titles))
 
 
-def _four(row: Row) -> list[str]:
-    return [percent_text(row), interval_text(row), str(row["n"]), time_text(row)]
+def _judged(results: Results) -> bool:
+    """Whether there is a rule by which an estimate counts as converged."""
+    return bool(results.settings.get("success"))
+
+
+def _counts(judged: bool) -> list[str]:
+    """Columns that count estimates; without a rule there is no percentage."""
+    return ["%", "95 %", "n"] if judged else ["n"]
+
+
+def _told(row: Row, judged: bool) -> list[str]:
+    """Counts and time of a cell."""
+    counts = [percent_text(row), interval_text(row), str(row["n"])] if judged else [str(row["n"] or NOT_RUN)]
+    return [*counts, time_text(row)]
 
 
 def _heading(results: Results) -> list[str | Table]:
@@ -231,14 +251,14 @@ def _heading(results: Results) -> list[str | Table]:
 
 def frequency_blocks(results: Results, rows: Sequence[Row]) -> Blocks:
     """Swept fields and estimators down, percentages and measures across."""
-    keys, measures = settings_of(rows), measures_of(rows)
+    keys, measures, judged = settings_of(rows), measures_of(rows), _judged(results)
     plain = (key.removeprefix("median_").removeprefix("false_").replace("_", " ") for key in measures)
     titles = (MEASURE_TITLES.get(key, title) for key, title in zip(measures, plain, strict=True))
-    header = [*map(setting_title, keys), "estimator", "%", "95 %", "n", *titles, "time"]
+    header = [*map(setting_title, keys), "estimator", *_counts(judged), *titles, "time"]
     body = [
         [
             *(setting_text(key, row[key]) for key in keys),
-            *(row["method"], *_four(row)[:3]),
+            *(row["method"], *_told(row, judged)[:-1]),
             *(number(row[key], 3) for key in measures),
             time_text(row),
         ]
@@ -249,9 +269,9 @@ def frequency_blocks(results: Results, rows: Sequence[Row]) -> Blocks:
     )
     rms = "rms: root-mean-square error of each tone over the window [rad/s]; medians over the data sets"
     alarms = " alarms: false ones, in all data sets together." if "false_alarms" in measures else ""
-    foot = f"{RULE} {settling}; - is never, or unknown. {rms}.{alarms}"
-    table = Table(header, body, "l" * (len(keys) + 1) + "r" * (len(measures) + 4))
-    return [_heading(results), [table], [f"{foot} {TIME}."]]
+    foot = f"{settling}; - is never, or unknown. {rms}.{alarms} {TIME}."
+    table = Table(header, body, "l" * (len(keys) + 1) + "r" * (len(header) - len(keys) - 1))
+    return [_heading(results), [table], [f"{RULE} {foot}" if judged else foot]]
 
 
 def record_blocks(results: Results) -> Blocks:

@@ -67,7 +67,8 @@ def read_measurement(
     left behind is estimated with the model where that is asked for.
     """
     require_choice("hold", hold, get_args(Hold))
-    table = read_table(path, "export the record as comma-separated text (.csv), or from MATLAB as vectors (.mat)")
+    cure = "export the record as comma-separated text (.csv) whose first line names the columns, or from MATLAB as"
+    table = read_table(path, f"{cure} vectors (.mat)")
     columns, notes = _choose(table, {"time": time, "input": input, "output": output})
     unit = {role: (units or {}).get(role) or split_header(name)[1] for role, name in columns.items()}
     t, u, y = (table.numbers(columns[role]) for role in ROLES)

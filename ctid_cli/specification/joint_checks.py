@@ -134,7 +134,7 @@ def _of_record(at: KeyPath, options: Any, extent: _Extent) -> Iterator[Complaint
         yield (*at, key), f"a delay of {latest:g} s is not shorter than the record ({extent.duration:g} s); lower it"
     elif left <= parameters:
         masked = f" after the first {latest:g} s" if left < extent.samples_after(0.0) else ""
-        yield at, f"{left} samples{masked} are too few for {parameters} parameters; take more, or a smaller model"
+        yield at, f"{left} samples{masked} are too few for {parameters} parameters; take more, or fewer poles or zeros"
 
 
 # --------------------------------------------------------------------------------------------------------------------

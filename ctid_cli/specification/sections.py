@@ -20,6 +20,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, 
 import numpy as np
 import pydantic
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import CtidError
@@ -90,7 +91,8 @@ class Section(BaseModel):
         try:
             section = handler(value)
         except ValidationError as error:
-            problems += [explained(detail, cls.descriptions()) for detail in error.errors(include_url=False)]
+            details = (cls.narrowed(detail, value) for detail in error.errors(include_url=False))
+            problems += [explained(detail, cls.descriptions()) for detail in details]
         else:
             if not problems:
                 found = _option_complaints(section) or section.complaints()
@@ -105,6 +107,11 @@ class Section(BaseModel):
     def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
         """What is wrong with the presence of keys, whatever their values."""
         yield from ()
+
+    @classmethod
+    def narrowed(cls, error: ErrorDetails, raw: Any) -> ErrorDetails:
+        """An error that allows only what the rest of the section allows."""
+        return error
 
     def complaints(self) -> Iterator[Complaint]:
         """What is wrong with the section although every value, and the option dataclass if any, is right by itself."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, PrivateAttr
+from pydantic_core import ErrorDetails
 
 from ctid_cli.canonical import canonical_json
 from ctid_cli.kinds import KINDS, resolve
@@ -153,6 +154,13 @@ class Spec(Section):
         random = _random_section(raw, present)
         if random and "monte_carlo" not in present:
             yield ("monte_carlo",), f"is missing, and the {random} is random; for example {{runs: 100, seed: 1}}"
+
+    @classmethod
+    def narrowed(cls, error: ErrorDetails, raw: Any) -> ErrorDetails:
+        """Estimators of a system where there is one, and of a signal where there is one."""
+        if error["type"] == "no_kind" and error["loc"][0] == "estimators" and {"signal", "system", "data"} & raw.keys():
+            error["ctx"] = {"allowed": ", ".join(KINDS["frequency_estimator" if "signal" in raw else "estimator"])}
+        return error
 
     def complaints(self) -> Iterator[Complaint]:
         """Say which estimators are the same."""

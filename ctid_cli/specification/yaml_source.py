@@ -144,7 +144,8 @@ class YamlSource:
             key = key_node.value
             here = (*path, key)
             if key == "<<":
-                self.problems.append(place.problem(here, "merge keys (<<) are not supported; write the keys out"))
+                message = "merge keys (<<) are not supported; write the keys out, or use an alias for a whole value"
+                self.problems.append(place.problem(here, message))
             elif key in mapping:
                 message = f"the key {key!r} is given twice, first on line {self.keys[here].line}; keep one"
                 self.problems.append(place.problem(here, message))

@@ -101,7 +101,7 @@ def test_a_saved_state_is_a_copy(options):
 def test_states_of_other_options_are_refused():
     options = DremFiniteTime(tones=2, h=0.4, d=0.3)
     state = options.start(INTERVAL).state()
-    message = r"this is not the state of .* restore it with those\."
+    message = r"this is not the state of .* restore it with the options and the interval"
     for other, interval in (
         (DremFiniteTime(tones=2, h=0.4, d=0.3, gamma=2.0), INTERVAL),  # arrays of the same shapes
         (DremFiniteTime(tones=2, h=0.4, d=0.31), INTERVAL),

@@ -115,6 +115,12 @@ def test_without_a_success_rule_there_is_no_percentage(make_results, estimate):
     results = make_results({(5.0, "0.0"): [estimate(8.0)] * 2}, success=None)
     row = cell(experiment_rows(results, "e"), 5.0, 0.0)
     assert (row["n"], row["converged"], row["percent"], row["low"]) == (2, None, None, None)
+    text = experiment_report(results).draw()
+    assert "%" not in text
+    assert "converged" not in text
+    done, open_ = (next(line for line in text.splitlines() if line.startswith(f"{snr} dB")) for snr in (5, 15))
+    assert done.split() == ["5", "dB", "0", "s", "2", "20", "ms"]
+    assert open_.endswith("not run")
 
 
 def test_rows_become_json_and_csv(results):

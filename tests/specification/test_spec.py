@@ -83,7 +83,10 @@ BROKEN = {
     "missing kind": ("  kind: prbs\n", "", 3, 1, "excitation.kind", "prbs, multisine, gaussian, step"),
     "unknown kind": ("kind: prbs", "kind: prsb", 4, 9, "excitation.kind", "did you mean 'prbs'?"),
     "kind is a list": ("kind: white", "kind: [white]", 8, 15, "noise.kind", "must be one of white, arma, not a list"),
-    "unknown estimator": ("kind: td_srivc", "kind: tdsrivc", 11, 11, "estimators.one.kind", "'td_srivc'"),
+    "unknown estimator": (
+        "kind: td_srivc", "kind: tdsrivc", 11, 11, "estimators.one.kind",
+        "additive_srivc, not the text 'tdsrivc'; did you mean 'td_srivc'?",
+    ),
     "text for a number": ("stages: 10", "stages: ten", 5, 11, "excitation.stages", "whole number, not the text 'ten'"),
     "quoted number": ("0.05, samples", "'0.05', samples", 7, 37, "sampling.interval", "a number [s], not the text"),
     "number with a unit": ("delay: 8.0", "delay: 8 s", 2, 62, "system.delay", "without quotes, underscores or a unit"),

@@ -204,20 +204,17 @@ class Descent:
             unit = _lengths(here)[free]
             scaled, slope = curvature / np.outer(unit, unit), here.gradient[free] / unit
             promise, values, vectors = _promise(scaled, slope)
-            promise /= max(here.squared_error, self.floor)
             saddle = bool(values[0] < -FLAT * values[-1])
+            promise = np.inf if saddle else promise / max(here.squared_error, self.floor)
             modes = values, vectors / unit[:, None]
-            if not saddle and promise <= AIM:
+            if promise <= AIM:
                 return self._judged(here, free, promise, modes)
             step = np.zeros(free.size)
             step[free] = _newton_step(values, vectors, slope) / unit
             length = float(np.abs(step).max())
             # At a saddle the gradient says nothing about how far to go.
             step *= (min(max(length, SADDLE), 1.0) if saddle else min(length, 1.0)) / max(length, 1e-300)
-            lower = None
-            for length in 0.4 ** np.arange(MOST_REJECTIONS):
-                whole = self._whole_and_to_edge(here.point, length * step)
-                lower = lower or self._lower(here, [*whole, -length * step] if saddle else whole)
+            lower = self._lower_along(here, step, saddle)
             if lower is not None:
                 # After a short step the second derivatives are still good enough to tell that it was the last.
                 same = np.array_equal(lower[1].damping < 0, here.point.damping < 0)
@@ -229,8 +226,17 @@ class Descent:
             elif free[-1] and self._in_a_kink(here, float(abs(step[-1]))):
                 kinked = True
             else:
-                return self._judged(here, free, np.inf if saddle else promise, modes)
-        return self._judged(here, free, np.inf if saddle else promise, modes)
+                return self._judged(here, free, promise, modes)
+        return self._judged(here, free, promise, modes)
+
+    def _lower_along(self, here: Local, step: Array, both: bool) -> tuple[Array, Point, Projected] | None:
+        """The longest part of a step that lowers the squared error; backwards too where its sign means nothing."""
+        for length in 0.4 ** np.arange(MOST_REJECTIONS):
+            whole = self._whole_and_to_edge(here.point, length * step)
+            lower = self._lower(here, [*whole, -length * step] if both else whole)
+            if lower is not None:
+                return lower
+        return None
 
     def _lower(self, here: Local, steps: Sequence[Array]) -> tuple[Array, Point, Projected] | None:
         """The first of several steps that lowers the squared error, with where it leads."""
