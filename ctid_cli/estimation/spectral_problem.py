@@ -160,6 +160,7 @@ def _transient(w: Array, power: Array, remainder: ComplexArray, n: int) -> tuple
 
     Returns the factor of the normal equations and the polynomial in descending powers.
     """
+    # Lane 0: power sums of 1/|A|^2, of which the normal matrix is made, a Hankel matrix up to signs; lane 1: of R.
     sums = np.zeros((2 * n - 1, 2))
     for k in range(w.size):
         weight = power[k]
@@ -174,6 +175,7 @@ def _transient(w: Array, power: Array, remainder: ComplexArray, n: int) -> tuple
             factor[i, j] = _product(sums, 0, i, j)
     _factor(factor)
     _forward(factor, solution)
+    # Back substitution with the transposed factor.
     for i in range(n - 1, -1, -1):
         for j in range(i + 1, n):
             solution[i] -= factor[j, i] * solution[j]
@@ -214,6 +216,7 @@ def _projected_moments(
         at = _at(den, w[k])
         gain = 1.0 / (at.real * at.real + at.imag * at.imag)
         inverse[k] = at.conjugate() * gain
+        # A frequency above zero stands for its negative too.
         side[k] = weight[k] if w[k] == 0.0 else 2.0 * weight[k]
         power[k] = side[k] * gain
         drive[k] = _at(num, w[k]) * inputs[k]

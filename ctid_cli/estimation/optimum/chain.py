@@ -31,6 +31,7 @@ def chain_dynamics(speed: Array, damping: Array) -> tuple[Array, Array]:
     for i in range(speed.size):
         w = speed[i]
         entry = row  # where the section is driven
+        # A pair has the states (s/w) x and x: x' = w (s/w) x, and ((s/w) x)' = -2 zeta w (s/w) x - w x + w v.
         if damping[i] < 0.0:
             F[row, row] = -w
             row += 1
@@ -50,6 +51,7 @@ def driven_chain(F: Array, g: Array, output: Array, direct: float) -> tuple[Arra
     """The chain with a second one behind it, driven by ``x = output z + direct v``."""
     n = g.size
     dynamics, gain = np.zeros((2 * n, 2 * n)), np.zeros(2 * n)
+    # Both have the same poles; no partial fraction needs them to be distinct.
     place(dynamics, 0, 0, F)
     place(dynamics, n, n, F)
     for i in range(n):

@@ -66,9 +66,11 @@ def _columns(rows: Array, n: int, forced: int, zeros: int, free: bool, offset: b
     proper = min(zeros, n - 1) + 1
     shared = proper + (1 if zeros == n else 0)
     own = (n if free else 0) + (1 if offset else 0)
+    # The numerator is common to all records; a free response and an offset are zero outside their own.
     columns = np.zeros((records * q, shared + records * own))
     for k in range(records):
         part = columns[k * q : (k + 1) * q]
+        # The last m + 1 states of the chain span B/A u; of degree n there is u itself besides.
         part[:, :proper] = rows[k, :, n - proper : n]
         if zeros == n:
             part[:, proper] = rows[k, :, forced]
@@ -83,6 +85,7 @@ def _columns(rows: Array, n: int, forced: int, zeros: int, free: bool, offset: b
 @njit(cache=True, nogil=True)
 def _factored(columns: Array) -> tuple[Array, Array, Array, Array]:
     """Lengths of the columns and singular values and vectors of what is left when these are taken out."""
+    # Columns of length one: the rank then does not depend on the units of input, output and time.
     lengths = np.sqrt((columns * columns).sum(axis=0))
     for i in range(lengths.size):
         if not lengths[i] > 0.0:
@@ -101,9 +104,11 @@ def _eliminated(rows: Array, n: int, zeros: int, free_response: bool, offset: bo
     y = np.ascontiguousarray(rows[:, :, -1]).ravel()
     along = left.T @ y
     residual = y - left @ along
+    # c = V S^-1 U'y; directions of no length are left out, which is the solution of least norm.
     solution = (right.T @ (along / values)) / lengths
     records = rows.shape[0]
     output, direct, free, offsets = np.zeros(n), 0.0, np.zeros((records, n)), np.zeros(records)
+    # Read in the order in which the columns were written.
     proper = min(zeros, n - 1) + 1
     output[n - proper :] = solution[:proper]
     place = proper
@@ -165,6 +170,7 @@ def _kaufman(
         psi[k * q : (k + 1) * q, :n] = -driven @ np.ascontiguousarray(readings.T)
         if delay_free:
             psi[k * q : (k + 1) * q, n] = -(np.ascontiguousarray(rows[k, :, : 2 * n + 1]) @ rate)
+    # (I - P): what the eliminated coefficients would follow is no effect of the poles.
     psi -= left @ (left.T @ psi)
     return Slopes(np.dot(residual, residual), -(psi.T @ residual), psi.T @ psi)
 

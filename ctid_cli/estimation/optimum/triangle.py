@@ -11,10 +11,11 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array
+from ctid_cli.filtering.chain_pass import _longest_step as longest_step
 from ctid_cli.filtering.chain_pass import _step as irregular_step
 from ctid_cli.filtering.chain_pass import _Transitions as Transitions
 from ctid_cli.filtering.chain_pass import _transitions as transitions
-from ctid_cli.filtering.exponential import exponential_minus_identity, held_step
+from ctid_cli.filtering.exponential import exponential_minus_identity, held_readout, held_step, place
 from ctid_cli.filtering.filter_data import FilterData, clock_slack, split_delay
 from ctid_cli.filtering.row_sink import BLOCK
 
@@ -57,11 +58,11 @@ def _advance(transition: Array, z: Array, following: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _table(dynamics: Array, gain: Array, data: FilterData, longest: float) -> Transitions:
-    """Transitions over any step up to the longest, or next to nothing on a regular clock."""
+def _table(dynamics: Array, gain: Array, data: FilterData, delay: float, period: float) -> Transitions:
+    """Transitions over any step of a pass, or next to nothing on a regular clock."""
     if data.interval > 0.0:
         return transitions(np.zeros((0, 0)), np.zeros(0), 0.0)
-    return transitions(dynamics, gain, longest)
+    return transitions(dynamics, gain, max(longest_step(data.t, data.tu, delay), period))
 
 
 @njit(cache=True, nogil=True)
@@ -105,14 +106,13 @@ def _free_states(chain: ChainState, data: FilterData) -> Array:
     if n == 0:
         return states
     step = held_step(chain.free_dynamics, chain.free_start, data.interval)
-    longest = 0.0
-    for k in range(data.t.size - 1):
-        longest = max(longest, data.t[k + 1] - data.t[k])
     regular = data.interval > 0.0
-    table = _table(chain.free_dynamics, np.zeros(n), data, longest)
+    table = _table(chain.free_dynamics, np.zeros(n), data, 0.0, 0.0)
+    # The two states behind the n are an input and its slope, which stay zero: z(t) = exp(F (t - t_s)) z(t_s).
     now, following = np.zeros(n + 2), np.zeros(n + 2)
     row = 0
     for k in range(data.t.size):
+        # Before the first used sample nothing moves; after it unused samples are steps of the way too.
         if row > 0 and regular:
             following[:n] = 0.0
             _advance(step.transition, now[:n], following[:n])
@@ -164,12 +164,7 @@ def _read(rows: Array, chain: ChainState, delay: Delay, interval: float) -> Arra
     n = chain.gain.size
     readout = np.zeros((n + 1, n + 2))
     fraction = place_of(delay, interval)[1] if interval > 0.0 else 0.0
-    part = held_step(chain.dynamics, chain.gain, fraction * interval)
-    for i in range(n):
-        for j in range(n):
-            readout[i, j] = part.transition[i, j]
-        # v and its change over the *part* of the interval.
-        readout[i, n], readout[i, n + 1] = part.from_value[i], part.from_change[i] * fraction
+    place(readout, 0, 0, held_readout(chain.dynamics, chain.gain, interval, fraction))
     readout[n, n], readout[n, n + 1] = 1.0, fraction
     result = np.empty((rows.shape[0], rows.shape[1] - 1))
     result[:, : n + 1] = np.ascontiguousarray(rows[:, : n + 2]) @ np.ascontiguousarray(readout.T)
@@ -191,15 +186,13 @@ def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wh
     tu, u, breaks = data.tu, data.u, data.tu.size
     alone = _free_states(chain, data)
     regular = data.interval > 0.0
-    shift, slack, longest = 0, 0.0, 0.0
+    shift, slack = 0, 0.0
     if regular:
         shift = place_of(delay, data.interval)[0]
     else:
         slack = clock_slack(data)
-        for j in range(breaks - 1):
-            longest = max(longest, tu[j + 1] - tu[j])
-        longest = max(longest, data.t[-1] - delay.seconds - tu[-1], period)
-    table = _table(chain.dynamics, chain.gain, data, longest)
+    table = _table(chain.dynamics, chain.gain, data, delay.seconds, period)
+    # The states at the breaks do not depend on the delay: it only chooses where they are read.
     states = _states_at_breaks(chain.dynamics, chain.gain, data, period, table)
     now, work = np.zeros(n + 2), np.zeros(n + 2)
     filled, row, j = 0, 0, -1
@@ -216,11 +209,13 @@ def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wh
             instant = data.t[k] - delay.seconds
             if period > 0.0 and instant + slack < tu[0]:
                 instant += period
+            # Instants rise but for one step back, out of the period before: from there the breaks begin anew.
             if j >= 0 and instant + slack < tu[j]:
                 j = -1
             while j + 1 < breaks and tu[j + 1] <= instant + slack:
                 j += 1
             rest = max(0.0, instant - tu[j]) if j >= 0 else 0.0
+        # The input that is held there, and its change up to the next break, after the last one that of the first.
         value, change, length = 0.0, 0.0, 1.0
         if j >= 0:
             value = u[j]
@@ -231,6 +226,7 @@ def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wh
         for i in range(n):
             now[i] = states[j, i] if j >= 0 else 0.0
         now[n], now[n + 1] = value, change / length
+        # On from the break to the instant itself, after which no change is left to be read.
         if not regular:
             irregular_step(table, rest, now, work)
             change = 0.0
@@ -244,6 +240,7 @@ def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wh
             every[row] = block[:, filled]
         row += 1
         filled += 1
+        # R <- qr[R; block]: memory is that of one block, however long the record.
         if filled == BLOCK:
             absorb(triangle, block, filled)
             filled = 0
