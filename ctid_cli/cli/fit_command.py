@@ -10,7 +10,7 @@ import typer
 
 from ctid_cli.cli._common import From, InputColumn, InputHold, Json, OutputColumn, TimeColumn, To, guarded, write_files
 from ctid_cli.errors import UsageError
-from ctid_cli.signals.treatment import InitialState, Offset
+from ctid_cli.signals.treatment import InitialState, LossKind, Offset
 
 
 @guarded
@@ -21,6 +21,7 @@ def fit(
     delay: Annotated[str, typer.Option("--delay", metavar="LOW:HIGH|VALUE", help="Range or value [time unit].")] = "0",
     initial_state: Annotated[InitialState, typer.Option("--initial-state", help="State before the record.")] = "rest",
     offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output.")] = "none",
+    loss: Annotated[LossKind, typer.Option("--loss", help="What large output errors count.")] = "squares",
     hold: InputHold = "zoh",
     time: TimeColumn = None,
     input: InputColumn = None,
@@ -48,7 +49,14 @@ def fit(
     try:
         # Every sample: the profile that is drawn is then the cost whose minimum the estimate is.
         options = DelayProfile(
-            poles, zeros, bounds, initial_state=initial_state, offset=offset, search="samples", nested=True
+            poles,
+            zeros,
+            bounds,
+            initial_state=initial_state,
+            offset=offset,
+            loss=loss,
+            search="samples",
+            nested=True,
         )
     except ValueError as error:
         raise UsageError(str(error)) from None

@@ -1,6 +1,7 @@
 """Measured records laid out for estimation: means, state before the record, and what is refused."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.output_error import Layout
 from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.inference.answer import output_bandwidth
+from ctid_cli.inference.faults import outliers
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.record import Record
@@ -27,6 +29,8 @@ class Treatment(NamedTuple):
     initial_state: InitialState
     offset: Offset
     hold_output: Hold
+    #: Whether samples far from their neighbours are bridged while the search looks for starts.
+    bridge: bool = False
 
 
 class MeasuredRecords:
@@ -43,13 +47,17 @@ class MeasuredRecords:
         for record in records:
             self._check_input(record)
         removed = treatment.offset == "remove"
-        centred = [_without_means(record) if removed else (record, 0.0, 0.0) for record in records]
+        bridged = [_bridged(record) if treatment.bridge else record for record in records]
+        centred = [_without_means(record) if removed else (record, 0.0, 0.0) for record in bridged]
         self.records = [one for one, _, _ in centred]
         self.input_offsets = [u0 for _, u0, _ in centred]
         self.offsets = [y0 for _, _, y0 in centred]
         self.data = [self._lay_out(record) for record in self.records]
         for record, data in zip(self.records, self.data, strict=True):
             check_record(record, data, self.layout.size, self.layout.initial_state)
+        each = zip(records, self.offsets, self.data, strict=True)
+        #: Outputs at the used samples as they were measured, less their means where those are removed.
+        self.outputs = [record.y[data.use] - y0 for record, y0, data in each]
 
     @cached_property
     def bandwidth(self) -> float:
@@ -108,6 +116,16 @@ class MeasuredRecords:
     def used(self) -> tuple[BoolArray, ...]:
         """Which samples of each record enter the sums."""
         return tuple(data.use for data in self.data)
+
+
+def _bridged(record: Record) -> Record:
+    """Record whose outliers are replaced by what lies between their neighbours."""
+    present = np.flatnonzero(record.valid)
+    wild = present[outliers(record.y[present])]
+    kept = np.setdiff1d(present, wild)
+    y = record.y.copy()
+    y[wild] = np.interp(record.t[wild], record.t[kept], record.y[kept])
+    return replace(record, y=y)
 
 
 def _without_means(record: Record) -> tuple[Record, float, float]:

@@ -11,6 +11,7 @@ from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.output_error import Layout, sensitivities
+from ctid_cli.inference.loss import Weighting
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 
@@ -33,21 +34,33 @@ class AppliedModel:
 class Refinement:
     """The output-error cost of measured records, minimised over all parameters."""
 
-    def __init__(self, measured: MeasuredRecords) -> None:
+    def __init__(self, measured: MeasuredRecords, problem: Problem | None = None) -> None:
         self.measured = measured
         self.structure = measured.structure
+        self.problem = problem or measured.problem
 
-    @property
-    def problem(self) -> Problem:
-        """The records and what is eliminated with them."""
-        return self.measured.problem
+    def with_outputs(self, outputs: Sequence[Array]) -> "Refinement":
+        """The same with other outputs at the used samples of each record."""
+        records = []
+        for data, values in zip(self.problem.records, outputs, strict=True):
+            y = data.y.copy()
+            y[data.use] = values
+            records.append(data._replace(y=y))
+        return Refinement(self.measured, self.problem._replace(records=tuple(records)))
+
+    def near(self, errors: Sequence[Array], weighting: Weighting | None) -> "Refinement":
+        """The records whose least squares are, near the estimate, what its loss is."""
+        if weighting is None:
+            return self
+        each = zip(self.measured.outputs, errors, weighting.pseudo_errors, strict=True)
+        return self.with_outputs([y - r + pseudo for y, r, pseudo in each])
 
     def best(self, starts: Sequence[tuple[Array, float]], nested: bool) -> Optimum:
         """The least output error from denominators and delays, and if nested of smaller models and at random too.
 
         A profile under an unknown initial state, an offset or a period has too few basins: smaller models help then.
         """
-        (poles, zeros), records = (self.structure.poles, self.structure.zeros), self.measured.data
+        (poles, zeros), records = (self.structure.poles, self.structure.zeros), self.problem.records
         random = RANDOM_STARTS + 2 * poles
         options = replace(
             self.measured.options,
@@ -63,6 +76,25 @@ class Refinement:
         # Where the starts disagree others are asked.
         starts = [(found.denominator, found.delay), *starts]
         return best_output_error(records, poles, zeros, replace(options, starts=starts, random_starts=random))
+
+    def local(self, near: Optimum) -> Optimum:
+        """The least output error in the basin of an optimum of other outputs."""
+        options = replace(self.measured.options, starts=[(near.denominator, near.delay)], nested=False)
+        return best_output_error(self.problem.records, near.denominator.size - 1, self.structure.zeros, options)
+
+    def parameters(self, found: Optimum) -> tuple[Layout, Array]:
+        """Which numbers an optimum has, and what they are."""
+        layout = self.layout_of(found.model.order, self.structure.delay)
+        theta = layout.theta(found.model)
+        for k in range(layout.experiments):
+            state, first = found.free_responses[k] if layout.initial_state else (), layout.first(k)
+            theta[first : first + layout.own] = [*state, found.offsets[k]][: layout.own]
+        return layout, theta
+
+    def simulated(self, found: Optimum) -> list[Array]:
+        """Outputs of an optimum at the used samples of each record."""
+        parts = sensitivities(self.problem, *self.parameters(found), found.model.delay)
+        return [data.y_used - eps for data, (_, eps) in zip(self.problem.records, parts, strict=True)]
 
     def squared_error_at(self, model: TransferFunction, delay: float) -> float:
         """Least sum of squared output errors at a given delay, in the basin of a model."""
@@ -83,7 +115,8 @@ class Refinement:
         for k, (psi, eps) in enumerate(sensitivities(self.problem, layout, theta, model.delay)):
             own = slice(layout.first(k), layout.first(k) + layout.own)
             theta[own] = np.linalg.lstsq(psi[:, own], eps)[0]
-            residuals.append(eps - psi[:, own] @ theta[own])
+            bridged = self.problem.records[k].y_used
+            residuals.append(eps - psi[:, own] @ theta[own] + (self.measured.outputs[k] - bridged))
         return AppliedModel(tuple(residuals), self.measured.used(), *self.own(layout, theta))
 
     def layout_of(self, poles: int, delay: bool) -> Layout:

@@ -1,7 +1,7 @@
 """Global estimation from measured records: a one-dimensional search over the delay, then the least output error."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -16,12 +16,14 @@ from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimation.output_error import sensitivities
 from ctid_cli.estimation.profile_refinement import Refinement
 from ctid_cli.estimation.profile_search import Profile, ProfileSearch, search_delay
+from ctid_cli.estimation.robust_fit import RobustFit, robust_fit
 from ctid_cli.inference.fit import Fit
+from ctid_cli.inference.loss import Weighting, weighted
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.treatment import InitialState, Offset
+from ctid_cli.signals.treatment import InitialState, LossKind, Offset
 
 
 class Starts(NamedTuple):
@@ -46,7 +48,7 @@ class MeasuredFit(Fit):
     status : Status
         How the iterations ended.
     cost : float
-        Mean squared output error over the used samples [output unit^2].
+        Mean squared output error over the used samples, or twice the mean of another loss [output unit^2].
     fit_percent : float
         ``100 (1 - ||y - x|| / ||y - mean y||)`` over the used samples of all experiments, means by experiment [%].
     r2 : float
@@ -81,6 +83,8 @@ class MeasuredFit(Fit):
         How many of the poles asked for have run to infinity, so that the model has fewer.
     box : Box or None
         The set of admissible models in which the estimate is the best.
+    weighting : Weighting or None
+        How much each sample counts, where the loss is not that of squares.
     """
 
     theta: Array = field(default_factory=lambda: np.zeros(0))
@@ -94,6 +98,17 @@ class MeasuredFit(Fit):
     starts: Starts | None = None
     poles_at_infinity: int = 0
     box: Box | None = None
+    weighting: Weighting | None = None
+
+    @property
+    def linear(self) -> "MeasuredFit":
+        """The fit by least squares that has the same law: itself, or with the pseudo-errors of its loss."""
+        if self.weighting is None:
+            return self
+        law = _linear(self.weighting, self.residuals, self.sensitivities, self.used)
+        count = sum(eps.size for eps in law.residuals)
+        cost = sum(float(eps @ eps) for eps in law.residuals) / count
+        return replace(self, **law._asdict(), count=count, cost=cost, weighting=None)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -118,6 +133,9 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
         state of an input that repeats the record for ever.
     offset : {"none", "remove", "estimate"}, default "none"
         Constant offset of the output: none, means of input and output subtracted first, or estimated with the model.
+    loss : {"squares", "huber", "tukey"}, default "squares"
+        What output errors count: their squares; their squares up to 1.345 standard deviations and their sizes beyond
+        (Huber); or nothing from 4.685 standard deviations on (Tukey's biweight), for records with outliers.
     search : {"time", "spectral", "samples"}, default "time"
         What the search over the delay looks at: low-pass-filtered signals resampled at a lower rate, the spectra of
         the record, or every sample. The first two need one record at rest without an estimated offset; every sample
@@ -146,6 +164,12 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
     Without bounds the least cost need not exist: with an undamped pole a free initial state fits noise, ever better.
     Poles have magnitudes between the reciprocal of the record's length and ten over its sampling interval, and pairs a
     damping of .001 at least; the status says whether the estimate lies at such a bound.
+
+    Outliers ruin least squares. Both other losses are 95 % efficient where the noise is normal and has none. Huber's
+    bounds what an outlier can do, Tukey's forgets the gross ones, on which one-sided ones leave no mark; it starts
+    from the estimate by Huber's. The standard deviation is that of the median absolute error of each record. With
+    ``offset`` "remove" the means are those of the record without samples far from their neighbours; "estimate" leaves
+    them to the loss too.
     """
 
     kind: ClassVar[str] = "delay_profile"
@@ -155,6 +179,7 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
     delay_bounds: tuple[float, float]
     initial_state: InitialState = "rest"
     offset: Offset = "none"
+    loss: LossKind = "squares"
     search: ProfileSearch = "time"
     svf_cutoff: float | None = None
     nested: bool = False
@@ -175,7 +200,9 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
         measured = MeasuredRecords(
             [records] if isinstance(records, Record) else list(records),
             Structure(self.poles, self.zeros, delay=low < high),
-            Treatment(self.delay_bounds, self.initial_state, self.offset, self.hold_output),
+            Treatment(
+                self.delay_bounds, self.initial_state, self.offset, self.hold_output, bridge=self.loss != "squares"
+            ),
         )
         return Refinement(measured)
 
@@ -184,31 +211,38 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
             if minima:
                 a = [np.concatenate(([1.0], minimum.theta[: self.poles])) for minimum in minima]
                 starts = [(each, minimum.delay) for each, minimum in zip(a, minima, strict=True)]
-                return _fit(refinement, refinement.best(starts, self.nested), profile)
+                if self.loss == "squares":
+                    return _fit(refinement, refinement.best(starts, self.nested), profile, None)
+                robust = robust_fit(refinement, self.loss, starts, self.nested)
+                return _fit(refinement, robust.found, profile, robust)
         raise DataError(Status.SINGULAR.value)
 
 
-def _fit(refinement: Refinement, found: Optimum, profile: Profile | None) -> MeasuredFit:
-    problem, measured, model = refinement.problem, refinement.measured, found.model
-    layout = refinement.layout_of(model.order, refinement.structure.delay)
-    theta = layout.theta(model)
-    for k in range(layout.experiments):
-        state, first = found.free_responses[k] if layout.initial_state else (), layout.first(k)
-        theta[first : first + layout.own] = [*state, found.offsets[k]][: layout.own]
-    parts = sensitivities(problem, layout, theta, model.delay)
-    hessian = np.sum([psi.T @ psi for psi, _ in parts], axis=0)
-    gradient = np.sum([psi.T @ eps for psi, eps in parts], axis=0)
-    equations = Equations(hessian, gradient, hessian, sum(float(eps @ eps) for _, eps in parts), 0.0)
+def _fit(refinement: Refinement, found: Optimum, profile: Profile | None, robust: RobustFit | None) -> MeasuredFit:
+    measured = refinement.measured
+    layout, theta = refinement.parameters(found)
+    parts = sensitivities(refinement.problem, layout, theta, found.model.delay)
+    residuals = [eps for _, eps in parts] if robust is None else robust.errors
+    weighting = None if robust is None else weighted(robust.losses, residuals, layout.size)
+    law = _linear(weighting, residuals, [psi for psi, _ in parts], measured.used())
+    hessian = np.sum([psi.T @ psi for psi in law.sensitivities], axis=0)
+    each = zip(law.sensitivities, law.residuals, strict=True)
+    gradient = np.sum([psi.T @ eps for psi, eps in each], axis=0)
+    equations = Equations(hessian, gradient, hessian, sum(float(eps @ eps) for eps in law.residuals), 0.0)
     status = Status.DELAY_AT_BOUND if found.delay_at_bound else Status[found.ending.name]
     free = np.arange(layout.size)
     if found.delay_at_bound:
         free = np.delete(free, layout.structure.size - 1)
-    count = sum(eps.size for _, eps in parts)
-    covariance, status = covariance_of(equations, free, count, status)
-    outputs = np.concatenate([data.y_used - data.y_used.mean() for data in problem.records])
+    covariance, status = covariance_of(equations, free, sum(eps.size for eps in law.residuals), status)
+    count = sum(eps.size for eps in residuals)
+    outputs = np.concatenate([y - y.mean() for y in measured.outputs])
+    equations = equations._replace(squared_error=sum(float(eps @ eps) for eps in residuals))
+    values = quality(equations, float(outputs @ outputs), count)
+    if robust is not None:
+        values["cost"] = robust.cost(robust.losses) / count
     states, offsets = refinement.own(layout, theta)
     return MeasuredFit(
-        model=model,
+        model=found.model,
         parameter_names=layout.names,
         covariance=covariance,
         status=status,
@@ -218,11 +252,38 @@ def _fit(refinement: Refinement, found: Optimum, profile: Profile | None) -> Mea
         offsets=offsets,
         input_offsets=tuple(measured.input_offsets),
         profile=profile,
-        residuals=tuple(eps for _, eps in parts),
+        residuals=tuple(residuals),
         sensitivities=tuple(psi for psi, _ in parts),
         used=measured.used(),
         starts=Starts(found.tried, found.agree),
         poles_at_infinity=found.poles_at_infinity,
         box=found.box,
-        **quality(equations, float(outputs @ outputs), count),
+        weighting=weighting,
+        **values,
+    )
+
+
+class LinearLaw(NamedTuple):
+    """Errors, sensitivities and samples of least squares that have the same law as an estimate."""
+
+    residuals: tuple[Array, ...]
+    sensitivities: tuple[Array, ...]
+    used: tuple[BoolArray, ...]
+
+
+def _linear(
+    weighting: Weighting | None, residuals: Sequence[Array], psi: Sequence[Array], used: Sequence[BoolArray]
+) -> LinearLaw:
+    """Pseudo-errors where there are weights; samples that count for nothing are as if they were missing."""
+    if weighting is None:
+        return LinearLaw(tuple(residuals), tuple(psi), tuple(used))
+    kept = [weights > 0.0 for weights in weighting.weights]
+    left = [use.copy() for use in used]
+    for use, keep in zip(left, kept, strict=True):
+        use[use] = keep
+    errors = zip(weighting.pseudo_errors, kept, strict=True)
+    return LinearLaw(
+        tuple(eps[keep] for eps, keep in errors),
+        tuple(block[keep] for block, keep in zip(psi, kept, strict=True)),
+        tuple(left),
     )

@@ -135,18 +135,21 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
         except DataError as error:
             raise DataError(f"validation record: {error}") from None
     prepared = options.prepare(records)
-    fit, refinement = prepared.fit(), prepared.laid_out
+    fit = prepared.fit()
+    # What the estimate is by least squares near it: pseudo-errors where the loss is another.
+    linear, refinement = fit.linear, prepared.laid_out.near(fit.residuals, fit.weighting)
     residuals = np.concatenate(fit.residuals)
     output = np.concatenate([record.y[use] for record, use in zip(records, fit.used, strict=True)])
-    tests = _tests(fit, records)
+    squared_error = float(residuals @ residuals) if fit.weighting is None else fit.cost * fit.count
+    tests = _tests(linear, records)
     robust = any(not test.white for test in tests)
-    covariance = _sandwich(fit, records) if robust else fit.covariance
-    free, hessian = _free_block(fit)
+    covariance = _sandwich(linear, records) if robust else fit.covariance
+    free, hessian = _free_block(linear)
     singular = not condition_number(hessian) <= NEARLY_SINGULAR
     unclear = {fit.parameter_names[k] for k in (free if singular else _undetermined(fit, covariance))}
     interval = None
     if refinement.structure.delay and "delay" not in unclear:
-        interval = _delay_interval(refinement, fit, covariance)
+        interval = _delay_interval(refinement, linear, covariance)
     judged = None if checked is None or validation is None else _validate(checked, fit, validation)
     size = fit.model.order + options.zeros + 1
     coefficients = np.full((size, size), np.nan) if singular else covariance[:size, :size]
@@ -159,7 +162,7 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
         delay_interval=interval,
         derived=derived_parameters(fit.model, coefficients, level=LEVEL),
         tests=tests,
-        criteria=criteria_of.information_criteria(float(residuals @ residuals), fit.count, fit.theta.size),
+        criteria=criteria_of.information_criteria(squared_error, fit.count, fit.theta.size),
         yic=criteria_of.young_information_criterion(residuals, output, fit.theta[free], covariance[np.ix_(free, free)]),
         r_t_squared=criteria_of.r_t_squared(residuals, output),
         warnings=(
@@ -167,7 +170,7 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
             *warnings.of_conditioning(fit, covariance, free, hessian),
             *warnings.of_interval(interval, options),
             *warnings.of_residuals(tests, len(records), FEWEST_TESTED),
-            *warnings.of_treatment(_gains(options, refinement, fit)),
+            *warnings.of_treatment(_gains(options, refinement, linear)),
             *(warnings.of_validation(fit.r2, judged.r2) if judged is not None else ()),
         ),
         validation=judged,

@@ -45,8 +45,12 @@ def _draw_record(
     residuals = result.fit.residuals[k]
     output.plot(record.t, record.y, color=LIGHT, linewidth=2.2, label="measured")
     output.plot(*_with_gaps(record.t, use, record.y[use] - residuals), color=DARK, linewidth=0.9, label="simulated")
+    weighting = result.fit.weighting
+    if weighting is not None and weighting.outliers[k].any():
+        little = np.flatnonzero(use)[weighting.outliers[k]]
+        output.plot(record.t[little], record.y[little], "x", color="black", markersize=4, label="counts for little")
     output.set_ylabel(f"{measurement.output} [{units.output}]")
-    output.legend(loc="lower right", ncols=2, fontsize=8)
+    output.legend(loc="lower right", ncols=3, fontsize=8)
     output.tick_params(labelbottom=False)
     output.margins(x=0.0)
     low, high = output.get_ylim()

@@ -14,6 +14,7 @@ from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
 from ctid_cli.reporting.layout import Table, count, number, picked
+from ctid_cli.reporting.loss_report import loss_object, loss_text
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import warning_lines, wrapped
 
@@ -76,6 +77,7 @@ def identification_object(
         "model": {"numerator": numerator, "denominator": fit.model.denominator, "delay": fit.model.delay},
         "parameters": [parameter_object(item) for item in parameters_of(result, units)],
         **picked(fit, ("fit_percent", "r2", "cost")),
+        "loss": loss_object(fit, [item.record for item in measurements]),
         "status": fit.status.name,
         "message": fit.status.value,
         "starts": fit.starts and fit.starts._asdict(),
@@ -119,6 +121,7 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
     for measurement, use in zip(measurements, fit.used, strict=True):
         lines.append(wrapped(_record_line(measurement, int(np.count_nonzero(use)), units)))
         lines += [wrapped(note, "  ") for note in measurement.notes]
+    loss = loss_text(fit, [item.record for item in measurements], units)
     low, high = options.delay_bounds
     searched = f"searched from {low:g} to {high:g} {units.time}" if low < high else f"known, {low:g} {units.time}"
     hold = measurements[0].record.input.hold
@@ -127,6 +130,8 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
     row("initial state", f"{TREATMENTS[options.initial_state]} (--initial-state {options.initial_state})")
     row("offset", f"{_offset(result, units)} (--offset {options.offset})")
     row("input", f"{'constant' if hold == 'zoh' else 'straight lines'} between its samples (--hold {hold})")
+    if loss:
+        row("loss", loss)
     lines += ["", parameter_table(parameters_of(result, units)), wrapped(_covariance_line(result)), ""]
     lines += [_derived_table(derived_of(result, units)), ""]
     row("fit", f"{number(fit.fit_percent, 5)} % = {FIT_DEFINITION}")
@@ -135,7 +140,8 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
     if judged is not None:
         text = f"fit {number(judged.fit_percent, 5)} %, R2 {number(judged.r2, 6)} on {judged.name}, "
         row("validation", f"{text}{count(judged.count, 'sample')}; initial state and offset treated in the same way")
-    row("cost", f"{number(fit.cost)} ({units.output})^2, mean squared output error")
+    what = "mean squared output error" if fit.weighting is None else "twice the mean loss"
+    row("cost", f"{number(fit.cost)} ({units.output})^2, {what}")
     sizes = f"N = {criteria.count} samples and p = {criteria.parameters} parameters"
     row("AIC", f"{number(criteria.aic)} = N ln cost + 2 p with {sizes}")
     row("AICc", f"{number(criteria.aicc)} = AIC + 2 (p + 1)(p + 2) / (N - p - 2)")

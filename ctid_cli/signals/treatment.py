@@ -8,3 +8,5 @@ Hold = Literal["zoh", "foh"]
 InitialState = Literal["rest", "estimate", "periodic"]
 #: A constant that the output has beside the answer to the input.
 Offset = Literal["none", "remove", "estimate"]
+#: What output errors count: their squares, or less where they are large.
+LossKind = Literal["squares", "huber", "tukey"]

@@ -80,7 +80,20 @@ def test_every_option_reaches_the_fit(ctid, tmp_path):
     values = rows(offset=5.0)
     file = write(tmp_path / "named.csv", values[:, [2, 0, 1]], "speed [rpm],clock [s],drive [V]")
     options = ("--time", "clock", "--input", "drive", "--output", "speed", "--from", 1, "--to", 40, "--hold", "foh")
-    options += ("--initial-state", "estimate", "--offset", "estimate", "--delay", 0.73, "--zeros", 1, "--poles", 2)
+    options += (
+        "--initial-state",
+        "estimate",
+        "--offset",
+        "estimate",
+        "--delay",
+        0.73,
+        "--zeros",
+        1,
+        "--poles",
+        2,
+        "--loss",
+        "tukey",
+    )
     content = json.loads(ctid("fit", file, *options, "--json", "--out", tmp_path).stdout)
     (used,) = content["records"]
     assert (used["start"], used["stop"]) == (1.0, 40.0)
@@ -89,6 +102,7 @@ def test_every_option_reaches_the_fit(ctid, tmp_path):
     assert (settings["hold"], settings["initial_state"], settings["offset"]) == ("foh", "estimate", "estimate")
     parameters = {item["name"]: item for item in content["parameters"]}
     assert list(parameters) == ["b0", "b1", "a1", "a2", "delay", "x1", "x2", "offset"]
+    assert content["loss"]["kind"] == settings["loss"] == "tukey"
     assert parameters["b0"]["unit"] == "rpm/V/s"
     assert parameters["delay"]["status"] == "fixed"
     assert content["offset"]["output"] == [parameters["offset"]["estimate"]]

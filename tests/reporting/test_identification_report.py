@@ -165,6 +165,23 @@ def test_the_figure_of_several_experiments_and_a_known_delay():
     assert b"known delay 0.73 ms" in figure
 
 
+def test_a_loss_names_the_samples_that_count_for_little():
+    one = measurement(n=300)
+    y = one.record.y.copy()
+    y[[30, 200]] += 9.0
+    files = [replace(one, record=Record(one.record.t, y, one.record.input))]
+    result = identify(DelayProfile(2, 0, (0.73, 0.73), loss="tukey"), [files[0].record])
+    loss = identification_object(result, files, UNITS)["loss"]
+    assert (loss["kind"], loss["outliers"]) == ("tukey", [[pytest.approx(3.0), pytest.approx(20.0)]])
+    assert loss["scales"] == [pytest.approx(0.1, rel=0.3)]
+    text = " ".join(identification_text(result, files, UNITS).split())
+    assert "2 of 300 samples have no weight, at 3, 20 ms; fit 8" in text
+    assert f"fit {loss['fit_percent']:.5g} % without them" in text
+    assert b"counts for little" in identification_svg(result, files, UNITS)
+    squares = identification_object(identify(DelayProfile(2, 0, (0.73, 0.73)), [one.record]), files, UNITS)["loss"]
+    assert squares == {"kind": "squares", "scales": None, "outliers": [[]], "fit_percent": None}
+
+
 def test_starts_bounds_and_poles_at_infinity_are_said(fitted):
     result, files, _ = fitted
     text, content = identification_text(result, files, UNITS), identification_object(result, files, UNITS)
