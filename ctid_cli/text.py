@@ -8,10 +8,10 @@ from collections.abc import Iterable
 WIDTH = 100
 
 
-def listed(words: Iterable[object], last: str = "and") -> str:
+def listed(words: Iterable[object]) -> str:
     """Words as a sentence lists them: ``a, b and c``, each once."""
     *first, end = dict.fromkeys(map(str, words))
-    return f"{', '.join(first)} {last} {end}" if first else end
+    return f"{', '.join(first)} and {end}" if first else end
 
 
 def wrapped(text: str, indent: str = "", hanging: str | None = None) -> str:

@@ -9,6 +9,8 @@ from ctid_cli.arrays import Array
 from ctid_cli.estimation.delay_search import Minimum, descend
 from ctid_cli.estimation.filtered_costs import FilteredCost
 
+#: Fewest delays of a grid over the whole range, whatever the bandwidth asks for.
+FEWEST_DELAYS = 24
 #: Local minima of a level around which the next level looks, and those of the last level that are returned.
 KEPT = 8
 MINIMA = 3
@@ -31,8 +33,14 @@ class GridCost(Protocol):
         """Least cost at a delay over several starts."""
 
 
+def quarter_periods(low: float, high: float, bandwidth: float, most: int) -> Array:
+    """Delays no more than a quarter period of a bandwidth apart, unless these are too many."""
+    wanted = int(np.ceil((high - low) * bandwidth / (0.5 * np.pi))) + 1
+    return np.linspace(low, high, min(max(wanted, FEWEST_DELAYS), most))
+
+
 def search_grid(
-    levels: Sequence[tuple[FilteredCost, float]], bounds: tuple[float, float], fewest: int
+    levels: Sequence[tuple[FilteredCost, float]], bounds: tuple[float, float]
 ) -> tuple[Array, Array, list[Minimum]]:
     """Search the whole range of the delay, each level a cost with the spacing of its grid [s].
 
@@ -42,7 +50,7 @@ def search_grid(
     """
     low, high = bounds
     (cost, first_spacing), *finer = levels
-    grid = delays = np.linspace(low, high, max(int(np.ceil((high - low) / first_spacing)) + 1, fewest))
+    grid = delays = np.linspace(low, high, max(int(np.ceil((high - low) / first_spacing)) + 1, FEWEST_DELAYS))
     found = scan(cost, delays)
     costs = costs_of(found)
     coarser = float(delays[1] - delays[0])

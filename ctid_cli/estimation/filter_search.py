@@ -23,8 +23,6 @@ SMALLEST_STEP = 0.01
 LARGEST_STEP = 1 / 3
 #: Where no path leads lower and J0 exceeds this [%], the paths start once more a period of their filter away.
 POOR = 25.0
-#: J0 of a filter in which nothing can be computed [%].
-NOTHING = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +133,7 @@ class FilterSearch:
                     reflect=True,
                 )
                 if found is not None:
-                    costs = np.array([self._percent(k, step) for step in found.steps])
+                    costs = np.array([cost.percent(step) for step in found.steps])
                     thetas = np.array([step.theta for step in found.steps])
                     paths.append(FilterPath(rounds, k, thetas[:, -1], costs, thetas[:, :-1]))
                     ends.append(found.minimum.delay)
@@ -148,12 +146,10 @@ class FilterSearch:
         place = round(delay / (LATTICE * self.period))
         if place not in self._known:
             minima = self._minima(float(np.clip(place * LATTICE * self.period, *self.limits.bounds)))
-            mean = float(np.mean([self._percent(k, minimum) for k, minimum in enumerate(minima)]))
+            percents = [cost.percent(minimum) for cost, minimum in zip(self.costs, minima, strict=True)]
+            mean = float(np.mean(percents))
             self._known[place] = mean, minima
         return self._known[place]
-
-    def _percent(self, k: int, minimum: Minimum | None) -> float:
-        return NOTHING if minimum is None else 100.0 * float(np.sqrt(minimum.squared_error / self.costs[k].spread))
 
     def _minima(self, delay: float) -> list[Minimum | None]:
         """Coefficients of every filter at a delay: good ones are handed from filter to filter, down and up again."""

@@ -10,7 +10,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.delay_search import DelayCost, Minimum, best_minimum
 from ctid_cli.estimation.iteration import GUARDED, Steps
-from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, least_squares_start
+from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, least_squares_starts
 from ctid_cli.estimation.spectral_problem import (
     SpectralProblem,
     enough_bins,
@@ -33,6 +33,8 @@ HIGHEST = 1.5
 SAMPLES_PER_PARAMETER = 3
 
 
+#: Cost of a filter in which nothing can be computed [%].
+NOTHING = 100.0
 #: How hard to work at each delay, unless a search asks for something else.
 EFFORT = Steps(max_iterations=10, tolerance=1e-2, rule=GUARDED, halvings=3)
 
@@ -61,6 +63,10 @@ class FilteredCost(DelayCost, ABC):
     @abstractmethod
     def starts(self, delay: float) -> list[Array]:
         """Least-squares start at a delay, if there is one."""
+
+    def percent(self, minimum: Minimum | None) -> float:
+        """``100 ||y - x|| / ||y - mean y||`` of the filtered data [%]; 100 where nothing can be computed."""
+        return NOTHING if minimum is None else 100.0 * float(np.sqrt(minimum.squared_error / self.spread))
 
     def minimise_from(self, delay: float, starts: Sequence[Array]) -> Minimum | None:
         """Least cost at a delay over several starts, each (a_1 … a_n, b_0 … b_m, any delay)."""
@@ -91,8 +97,7 @@ class SampledCost(FilteredCost):
 
     def starts(self, delay: float) -> list[Array]:
         """Least-squares start at a delay, if there is one."""
-        start = least_squares_start(self.data, self.structure, delay, self.svf_cutoff)
-        return [] if start is None else [start]
+        return least_squares_starts(self.data, self.structure, delay, [self.svf_cutoff])
 
 
 class SpectralCost(FilteredCost):

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from ctid_cli.estimation.delay_grid import lowest_minima
+from ctid_cli.estimation.delay_grid import lowest_minima, quarter_periods
 from ctid_cli.estimation.delay_search import Minimum
 from ctid_cli.estimation.iteration import GUARDED, Steps, iterate, with_best
 from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.inference.fit import Fit
 
-#: Delays that are looked at: four to a period of the bandwidth, between these numbers.
-FEWEST_DELAYS, MOST_DELAYS = 24, 400
+#: Most delays that are looked at, four to a period of the bandwidth.
+MOST_DELAYS = 400
 #: Lowest minima of the look from which coefficients and delay are refined, and how hard.
 MINIMA = 3
 EFFORT = Steps(10, 1e-3, GUARDED)
@@ -26,8 +26,7 @@ def lower_elsewhere(problem: SampledProblem, fit: Fit, bandwidth: float) -> bool
         trial = with_best(held, np.concatenate((fit.model.denominator[1:], np.zeros(m + 1), [delay])), n, n + m + 1)
         return Minimum(trial, held.equations(trial).squared_error)
 
-    wanted = int(np.ceil((problem.high - problem.low) * bandwidth / (0.5 * np.pi))) + 1
-    delays = np.linspace(problem.low, problem.high, min(max(wanted, FEWEST_DELAYS), MOST_DELAYS))
+    delays = quarter_periods(problem.low, problem.high, bandwidth, MOST_DELAYS)
     minima = lowest_minima([looked_at(delay) for delay in delays.tolist()], MINIMA)
     refined = (iterate(problem, minimum.theta, EFFORT) for minimum in minima)
     bound = (1.0 - LOWER) * fit.cost * fit.count

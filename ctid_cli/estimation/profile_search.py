@@ -7,13 +7,13 @@ from typing import Literal
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.delay_grid import costs_of, lowest_minima, scan, search_grid
+from ctid_cli.estimation.delay_grid import costs_of, lowest_minima, quarter_periods, scan, search_grid
 from ctid_cli.estimation.delay_search import Minimum, best_minimum
 from ctid_cli.estimation.filtered_costs import filtered_costs
 from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.search import local_minimum
-from ctid_cli.estimation.sampled_problem import CUTOFFS, at_known_delay, least_squares_start
+from ctid_cli.estimation.sampled_problem import CUTOFFS, at_known_delay, least_squares_starts
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.sensitivity import Structure
 
@@ -27,8 +27,7 @@ GRID_EFFORT = Steps(max_iterations=15, tolerance=1e-2, rule=GAUSS_NEWTON, halvin
 #: The same where an initial state, an offset, a period or several records are treated: the fall of the cost that a step
 #: must promise, as a fraction of it, and most steps.
 ROUGH = 1e-3, 15
-#: Delays on the grid: between these numbers, whatever the bandwidth asks for.
-FEWEST_DELAYS = 24
+#: Most delays on the grid, whatever the bandwidth asks for.
 MOST_DELAYS = 2000
 #: Most parts into which a step of the grid is divided around its minima.
 FINEST = 32
@@ -73,11 +72,9 @@ class RecordsCost:
         """Denominators of least-squares starts; the output's mean is left to the offset."""
         n, m = self.coefficients.poles, self.coefficients.zeros
         strictly_proper = Structure(n, min(m, n - 1))
-        found: list[Array] = []
-        for cutoff in self.cutoffs:
-            theta = least_squares_start(self.measured.centred, strictly_proper, delay, cutoff * self.bandwidth)
-            if theta is not None:
-                found.append(theta[:n])
+        cutoffs = [cutoff * self.bandwidth for cutoff in self.cutoffs]
+        thetas = least_squares_starts(self.measured.centred, strictly_proper, delay, cutoffs)
+        found = [theta[:n] for theta in thetas]
         # Without any, a system of the right speed, whatever the data say: a start for Gauss-Newton.
         found = found or [np.asarray(np.poly(np.full(n, -0.5 * self.bandwidth))[1:], dtype=float)]
         return [np.concatenate((a, np.zeros(m + 1), [delay])) for a in found]
@@ -130,7 +127,7 @@ def _search_levels(cost: RecordsCost, search: Literal["time", "spectral"]) -> Fo
         return [], None
     usable = [(level, cutoff) for level, cutoff in zip(costs, cutoffs, strict=True) if level is not None]
     levels = [(level, 0.5 * np.pi / cutoff) for level, cutoff in usable]
-    delays, found, minima = search_grid(levels, treatment.delay_bounds, FEWEST_DELAYS)
+    delays, found, minima = search_grid(levels, treatment.delay_bounds)
     first, cutoff = usable[0]
     profile = Profile(delays, found * first.mean_factor, bandwidth, cutoff)
     interval = measured.data[0].interval
@@ -154,7 +151,8 @@ def _cutoffs(bounds: tuple[float, float], bandwidth: float) -> list[float]:
 def _search_samples(cost: RecordsCost) -> Found:
     """Search on every sample."""
     measured = cost.measured
-    delays = _grid(measured.treatment.delay_bounds, cost.bandwidth)
+    low, high = measured.treatment.delay_bounds
+    delays = quarter_periods(low, high, cost.bandwidth, MOST_DELAYS) if low < high else np.array([low])
     found = scan(cost, delays)
     costs = costs_of(found)
     if np.isnan(costs).all():
@@ -170,15 +168,6 @@ def _search_samples(cost: RecordsCost) -> Found:
     parts = int(np.clip(np.ceil(4.0 * spacing / interval), 4, FINEST))
     profile = Profile(delays, costs / count, cost.bandwidth)
     return _local_grid(cost, chosen, spacing, parts, MINIMA) or chosen, profile
-
-
-def _grid(bounds: tuple[float, float], bandwidth: float) -> Array:
-    """Delays of the search: the spacing is at most a quarter period of the output's bandwidth."""
-    low, high = bounds
-    if low == high:
-        return np.array([low])
-    wanted = int(np.ceil((high - low) * bandwidth / (0.5 * np.pi))) + 1
-    return np.linspace(low, high, min(max(wanted, FEWEST_DELAYS), MOST_DELAYS))
 
 
 def _local_grid(cost: RecordsCost, centres: Sequence[Minimum], reach: float, parts: int, most: int) -> list[Minimum]:

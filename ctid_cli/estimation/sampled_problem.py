@@ -1,5 +1,6 @@
 """The estimation problem of a single transfer function on the samples of one record."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -111,6 +112,14 @@ def cutoffs_of(record: Record, given: float | None) -> tuple[float, ...]:
         return (given,)
     bandwidth = output_bandwidth(record)
     return tuple(multiple * bandwidth for multiple in CUTOFFS)
+
+
+def least_squares_starts(
+    data: FilterData, structure: Structure, delay: float, svf_cutoffs: Sequence[float], refit: bool = False
+) -> list[Array]:
+    """The least-squares estimates of several cut-offs, singular ones left out."""
+    found = (least_squares_start(data, structure, delay, cutoff, refit) for cutoff in svf_cutoffs)
+    return [theta for theta in found if theta is not None]
 
 
 def least_squares_start(

@@ -11,7 +11,7 @@ from ctid_cli.estimation.additive_estimate import Covariance, estimate_submodels
 from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, check_record, finish, history_of
 from ctid_cli.estimation.iteration import RULES, StepRule, Steps, iterate
-from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, cutoffs_of, least_squares_start
+from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, cutoffs_of, least_squares_starts
 from ctid_cli.estimation.stability import with_stable_denominator
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import filter_data
@@ -140,8 +140,8 @@ class Srivc(Estimator[Iteration, Fit]):
             return self._from(problem, given_coefficients(start.model, structure, self.delay))
         refit = self.step_rule != "plain" or isinstance(problem, AdditiveProblem)
         cutoffs = cutoffs_of(record, self.svf_cutoff)
-        starts = (least_squares_start(problem.data, structure, self.delay, cutoff, refit) for cutoff in cutoffs)
-        fits = [self._from(problem, theta) for theta in starts if theta is not None]
+        starts = least_squares_starts(problem.data, structure, self.delay, cutoffs, refit)
+        fits = [self._from(problem, theta) for theta in starts]
         if not fits:
             raise DataError(Status.SINGULAR.value)
         return min(fits, key=lambda fit: (not fit.status.succeeded, np.nan_to_num(fit.cost, nan=np.inf)))

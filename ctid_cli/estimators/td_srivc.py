@@ -25,7 +25,7 @@ from ctid_cli.estimation.common import (
 from ctid_cli.estimation.delay_search import LEAST_CURVATURE, Descent, Minimum, bound_in_the_way, delay_step, descend
 from ctid_cli.estimation.global_look import lower_elsewhere
 from ctid_cli.estimation.iteration import GUARDED, RULES, Iterated, Steps, Variant, iterate
-from ctid_cli.estimation.sampled_problem import SampledProblem, cutoffs_of, least_squares_start
+from ctid_cli.estimation.sampled_problem import SampledProblem, cutoffs_of, least_squares_starts
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.answer import output_bandwidth
@@ -214,16 +214,11 @@ class SrivcCost:
     def minimise(self, delay: float, theta: Array | None) -> Minimum | None:
         """SRIVC at one delay, from given coefficients or from the least-squares starts."""
         problem, refit = self.problem, self.options.variant == "guarded"
-        starts = (
-            [theta]
-            if theta is not None
-            else [
-                least_squares_start(problem.data, problem.structure, delay, cutoff, refit)
-                for cutoff in self.svf_cutoffs
-            ]
-        )
+        cutoffs = self.svf_cutoffs if theta is None else ()
+        starts = least_squares_starts(problem.data, problem.structure, delay, cutoffs, refit)
+        starts += [] if theta is None else [theta]
         steps = Steps(INNER_ITERATIONS, self.tolerance, RULES[self.options.variant])
-        tried = (iterate(problem, np.append(start[:-1], delay), steps) for start in starts if start is not None)
+        tried = (iterate(problem, np.append(start[:-1], delay), steps) for start in starts)
         results = [result for result in tried if result is not None]
         if not results:
             return None

@@ -66,7 +66,7 @@ def run_job(job: Job) -> list[Outcome]:
     return outcomes
 
 
-def failure(error: BaseException, status: str = "FAILED") -> dict[str, Any]:
+def failure(error: BaseException) -> dict[str, Any]:
     """The result of an estimate that an exception ended.
 
     The message is part of the stored results, which must not differ between two runs. Hence file names without their
@@ -75,4 +75,4 @@ def failure(error: BaseException, status: str = "FAILED") -> dict[str, Any]:
     frames = traceback.extract_tb(error.__traceback__)[-TRACEBACK_FRAMES:]
     places = [f"  {Path(frame.filename).name}:{frame.lineno} in {frame.name}" for frame in frames]
     text = "\n".join([f"{type(error).__name__}: {error}", *places])
-    return failed(re.sub(r"\b0x[0-9a-fA-F]+", "0x…", text), status)
+    return failed(re.sub(r"\b0x[0-9a-fA-F]+", "0x…", text), "FAILED")

@@ -18,10 +18,10 @@ def require_positive(name: str, value: float, unit: str, label: str = "") -> Non
         raise OptionError(name, f"{label or name} must be a positive number [{unit}], not {value!r}.")
 
 
-def require_not_negative(name: str, value: float, unit: str, label: str = "") -> None:
+def require_not_negative(name: str, value: float, unit: str) -> None:
     """Refuse anything but zero or a positive finite number."""
     if not _is_number(value) or value < 0:
-        raise OptionError(name, f"{label or name} must be zero or a positive number [{unit}], not {value!r}.")
+        raise OptionError(name, f"{name} must be zero or a positive number [{unit}], not {value!r}.")
 
 
 def require_finite(name: str, value: float, unit: str, label: str = "") -> None:

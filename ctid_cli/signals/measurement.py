@@ -59,7 +59,6 @@ def read_measurement(
     hold: Hold = "zoh",
     start: float | None = None,
     stop: float | None = None,
-    units: Mapping[Role, str] | None = None,
 ) -> Measurement:
     """Record from a comma-separated or MATLAB file, with its units.
 
@@ -70,7 +69,7 @@ def read_measurement(
     cure = "export the record as comma-separated text (.csv) whose first line names the columns, or from MATLAB as"
     table = read_table(path, f"{cure} vectors (.mat)")
     columns, notes = _choose(table, {"time": time, "input": input, "output": output})
-    unit = {role: (units or {}).get(role) or split_header(name)[1] for role, name in columns.items()}
+    unit = {role: split_header(name)[1] for role, name in columns.items()}
     t, u, y = (table.numbers(columns[role]) for role in ROLES)
     label = unit["time"] or "s"
     if t.size == 1 and y.size > 1:

@@ -67,9 +67,9 @@ class Table:
             sizes = f"{name!r} has {values.size} values and {other!r} has {others.size}"
             raise DataError(f"{self.file}: {sizes}; they must be equally many")
 
-    def times(self, name: str, unit: str = "s") -> Array:
-        """The column of the instants."""
-        return self.check_times(name, self.numbers(name), unit)
+    def times(self, name: str) -> Array:
+        """The column of the instants [s]."""
+        return self.check_times(name, self.numbers(name))
 
     def check_times(self, name: str, t: Array, unit: str = "s") -> Array:
         """Refuse instants that are missing or do not increase."""

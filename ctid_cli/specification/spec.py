@@ -212,9 +212,9 @@ def _of_a_record(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complain
     for name in (*_SIMULATED, "noise"):
         if name in present:
             yield (name,), "belongs to simulated data, and 'data' names a measured record; keep one of the two"
-    if _given(raw, "loop", "reference") is not None:
+    if _reference(raw, "loop") is not None:
         yield ("loop", "reference"), "belongs to simulated data; that of a record is a column, data.reference"
-    column = _given(raw, "data", "reference") is not None
+    column = _reference(raw, "data") is not None
     if column and "loop" not in present:
         yield ("data", "reference"), "needs the controller too; add loop: {controller: {…}}"
     elif not column and "loop" in present and isinstance(raw["data"], Mapping):
@@ -234,10 +234,10 @@ def _of_a_simulation(raw: Mapping[str, Any], present: set[str]) -> Iterator[Comp
         yield (name,), "is missing; data are simulated with system, excitation (or loop) and sampling"
 
 
-def _given(raw: Mapping[str, Any], section: str, key: str) -> Any:
-    """What stands under a key of a section, whatever the section is."""
+def _reference(raw: Mapping[str, Any], section: str) -> Any:
+    """The reference in a section, whatever the section is."""
     content = raw.get(section)
-    return content.get(key) if isinstance(content, Mapping) else None
+    return content.get("reference") if isinstance(content, Mapping) else None
 
 
 def _random_section(raw: Mapping[str, Any], present: set[str]) -> str:
@@ -245,7 +245,7 @@ def _random_section(raw: Mapping[str, Any], present: set[str]) -> str:
     if "data" in present:
         return ""
     parts = {name: raw.get(name) for name in ("excitation", "sampling", "noise", "disturbance")}
-    for name, part in {**parts, "excitation of the loop": _given(raw, "loop", "reference")}.items():
+    for name, part in {**parts, "excitation of the loop": _reference(raw, "loop")}.items():
         if part is None or part == "none":
             continue
         kinds = KINDS[name.split()[0]]

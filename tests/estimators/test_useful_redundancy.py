@@ -30,7 +30,7 @@ SEARCHES = ["time", "spectral"]
 def member_costs(prepared, delay):
     """Costs of all filters at a delay, each with its own coefficients."""
     search = prepared.laid_out.filtered
-    return np.array([search._percent(k, minimum) for k, minimum in enumerate(search._minima(delay))])
+    return np.array([c.percent(minimum) for c, minimum in zip(search.costs, search._minima(delay), strict=True)])
 
 
 def options(model=CASE_1, **more):

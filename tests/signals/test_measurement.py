@@ -41,9 +41,6 @@ def test_units_in_the_header_are_labels_and_convert_nothing(write):
     assert (measurement.time_unit, measurement.input_unit, measurement.output_unit) == ("ms", "V", "m/s (rms)")
     assert measurement.record.t.tolist() == [0.0, 10.0, 20.0]
     assert measurement.time == "Time [ms]"
-    given = read_measurement(path, units={"time": "us"})
-    assert (given.time_unit, given.input_unit) == ("us", "V")
-    assert given.record.t.tolist() == [0.0, 10.0, 20.0]
 
 
 def test_columns_by_name_with_or_without_their_unit(write):

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.delay_search import Minimum
-from ctid_cli.estimation.filter_search import NOTHING, FilterSearch
+from ctid_cli.estimation.filter_search import FilterSearch
 from ctid_cli.estimation.filtered_costs import FilteredCost
 from ctid_cli.estimators.useful_redundancy import RedundantFit, UsefulRedundancy
 from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, pointed, ramp, spread, svg
@@ -95,11 +95,7 @@ def _least_costs(costs: Sequence[FilteredCost], delays: Array, sweeps: int) -> A
         for i in range(delays.size) if sweep % 2 == 0 else reversed(range(delays.size)):
             _improve(best[i], before, costs, float(delays[i]), first=sweep == 0)
             before = best[i]
-    least = np.full((delays.size, len(costs)), float(NOTHING))
-    for (i, k), minimum in np.ndenumerate(np.array(best, dtype=object)):
-        if minimum is not None:
-            least[i, k] = 100.0 * float(np.sqrt(minimum.squared_error / costs[k].spread))
-    return least
+    return np.array([[cost.percent(minimum) for cost, minimum in zip(costs, row, strict=True)] for row in best])
 
 
 def _improve(
