@@ -72,7 +72,11 @@ class _Progress:
 
 
 class RecordProgress(_Progress):
-    """How far a record is done; nothing for one that is done at once."""
+    """How far a record is done, or draws of its noise; nothing for what is done at once."""
+
+    def __init__(self, name: str, what: str = "the record") -> None:
+        super().__init__(name)
+        self.what = what
 
     def __call__(self, done: int, total: int) -> None:
         """Show that so many of all samples are done."""
@@ -83,7 +87,7 @@ class RecordProgress(_Progress):
                 self._start(total, TaskProgressColumn())
             self._update(done)
         elif self._is_time():
-            self._say(f"{100 * done / total:.0f} % of the record")
+            self._say(f"{100 * done / total:.0f} % of {self.what}")
 
 
 class Reporter(_Progress):

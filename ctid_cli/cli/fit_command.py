@@ -4,11 +4,12 @@ import contextlib
 import json
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from ctid_cli.cli._common import From, InputColumn, InputHold, Json, OutputColumn, TimeColumn, To, guarded, write_files
+from ctid_cli.cli._progress import RecordProgress
 from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import InitialState, LossKind, Offset
 
@@ -29,6 +30,7 @@ def fit(
     start: From = None,
     stop: To = None,
     validate: Annotated[Path | None, typer.Option("--validate", metavar="FILE", help="Judge on this record.")] = None,
+    bootstrap: Annotated[int | None, typer.Option("--bootstrap", metavar="DRAWS", help="Bootstrap intervals.")] = None,
     as_json: Json = False,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for fit.json and fit.svg.")] = Path("."),
 ) -> None:
@@ -37,6 +39,7 @@ def fit(
     Prints the parameters with their standard errors and what tells whether to believe them, and writes fit.json and
     fit.svg. The delay is searched over its whole range: no start is needed.
     """
+    from ctid_cli.estimation.common import LEAST_DRAWS
     from ctid_cli.estimators.delay_profile import DelayProfile
     from ctid_cli.estimators.identification import identify
     from ctid_cli.reporting.identification_plot import identification_svg
@@ -45,6 +48,8 @@ def fit(
 
     if poles is None:
         raise UsageError(f"--poles is missing; to see what the record allows and a first fit: ctid check {files[0]}")
+    if bootstrap is not None and bootstrap < LEAST_DRAWS:
+        raise UsageError(f"--bootstrap must be at least {LEAST_DRAWS} draws, for example 500; got {bootstrap}")
     bounds = _delay_bounds(delay)
     try:
         # Every sample: the profile that is drawn is then the cost whose minimum the estimate is.
@@ -64,7 +69,10 @@ def fit(
     measurements = [read(file, start=start, stop=stop) for file in files]
     other = None if validate is None else read(validate)
     units = common_units(measurements if other is None else [*measurements, other])
-    result = identify(options, [item.record for item in measurements], None if other is None else other.record)
+    validation = None if other is None else other.record
+    with RecordProgress("bootstrap", "the draws") as progress:
+        noise: Any = ("auto",) if bootstrap is None else ("bootstrap", bootstrap, progress)
+        result = identify(options, [item.record for item in measurements], validation, *noise)
     text = json.dumps(identification_object(result, measurements, units, other), allow_nan=False)
     figure = identification_svg(result, measurements, units)
     write_files({out / "fit.json": text.encode() + b"\n", out / "fit.svg": figure})

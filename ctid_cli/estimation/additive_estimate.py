@@ -1,7 +1,7 @@
 """From a start to an estimate of a sum of submodels with its covariance: what additive SRIVC and CLSRIVC share."""
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,12 +13,10 @@ from ctid_cli.estimation.iteration import GUARDED, Equations, Iterated, Steps, i
 from ctid_cli.filtering.loop import loop_radius
 from ctid_cli.inference.covariance import white_noise_covariance
 from ctid_cli.inference.fit import IterationRecord
-from ctid_cli.inference.robust import sandwich_covariance
 from ctid_cli.inference.status import Status
+from ctid_cli.inference.uncertainty import Covariance, estimate_uncertainty
 from ctid_cli.models.controller import DiscreteController
 
-#: Noise that standard errors hold for.
-Covariance = Literal["white", "sandwich"]
 #: An unstable loop is simulated over a record unless it would grow beyond this factor.
 LARGEST_GROWTH = 1e20
 
@@ -62,7 +60,7 @@ class SubmodelEstimate(NamedTuple):
 
 
 def estimate_submodels(
-    problem: AdditiveProblem, theta: Array, steps: Steps, covariance: Covariance
+    problem: AdditiveProblem, theta: Array, steps: Steps, covariance: Covariance, draws: int
 ) -> SubmodelEstimate:
     """Iterate from a start and judge the result.
 
@@ -96,7 +94,7 @@ def estimate_submodels(
     equations, status = result.equations, result.status
     matrix = np.full((p, p), np.nan)
     if status is not Status.DIVERGED:
-        matrix = _covariance(problem, result.theta, equations, covariance)[:p, :p]
+        matrix = _covariance(problem, result.theta, equations, covariance, draws)[:p, :p]
         if status is Status.CONVERGED and np.isnan(matrix).any():
             status = Status.SINGULAR
     values |= {"covariance": matrix, "status": status, **quality(equations, float(np.sum((y - y.mean()) ** 2)), y.size)}
@@ -112,7 +110,7 @@ def _better(one: Iterated | None, other: Iterated | None) -> Iterated | None:
     return one if one.equations.squared_error <= other.equations.squared_error else other
 
 
-def _covariance(problem: AdditiveProblem, theta: Array, equations: Equations, kind: Covariance) -> Array:
+def _covariance(problem: AdditiveProblem, theta: Array, equations: Equations, kind: Covariance, draws: int) -> Array:
     """Covariance of all parameters, those of a free response included."""
     if kind == "white":
         return white_noise_covariance(equations.hessian, equations.squared_error, problem.data.count)
@@ -120,7 +118,7 @@ def _covariance(problem: AdditiveProblem, theta: Array, equations: Equations, ki
     if rows is None:
         return np.full((theta.size, theta.size), np.nan)
     psi, _, error, _ = rows
-    return sandwich_covariance([psi], [error], regular=problem.data.interval > 0.0)
+    return estimate_uncertainty([psi], [error], kind, draws, regular=problem.data.interval > 0.0).widened()
 
 
 def _loop_radius(problem: AdditiveProblem, theta: Array) -> float:

@@ -13,16 +13,20 @@ from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.iteration import Equations, Iterated, Problem
 from ctid_cli.estimation.sampled_problem import SampledProblem
+from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
 from ctid_cli.inference.diagnostics import percent_from_r_squared
 from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.status import Status
+from ctid_cli.inference.uncertainty import DRAWS, Covariance, estimate_uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_choice, require_integer, require_not_negative, require_positive
 from ctid_cli.signals.record import Record
 
+#: Draws without which the 95 % quantile of a bootstrap means nothing.
+LEAST_DRAWS = 40
 #: What an estimator takes from a start: an initial delay, or initial parameters.
 StartFrom = Literal["delay", "parameters"]
 #: What an estimator makes of a record before it knows a start, and what it returns.
@@ -109,6 +113,7 @@ CHECKS: Mapping[str, Callable[[str, Any], None]] = {
     "filters": lambda name, value: require_integer(name, value, 2),
     "order": lambda name, value: require_integer(name, value, 1, 20),
     "tolerance": _require_fraction,
+    "bootstrap_draws": lambda name, value: require_integer(name, value, LEAST_DRAWS),
 }
 
 
@@ -232,9 +237,15 @@ def diverged(size: int, count: int) -> dict[str, Any]:
 
 
 def finish(
-    problem: SampledProblem, theta: Array, status: Status, iterations: int, history: list[IterationRecord]
+    problem: SampledProblem,
+    theta: Array,
+    status: Status,
+    iterations: int,
+    history: list[IterationRecord],
+    kind: Covariance = "white",
+    draws: int = DRAWS,
 ) -> Fit:
-    """Assemble the result of an estimation."""
+    """Assemble the result of an estimation, with standard errors for a kind of noise."""
     a, b, delay = problem.split(theta)
     size, y = problem.free, problem.data.y_used
     found = problem.equations(theta)
@@ -244,6 +255,12 @@ def finish(
         # A delay at its bound is no minimum: it has no standard error, and the others hold for that delay.
         accurate = 0 if status is Status.LEAST_SQUARES else size - int(status is Status.DELAY_AT_BOUND)
         covariance, status = covariance_of(found, np.arange(accurate), y.size, status)
+        if kind != "white" and accurate:
+            rows = standard_rows(problem.data, a, b, delay)
+            psi = (rows[:, problem.structure.sensitivity_rows] * problem.structure.signs)[:, :accurate]
+            errors, regular = rows[:, problem.structure.error_row], problem.data.interval > 0.0
+            uncertainty = estimate_uncertainty([psi], [errors], kind, draws, regular=regular)
+            covariance[:accurate, :accurate] = uncertainty.widened()
         spread = float(np.sum((y - y.mean()) ** 2))
         values = {"covariance": covariance, "status": status, **quality(found, spread, y.size)}
     else:

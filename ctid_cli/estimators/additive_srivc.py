@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.estimation.additive_estimate import Covariance, SubmodelEstimate, estimate_submodels
+from ctid_cli.estimation.additive_estimate import SubmodelEstimate, estimate_submodels
 from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_record, named
 from ctid_cli.estimation.iteration import RULES, StepRule, Steps
@@ -19,6 +19,7 @@ from ctid_cli.filtering.submodels import InitialState
 from ctid_cli.inference.derived import additive_derived
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.held import Hold
@@ -86,9 +87,10 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         reference: needed for unbiased estimates where feedback brings coloured noise into the input.
     initial_state : {"rest", "periodic", "estimated"}, default "rest"
         State at the first sample: at rest, that of one period of a steady state, or free responses to be estimated.
-    covariance : {"white", "sandwich"}, default "white"
+    covariance : {"auto", "white", "robust", "bootstrap"}, default "white"
         Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
-        residuals.
+        residuals; ``auto`` is white unless the residuals are not. ``bootstrap`` scales those for coloured noise so that
+        1.96 of them make the interval of a bootstrap-t. ``sandwich`` is an earlier name of ``robust``.
     max_iterations : int, default 100
         Largest number of iterations.
     tolerance : float, default 1e-8
@@ -99,6 +101,8 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
     hold_output : {"foh", "zoh"}, default "foh"
         Interpolation of what the other submodels leave of the output; changes the path, not the converged estimate.
         Where the iteration does not converge it is run once more with the other one.
+    bootstrap_draws : int, default 500
+        Simulated noise sequences of a bootstrap [-].
 
     Raises
     ------
@@ -151,6 +155,7 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
     tolerance: float = 1e-8
     variant: StepRule = "relaxed"
     hold_output: Hold = "foh"
+    bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -182,7 +187,8 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         else:
             model, method = laid_out.start
         steps = Steps(self.max_iterations, self.tolerance, RULES[self.variant])
-        estimate = estimate_submodels(laid_out.problem, model.theta, steps, self.covariance)
+        noise = self.covariance, self.bootstrap_draws
+        estimate = estimate_submodels(laid_out.problem, model.theta, steps, *noise)
         return _fit(laid_out.problem, estimate, model, method)
 
 

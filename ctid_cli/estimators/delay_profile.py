@@ -2,25 +2,28 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.estimation.common import Estimator, Start, checked_bounds, covariance_of, quality
+from ctid_cli.estimation.common import Estimator, Start, checked_bounds, quality
 from ctid_cli.estimation.iteration import Equations
 from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
 from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.box import Box
-from ctid_cli.estimation.output_error import sensitivities
+from ctid_cli.estimation.output_error import Layout, sensitivities
 from ctid_cli.estimation.profile_refinement import Refinement
 from ctid_cli.estimation.profile_search import Profile, ProfileSearch, search_delay
 from ctid_cli.estimation.robust_fit import RobustFit, robust_fit
+from ctid_cli.inference.bootstrap import Progress
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.loss import Weighting, weighted
+from ctid_cli.inference.robust import nearly_regular
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
+from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty, estimate_uncertainty
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import InitialState, LossKind, Offset
@@ -85,6 +88,12 @@ class MeasuredFit(Fit):
         The set of admissible models in which the estimate is the best.
     weighting : Weighting or None
         How much each sample counts, where the loss is not that of squares.
+    held_poles : tuple of complex
+        Poles at a bound of that set [rad/s]; standard errors take them as known.
+    tangent : ndarray, shape (p, f)
+        Directions in which the parameters could move: those of the identity unless poles or the delay are held.
+    regular : bool
+        Whether lags counted in samples are lags in time, up to jitter.
     """
 
     theta: Array = field(default_factory=lambda: np.zeros(0))
@@ -99,6 +108,32 @@ class MeasuredFit(Fit):
     poles_at_infinity: int = 0
     box: Box | None = None
     weighting: Weighting | None = None
+    held_poles: tuple[complex, ...] = ()
+    tangent: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    regular: bool = True
+
+    def uncertainty(
+        self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
+    ) -> Uncertainty:
+        """Standard errors and intervals for a kind of noise.
+
+        Parameters
+        ----------
+        kind : {"auto", "white", "robust", "bootstrap"}, default "auto"
+            What the noise is taken for; ``auto`` is white unless the residuals are not.
+        draws : int, default 500
+            Simulated noise sequences of a bootstrap [-].
+        progress : callable, optional
+            Told after each of them how many of how many are done.
+
+        Returns
+        -------
+        Uncertainty
+            Covariance, and how many standard errors intervals reach.
+        """
+        noise: Any = {"regular": self.regular, "tangent": self.tangent, "progress": progress}
+        law = self.linear
+        return estimate_uncertainty(law.sensitivities, law.residuals, kind, draws, **noise)
 
     @property
     def linear(self) -> "MeasuredFit":
@@ -147,6 +182,12 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
         cost then never rises with the number of poles or zeros. Else only the minima of the profile are refined.
     hold_output : {"foh", "zoh"}, default "foh"
         Interpolation of the measured output between samples; does not change the estimate.
+    covariance : {"auto", "white", "robust", "bootstrap"}, default "white"
+        Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
+        residuals; ``auto`` is white unless the residuals are not. ``bootstrap`` scales those for coloured noise so that
+        1.96 of them make the interval of a bootstrap-t. ``sandwich`` is an earlier name of ``robust``.
+    bootstrap_draws : int, default 500
+        Simulated noise sequences of a bootstrap [-].
 
     Raises
     ------
@@ -184,6 +225,8 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
     svf_cutoff: float | None = None
     nested: bool = False
     hold_output: Hold = "foh"
+    covariance: Covariance = field(default="white", metadata={"added_later": True})
+    bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -212,13 +255,19 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
                 a = [np.concatenate(([1.0], minimum.theta[: self.poles])) for minimum in minima]
                 starts = [(each, minimum.delay) for each, minimum in zip(a, minima, strict=True)]
                 if self.loss == "squares":
-                    return _fit(refinement, refinement.best(starts, self.nested), profile, None)
-                robust = robust_fit(refinement, self.loss, starts, self.nested)
-                return _fit(refinement, robust.found, profile, robust)
+                    fit = _fit(refinement, refinement.best(starts, self.nested), profile, None)
+                else:
+                    robust = robust_fit(refinement, self.loss, starts, self.nested)
+                    fit = _fit(refinement, robust.found, profile, robust)
+                uncertainty = fit.uncertainty(self.covariance, self.bootstrap_draws)
+                singular = fit.status is Status.CONVERGED and not np.isfinite(uncertainty.free_covariance).all()
+                status = Status.SINGULAR if singular else fit.status
+                return replace(fit, covariance=uncertainty.widened(), status=status)
         raise DataError(Status.SINGULAR.value)
 
 
 def _fit(refinement: Refinement, found: Optimum, profile: Profile | None, robust: RobustFit | None) -> MeasuredFit:
+    """The result, but for its covariance."""
     measured = refinement.measured
     layout, theta = refinement.parameters(found)
     parts = sensitivities(refinement.problem, layout, theta, found.model.delay)
@@ -228,15 +277,9 @@ def _fit(refinement: Refinement, found: Optimum, profile: Profile | None, robust
     hessian = np.sum([psi.T @ psi for psi in law.sensitivities], axis=0)
     each = zip(law.sensitivities, law.residuals, strict=True)
     gradient = np.sum([psi.T @ eps for psi, eps in each], axis=0)
-    equations = Equations(hessian, gradient, hessian, sum(float(eps @ eps) for eps in law.residuals), 0.0)
-    status = Status.DELAY_AT_BOUND if found.delay_at_bound else Status[found.ending.name]
-    free = np.arange(layout.size)
-    if found.delay_at_bound:
-        free = np.delete(free, layout.structure.size - 1)
-    covariance, status = covariance_of(equations, free, sum(eps.size for eps in law.residuals), status)
+    equations = Equations(hessian, gradient, hessian, sum(float(eps @ eps) for eps in residuals), 0.0)
     count = sum(eps.size for eps in residuals)
     outputs = np.concatenate([y - y.mean() for y in measured.outputs])
-    equations = equations._replace(squared_error=sum(float(eps @ eps) for eps in residuals))
     values = quality(equations, float(outputs @ outputs), count)
     if robust is not None:
         values["cost"] = robust.cost(robust.losses) / count
@@ -244,8 +287,8 @@ def _fit(refinement: Refinement, found: Optimum, profile: Profile | None, robust
     return MeasuredFit(
         model=found.model,
         parameter_names=layout.names,
-        covariance=covariance,
-        status=status,
+        covariance=np.full((layout.size, layout.size), np.nan),
+        status=Status.DELAY_AT_BOUND if found.delay_at_bound else Status[found.ending.name],
         iterations=found.evaluations,
         theta=theta,
         initial_states=states,
@@ -259,6 +302,9 @@ def _fit(refinement: Refinement, found: Optimum, profile: Profile | None, robust
         poles_at_infinity=found.poles_at_infinity,
         box=found.box,
         weighting=weighting,
+        held_poles=tuple(found.held_poles.tolist()),
+        tangent=_tangent(layout, found),
+        regular=all(nearly_regular(data.t) for data in refinement.problem.records),
         **values,
     )
 
@@ -287,3 +333,15 @@ def _linear(
         tuple(block[keep] for block, keep in zip(psi, kept, strict=True)),
         tuple(left),
     )
+
+
+def _tangent(layout: Layout, found: Optimum) -> Array:
+    """Directions of the parameters along which neither a pole nor the delay leaves the set of admissible models."""
+    n, delay = layout.structure.poles, layout.structure.size - 1
+    tangent = np.eye(layout.size)
+    if found.delay_at_bound:
+        tangent = np.delete(tangent, delay, axis=1)
+    if found.held_poles.size:
+        moving = np.pad(found.pole_slopes, ((0, layout.size - n), (0, 0)))
+        tangent = np.column_stack((moving, tangent[:, n:]))
+    return tangent

@@ -13,23 +13,20 @@ from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
 from ctid_cli.estimators import identification_warnings as warnings
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.inference import criteria as criteria_of
+from ctid_cli.inference.bootstrap import Progress
 from ctid_cli.inference.conditioning import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR
 from ctid_cli.inference.covariance import condition_number
 from ctid_cli.inference.delay_interval import CostOfDelay, DelayInterval
 from ctid_cli.inference.derived import derived_parameters
 from ctid_cli.inference.diagnostics import fit_percent, r_squared
-from ctid_cli.inference.residuals import ResidualTests, residual_tests
-from ctid_cli.inference.robust import sandwich_covariance
+from ctid_cli.inference.residuals import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty
 from ctid_cli.signals.record import Record
 
 #: Confidence level of intervals and tests.
 LEVEL = 0.95
-#: Fewer residuals than this are not tested.
-FEWEST_TESTED = 20
-#: A clock of which 95 % of the intervals are this close to their median counts as regular for the noise.
-NEARLY_REGULAR = 0.05
 #: An initial state or offset is asked for where it lowers the cost by this fraction, and Schwarz's criterion by ten.
 WORTHWHILE = 0.02
 DECISIVE = 10.0
@@ -58,10 +55,8 @@ class Identification:
         What was asked for.
     fit : MeasuredFit
         The estimate.
-    covariance : ndarray, shape (p, p)
-        Covariance that the standard errors are from; NaN where it is not defined.
-    robust : bool
-        Whether it is the sandwich for coloured residuals, and not that for white ones.
+    uncertainty : Uncertainty
+        Covariance that the standard errors are from, for white or coloured noise, and how many of them intervals reach.
     estimates : tuple of UncertainValue
         The parameters with their uncertainty.
     delay_interval : DelayInterval or None
@@ -82,8 +77,7 @@ class Identification:
 
     options: DelayProfile
     fit: MeasuredFit
-    covariance: Array
-    robust: bool
+    uncertainty: Uncertainty
     estimates: tuple[UncertainValue, ...]
     delay_interval: DelayInterval | None
     derived: tuple[UncertainValue, ...]
@@ -95,11 +89,17 @@ class Identification:
     validation: Validation | None = None
 
     def __repr__(self) -> str:
-        kind = "robust" if self.robust else "white"
-        return f"Identification: {kind} covariance, {len(self.warnings)} warnings\n{self.fit!r}"
+        return f"Identification: {self.uncertainty.kind} covariance, {len(self.warnings)} warnings\n{self.fit!r}"
 
 
-def identify(options: DelayProfile, records: Sequence[Record], validation: Record | None = None) -> Identification:
+def identify(
+    options: DelayProfile,
+    records: Sequence[Record],
+    validation: Record | None = None,
+    covariance: Covariance = "auto",
+    bootstrap_draws: int = DRAWS,
+    progress: Progress | None = None,
+) -> Identification:
     """Fit one model to the records and judge it.
 
     Parameters
@@ -111,6 +111,13 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
     validation : Record, optional
         Another record of the same system; its initial state and offset are treated as those of the others, with the
         model fixed.
+    covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
+        What the noise is taken for: white unless the residuals are not, white, or coloured with standard errors and
+        Student's t, or coloured with the intervals of a bootstrap-t.
+    bootstrap_draws : int, default 500
+        Simulated noise sequences of a bootstrap [-].
+    progress : callable, optional
+        Told after each of them how many of how many are done.
 
     Returns
     -------
@@ -124,8 +131,10 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
 
     Notes
     -----
-    Standard errors are those for white residuals if no experiment's residuals fail the test of whiteness, and the
-    sandwich's otherwise. The delay has a profile-likelihood interval where the quadratic one is doubtful.
+    Standard errors are those for white residuals if no experiment's residuals fail the test of whiteness, and those for
+    coloured noise (:func:`~ctid_cli.inference.robust.robust_covariance`) otherwise. Intervals are those of Student's t
+    with as many degrees of freedom as the record is worth independent samples, less the number of parameters. The delay
+    has a profile-likelihood interval where the quadratic one is doubtful.
     """
     checked = None
     if validation is not None:
@@ -142,32 +151,34 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
     output = np.concatenate([record.y[use] for record, use in zip(records, fit.used, strict=True)])
     squared_error = float(residuals @ residuals) if fit.weighting is None else fit.cost * fit.count
     tests = _tests(linear, records)
-    robust = any(not test.white for test in tests)
-    covariance = _sandwich(linear, records) if robust else fit.covariance
-    free, hessian = _free_block(linear)
+    uncertainty = fit.uncertainty(covariance, bootstrap_draws, progress)
+    matrix = uncertainty.covariance
+    free, hessian = _free(linear)
     singular = not condition_number(hessian) <= NEARLY_SINGULAR
-    unclear = {fit.parameter_names[k] for k in (free if singular else _undetermined(fit, covariance))}
+    unclear = {fit.parameter_names[k] for k in (free if singular else _undetermined(fit, matrix))}
     interval = None
     if refinement.structure.delay and "delay" not in unclear:
-        interval = _delay_interval(refinement, linear, covariance)
+        interval = _delay_interval(refinement, linear, uncertainty)
     judged = None if checked is None or validation is None else _validate(checked, fit, validation)
     size = fit.model.order + options.zeros + 1
-    coefficients = np.full((size, size), np.nan) if singular else covariance[:size, :size]
+    coefficients = np.full((size, size), np.nan) if singular else matrix[:size, :size]
     return Identification(
-        options=options,
+        options=replace(options, covariance=covariance, bootstrap_draws=bootstrap_draws),
         fit=fit,
-        covariance=covariance,
-        robust=robust,
-        estimates=_estimates(fit, covariance, unclear, interval),
+        uncertainty=uncertainty,
+        estimates=_estimates(fit, uncertainty, unclear, interval),
         delay_interval=interval,
-        derived=derived_parameters(fit.model, coefficients, level=LEVEL),
+        derived=derived_parameters(
+            fit.model, coefficients, uncertainty.quantile, fit.tangent[:size] if fit.held_poles else None
+        ),
         tests=tests,
         criteria=criteria_of.information_criteria(squared_error, fit.count, fit.theta.size),
-        yic=criteria_of.young_information_criterion(residuals, output, fit.theta[free], covariance[np.ix_(free, free)]),
+        yic=criteria_of.young_information_criterion(residuals, output, fit.theta[free], matrix[np.ix_(free, free)]),
         r_t_squared=criteria_of.r_t_squared(residuals, output),
         warnings=(
             *warnings.of_status(fit),
-            *warnings.of_conditioning(fit, covariance, free, hessian),
+            *warnings.of_conditioning(fit, uncertainty.free_covariance, hessian),
+            *warnings.of_short_record(uncertainty, fit.count),
             *warnings.of_interval(interval, options),
             *warnings.of_residuals(tests, len(records), FEWEST_TESTED),
             *warnings.of_treatment(_gains(options, refinement, linear)),
@@ -177,7 +188,7 @@ def identify(options: DelayProfile, records: Sequence[Record], validation: Recor
     )
 
 
-# --- residuals and covariance ----------------------------------------------------------------------
+# --- residuals and uncertainty ----------------------------------------------------------------------
 
 
 def _tests(fit: MeasuredFit, records: Sequence[Record]) -> tuple[ResidualTests, ...]:
@@ -191,25 +202,6 @@ def _tests(fit: MeasuredFit, records: Sequence[Record]) -> tuple[ResidualTests, 
     return tuple(found)
 
 
-def _sandwich(fit: MeasuredFit, records: Sequence[Record]) -> Array:
-    """Covariance for coloured residuals; a delay at its bound is taken as known, as in the white one."""
-    free = np.isfinite(np.diag(fit.covariance))
-    covariance = np.full_like(fit.covariance, np.nan)
-    if not free.any():
-        return covariance
-    regular = all(_nearly_regular(record) for record in records)
-    psi = [block[:, free] for block in fit.sensitivities]
-    covariance[np.ix_(free, free)] = sandwich_covariance(psi, fit.residuals, regular=regular)
-    return covariance
-
-
-def _nearly_regular(record: Record) -> bool:
-    """Whether lags counted in samples are lags in time, up to jitter."""
-    intervals = np.diff(record.t)
-    middle = float(np.median(intervals))
-    return bool(np.mean(np.abs(intervals - middle) <= NEARLY_REGULAR * middle) >= 0.95)
-
-
 def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
     """Parameters that the data say next to nothing about, so that no tidy number may stand beside them.
 
@@ -218,32 +210,33 @@ def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
     names, errors = fit.parameter_names, np.sqrt(np.diag(covariance))
     looked_at = np.array([re.fullmatch(r"[ab]\d+|delay", name) is not None for name in names])
     unclear = ~np.isfinite(errors) | (looked_at & (errors > LARGE_STANDARD_ERROR * np.abs(fit.theta)))
-    if fit.status is Status.DELAY_AT_BOUND:
-        unclear[[name == "delay" for name in names]] = False
+    unclear[~fit.tangent.any(axis=1)] = False
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = np.abs(covariance / np.outer(errors, errors))
     moving = (correlation[unclear] > CLOSE_TO_ONE).any(axis=0)
     return set(np.flatnonzero(unclear | moving).tolist())
 
 
-def _free_block(fit: MeasuredFit) -> tuple[IndexArray, Array]:
-    """Indices of the parameters that are not at a bound, and their part of ``sum psi psi'``."""
-    held = fit.status is Status.DELAY_AT_BOUND
-    free = np.array([k for k, name in enumerate(fit.parameter_names) if not (held and name == "delay")])
+def _free(fit: MeasuredFit) -> tuple[IndexArray, Array]:
+    """Indices of the parameters that are not held at a bound, and ``sum psi psi'`` along the free directions."""
     hessian = sum((psi.T @ psi for psi in fit.sensitivities), np.zeros((fit.theta.size, fit.theta.size)))
-    return free, hessian[np.ix_(free, free)]
+    return np.flatnonzero(fit.tangent.any(axis=1)), fit.tangent.T @ hessian @ fit.tangent
 
 
 # --- the delay -------------------------------------------------------------------------------------
 
 
-def _delay_interval(refinement: Refinement, fit: MeasuredFit, covariance: Array) -> DelayInterval | None:
+def _delay_interval(refinement: Refinement, fit: MeasuredFit, uncertainty: Uncertainty) -> DelayInterval | None:
     """Profile-likelihood interval of a free delay, None where estimate plus or minus two errors is as good."""
     place = fit.parameter_names.index("delay")
-    variance, white = float(covariance[place, place]), float(fit.covariance[place, place])
-    error = float(np.sqrt(variance))
-    if fit.status is Status.DELAY_AT_BOUND:
-        variance, white, error = 1.0, 1.0, float("nan")  # no standard error to inflate by
+    held = fit.status is Status.DELAY_AT_BOUND
+    if held:
+        # What the noise does to a delay is seen where it is free.
+        fit = replace(fit, tangent=np.eye(fit.theta.size))
+        uncertainty = fit.uncertainty("white" if uncertainty.kind == "white" else "robust")
+    variance = float(uncertainty.covariance[place, place])
+    white = float(fit.uncertainty("white").covariance[place, place])
+    error = float("nan") if held else float(np.sqrt(variance))
     profile = CostOfDelay(
         cache(lambda trial: refinement.squared_error_at(fit.model, trial)),
         float(fit.theta[place]),
@@ -253,7 +246,8 @@ def _delay_interval(refinement: Refinement, fit: MeasuredFit, covariance: Array)
         refinement.measured.treatment.delay_bounds,
         max(variance / white, np.finfo(float).tiny),
     )
-    return profile.interval(LEVEL) if profile.quadratic_is_doubtful(error) else None
+    reach = uncertainty.quantile(np.eye(fit.theta.size)[place], LEVEL)
+    return profile.interval(reach) if profile.quadratic_is_doubtful(error) else None
 
 
 # --- results ---------------------------------------------------------------------------------------
@@ -278,20 +272,23 @@ def _gains(options: DelayProfile, refinement: Refinement, fit: MeasuredFit) -> d
 
 
 def _estimates(
-    fit: MeasuredFit, covariance: Array, unclear: set[str], interval: DelayInterval | None
+    fit: MeasuredFit, uncertainty: Uncertainty, unclear: set[str], interval: DelayInterval | None
 ) -> tuple[UncertainValue, ...]:
     """Parameters, numerator first, then denominator, delay, and what belongs to the experiments."""
     found: dict[str, UncertainValue] = {}
-    for name, value, variance in zip(fit.parameter_names, fit.theta.tolist(), np.diag(covariance), strict=True):
+    with np.errstate(invalid="ignore"):
+        errors = np.sqrt(np.diag(uncertainty.covariance))
+    free = set(_free(fit)[0].tolist())
+    for k, (name, value) in enumerate(zip(fit.parameter_names, fit.theta.tolist(), strict=True)):
         if name in unclear:
             found[name] = UncertainValue(name, value, status="undetermined")
-            continue
-        item = UncertainValue.normal(name, value, float(np.sqrt(variance)), level=LEVEL)
+        elif k in free:
+            reach = uncertainty.quantile(np.eye(errors.size)[k], LEVEL)
+            found[name] = UncertainValue.symmetric(name, value, float(errors[k]), quantile=reach)
+        else:
+            found[name] = UncertainValue(name, value, status="at bound")
         if name == "delay" and interval is not None:
-            item = replace(item, low=interval.low, high=interval.high)
-        if name == "delay" and fit.status is Status.DELAY_AT_BOUND:
-            item = replace(item, standard_error=float("nan"), status="at bound")
-        found[name] = item
+            found[name] = replace(found[name], low=interval.low, high=interval.high)
     found.setdefault("delay", UncertainValue("delay", fit.model.delay, status="fixed"))
     order = {"b": 0, "a": 1, "d": 2}
     return tuple(sorted(found.values(), key=lambda item: order.get(item.name[0], 3)))

@@ -4,13 +4,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.arrays import Array
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.inference.conditioning import describe_conditioning
 from ctid_cli.inference.covariance import condition_number
 from ctid_cli.inference.delay_interval import DelayInterval
 from ctid_cli.inference.residuals import ResidualTests
 from ctid_cli.inference.status import Status
+from ctid_cli.inference.uncertainty import Uncertainty
+from ctid_cli.text import listed
 
 
 def of_status(fit: MeasuredFit) -> list[str]:
@@ -31,17 +33,41 @@ def _of_lost_poles(lost: int, left: int) -> list[str]:
     return [f"{what} to infinity: more than {left} lower the cost no further, and the model has that many."]
 
 
-def of_conditioning(fit: MeasuredFit, covariance: Array, free: IndexArray, hessian: Array) -> list[str]:
-    """What the data do not determine; a delay at its bound is taken as known."""
+def of_conditioning(fit: MeasuredFit, covariance: Array, hessian: Array) -> list[str]:
+    """What the data do not determine, from covariance and ``sum psi psi'`` along the free directions.
+
+    A delay or a pole at its bound is taken as known.
+    """
     words = []
     if fit.status is Status.DELAY_AT_BOUND:
         reason = "because it stopped at a bound; the other standard errors take it as known"
         words.append(f"The delay has no standard error, {reason} and are too small if it is not.")
-    names = [fit.parameter_names[k] for k in free]
-    block = covariance[np.ix_(free, free)]
-    found = describe_conditioning(block, fit.theta[free], names, condition_number(hessian), hessian)
+    if fit.held_poles:
+        held = listed(f"{pole:.4g}" if pole.imag else f"{pole.real:.4g}" for pole in fit.held_poles)
+        what = f"Held at the border of the admissible models: {held} (poles, rad per unit of time)"
+        words.append(f"{what}; the other standard errors take this as known.")
+    names: list[str] = []
+    values: list[float] = []
+    for column in fit.tangent.T:
+        place = int(np.argmax(np.abs(column)))
+        own = np.count_nonzero(column) == 1
+        names.append(fit.parameter_names[place] if own else f"pole {len(names) + 1}")
+        values.append(fit.theta[place])
+    found = describe_conditioning(covariance, np.array(values), names, condition_number(hessian), hessian)
     # At a bound and along a ridge the status has said why, and one sentence is enough.
     return [*words, *found[: 1 if fit.status in (Status.AT_BOUND, Status.RIDGE) else None]]
+
+
+def of_short_record(uncertainty: Uncertainty, count: int) -> list[str]:
+    """Whether the noise is so slow that the record hardly shows what it is."""
+    if not uncertainty.short:
+        return []
+    worth = f"its {count} samples are worth {uncertainty.effective_count:.2g} independent ones"
+    size = len(uncertainty.free_covariance)
+    return [
+        f"The record is too short for its noise: {worth}, and the model has {size} parameters. The intervals are "
+        "rough; take a longer record."
+    ]
 
 
 def of_interval(interval: DelayInterval | None, options: DelayProfile) -> list[str]:

@@ -1,24 +1,23 @@
 """Simplified refined instrumental variables for continuous-time models (SRIVC) at a known delay."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.additive_estimate import Covariance, estimate_submodels
+from ctid_cli.estimation.additive_estimate import estimate_submodels
 from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, check_record, finish, history_of
 from ctid_cli.estimation.iteration import RULES, StepRule, Steps, iterate
 from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, cutoffs_of, least_squares_starts
 from ctid_cli.estimation.stability import with_stable_denominator
-from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.robust import sandwich_covariance
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
+from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
 from ctid_cli.signals.held import Hold
@@ -63,9 +62,12 @@ class Srivc(Estimator[Iteration, Fit]):
     instruments : {"open_loop", "closed_loop"}, default "open_loop"
         ``closed_loop`` (CLSRIVC) simulates the instruments in the noise-free loop of the model with the record's
         controller and reference: needed where feedback brings coloured noise into the input.
-    covariance : {"white", "sandwich"}, default "white"
+    covariance : {"auto", "white", "robust", "bootstrap"}, default "white"
         Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
-        residuals.
+        residuals; ``auto`` is white unless the residuals are not. ``bootstrap`` scales those for coloured noise so that
+        1.96 of them make the interval of a bootstrap-t. ``sandwich`` is an earlier name of ``robust``.
+    bootstrap_draws : int, default 500
+        Simulated noise sequences of a bootstrap [-].
 
     Raises
     ------
@@ -109,6 +111,7 @@ class Srivc(Estimator[Iteration, Fit]):
     hold_output: Hold = "foh"
     instruments: Instruments = field(default="open_loop", metadata={"added_later": True})
     covariance: Covariance = field(default="white", metadata={"added_later": True})
+    bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -156,18 +159,15 @@ class Srivc(Estimator[Iteration, Fit]):
         if result is None:
             return finish(problem, theta, Status.DIVERGED, 0, [])
         history = history_of("refine", problem, result)
-        fit = finish(problem, result.theta, result.status, result.iterations, history)
-        if self.covariance == "white":
-            return fit
-        rows = standard_rows(problem.data, *problem.split(result.theta))
-        psi = rows[:, structure.sensitivity_rows] * structure.signs
-        regular = problem.data.interval > 0.0
-        return replace(fit, covariance=sandwich_covariance([psi], [rows[:, structure.error_row]], regular=regular))
+        noise = self.covariance, self.bootstrap_draws
+        return finish(problem, result.theta, result.status, result.iterations, history, *noise)
 
     def _as_submodel(self, problem: AdditiveProblem, theta: Array, structure: Structure, steps: Steps) -> Fit:
         """Estimate a sum of one submodel; coefficients and covariance are converted to the monic form."""
         single = Submodel(theta[self.poles : -1], np.concatenate(([1.0], theta[: self.poles])))
-        estimate = estimate_submodels(problem, AdditiveModel([single]).theta, steps, self.covariance)
+        estimate = estimate_submodels(
+            problem, AdditiveModel([single]).theta, steps, self.covariance, self.bootstrap_draws
+        )
         additive = problem.model(estimate.theta)
         jacobian = unfactored_jacobian(additive)
         # The numerator has all its powers there, and the highest of them are zero.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -31,6 +31,7 @@ from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.status import Status
+from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
@@ -67,6 +68,12 @@ class TdSrivc(Estimator["Searches", Fit]):
         iterations on coefficients and delay.
     hold_output : {"foh", "zoh"}, default "foh"
         Interpolation of the measured output between samples; changes the path, not the converged estimate.
+    covariance : {"auto", "white", "robust", "bootstrap"}, default "white"
+        Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
+        residuals; ``auto`` is white unless the residuals are not. ``bootstrap`` scales those for coloured noise so that
+        1.96 of them make the interval of a bootstrap-t. ``sandwich`` is an earlier name of ``robust``.
+    bootstrap_draws : int, default 500
+        Simulated noise sequences of a bootstrap [-].
 
     Raises
     ------
@@ -102,6 +109,8 @@ class TdSrivc(Estimator["Searches", Fit]):
     tolerance: float = 1e-6
     variant: Variant = "guarded"
     hold_output: Hold = "foh"
+    covariance: Covariance = field(default="white", metadata={"added_later": True})
+    bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -178,7 +187,7 @@ class TdSrivc(Estimator["Searches", Fit]):
             if self.variant == "guarded":
                 theta = there.theta
                 history.append(history_entry("bound", 0, problem, theta, there.equations.squared_error))
-        return finish(problem, theta, status, iterations, history)
+        return finish(problem, theta, status, iterations, history, self.covariance, self.bootstrap_draws)
 
     def _at_bound(self, problem: SampledProblem, theta: Array) -> Iterated | None:
         """The estimate with the delay on a bound, if that is where the cost leads."""

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.special import fdtri
 
 #: The rise of the cost two standard errors away is called quadratic if its square root is right to this share.
 QUADRATIC_TOLERANCE = 0.1
@@ -36,22 +35,23 @@ class CostOfDelay:
     #: By what factor coloured noise raises the variance of the delay [-].
     inflation: float = 1.0
 
-    def interval(self, level: float = 0.95) -> DelayInterval:
+    def interval(self, quantile: float) -> DelayInterval:
         r"""Interval of delays around the estimate whose best fits are not significantly worse.
 
         The delays with
 
-        .. math:: S(\tau) \le S_{\min} \Big(1 + c \, \frac{F_{1, N - p}(level)}{N - p}\Big),
+        .. math:: S(\tau) \le S_{\min} \Big(1 + \frac{c \, t^2}{N - p}\Big),
 
-        c the inflation: the F version of ``N ln(S/S_min) <= chi2_1(level)``, which it becomes for large N. Where S is a
-        parabola, this is the t interval ``estimate +- t se`` exactly. Each end is bracketed by steps that grow from a
+        c the inflation and t the quantile [standard errors]: with that of Student's t for ``N - p`` degrees of freedom
+        the F version of ``N ln(S/S_min) <= chi2_1(level)``, which it becomes for large N. Where S is a parabola, this
+        is the interval ``estimate +- t se`` exactly. Each end is bracketed by steps that grow from a
         small one outward, then found by Brent's method to 1e-6 of its distance from the estimate. A second basin
         further away is not looked for.
         """
         freedom = self.count - self.parameters
         if freedom <= 0 or not np.isfinite(self.inflation) or not self.squared_error >= 0:
             return DelayInterval(float("nan"), float("nan"), False, False)
-        allowed = self.inflation * float(fdtri(1, freedom, level)) / freedom
+        allowed = self.inflation * quantile**2 / freedom
 
         def excess(delay: float) -> float:
             value = self.squared_error_at(delay)

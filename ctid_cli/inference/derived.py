@@ -1,5 +1,6 @@
 """Poles, time constants, frequencies, damping and gain of estimated models, with their standard errors."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,19 +14,33 @@ from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
 
 NAN = float("nan")
 GAIN_UNIT = "output unit/input unit"
+HELD = "A pole is held at a bound of the admissible models, where the record does not determine it."
+#: A quantity that changes by less than this fraction where a free pole changes by its own size is held [-].
+UNMOVED = 1e-6
+
+#: Standard errors to each side of a quantity with a given gradient by the leading parameters.
+Quantile = Callable[[Array], float]
 
 
-def derived_parameters(model: TransferFunction, covariance: Array, level: float = 0.95) -> tuple[UncertainValue, ...]:
+def normal_interval(gradient: Array) -> float:
+    """The same for every quantity: that of the normal distribution, 95 %."""
+    return normal_quantile()
+
+
+def derived_parameters(
+    model: TransferFunction, covariance: Array, quantile: Quantile = normal_interval, tangent: Array | None = None
+) -> tuple[UncertainValue, ...]:
     r"""What users read off a model, with standard errors by the delta method.
 
     ``var g = (dg/dtheta) C (dg/dtheta)'`` with analytic derivatives, those of the poles from :func:`pole_jacobian`, and
     ``g +- z se``. The linearisation only holds where a pole moves little compared with its distance to the others. A
     pole whose ``z`` standard errors, ``sqrt(var Re p + var Im p)``, reach another pole is called undetermined: its
     accuracy is NaN and the reason is given. Natural frequency and damping of a pair only need it to be far
-    from the *other* poles: they are regular where the pair meets on the real axis.
+    from the *other* poles: they are regular where the pair meets on the real axis. What does not change along the
+    tangent, the directions in which the coefficients were free, is held and has no standard error.
     """
     n, poles = model.order, model.poles
-    rows = _Rows(covariance, level)
+    rows = _Rows(covariance, quantile, tangent)
     rows.add_poles(poles, pole_jacobian(model.denominator, poles))
     gradient = np.zeros(covariance.shape[0])
     last = float(model.denominator[-1])
@@ -51,13 +66,13 @@ def additive_derived(model: AdditiveModel, covariance: Array, *, level: float = 
     first = 0
     for number, (submodel, term) in enumerate(zip(model.submodels, model.terms, strict=True), 1):
         own = slice(first, first + term.size)
-        rows = _of_submodel(submodel, covariance[own, own], level)
+        rows = _of_submodel(submodel, covariance[own, own], lambda _: normal_quantile(level))
         found += [replace(row, name=f"g{number}_{row.name}") for row in rows]
         first = own.stop
     return tuple(found)
 
 
-def _of_submodel(submodel: Submodel, covariance: Array, level: float) -> list[UncertainValue]:
+def _of_submodel(submodel: Submodel, covariance: Array, quantile: Quantile) -> list[UncertainValue]:
     """All quantities of one submodel; covariance of its own parameters."""
     n = submodel.term().poles
     falling = submodel.denominator
@@ -65,7 +80,7 @@ def _of_submodel(submodel: Submodel, covariance: Array, level: float) -> list[Un
     # A = a_n times the monic polynomial, whose derivatives run from p^(n-1) down to 1; here they run from p to p^n.
     with np.errstate(invalid="ignore"):
         jacobian = poles[:, None] * pole_jacobian(falling / falling[0], poles)[:, ::-1] / falling[0]
-    rows = _Rows(covariance, level)
+    rows = _Rows(covariance, quantile)
     rows.add_poles(poles, jacobian, number_lone=False)
     if n == 2 and falling[0] > 0 and not poles.imag.any():
         # Of two real poles, however close: natural frequency a_2^(-1/2) and damping a_1 a_2^(-1/2) / 2.
@@ -83,19 +98,24 @@ def _of_submodel(submodel: Submodel, covariance: Array, level: float) -> list[Un
 class _Rows:
     """Quantities computed from parameters of known covariance."""
 
-    def __init__(self, covariance: Array, level: float) -> None:
+    def __init__(self, covariance: Array, quantile: Quantile, tangent: Array | None = None) -> None:
         self.covariance = covariance
-        self.level = level
+        self.quantile = quantile
+        self.tangent = tangent
         self.found: list[UncertainValue] = []
 
     def add(self, name: str, estimate: float, gradient: Array, unit: str, reason: str = "") -> None:
         """One quantity, from its gradient by the leading parameters; with a reason, it has no standard error."""
         covariance = self.covariance[: gradient.size, : gradient.size]
+        if self.tangent is not None and not reason:
+            moved = np.abs(gradient @ self.tangent[: gradient.size]).max(initial=0.0)
+            reason = HELD if moved <= UNMOVED * abs(estimate) else ""
         variance = float(gradient @ covariance @ gradient) if np.isfinite(gradient).all() else NAN
         error = float(np.sqrt(variance)) if variance >= 0 and not reason else NAN
         if not reason and not np.isfinite(error):
             reason = "The covariance of the coefficients is not defined."
-        self.found.append(UncertainValue.normal(name, estimate, error, unit, level=self.level, reason=reason))
+        reach = self.quantile(gradient) if np.isfinite(error) else NAN
+        self.found.append(UncertainValue.symmetric(name, estimate, error, unit, reach, reason))
 
     def add_mode(
         self, label: str, frequency: float, radial: Array, damping: float, turning: Array, reason: str = ""
@@ -144,4 +164,4 @@ class _Rows:
         A = self.covariance[: slope.size, : slope.size]
         with np.errstate(invalid="ignore"):
             spread = float(np.sqrt(slope.real @ A @ slope.real + slope.imag @ A @ slope.imag))
-        return text if normal_quantile(self.level) * spread >= distance else ""
+        return text if self.quantile(slope.real) * spread >= distance else ""

@@ -26,6 +26,12 @@ class NoiseModel:
         """Order r; 0 is white noise."""
         return int(self.coefficients.size - 1)
 
+    def effective_count(self, count: int) -> float:
+        """How many independent samples have a mean as uncertain as so many of these, and not more than these."""
+        gain = float(self.coefficients.sum()) ** 2
+        ratio = gain * float(self.first_autocovariances[0]) / self.innovation_variance if self.order else 1.0
+        return count * min(ratio, 1.0)
+
     def autocovariance(self, count: int) -> Array:
         """Autocovariances at the lags 0, 1 … count - 1 intervals."""
         result = np.zeros(max(count, self.order + 1))

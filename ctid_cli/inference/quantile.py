@@ -1,8 +1,13 @@
-"""The quantile of the normal distribution on which intervals of estimates rest."""
+"""The quantiles on which intervals of estimates rest."""
 
-from scipy.special import ndtri
+from scipy.special import ndtri, stdtrit
 
 
 def normal_quantile(level: float = 0.95) -> float:
     """Half the width of a two-sided interval of that probability [standard errors]."""
     return float(ndtri(0.5 + level / 2))
+
+
+def student_quantile(degrees_of_freedom: float, level: float = 0.95) -> float:
+    """The same where the standard error itself is known only as well as these degrees of freedom tell."""
+    return float(stdtrit(degrees_of_freedom, 0.5 + level / 2))

@@ -1,5 +1,6 @@
 """Tests of the residuals: whether they are white, and whether they still depend on the input."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,6 +10,8 @@ from ctid_cli.arrays import Array
 from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.inference.quantile import normal_quantile
 
+#: Fewer residuals than this are not tested.
+FEWEST_TESTED = 20
 #: Directions of the lagged inputs with less than this share of the largest variance are repetitions of the others.
 NEGLIGIBLE_VARIANCE = 1e-8
 
@@ -98,20 +101,37 @@ def residual_tests(
     Samples are taken as equally spaced; with an irregular clock the lags count samples.
     """
     count = e.size
-    lags = min(25, count // 4) if lags is None else lags
+    lags = _lags(count) if lags is None else lags
     quantile = normal_quantile(level)
 
-    power = float(e @ e)
-    autocorrelation = np.full(lags, np.nan)
-    statistic = whiteness_p = float("nan")
-    if power > 0:
-        autocorrelation = np.array([e[k:] @ e[:-k] for k in range(1, lags + 1)]) / power
-        statistic = float(count * (count + 2) * np.sum(autocorrelation**2 / (count - np.arange(1, lags + 1))))
-        whiteness_p = float(chdtrc(lags, statistic))
+    autocorrelation, statistic, whiteness_p = whiteness(e, lags)
 
     band = quantile / float(np.sqrt(count))
     cross = _cross_correlation(e, u, lags, quantile, sensitivities)
     return ResidualTests(count, lags, level, autocorrelation, band, statistic, lags, whiteness_p, *cross)
+
+
+def _lags(count: int) -> int:
+    return min(25, count // 4)
+
+
+def all_white(residuals: Sequence[Array], level: float = 0.95) -> bool:
+    """Whether the residuals of all experiments pass as white; too few to be tested pass.
+
+    A false alarm is as likely as with one experiment.
+    """
+    least = (1.0 - level) / len(residuals)
+    return not any(e.size >= FEWEST_TESTED and whiteness(e, _lags(e.size))[2] < least for e in residuals)
+
+
+def whiteness(e: Array, lags: int) -> tuple[Array, float, float]:
+    """Autocorrelation at the lags from 1 on, Ljung and Box's statistic and its p-value; NaN where all is zero."""
+    count, power = e.size, float(e @ e)
+    if not power > 0:
+        return np.full(lags, np.nan), float("nan"), float("nan")
+    autocorrelation = np.array([e[k:] @ e[:-k] for k in range(1, lags + 1)]) / power
+    statistic = float(count * (count + 2) * np.sum(autocorrelation**2 / (count - np.arange(1, lags + 1))))
+    return autocorrelation, statistic, float(chdtrc(lags, statistic))
 
 
 def _cross_correlation(

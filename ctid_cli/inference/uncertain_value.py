@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from ctid_cli.inference.quantile import normal_quantile
 
+#: Standard errors to each side of a normal estimate.
+NORMAL = normal_quantile()
+
 
 @dataclass(frozen=True)
 class UncertainValue:
@@ -25,11 +28,17 @@ class UncertainValue:
     reason: str = ""
 
     @classmethod
-    def normal(
-        cls, name: str, estimate: float, standard_error: float, unit: str = "", *, level: float = 0.95, reason: str = ""
+    def symmetric(
+        cls,
+        name: str,
+        estimate: float,
+        standard_error: float,
+        unit: str = "",
+        quantile: float = NORMAL,
+        reason: str = "",
     ) -> UncertainValue:
-        """Estimate of a normal distribution: the interval reaches as far to both sides."""
-        reach = normal_quantile(level) * standard_error
+        """An interval that reaches so many standard errors to both sides."""
+        reach = quantile * standard_error
         return cls(name, estimate, standard_error, estimate - reach, estimate + reach, unit, reason=reason)
 
     @property

@@ -88,7 +88,7 @@ def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None
     delay = estimate.get("delay")
     values |= {**submodels, "delay": delay}
     found = [
-        UncertainValue.normal(name, _or_nan(values[name]), _or_nan(errors.get(name)), unit)
+        UncertainValue.symmetric(name, _or_nan(values[name]), _or_nan(errors.get(name)), unit)
         for name, unit in {**named, "delay": units.time}.items()
     ]
     return [*found[:-1], replace(found[-1], status=_delay_status(delay, delay_bounds))]

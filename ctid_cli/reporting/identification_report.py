@@ -72,7 +72,7 @@ def identification_object(
     fit, options, criteria = result.fit, result.options, result.criteria
     interval, profile, judged = result.delay_interval, fit.profile, result.validation
     numerator = [item.estimate for item in result.estimates if item.name.startswith("b")]
-    kind = "robust" if result.robust else "white"
+    uncertainty, draws = result.uncertainty, result.uncertainty.bootstrap
     content = {
         "model": {"numerator": numerator, "denominator": fit.model.denominator, "delay": fit.model.delay},
         "parameters": [parameter_object(item) for item in parameters_of(result, units)],
@@ -89,7 +89,14 @@ def identification_object(
         "warnings": result.warnings,
         "notes": [note for measurement in measurements for note in measurement.notes],
         "derived": [picked(row, DERIVED_KEYS) for row in derived_of(result, units)],
-        "covariance": {"kind": kind, "names": fit.parameter_names, "values": result.covariance},
+        "covariance": {
+            "kind": uncertainty.kind,
+            "names": fit.parameter_names,
+            "values": uncertainty.covariance,
+            "effective_samples": uncertainty.effective_count,
+            "degrees_of_freedom": uncertainty.degrees_of_freedom if draws is None else None,
+            "bootstrap_draws": 0 if draws is None else len(draws.errors),
+        },
         "delay_interval": "profile likelihood" if interval is not None else "quadratic",
         "criteria": {
             **picked(criteria, ("aic", "aicc", "bic", "fpe")),
@@ -196,12 +203,18 @@ def _offset(result: Identification, units: Units) -> str:
 
 
 def _covariance_line(result: Identification) -> str:
+    found, asked = result.uncertainty, all(test.white for test in result.tests)
     text = "Standard errors are those for white residuals"
-    if result.robust:
-        text = "Standard errors are robust (sandwich), because the residuals are not white"
+    if found.kind != "white":
+        text = "Standard errors are those for coloured noise" + ", because the residuals are not white" * (not asked)
     elif result.tests:
         text += ", as the residuals pass the test"
-    text += "; intervals are estimate -+ 1.96 of them"
+    if found.bootstrap is None:
+        text += f"; intervals are estimate -+ {found.quantile(np.zeros(1)):.3g} of them"
+        text += f" (t, {found.degrees_of_freedom:.4g} degrees of freedom)"
+    else:
+        draws = f"95 % of {len(found.bootstrap.errors)} estimates from simulated noise"
+        text += f"; intervals are estimate -+ as many of them as {draws} keep within (bootstrap-t)"
     if result.delay_interval is not None:
         text += ", that of the delay from the profile of the cost, which is not quadratic there"
     return text + ". Monic denominator, descending powers."

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.robust import sandwich_covariance
+from ctid_cli.inference.robust import robust_covariance
 from ctid_cli.reporting.layout import Table
 from ctid_cli.reporting.parameter_errors import error_statistics
 from ctid_cli.reporting.results import Results
@@ -75,7 +75,7 @@ def _sandwich(plan: Any, replicates: list[int]) -> Array:
     for replicate in replicates:
         record = cell.dataset(replicate).record
         fit = estimator.estimator.prepare(record).fit(None)
-        covariance = sandwich_covariance(fit.sensitivities, fit.residuals, regular=record.interval is not None)
+        covariance, _ = robust_covariance(fit.sensitivities, fit.residuals, regular=record.interval is not None)
         errors.append(np.sqrt(np.diag(covariance)))
     return np.array(errors)
 

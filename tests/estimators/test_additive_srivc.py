@@ -421,7 +421,7 @@ def test_start_that_loses_a_pole_ends_in_words():
         ({"delay": np.nan}, r"delay must be zero or a positive number \[s\]"),
         ({"instruments": "closed"}, "instruments must be .*'closed_loop'.* not 'closed'"),
         ({"initial_state": "zero"}, "initial_state must be .*'estimated'.* not 'zero'"),
-        ({"covariance": "robust"}, "covariance must be .*'sandwich'.* not 'robust'"),
+        ({"covariance": "hac"}, "covariance must be .*'robust'.* not 'hac'"),
         ({"variant": "auto"}, "variant must be .*'relaxed'.* not 'auto'"),
         ({"hold_output": "linear"}, "hold_output must be .*'foh'.* not 'linear'"),
         ({"max_iterations": 0}, "max_iterations must be .*1.*0"),

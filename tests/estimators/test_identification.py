@@ -7,7 +7,8 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import identify
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.robust import sandwich_covariance
+from ctid_cli.inference.quantile import student_quantile
+from ctid_cli.inference.robust import robust_covariance
 from ctid_cli.inference.status import Status
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
@@ -36,8 +37,8 @@ def by_name(result):
 def test_white_residuals_keep_the_classical_covariance():
     record = record_of()
     result = identify(OPTIONS, [record])
-    assert not result.robust
-    np.testing.assert_array_equal(result.covariance, result.fit.covariance)
+    assert result.uncertainty.kind == "white"
+    np.testing.assert_array_equal(result.uncertainty.covariance, result.fit.covariance)
     items = by_name(result)
     assert list(items) == ["b0", "a1", "delay"]
     for name, item in items.items():
@@ -45,7 +46,7 @@ def test_white_residuals_keep_the_classical_covariance():
         assert item.standard_error == result.fit.standard_errors[name]
         assert item.status == "free"
         if name != "delay":
-            assert item.high - item.estimate == pytest.approx(1.959964 * item.standard_error)
+            assert item.high - item.estimate == pytest.approx(student_quantile(997) * item.standard_error)
     assert result.warnings == ()
     assert repr(result).startswith("Identification: white covariance, 0 warnings\nMeasuredFit: CONVERGED, fit ")
     assert len(repr(result).splitlines()) == 3
@@ -56,10 +57,13 @@ def test_white_residuals_keep_the_classical_covariance():
 
 def test_coloured_residuals_take_the_sandwich():
     result = identify(OPTIONS, [record_of(colour=0.9)])
-    assert result.robust
-    expected = sandwich_covariance(result.fit.sensitivities, result.fit.residuals, regular=True)
-    np.testing.assert_allclose(result.covariance, expected, rtol=1e-9)
-    assert by_name(result)["b0"].standard_error > 1.5 * result.fit.standard_errors["b0"]
+    assert result.uncertainty.kind == "robust"
+    expected, noise = robust_covariance(result.fit.sensitivities, result.fit.residuals, regular=True)
+    np.testing.assert_allclose(result.uncertainty.covariance, expected, rtol=1e-9)
+    b0 = by_name(result)["b0"]
+    assert b0.standard_error > 1.5 * result.fit.standard_errors["b0"]
+    reach = student_quantile(noise.effective_count(1000) - 3)
+    assert b0.high - b0.estimate == pytest.approx(reach * b0.standard_error)
     assert any("not white" in warning for warning in result.warnings)
 
 
@@ -69,9 +73,9 @@ def test_a_clock_that_jitters_a_little_counts_as_regular(jitter, regular):
     t = record.t + np.random.default_rng(2).uniform(-jitter, jitter, record.n_samples)
     moved = Record(t, record.y, HeldSignal(t, record.input.values))
     result = identify(OPTIONS, [moved])
-    expected = sandwich_covariance(result.fit.sensitivities, result.fit.residuals, regular=regular)
-    np.testing.assert_allclose(result.covariance, expected, rtol=1e-9)
-    other = sandwich_covariance(result.fit.sensitivities, result.fit.residuals, regular=not regular)
+    expected, _ = robust_covariance(result.fit.sensitivities, result.fit.residuals, regular=regular)
+    np.testing.assert_allclose(result.uncertainty.covariance, expected, rtol=1e-9)
+    other, _ = robust_covariance(result.fit.sensitivities, result.fit.residuals, regular=not regular)
     assert not np.allclose(expected, other, rtol=1e-3)
 
 
@@ -160,7 +164,7 @@ def test_two_experiments_are_tested_one_by_one():
     result = identify(OPTIONS, [record_of(), record_of(seed=1, colour=0.9)])
     assert [test.white for test in result.tests] == [True, False]
     assert result.tests[0].level == pytest.approx(0.975)
-    assert result.robust
+    assert result.uncertainty.kind == "robust"
     assert any(warning.startswith("Experiment 2: ") for warning in result.warnings)
 
 
@@ -174,3 +178,44 @@ def test_a_bad_validation_record_is_refused():
     flat = Record.from_arrays(0.1 * np.arange(50), np.ones(50), np.arange(50.0))
     with pytest.raises(DataError, match=r"validation record: .*constant"):
         identify(OPTIONS, [record_of()], flat)
+
+
+def test_a_pole_at_the_border_is_held_and_the_others_have_standard_errors():
+    """Those of the model whose parameters are the free pole and the numerator, from central differences."""
+    record = record_of(TransferFunction([1.0], [1.0, 2.0]), n=400, seed=3)
+    result = identify(DelayProfile(2, 1, (0, 0)), [record], covariance="white")
+    slow, free = 1 / record.t[-1], float(result.fit.model.poles.real.min())
+    assert result.fit.status is Status.AT_BOUND
+    assert result.fit.held_poles == pytest.approx([-slow])
+
+    def output(pole, b0, b1):
+        return simulate(TransferFunction([b0, b1], np.poly([pole, -slow])), record.input, record.t)
+
+    point = np.array([free, *result.fit.model.numerator])
+    steps = 1e-5 * np.diag(np.abs(point))
+    psi = np.column_stack([(output(*(point + h)) - output(*(point - h))) / (2 * h.sum()) for h in steps])
+    squared = np.sum((record.y - output(*point)) ** 2)
+    errors = np.sqrt(np.diag(np.linalg.inv(psi.T @ psi)) * squared / (400 - 3))
+    rows = {row.estimate: row for row in result.derived}
+    assert rows[free].standard_error == pytest.approx(errors[0], rel=1e-4)
+    assert [by_name(result)[name].standard_error for name in ("b0", "b1")] == pytest.approx(errors[1:], rel=1e-4)
+    assert all(item.status == "free" for item in result.estimates[:4])
+    held = min(rows.values(), key=lambda row: abs(row.estimate + slow))
+    assert np.isnan(held.standard_error)
+    assert "held" in held.reason
+    assert sum("Held at the border" in warning for warning in result.warnings) == 1
+
+
+def test_bootstrap_intervals_are_those_of_its_draws_and_always_the_same():
+    result, again = (identify(OPTIONS, [record_of(colour=0.9)], None, "bootstrap", 60) for _ in range(2))
+    assert result.uncertainty.kind == "bootstrap"
+    draws = result.uncertainty.bootstrap
+    ratios = np.abs(draws.errors[:, 0]) / np.sqrt(draws.covariances[:, 0, 0])
+    item = by_name(result)["a1"]
+    assert item.high - item.estimate == pytest.approx(np.quantile(ratios, 0.95) * item.standard_error)
+    assert by_name(again)["a1"] == item
+
+
+def test_a_record_too_short_for_its_noise_is_said():
+    result = identify(DelayProfile(1, 0, (0.55, 0.55)), [record_of(n=150, colour=0.99, noise=0.02, seed=1)])
+    assert any("too short for its noise" in warning for warning in result.warnings)

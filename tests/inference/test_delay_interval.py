@@ -5,10 +5,12 @@ import pytest
 from scipy.stats import f, t
 
 from ctid_cli.inference.delay_interval import CostOfDelay
+from ctid_cli.inference.quantile import student_quantile
 
 
 def profile_likelihood_interval(squared_error_at, estimate, smallest, count, parameters, bounds, level=0.95, **more):
-    return CostOfDelay(squared_error_at, estimate, smallest, count, parameters, bounds, **more).interval(level)
+    quantile = student_quantile(count - parameters, level)
+    return CostOfDelay(squared_error_at, estimate, smallest, count, parameters, bounds, **more).interval(quantile)
 
 
 def quadratic_is_doubtful(squared_error_at, estimate, error, *common, **more):

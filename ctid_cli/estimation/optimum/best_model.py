@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.estimation.optimum.box import Box, box_of, point_of
 from ctid_cli.estimation.optimum.chain import numerators
 from ctid_cli.estimation.optimum.projection import Problem
@@ -60,6 +60,10 @@ class Optimum:
     promise: float
     #: Poles of the structure that have run to infinity, where a smaller model has the least squared error.
     poles_at_infinity: int
+    #: Derivatives of ``a_1 ... a_n`` to the coordinates of the poles that are not held at a bound of the set, and the
+    #: poles that are.
+    pole_slopes: Array
+    held_poles: ComplexArray
     #: Whether the delay would leave its bounds.
     delay_at_bound: bool
     #: Whether the delay sits in a kink of the cost, at a sample.
@@ -128,6 +132,7 @@ def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Opt
     point, projected = best.local.point, best.local.projected
     a = point.denominator
     over = numerators(point.speed, point.damping)
+    held = best.held[: point.poles.size]
     b = projected.output @ over
     if projected.direct:
         b = np.concatenate(([0.0], b)) + projected.direct * a
@@ -141,6 +146,8 @@ def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Opt
         ending=best.ending,
         promise=best.promise,
         poles_at_infinity=lost,
+        pole_slopes=point.denominator_slopes()[:, ~held],
+        held_poles=point.poles[point.whole_sections(held)],
         delay_at_bound=nest.box.delay_free and bool(best.held[-1]) and not best.pinned,
         pinned=best.pinned,
         tried=tried,

@@ -96,6 +96,22 @@ class Point:
             k += 1 if zeta < 0 else 2
         return result
 
+    def denominator_slopes(self) -> Array:
+        """Derivatives of ``a_1 ... a_n`` to the coordinates, shape (n, n)."""
+        n, columns = self.poles.size, []
+        for i, (w, zeta) in enumerate(zip(self.speed.tolist(), self.damping.tolist(), strict=True)):
+            others = polynomial(np.delete(self.speed, i), np.delete(self.damping, i))
+            own = [[w]] if zeta < 0 else [[2 * zeta * w, 2 * w * w], [2 * zeta * w, 0.0]]
+            columns += [np.convolve(others, slope) for slope in own]
+        slopes = np.column_stack([np.pad(column, (n - column.size, 0)) for column in columns])
+        return np.asarray(slopes @ self.jacobian())
+
+    def whole_sections(self, chosen: BoolArray) -> BoolArray:
+        """All coordinates, or poles, of the sections of which one is chosen."""
+        sizes = np.where(self.damping < 0, 1, 2)
+        starts = np.cumsum(sizes) - sizes
+        return np.repeat(np.logical_or.reduceat(chosen, starts), sizes)
+
     def shifted(self, step: Array) -> tuple[Array, Array]:
         """Speeds and dampings a step away in the coordinates of the poles."""
         speed, damping, k = self.speed.copy(), self.damping.copy(), 0

@@ -1,0 +1,197 @@
+r"""Autoregressive output noise by restricted maximum likelihood (REML), from what a fit has left of it.
+
+A fit takes from the residuals whatever its sensitivities explain. On a short record of slow noise that is much of the
+noise's power at low frequency, and the autocovariances of the residuals are too small. REML maximises the likelihood of
+what is left, whatever the parameters [1]_: with V the covariance matrix of the noise over its innovation variance,
+
+.. math:: \min\; (N - p) \ln s^2 + \ln|V| + \ln|\Psi'V^{-1}\Psi|,\qquad
+          s^2 = \min_x (e - \Psi x)' V^{-1} (e - \Psi x) / (N - p).
+
+References
+----------
+.. [1] H. D. Patterson and R. Thompson, "Recovery of inter-block information when block sizes are unequal",
+   *Biometrika* 58 (1971) 545-554. doi:10.1093/biomet/58.3.545
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from ctid_cli.arrays import Array
+from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
+
+#: Orders up to this are tried in turn, until the criterion has risen so often.
+ORDERS, RISES = 8, 3
+#: Greatest partial correlation.
+INSIDE = 0.9999
+#: Fisher's steps end where they promise less than this of the criterion, or after so many.
+PROMISE, STEPS = 1e-10, 60
+#: A model has no more than the record's samples over this for an order.
+SAMPLES_PER_ORDER = 10
+
+
+class _Likelihood(NamedTuple):
+    """The criterion at one model, with what Fisher's scoring needs, and the innovation variance."""
+
+    criterion: float
+    #: By the partial correlations, shape (r,), and the expected second derivatives, shape (r, r).
+    gradient: Array
+    information: Array
+    variance: float
+
+
+@njit(cache=True, nogil=True)
+def levinson(partial: Array) -> tuple[Array, Array, Array]:
+    """Coefficients ``(1, c_1 ... c_r)``, their slopes by the partial correlations, and autocovariances over s^2.
+
+    Shapes (r + 1,), (r, r + 1) and (r + 1,).
+    """
+    r = partial.size
+    c, slopes, covariances = np.zeros(r + 1), np.zeros((r, r + 1)), np.zeros(r + 1)
+    c[0] = 1.0
+    variance = 1.0 / np.prod(1.0 - partial**2)
+    covariances[0] = variance
+    for k in range(r):
+        value = partial[k]
+        # The model of order k predicts the next autocovariance, but for the partial correlation.
+        covariances[k + 1] = -value * variance
+        for j in range(1, k + 1):
+            covariances[k + 1] -= c[j] * covariances[k + 1 - j]
+        variance *= 1.0 - value * value
+        # c of order k + 1 is c of order k plus the partial correlation times the same backwards; so are its slopes.
+        backwards = c[: k + 2][::-1].copy()
+        for i in range(k):
+            turned = slopes[i, : k + 2][::-1].copy()
+            slopes[i, : k + 2] += value * turned
+        slopes[k, : k + 2] = backwards
+        c[: k + 2] += value * backwards
+    return c, slopes, covariances
+
+
+@njit(cache=True, nogil=True)
+def restricted_likelihood(products: Array, count: int, blocks: int, partial: Array) -> _Likelihood:
+    """The criterion from products of the columns (Q, e) at pairs of lags, shape (lags, lags, p + 1, p + 1).
+
+    ``v'V^-1 v = sum_ij c_i c_j D_ij`` with ``D_ij = sum_t v(t + i) v(t + j)`` over ``0 <= t < n - i - j``: exactly, the
+    first samples included (Box and Jenkins, *Time Series Analysis*, appendix A7.4).
+    """
+    p, r = products.shape[2] - 1, partial.size
+    left = count - p
+    c, slopes, covariances = levinson(partial)
+    gram = np.zeros((p + 1, p + 1))
+    for i in range(r + 1):
+        for j in range(r + 1):
+            gram += c[i] * c[j] * products[i, j]
+    # Cholesky's factor of (Q, e)' V^-1 (Q, e): its last diagonal entry is what the sensitivities do not explain.
+    factor = np.linalg.cholesky(gram)
+    squared = factor[p, p] ** 2
+    criterion = left * np.log(squared / left)
+    # d criterion = sum W d(gram): with L the factor, its inverse's last row is the residual's combination.
+    inverse = np.linalg.inv(factor)
+    weight = np.zeros((p + 1, p + 1))
+    for k in range(p):
+        criterion += 2.0 * np.log(factor[k, k])
+        weight += np.outer(inverse[k], inverse[k])
+    weight += left * np.outer(inverse[p], inverse[p])
+    by_coefficient = np.zeros(r + 1)
+    for i in range(r + 1):
+        for j in range(r + 1):
+            by_coefficient[i] += 2.0 * c[j] * np.sum(products[i, j] * weight)
+    gradient = slopes @ by_coefficient
+    for k in range(r):
+        # |V| = prod (1 - partial_k^2)^-k for each experiment.
+        one = 1.0 - partial[k] ** 2
+        criterion -= blocks * (k + 1) * np.log(one)
+        gradient[k] += 2.0 * blocks * (k + 1) * partial[k] / one
+    # The coefficients have the information of a regression on the samples before, N R(i - j) / s^2, twice in -2 ln L.
+    toeplitz = np.zeros((r, r))
+    for i in range(r):
+        for j in range(r):
+            toeplitz[i, j] = 2.0 * left * covariances[abs(i - j)]
+    steps = slopes[:, 1:].copy()
+    return _Likelihood(criterion, gradient, steps @ toeplitz @ steps.T, squared / left)
+
+
+def fit_residual_noise(psi: Sequence[Array], residuals: Sequence[Array]) -> NoiseModel:
+    """REML model of the noise behind the residuals of a fit with sensitivities psi, of full rank.
+
+    The order is that of the least AICc among those up to 8, until it has risen three times, and the one that Akaike's
+    criterion chooses for the Yule-Walker model: the noise may have a memory much longer than its first lags show.
+    """
+    power = sum(float(block @ block) for block in residuals)
+    if not power > 0:
+        return fit_noise_model(residuals)
+    stacked, unit = np.concatenate(psi), np.sqrt(power)
+    orthonormal = np.linalg.qr(stacked / np.linalg.norm(stacked, axis=0))[0]
+    columns = np.column_stack((orthonormal, np.concatenate(residuals) / unit))
+    blocks = np.split(columns, np.cumsum([len(block) for block in psi])[:-1])
+    most = min(len(block) for block in blocks) // SAMPLES_PER_ORDER
+    guess = _partial(fit_noise_model(residuals).coefficients)[:most]
+    products = _products(blocks, min(most, max(ORDERS, guess.size)))
+    (count, size), number = columns.shape, len(blocks)
+
+    def at(partial: Array) -> _Likelihood:
+        likelihood: _Likelihood = restricted_likelihood(products, count, number, partial)
+        return likelihood
+
+    def penalised(partial: Array) -> float:
+        k = partial.size + 1
+        return float(at(partial).criterion + 2 * k + 2 * k * (k + 1) / max(count - size - k, 1))
+
+    best = partial = np.zeros(0)
+    least, rises = penalised(best), 0
+    for _ in range(min(most, ORDERS)):
+        partial = _scored(at, np.append(partial, 0.0))
+        value = penalised(partial)
+        best, least, rises = (partial, value, 0) if value < least else (best, least, rises + 1)
+        if rises == RISES:
+            break
+    if guess.size > ORDERS and penalised(far := _scored(at, guess)) < least:
+        best = far
+    c, _, covariances = levinson(best)
+    variance = at(best).variance * power
+    return NoiseModel(c, covariances * variance, variance)
+
+
+def _scored(at: Callable[[Array], _Likelihood], start: Array) -> Array:
+    """Partial correlations of the least criterion nearby, by Fisher's scoring in their inverse hyperbolic tangents."""
+    z = np.arctanh(np.clip(start, -INSIDE, INSIDE))
+    here = at(np.tanh(z))
+    for _ in range(STEPS):
+        slope = 1.0 - np.tanh(z) ** 2
+        gradient = slope * here.gradient
+        step = -np.linalg.solve(here.information * np.outer(slope, slope), gradient)
+        promise = -float(step @ gradient)
+        step /= max(1.0, float(np.abs(step).max()))
+        while promise > PROMISE:
+            moved = np.clip(z + step, -np.arctanh(INSIDE), np.arctanh(INSIDE))
+            there = at(np.tanh(moved))
+            if there.criterion < here.criterion:
+                break
+            step, promise = 0.5 * step, 0.5 * promise
+        else:
+            break
+        z, here = moved, there
+    return np.asarray(np.tanh(z))
+
+
+def _products(blocks: Sequence[Array], order: int) -> Array:
+    """D of all pairs of lags."""
+    size = blocks[0].shape[1]
+    products = np.zeros((order + 1, order + 1, size, size))
+    for i in range(order + 1):
+        for j in range(i + 1):
+            products[i, j] = sum(block[i : len(block) - j].T @ block[j : len(block) - i] for block in blocks)
+            products[j, i] = products[i, j].T
+    return products
+
+
+def _partial(coefficients: Array) -> Array:
+    """Partial correlations of given coefficients: Levinson's recursion backwards."""
+    c, found = coefficients, []
+    while c.size > 1:
+        found.append(float(c[-1]))
+        c = ((c - c[-1] * c[::-1]) / (1.0 - c[-1] ** 2))[:-1]
+    return np.array(found[::-1])
