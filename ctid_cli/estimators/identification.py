@@ -13,6 +13,7 @@ from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
 from ctid_cli.estimators import identification_warnings as warnings
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.inference import criteria as criteria_of
+from ctid_cli.inference.answer_test import AnswerTest, answer_test
 from ctid_cli.inference.bootstrap import Progress
 from ctid_cli.inference.conditioning import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR
 from ctid_cli.inference.covariance import condition_number
@@ -55,6 +56,8 @@ class Identification:
         What was asked for.
     fit : MeasuredFit
         The estimate.
+    answer : AnswerTest
+        Whether the outputs are seen to answer to the inputs at all; without it no parameter has a standard error.
     uncertainty : Uncertainty
         Covariance that the standard errors are from, for white or coloured noise, and how many of them intervals reach.
     estimates : tuple of UncertainValue
@@ -77,6 +80,7 @@ class Identification:
 
     options: DelayProfile
     fit: MeasuredFit
+    answer: AnswerTest
     uncertainty: Uncertainty
     estimates: tuple[UncertainValue, ...]
     delay_interval: DelayInterval | None
@@ -134,7 +138,8 @@ def identify(
     Standard errors are those for white residuals if no experiment's residuals fail the test of whiteness, and those for
     coloured noise (:func:`~ctid_cli.inference.robust.robust_covariance`) otherwise. Intervals are those of Student's t
     with as many degrees of freedom as the record is worth independent samples, less the number of parameters. The delay
-    has a profile-likelihood interval where the quadratic one is doubtful.
+    has a profile-likelihood interval where the quadratic one is doubtful. Whether there is a model at all is tested
+    against noise of the outputs' colour, the search over poles and delays included.
     """
     checked = None
     if validation is not None:
@@ -149,22 +154,32 @@ def identify(
     linear, refinement = fit.linear, prepared.laid_out.near(fit.residuals, fit.weighting)
     residuals = np.concatenate(fit.residuals)
     output = np.concatenate([record.y[use] for record, use in zip(records, fit.used, strict=True)])
+    answer = answer_test(
+        prepared.laid_out.measured.records,
+        fit.used,
+        options.delay_bounds,
+        free_response=options.initial_state == "estimate",
+        periodic=options.initial_state == "periodic",
+    )
     squared_error = float(residuals @ residuals) if fit.weighting is None else fit.cost * fit.count
-    tests = _tests(linear, records)
+    tests = _tests(linear, records, answer)
     uncertainty = fit.uncertainty(covariance, bootstrap_draws, progress)
     matrix = uncertainty.covariance
     free, hessian = _free(linear)
     singular = not condition_number(hessian) <= NEARLY_SINGULAR
     unclear = {fit.parameter_names[k] for k in (free if singular else _undetermined(fit, matrix))}
+    if not answer.seen:
+        unclear |= {name for name in fit.parameter_names if not name.startswith("offset")}
     interval = None
     if refinement.structure.delay and "delay" not in unclear:
         interval = _delay_interval(refinement, linear, uncertainty)
     judged = None if checked is None or validation is None else _validate(checked, fit, validation)
     size = fit.model.order + options.zeros + 1
-    coefficients = np.full((size, size), np.nan) if singular else matrix[:size, :size]
+    coefficients = np.full((size, size), np.nan) if singular or not answer.seen else matrix[:size, :size]
     return Identification(
         options=replace(options, covariance=covariance, bootstrap_draws=bootstrap_draws),
         fit=fit,
+        answer=answer,
         uncertainty=uncertainty,
         estimates=_estimates(fit, uncertainty, unclear, interval),
         delay_interval=interval,
@@ -176,9 +191,10 @@ def identify(
         yic=criteria_of.young_information_criterion(residuals, output, fit.theta[free], matrix[np.ix_(free, free)]),
         r_t_squared=criteria_of.r_t_squared(residuals, output),
         warnings=(
-            *warnings.of_status(fit),
-            *warnings.of_conditioning(fit, uncertainty.free_covariance, hessian),
-            *warnings.of_short_record(uncertainty, fit.count),
+            *warnings.of_answer(answer, options),
+            *(warnings.of_status(fit) if answer.seen else ()),
+            *(warnings.of_conditioning(fit, uncertainty.free_covariance, hessian) if answer.seen else ()),
+            *(warnings.of_short_record(uncertainty, fit.count) if answer.seen else ()),
             *warnings.of_interval(interval, options),
             *warnings.of_residuals(tests, len(records), FEWEST_TESTED),
             *warnings.of_treatment(_gains(options, refinement, linear)),
@@ -191,14 +207,15 @@ def identify(
 # --- residuals and uncertainty ----------------------------------------------------------------------
 
 
-def _tests(fit: MeasuredFit, records: Sequence[Record]) -> tuple[ResidualTests, ...]:
+def _tests(fit: MeasuredFit, records: Sequence[Record], answer: AnswerTest) -> tuple[ResidualTests, ...]:
     """Tests of each experiment, at levels that make a false alarm as likely as with one."""
     level = 1.0 - (1.0 - LEVEL) / len(records)
     found = []
     for record, eps, psi, use in zip(records, fit.residuals, fit.sensitivities, fit.used, strict=True):
         if eps.size >= FEWEST_TESTED:
             delayed = record.input.at(record.t[use] - fit.model.delay)
-            found.append(residual_tests(eps, delayed, level=level, sensitivities=psi))
+            tested = residual_tests(eps, delayed, level=level, sensitivities=psi)
+            found.append(replace(tested, answered=answer.seen))
     return tuple(found)
 
 

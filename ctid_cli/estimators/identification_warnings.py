@@ -6,6 +6,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.inference.answer_test import AnswerTest
 from ctid_cli.inference.conditioning import describe_conditioning
 from ctid_cli.inference.covariance import condition_number
 from ctid_cli.inference.delay_interval import DelayInterval
@@ -13,6 +14,18 @@ from ctid_cli.inference.residuals import ResidualTests
 from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.text import listed
+
+
+def of_answer(answer: AnswerTest, options: DelayProfile) -> list[str]:
+    """That no answer to the input is seen, so that the model describes noise."""
+    if answer.seen:
+        return []
+    low, high = options.delay_bounds
+    return [
+        f"No model: the output is not seen to answer to the input (p = {answer.p_value:.2g}). {answer.evidence} Check "
+        f"the columns with ctid check, search other delays than {low:g}{f' to {high:g}' * (low < high)} (--delay), or "
+        "record longer, with a stronger input."
+    ]
 
 
 def of_status(fit: MeasuredFit) -> list[str]:

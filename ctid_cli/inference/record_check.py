@@ -111,6 +111,9 @@ class RecordReport:
     suggested_delay: tuple[float, float] | None
     suggested_offset: Literal["none", "remove", "estimate"]
     suggested_initial_state: Literal["rest", "estimate"]
+    #: Probability that noise of the output's colour follows the input as much as the output does [-]; nan where that
+    #: cannot be tested.
+    answer_p_value: float = math.nan
     findings: tuple[Finding, ...] = ()
 
     @property

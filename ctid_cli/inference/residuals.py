@@ -45,6 +45,8 @@ class ResidualTests:
     #: Probability of a larger statistic if the residuals are independent of the input [-]; NaN where it cannot be
     #: computed.
     cross_p_value: float
+    #: Whether the output is seen to answer to the input at all; else no dynamics can be missed.
+    answered: bool = True
 
     @property
     def white(self) -> bool:
@@ -69,7 +71,7 @@ class ResidualTests:
         if np.isnan(self.cross_p_value):
             second = "Their correlation with the input cannot be tested: the input does not vary enough."
         elif self.uncorrelated:
-            second = f"{correlated.replace('are', 'are not')}: no missing dynamics are seen."
+            second = f"{correlated.replace('are', 'are not')}{': no missing dynamics are seen' * self.answered}."
         elif int(np.argmax(np.abs(self.cross_correlation))) < self.lags:
             why = "feedback from the output, the delay is too long, or the clocks of input and output differ"
             second = f"{correlated}, most with later inputs: there is {why}."

@@ -89,6 +89,7 @@ def identification_object(
         "warnings": result.warnings,
         "notes": [note for measurement in measurements for note in measurement.notes],
         "derived": [picked(row, DERIVED_KEYS) for row in derived_of(result, units)],
+        "answer": picked(result.answer, ("seen", "p_value", "explained", "by_chance")),
         "covariance": {
             "kind": uncertainty.kind,
             "names": fit.parameter_names,
@@ -205,6 +206,8 @@ def _offset(result: Identification, units: Units) -> str:
 def _covariance_line(result: Identification) -> str:
     found, asked = result.uncertainty, all(test.white for test in result.tests)
     text = "Standard errors are those for white residuals"
+    if not result.answer.seen:
+        return "There are no standard errors, as no answer to the input is seen. Monic denominator, descending powers."
     if found.kind != "white":
         text = "Standard errors are those for coloured noise" + ", because the residuals are not white" * (not asked)
     elif result.tests:

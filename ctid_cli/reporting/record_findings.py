@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctid_cli.inference import record_check
-from ctid_cli.inference.record_check import Examined, Finding, RecordReport
+from ctid_cli.inference.answer_test import AnswerTest, answer_test
+from ctid_cli.inference.record_check import Examined, Finding, Level, RecordReport
 from ctid_cli.signals.record import Record
 from ctid_cli.text import listed
 
@@ -17,6 +18,10 @@ JITTER = 0.05
 FEW_SAMPLES = 50
 #: Fewer samples than this in a period of the fastest part of the answer leave much to the assumed hold.
 FEW_PER_PERIOD = 2.5
+#: Without a hint of the delay, delays up to this fraction of the record are tried.
+LONGEST_DELAY = 0.1
+#: Where spectra show that so much of the output follows the input, no test has to.
+EXPLAINED = 0.3
 #: Below this order no model with a delay can be told from one without.
 ENOUGH_ORDER = 4
 
@@ -30,9 +35,11 @@ def check_record_quality(
     is fitted later; a hint is not an estimate.
     """
     found = record_check.examine(record, ENOUGH_ORDER)
-    findings = _Words(found, found.report, time_unit, input_unit, output_unit).findings()
+    low, high = found.report.suggested_delay or (0.0, LONGEST_DELAY * found.report.duration)
+    test = answer_test([record], [record.valid], (low, high))
+    findings = _Words(found, found.report, test, time_unit, input_unit, output_unit).findings()
     worst_first = sorted(findings, key=lambda finding: -record_check.LEVELS.index(finding.level))
-    return replace(found.report, findings=tuple(worst_first))
+    return replace(found.report, answer_p_value=test.p_value, findings=tuple(worst_first))
 
 
 def _digits(x: float, digits: int) -> str:
@@ -46,6 +53,7 @@ class _Words:
 
     found: Examined
     r: RecordReport
+    test: AnswerTest
     time: str
     input: str
     output: str
@@ -71,14 +79,20 @@ class _Words:
         yield from self._output()
         yield from self._faults()
         yield from self._answer()
-        yield from self._speed()
         yield from self._pairing()
-        yield from self._delay()
-        yield from self._start()
+        if self._answers:
+            yield from self._speed()
+            yield from self._delay()
+            yield from self._start()
 
     @property
     def _seldom(self) -> bool:
         return self.r.input_kind in ("constant", "steps")
+
+    @property
+    def _answers(self) -> bool:
+        """Whether an answer is seen at all."""
+        return self.test.seen or self.r.explained >= EXPLAINED
 
     def _clock(self) -> Iterator[Finding]:
         r = self.r
@@ -191,21 +205,26 @@ class _Words:
 
     def _answer(self) -> Iterator[Finding]:
         r = self.r
-        if self._seldom or r.output_deviation == 0:
+        if r.input_kind == "constant" or r.output_deviation == 0:
+            return
+        if not self._answers:
+            text = f"The output is not seen to answer to the input (p = {self.test.p_value:.2g}). {self.test.evidence}"
+            why = "Too much noise, too short a record, a longer delay, or the wrong columns."
+            level: Level = "problem" if r.n_samples - r.n_masked >= FEW_SAMPLES else "warning"
+            yield Finding(level, "answer", f"{text} {why}")
+            return
+        if self._seldom:
             return
         weak = "Expect large standard errors; a longer record would help."
         share = f"At least {100 * min(r.explained, 0.999):.3g} % of the output's variance follows the input linearly"
         text = f"{share} (signal-to-noise ratio {r.snr_db:.2g} dB or better)."
-        if r.explained >= 0.3:
+        if r.explained >= EXPLAINED:
             yield Finding("ok", "answer", text)
         elif r.explained > 0:
             yield Finding("warning", "answer", f"{text} {weak}")
-        elif self.found.answer.delay is not None:
+        elif not math.isnan(self.test.p_value):
             text = f"The output follows the input, but noise dominates at every frequency. {weak}"
             yield Finding("warning", "answer", text)
-        else:
-            text = "No part of the output follows the input visibly: too much noise, too short, or the wrong columns."
-            yield Finding("problem" if r.n_samples - r.n_masked >= FEW_SAMPLES else "warning", "answer", text)
 
     def _speed(self) -> Iterator[Finding]:
         """Whether the clock is fast enough for the answer, and the record long enough."""

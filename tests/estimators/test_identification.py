@@ -160,6 +160,23 @@ def test_validation_estimates_its_own_state_and_offset():
     assert result.validation.r2 > 0.9
 
 
+def test_where_no_answer_is_seen_the_first_warning_says_so():
+    record = record_of(FIRST_ORDER, seed=3, n=300)
+    noise = Record(record.t, np.random.default_rng(3).standard_normal(300), record.input)
+    result = identify(DelayProfile(1, 0, (0, 3), offset="estimate"), [noise])
+    assert not result.answer.seen
+    assert result.warnings[0].startswith("No model: the output is not seen to answer to the input (p = ")
+    for name in ("b0", "a1", "delay"):
+        item = by_name(result)[name]
+        assert (item.status, np.isnan(item.standard_error)) == ("undetermined", True)
+    assert all(np.isnan(row.standard_error) for row in result.derived)
+    assert "missing dynamics" not in " ".join((result.tests[0].sentence, *result.warnings))
+    # Beside a model the same test says more.
+    seen = identify(OPTIONS, [record])
+    assert seen.answer.p_value == 0.005
+    assert "no missing dynamics are seen" in seen.tests[0].sentence
+
+
 def test_two_experiments_are_tested_one_by_one():
     result = identify(OPTIONS, [record_of(), record_of(seed=1, colour=0.9)])
     assert [test.white for test in result.tests] == [True, False]

@@ -110,6 +110,19 @@ def test_what_is_not_finite_is_null_and_a_dash():
     assert line.split()[1:4] == ["0.5", "-", "-"]
 
 
+def test_a_model_of_noise_has_no_standard_errors():
+    one = measurement()
+    noise = Record(one.record.t, np.random.default_rng(4).standard_normal(800), one.record.input)
+    one = replace(one, record=noise)
+    result = identify(DelayProfile(1, 0, (0, 3)), [one.record])
+    content = identification_object(result, [one], UNITS)
+    answer = content["answer"]
+    assert (answer["seen"], answer["explained"] < answer["by_chance"]) == (False, True)
+    assert answer["p_value"] > 0.05
+    assert {item["status"] for item in content["parameters"]} == {"undetermined"}
+    assert "There are no standard errors, as no answer" in identification_text(result, [one], UNITS)
+
+
 def test_real_poles_are_modes_too():
     one = measurement()
     model = identify(DelayProfile(1, 0, (0, 3)), [one.record])

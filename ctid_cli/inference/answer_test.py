@@ -1,0 +1,214 @@
+"""Whether outputs answer to their inputs at all: the best of many simple responses against noise of its own colour.
+
+The statistic is the largest share of the output that one response of a dictionary explains. What it is without an
+answer is seen on simulated noise, searched in the same way: the search over poles and delays is in the distribution.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.inference.noise_model import fit_noise_model
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
+
+#: Probability that noise is taken for an answer.
+LEVEL = 0.05
+#: Simulated series of noise, and their seed: one record always gets one answer.
+SERIES, SEED = 199, 20140801
+#: The dictionary beside an integrator: time constants of first order, frequencies and dampings of second order.
+TIME_CONSTANTS, FREQUENCIES, DAMPINGS = 10, 8, (0.05, 0.3, 0.9)
+#: Least and greatest number of delays of each response; between them, one for each time constant of the response.
+FEWEST_DELAYS, MOST_DELAYS = 12, 48
+#: Of longer records means over successive samples are tested, so many that at most this number is left.
+MOST_SAMPLES = 2000
+#: Share of the false alarms that is given to the test behind the whitening filter. After slow inputs it sees little;
+#: after fast ones in slow noise it alone sees anything.
+WHITENED = 0.2
+#: Decay of the transient before a series of noise begins.
+SETTLED = 1e-2
+#: Outliers are cut off at so many times the deviation from the median that nine samples in ten do not exceed.
+CUT_OFF = 5.0
+#: Fewer samples than this tell nothing.
+FEWEST_SAMPLES = 8
+#: A response of which less than this share of the power is left beside offset and free response shows nothing.
+NOTHING_LEFT = 1e-8
+
+
+@dataclass(frozen=True)
+class AnswerTest:
+    """The test of any response to the input against none."""
+
+    #: Greatest share of the outputs' power about their means that one response explains [-].
+    explained: float
+    #: The share that noise of the outputs' colour exceeds in one record of twenty [-].
+    by_chance: float
+    #: Probability that such noise is explained as well as the outputs [-]; nan where it cannot be tested, because there
+    #: are fewer than eight samples, or no response can be told from an offset and a free response.
+    p_value: float
+
+    @property
+    def seen(self) -> bool:
+        """Whether an answer is seen; what cannot be tested is not denied."""
+        return not self.p_value > LEVEL
+
+    @property
+    def evidence(self) -> str:
+        """What was found, and what noise alone reaches."""
+        return (
+            f"One simple response explains at most {100 * self.explained:.2g} % of the output's variance; noise of the "
+            f"output's colour reaches {100 * self.by_chance:.2g} % in one record of twenty."
+        )
+
+
+def answer_test(
+    records: Sequence[Record],
+    used: Sequence[BoolArray],
+    delays: tuple[float, float],
+    *,
+    free_response: bool = False,
+    periodic: bool = False,
+) -> AnswerTest:
+    """Test the answer of the outputs to the inputs, at the used samples of records of one system.
+
+    Each record has an offset of its own, and a free response where it is estimated. The largest share is looked for
+    in the signals as they are, and in the signals behind the filter that makes the output white; the smaller of the
+    two p-values, weighted, is compared with that of each series of noise. Samples count in their order: on an
+    irregular clock the noise is taken as stationary in it.
+    """
+    rng = np.random.default_rng(SEED)
+    outputs = [_Output.of(record, use, periodic, rng) for record, use in zip(records, used, strict=True)]
+    longest = max((output.t[:, 0] for output in outputs), key=len)
+    shares, testable = np.zeros((2, SERIES + 1)), False
+    if longest.size < FEWEST_SAMPLES:
+        return AnswerTest(float("nan"), float("nan"), float("nan"))
+    for pole in _poles(float(np.median(np.diff(longest))), float(np.ptp(longest))):
+        count = int(np.clip(abs(pole) * np.ptp(delays) + 1, FEWEST_DELAYS, MOST_DELAYS))
+        grid = np.unique(np.linspace(*delays, count))
+        parts = [output.regressed(pole, grid, free_response) for output in outputs]
+        for k, kind in enumerate(zip(*parts, strict=True)):
+            products, left, power, total = (sum(terms) for terms in zip(*kind, strict=True))
+            useful = left > NOTHING_LEFT * power
+            testable |= bool(useful.any())
+            fit = (products[useful] ** 2 / left[useful, None]).max(axis=0, initial=0.0)
+            share = np.divide(fit, total, out=np.zeros_like(fit), where=total > 0.0)
+            shares[k] = np.maximum(shares[k], share)
+    # The two tests have one level: the smaller of their weighted p-values is compared with that of each series.
+    smaller = np.minimum(_p_values(shares[0]) / (1.0 - WHITENED), _p_values(shares[1]) / WHITENED)
+    p_value = float(np.mean(smaller <= smaller[0])) if testable else float("nan")
+    return AnswerTest(float(shares[0, 0]), float(np.quantile(shares[0, 1:], 1.0 - LEVEL)), p_value)
+
+
+@dataclass(frozen=True, eq=False)
+class _Output:
+    """The output of one record beside series of noise of its colour, and the input that they are tested against."""
+
+    signal: HeldSignal
+    #: Instants of the clock, shape (N,).
+    clock: Array
+    #: Instants of the used samples, those that are averaged in a row, shape (n, width).
+    t: Array
+    #: Prediction-error filter of the output.
+    noise: Array
+    #: The output first, about its mean, then the noise, shape (n, 1 + SERIES); and what is new in each sample of them.
+    series: Array
+    new: Array
+
+    @classmethod
+    def of(cls, record: Record, use: BoolArray, periodic: bool, rng: np.random.Generator) -> "_Output":
+        """Lay a record out, and draw the noise."""
+        signal, clock = record.input, record.t
+        if periodic:
+            # One period before the record settles all but the slowest responses.
+            period = record.duration + float(np.median(np.diff(clock)))
+            within = signal.t < signal.t[0] + period * (1.0 - 1e-9)
+            once, values = signal.t[within], signal.values[within]
+            signal = HeldSignal(np.append(once - period, once), np.append(values, values), signal.hold)
+            clock = np.append(clock - period, clock)
+        count = int(np.count_nonzero(use))
+        width = -(-count // MOST_SAMPLES)
+        t, y = (x[use][: count // width * width].reshape(-1, width) for x in (record.t, record.y))
+        y = y.mean(axis=1) - np.median(y)
+        limit = CUT_OFF * float(np.quantile(np.abs(y), 0.9))
+        y = np.clip(y, -limit, limit) if limit > 0.0 else y
+        y = y - y.mean()
+        noise = _unbiased(fit_noise_model([y]).coefficients, y.size)
+        series = np.column_stack([y, _drawn(noise, y.size, rng)])
+        series -= series.mean(axis=0)
+        # Each record weighs as its noise would: by the reciprocal of its variance.
+        series /= np.where(np.any(series, axis=0), series.std(axis=0), 1.0)
+        return cls(signal, clock, t, noise, series, _filtered(series, noise))
+
+    def regressed(self, pole: complex, delays: Array, free_response: bool) -> Iterator[tuple[Array, ...]]:
+        """What regression on the responses needs, of the signals as they are and of what is new in them.
+
+        Products of responses and series, and powers of the responses beside offset and free response, of the responses
+        by themselves, and of the series.
+        """
+        denominator = np.real(np.poly([pole, pole.conjugate()] if pole.imag else [pole]))
+        response = simulate(TransferFunction([1.0], denominator), self.signal, self.clock)
+        responses = np.interp(self.t[:, None, :] - delays[:, None], self.clock, response, left=0.0).mean(axis=2)
+        nuisances = [np.ones(len(responses))]
+        if free_response and pole:
+            free = np.exp(pole * (self.t.mean(axis=1) - self.t[0, 0]))
+            nuisances += [free.real, free.imag] if pole.imag else [free.real]
+        columns = np.column_stack([*nuisances, responses])
+        for series, seen in ((self.series, columns), (self.new, _filtered(columns, self.noise))):
+            basis, _ = np.linalg.qr(seen[:, : len(nuisances)])
+            raw = seen[:, len(nuisances) :]
+            left = raw - basis @ (basis.T @ raw)
+            total = np.sum(series**2, axis=0) - np.sum((basis.T @ series) ** 2, axis=0)
+            yield left.T @ series, np.sum(left**2, axis=0), np.sum(raw**2, axis=0), total
+
+
+def _poles(interval: float, length: float) -> Iterator[complex]:
+    yield 0.0
+    for constant in np.geomspace(interval / 2.0, length / 4.0, TIME_CONSTANTS):
+        yield complex(-1.0 / constant)
+    for w in np.geomspace(4.0 * np.pi / length, 0.8 * np.pi / interval, FREQUENCIES):
+        for zeta in DAMPINGS:
+            yield w * complex(-zeta, np.sqrt(1.0 - zeta**2))
+
+
+def _unbiased(noise: Array, count: int) -> Array:
+    """The autoregression with its slowest root, or pair of them, where it is on average.
+
+    About the mean of a record the correlation of slow noise comes out too small, by (1 + 4 root)/n in Yule and Walker's
+    equations (Marriott and Pope, Biometrika 41, 390-402, 1954).
+    """
+    roots = np.roots(noise)
+    size = np.abs(roots)
+    slowest = float(size.max(initial=0.0))
+    if slowest == 0.0:
+        return noise
+    farther = min(slowest + (1.0 + 4.0 * slowest) / count, max(slowest, 1.0 - 0.5 / count))
+    return np.real(np.poly(np.where(size == slowest, farther / slowest, 1.0) * roots))
+
+
+def _drawn(noise: Array, count: int, rng: np.random.Generator) -> Array:
+    """Series of the noise, one a column."""
+    from scipy.signal import lfilter  # slow to import
+
+    radius = float(np.abs(np.roots(noise)).max(initial=0.0))
+    transient = min(int(np.log(SETTLED) / np.log(radius)), 10 * count) if radius > SETTLED else 0
+    innovations = rng.standard_normal((transient + count, SERIES))
+    drawn: Array = lfilter([1.0], noise, innovations, axis=0)[transient:]
+    return drawn
+
+
+def _filtered(columns: Array, noise: Array) -> Array:
+    """What is new in each sample, without the transient of the filter."""
+    from scipy.signal import lfilter  # slow to import
+
+    new: Array = lfilter(noise, [1.0], columns, axis=0)[noise.size - 1 :]
+    return new
+
+
+def _p_values(statistic: Array) -> Array:
+    """Share of all series, each itself included, whose statistic is as large."""
+    ordered = np.sort(statistic)
+    return 1.0 - np.searchsorted(ordered, statistic, side="left") / statistic.size
