@@ -114,7 +114,7 @@ def test_equations_without_information_leave_everything_undetermined():
 
 def test_the_delay_has_a_profile_interval_where_the_cost_is_not_quadratic():
     # A held input puts kinks into the cost, and noise makes the interval reach over them.
-    result = identify(OPTIONS, [record_of(n=60, noise=0.3, every=7)])
+    result = identify(OPTIONS, [record_of(n=60, noise=0.1, every=3)])
     interval = result.delay_interval
     assert interval is not None
     delay = by_name(result)["delay"]
