@@ -50,8 +50,15 @@ ROUNDING = 1e-13
 FIRST_ROWS = 64
 
 #: How an iteration ends, by number for the compiled iteration; a start may also be inadmissible.
-ENDS = (Status.CONVERGED, Status.MAX_ITERATIONS, Status.STALLED, Status.SINGULAR, Status.DIVERGED)
-CONVERGED, MAX_ITERATIONS, STALLED, SINGULAR, DIVERGED, INADMISSIBLE = range(6)
+ENDS = (
+    Status.CONVERGED,
+    Status.MAX_ITERATIONS,
+    Status.STALLED,
+    Status.SINGULAR,
+    Status.DIVERGED,
+    Status.REFLECTED,
+)
+CONVERGED, MAX_ITERATIONS, STALLED, SINGULAR, DIVERGED, REFLECTED, INADMISSIBLE = range(7)
 
 
 class Equations(NamedTuple):
@@ -232,10 +239,13 @@ def run(problem: Any, theta: Array, free: int, steps: Steps) -> tuple[Array, Equ
     slow = 0
     # Pace of the relaxed variant: which fraction, the shortest full step with it, and how long ago that was.
     pace, shortest, waited = 0, np.inf, 0
+    # Where the last step led out of the stable models, what it was moved to is no fixed point of the iteration.
+    converged = CONVERGED
     for iteration in range(steps.max_iterations):
         accepted = newton = False
         change, fraction = 0.0, 1.0
-        candidate, trial = theta, current
+        target = candidate = theta
+        trial = current
         # First the refined instrumental variable step; where that does not lower a guarded cost, the Gauss-Newton step.
         for attempt in range(0 if instruments else 1, 2 if guarded else 1):
             # A direction in which the cost does not fall will not be better at the next step: it is not tried again.
@@ -259,7 +269,8 @@ def run(problem: Any, theta: Array, free: int, steps: Steps) -> tuple[Array, Equ
             slope = max(float(step @ current.instrument_error), 0.0)
             # The first acceptable fraction: any with a finite response, unless the cost is guarded.
             for _ in range(trials):
-                candidate = admissible(problem, theta + fraction * step)
+                target = theta + fraction * step
+                candidate = admissible(problem, target)
                 trial = equations(problem, candidate)
                 if np.isfinite(trial.squared_error) and (
                     not guarded or trial.squared_error <= _most(current, trial, fraction, slope)
@@ -274,13 +285,14 @@ def run(problem: Any, theta: Array, free: int, steps: Steps) -> tuple[Array, Equ
                 return theta, current, DIVERGED, iteration, path[: iteration + 1]
             # At the minimum up to rounding no step can lower the cost: that is convergence, not failure.
             done = change <= max(steps.tolerance, 1e-7)
-            return theta, current, CONVERGED if done else STALLED, iteration, path[: iteration + 1]
+            return theta, current, converged if done else STALLED, iteration, path[: iteration + 1]
         fall = current.squared_error - trial.squared_error
         expected = change**2 * current.output_power
         theta, current = candidate, trial
+        converged = CONVERGED if (candidate == target).all() else REFLECTED
         path = _logged(path, iteration + 1, theta, current.squared_error)
         if (fraction == 1.0 or relaxed) and change <= steps.tolerance:
-            return theta, current, CONVERGED, iteration + 1, path[: iteration + 2]
+            return theta, current, converged, iteration + 1, path[: iteration + 2]
         # Steps that keep promising more than they give: along a curved valley of equal cost, or across a kink of it.
         slow = slow + 1 if fall < NEGLIGIBLE_FALL * expected else 0
         if guarded and slow == SLOW_STEPS:

@@ -25,6 +25,10 @@ class Status(Enum):
     )
     DELAY_AT_BOUND = "The delay stopped at one of its bounds; widen delay_bounds, or start the delay elsewhere."
     LOCAL = "A local minimum: at another delay within the bounds the cost is lower; start there, or use delay_profile."
+    REFLECTED = (
+        "The last step led to an unstable model, whose poles were mirrored: this is no minimum of the output-error "
+        "cost; use fewer poles or another start, or closed-loop instruments for an unstable plant in a loop."
+    )
     SINGULAR = (
         "The equations became singular: the data do not determine all parameters; use fewer poles or zeros, or an "
         "input that excites the system more."

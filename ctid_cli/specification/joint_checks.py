@@ -80,6 +80,9 @@ def joint_warnings(spec: Spec) -> list[Complaint]:
         warnings += over({(): variants(spec.sampling)}, partial(_slow, fastest))
     if spec.data is not None and spec.monte_carlo is not None and spec.monte_carlo.runs > 1:
         warnings.append((("monte_carlo", "runs"), "a measured record is one data set; it is run once"))
+    if spec.loop is not None:
+        for name, section in spec.estimators.items():
+            warnings += over({(): variants(section)}, partial(_of_open_loop, ("estimators", name)))
     if spec.starts is not None:
         taken = {variants(section)[0].options.start_from for section in spec.estimators.values()}
         for name, kind in (("initial_delay", "delay"), ("parameters", "parameters")):
@@ -158,6 +161,12 @@ def _of_instruments(at: KeyPath, options: Any) -> Iterator[Complaint]:
     if getattr(options, "instruments", None) == "closed_loop":
         give = "give loop, or data.reference and loop.controller for a measured record"
         yield (*at, "instruments"), f"closed-loop instruments need the reference and the controller; {give}"
+
+
+def _of_open_loop(at: KeyPath, options: Any) -> Iterator[Complaint]:
+    if getattr(options, "instruments", "open_loop") == "open_loop":
+        ignored = "ignores the loop, through which noise reaches the input and biases the estimate"
+        yield at, f"{ignored}; use srivc or additive_srivc with instruments: closed_loop, unless that is the point"
 
 
 def _of_delays(name: str, delays: Sequence[float | UniformStart], options: Any) -> Iterator[Complaint]:

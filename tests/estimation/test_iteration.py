@@ -151,6 +151,21 @@ def test_every_end_has_its_status(sequence, variant, status):
     assert result.status is status
 
 
+class Mirrored(Fixed):
+    """Parameters below zero are moved to the other side."""
+
+    def admissible(self, theta):
+        return np.abs(theta)
+
+
+@pytest.mark.parametrize("variant", ["plain", "relaxed", "guarded"])
+@pytest.mark.parametrize(("error", "status"), [(-1e-9, Status.REFLECTED), (1e-9, Status.CONVERGED)])
+def test_a_last_step_that_was_mirrored_is_no_convergence(error, status, variant):
+    sequence = [equations(error=error), equations(error=0.0, cost=0.0)]
+    result = iterate(Mirrored(sequence), np.zeros(1), max_iterations=10, tolerance=1e-8, variant=variant)
+    assert result.status is status
+
+
 def test_start_that_is_not_admissible_gives_nothing():
     assert iterate(Fixed([]), np.zeros(1), max_iterations=10, tolerance=1e-8, variant="guarded") is None
 

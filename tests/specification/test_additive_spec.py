@@ -404,11 +404,22 @@ def test_starts_and_estimators_of_both_kinds(tmp_path):
     ]  # fmt: skip
 
 
+def test_an_estimator_that_ignores_the_loop_is_a_warning(tmp_path):
+    """Also in the loop of a measured record; what knows the loop is not warned of."""
+    (warning,) = load(tmp_path, CLOSED, "estimators.one.instruments=open_loop").warnings
+    assert "estimators.one: ignores the loop" in warning
+    (tmp_path / "record.csv").write_text(RECORD, encoding="utf-8")
+    assert load(tmp_path, MEASURED).warnings == ()
+    (warning,) = load(tmp_path, MEASURED, "estimators.one={kind: svf, poles: 2, zeros: 0}").warnings
+    assert "estimators.one: ignores the loop" in warning
+
+
 def test_starts_that_nobody_takes_are_a_warning(tmp_path):
     (warning,) = load(tmp_path, CLOSED, "starts.initial_delay=1").warnings
     assert "starts.initial_delay: no estimator here uses a start of this kind" in warning
     only = "estimators={one: {kind: svf, poles: 4, zeros: 2}}"
-    (warning,) = load(tmp_path, CLOSED, only).warnings
+    loop, warning = load(tmp_path, CLOSED, only).warnings
+    assert "estimators.one: ignores the loop" in loop
     assert "starts.parameters: no estimator here uses a start of this kind" in warning
 
 
