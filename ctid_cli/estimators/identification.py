@@ -12,6 +12,8 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
 from ctid_cli.estimators import identification_warnings as warnings
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.second_look import look_again
+from ctid_cli.estimators.second_look_words import of_second_look
 from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.answer_test import AnswerTest, answer_test
 from ctid_cli.inference.bootstrap import Progress
@@ -173,6 +175,7 @@ def identify(
     interval = None
     if refinement.structure.delay and "delay" not in unclear:
         interval = _delay_interval(refinement, linear, uncertainty)
+    look = look_again(refinement, linear, records)
     judged = None if checked is None or validation is None else _validate(checked, fit, validation)
     size = fit.model.order + options.zeros + 1
     coefficients = np.full((size, size), np.nan) if singular or not answer.seen else matrix[:size, :size]
@@ -192,7 +195,8 @@ def identify(
         r_t_squared=criteria_of.r_t_squared(residuals, output),
         warnings=(
             *warnings.of_answer(answer, options),
-            *(warnings.of_status(fit) if answer.seen else ()),
+            *of_second_look(look, options, fit, tests, answered=answer.seen),
+            *(warnings.of_status(fit, said=look.integrator > 0) if answer.seen else ()),
             *(warnings.of_conditioning(fit, uncertainty.free_covariance, hessian) if answer.seen else ()),
             *(warnings.of_short_record(uncertainty, fit.count) if answer.seen else ()),
             *warnings.of_interval(interval, options),

@@ -28,15 +28,20 @@ def of_answer(answer: AnswerTest, options: DelayProfile) -> list[str]:
     ]
 
 
-def of_status(fit: MeasuredFit) -> list[str]:
-    """How the search ended, where it did not end well, and poles that are not in the table."""
+def of_status(fit: MeasuredFit, *, said: bool = False) -> list[str]:
+    """How the search ended, where it did not end well, and poles that are not in the table.
+
+    A bound need not be named where it has been said that a pole is too slow.
+    """
     words = _of_lost_poles(fit.poles_at_infinity, fit.model.order)
     if fit.status is Status.DELAY_AT_BOUND and fit.model.delay == 0.0:
         return [
             *words,
             "The delay stopped at zero: this model needs none; take it as known (--delay 0), or use fewer poles.",
         ]
-    return words if fit.status is Status.CONVERGED else [*words, fit.status.value]
+    if fit.status is Status.CONVERGED or (said and fit.status is Status.AT_BOUND):
+        return words
+    return [*words, fit.status.value]
 
 
 def _of_lost_poles(lost: int, left: int) -> list[str]:

@@ -37,6 +37,8 @@ FIRST_ORDER = 12.7
 CERTAIN, CERTAIN_FRACTION = 5.0, 0.3
 #: Before that, an answer may have begun where it is above this many standard deviations.
 DOUBTFUL = 3.0
+#: An answer of the input to the output that is this many standard deviations of chance is none.
+FED_BACK = 8.0
 #: An input repeats itself where its correlation with its own past is above this.
 REPEATS = 0.3
 
@@ -83,6 +85,11 @@ class Answer:
     #: Greatest answer of the input to the output, that is at negative lags, over the standard deviation of what chance
     #: gives [-]; nan where it cannot be told. Feedback shows here.
     before: float = math.nan
+
+    @property
+    def fed_back(self) -> bool:
+        """Whether the input seems to answer the output."""
+        return self.before > FED_BACK and self.delay is not None and self.before >= 0.2 * self.delay.strength
 
 
 def output_bandwidth(record: Record) -> float:

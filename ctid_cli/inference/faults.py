@@ -1,27 +1,46 @@
-"""What sensors and recorders do to an output: outliers, limits, and coarse steps."""
+"""What sensors, recorders and unstable plants do to an output: outliers, limits, coarse steps, growth."""
 
 import math
 
 import numpy as np
 
 from ctid_cli.arrays import Array, IntArray
+from ctid_cli.inference.noise_model import fit_noise_model
 
 #: A sample this many robust standard deviations away from its neighbours is an outlier.
 OUTLIER = 10.0
+#: So many samples of one value are a recorder that stood still, if neighbours are otherwise alike this seldom.
+STILL, SELDOM_ALIKE = 6, 0.02
+#: A part of the record in which an unstable plant grows by less than this is not told from a polynomial in time.
+GROWTH = 2.5
 
 
 def outliers(y: Array) -> IntArray:
     """Single samples, or pairs, far from the median of the five about them."""
+    return far_off(y)[0]
+
+
+def far_off(y: Array) -> tuple[IntArray, Array]:
+    """Outliers, and how far they are from the median of their neighbours."""
     if y.size < 20:
-        return np.empty(0, dtype=np.int64)
+        return np.empty(0, dtype=np.int64), np.empty(0)
     padded = np.pad(y, 2, mode="edge")
     rest = y - np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
     spread = 1.4826 * float(np.median(np.abs(rest)))
-    # The fast part of an answer leaves its own medians behind, everywhere and not at single samples.
-    usual = float(np.quantile(np.abs(rest), 0.98))
+    # The fast part of an answer leaves its own medians behind, everywhere and not at one sample in ten.
+    usual = float(np.quantile(np.abs(rest), 0.9))
     step = quantum(y)
-    limit = max(OUTLIER * spread, 4 * usual, 0.2 * float(y.std()), 0.0 if math.isnan(step) else 4 * step)
-    return np.flatnonzero(np.abs(rest) > limit)
+    limit = max(OUTLIER * spread, 6 * usual, 0.2 * float(y.std()), 0.0 if math.isnan(step) else 4 * step)
+    found = np.flatnonzero(np.abs(rest) > limit)
+    return found, np.abs(rest[found])
+
+
+def residual_outliers(e: Array) -> tuple[IntArray, Array]:
+    """Residuals that are far off and come as a surprise, too; the peaks of a smooth sequence do not."""
+    found, off = far_off(e)
+    surprise = np.abs(fit_noise_model([e]).innovations(e))
+    sudden = surprise[found] > OUTLIER * 1.4826 * float(np.median(surprise))
+    return found[sudden], off[sudden]
 
 
 def saturated(y: Array) -> float:
@@ -38,6 +57,39 @@ def saturated(y: Array) -> float:
         if in_runs >= 0.01 * y.size and counts[k] > 5 * counts[inner]:
             total += in_runs
     return total / y.size
+
+
+def stood_still(y: Array) -> IntArray:
+    """First and last samples of the runs of one value in an output that else never keeps one, shape (k, 2).
+
+    At rest before the first change, and at a limit of the sensor, an output may keep its value.
+    """
+    alike = np.diff(y) == 0
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], alike.astype(int), [0]))))
+    first, last = edges[::2], edges[1::2]
+    long = last - first + 1 >= STILL
+    elsewhere = np.count_nonzero(alike) - int((last - first)[long].sum())
+    inside = long & (first > 0) & (y[first] > y.min()) & (y[first] < y.max())
+    if elsewhere > SELDOM_ALIKE * y.size:
+        inside[:] = False
+    runs: IntArray = np.column_stack((first, last))[inside]
+    return runs
+
+
+def growth_time(t: Array, y: Array, u: Array) -> float:
+    """Time in which an output that diverges exponentially grows by the factor e; nan for any other."""
+    if y.size < 64:
+        return math.nan
+    sizes = []
+    for x in (u, y):
+        parts = np.array_split(x - np.median(x[: x.size // 8]), 8)
+        sizes.append(np.log([float(np.mean(part**2)) or np.finfo(float).tiny for part in parts[3:]]) / 2)
+    driven, grown = sizes
+    steps = np.diff(grown)
+    # An exponential grows in the same ratio all the time; powers of time ever more slowly, and a late event at once.
+    even = steps[-2:].min() > 0.4 * steps[-2:].max() and steps[-2:].sum() > 0.8 * steps[:2].sum()
+    by_itself = grown[-1] - grown[-3] > max(math.log(GROWTH), 2 * (driven[-1] - driven[-3]))
+    return float((t[-1] - t[0]) / 4 / (grown[-1] - grown[-3])) if even and by_itself else math.nan
 
 
 def quantum(y: Array) -> float:

@@ -32,6 +32,13 @@ class NoiseModel:
         ratio = gain * float(self.first_autocovariances[0]) / self.innovation_variance if self.order else 1.0
         return count * min(ratio, 1.0)
 
+    def innovations(self, v: Array) -> Array:
+        """The white noise e behind successive samples of v, which is taken as zero before."""
+        from scipy.signal import lfilter  # slow to import
+
+        white: Array = lfilter(self.coefficients, [1.0], v)
+        return white
+
     def autocovariance(self, count: int) -> Array:
         """Autocovariances at the lags 0, 1 … count - 1 intervals."""
         result = np.zeros(max(count, self.order + 1))

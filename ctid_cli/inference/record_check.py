@@ -22,6 +22,8 @@ LONG_INTERVAL = 3.0
 OFFSET = 0.3
 #: Persistence of excitation is counted up to this order.
 HIGHEST_ORDER = 50
+#: Below this order no model with a delay can be told from one without.
+ENOUGH_ORDER = 4
 #: A trend is one above this many standard errors.
 SIGNIFICANT = 4.0
 
@@ -132,12 +134,12 @@ class Examined:
     report: RecordReport
 
 
-def examine(record: Record, enough_order: int) -> Examined:
-    """Numbers of a record; an input that excites fewer than ``enough_order`` parameters shows no delay."""
+def examine(record: Record) -> Examined:
+    """Numbers of a record; an input that excites fewer than four parameters shows no delay."""
     moves = input_moves(record)
     answer = analyse_answer(record, moves)
     order = _excitation_order(record, moves, answer)
-    if order < enough_order and moves.kind != "steps":
+    if order < ENOUGH_ORDER and moves.kind != "steps":
         # A sine that comes later and one that is filtered look the same.
         answer = replace(answer, delay=None)
     t, y = record.t, record.y
@@ -146,7 +148,7 @@ def examine(record: Record, enough_order: int) -> Examined:
     interval = float(np.median(steps))
     long = np.flatnonzero(steps > LONG_INTERVAL * interval)
     deviation = float(present.std())
-    slope, error, mean_error = _trend(t[record.valid], present)
+    slope, error, mean_error = trend(t[record.valid], present)
     explained = min(answer.explained, 1 - 1e-9) if answer.explained > 0 else math.nan
     starts = _start(record, answer, deviation, explained)
     seldom = moves.kind in ("constant", "steps")
@@ -216,7 +218,7 @@ def _excitation_order(record: Record, moves: InputMoves, answer: Answer) -> int:
     return int(np.count_nonzero(strength > 1e-4 * strength[-1]))
 
 
-def _trend(t: Array, y: Array) -> tuple[float, float, float]:
+def trend(t: Array, y: Array) -> tuple[float, float, float]:
     """Slope of the straight line through the samples, and the standard errors of slope and mean.
 
     They allow for the correlation of the residuals, as seen in the order of the samples.

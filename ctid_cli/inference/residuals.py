@@ -2,18 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.noise_model import fit_noise_model
+from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
 from ctid_cli.inference.quantile import normal_quantile
 
 #: Fewer residuals than this are not tested.
 FEWEST_TESTED = 20
 #: Directions of the lagged inputs with less than this share of the largest variance are repetitions of the others.
 NEGLIGIBLE_VARIANCE = 1e-8
+#: What projections leave of a column that they should take away altogether, as a share of its power.
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,12 +167,31 @@ def _cross_correlation(
     band = quantile * float(np.sqrt(max(spread, 0.0) / count))
 
     # Beside the constant and psi, whatever was subtracted from the noise along them does not count.
-    used = np.ones((count, 1)) if psi is None else np.column_stack((np.ones(count), psi))
-    used = used / np.maximum(np.linalg.norm(used, axis=0), np.finfo(float).tiny)
-    shifted = shifted - used @ np.linalg.lstsq(used, shifted, rcond=None)[0]
-    covariance = shifted.T @ noise.covariance_times(shifted) * count / max(count - used.shape[1], 1)
+    found = dependence(
+        e, shifted, noise, np.ones((count, 1)) if psi is None else np.column_stack((np.ones(count), psi))
+    )
+    return cross, band, found.statistic, found.freedom, found.p_value
+
+
+class Dependence(NamedTuple):
+    """Whether residuals follow given columns."""
+
+    statistic: float
+    freedom: int
+    #: Probability of a larger statistic if they do not; NaN without anything to follow.
+    p_value: float
+
+
+def dependence(e: Array, columns: Array, noise: NoiseModel, beside: Array) -> Dependence:
+    """Chi-square statistic ``c' cov(c)^+ c`` of the products c of the residuals with what others leave of columns."""
+    beside = beside / np.maximum(np.linalg.norm(beside, axis=0), np.finfo(float).tiny)
+    power = float(np.max(np.sum(columns**2, axis=0), initial=0.0))
+    columns = columns - beside @ np.linalg.lstsq(beside, columns, rcond=None)[0]
+    covariance = columns.T @ noise.covariance_times(columns) * e.size / max(e.size - beside.shape[1], 1)
     values, vectors = np.linalg.eigh(covariance)
-    kept = values > NEGLIGIBLE_VARIANCE * values[-1]
-    statistic = float(np.sum((vectors[:, kept].T @ (shifted.T @ e)) ** 2 / values[kept]))
+    # What others leave of a repetition of theirs is rounding.
+    least = NEGLIGIBLE_VARIANCE * max(float(values[-1]), ROUNDING * power * noise.innovation_variance)
+    kept = values > least
+    statistic = float(np.sum((vectors[:, kept].T @ (columns.T @ e)) ** 2 / values[kept]))
     freedom = int(kept.sum())
-    return cross, band, statistic, freedom, float(chdtrc(freedom, statistic)) if freedom else np.nan
+    return Dependence(statistic, freedom, float(chdtrc(freedom, statistic)) if freedom else np.nan)

@@ -22,8 +22,6 @@ FEW_PER_PERIOD = 2.5
 LONGEST_DELAY = 0.1
 #: Where spectra show that so much of the output follows the input, no test has to.
 EXPLAINED = 0.3
-#: Below this order no model with a delay can be told from one without.
-ENOUGH_ORDER = 4
 
 
 def check_record_quality(
@@ -34,7 +32,7 @@ def check_record_quality(
     The findings rest on spectra, correlations and order statistics, never on a model, so they hold whatever model
     is fitted later; a hint is not an estimate.
     """
-    found = record_check.examine(record, ENOUGH_ORDER)
+    found = record_check.examine(record)
     low, high = found.report.suggested_delay or (0.0, LONGEST_DELAY * found.report.duration)
     test = answer_test([record], [record.valid], (low, high))
     findings = _Words(found, found.report, test, time_unit, input_unit, output_unit).findings()
@@ -145,7 +143,7 @@ class _Words:
             else f"{r.excitation_order}"
         )
         power = f"95 % of its power lies from {_digits(r.input_band[0], 2)} to {self.w(r.input_band[1])}"
-        if r.excitation_order < ENOUGH_ORDER:
+        if r.excitation_order < record_check.ENOUGH_ORDER:
             text = f"The input is persistently exciting of order {order} only, enough for as many parameters; {power}."
             return Finding("warning", "input", f"{text} Add frequencies, or switch at random.")
         return Finding("ok", "input", f"{self._movement()} It is persistently exciting of order {order}; {power}.")
@@ -247,14 +245,14 @@ class _Words:
 
     def _pairing(self) -> Iterator[Finding]:
         """What is odd about input and output together."""
-        r, before, delay = self.r, self.found.answer.before, self.found.answer.delay
+        r, answer = self.r, self.found.answer
         own_times = not np.array_equal(self.found.record.input.t, self.found.record.t)
         if r.interval_deviation > JITTER * r.interval and r.input_kind in ("levels", "steps") and not own_times:
             late = f"late by {self.t(r.interval / 2)} on average, and the delay too short by as much"
             text = f"The input is known at irregular instants only: its changes seem {late}. Record when it changes."
             yield Finding("warning", "edges", text)
-        if before > 8 and delay is not None and before >= 0.2 * delay.strength:
-            shown = f"at negative lags their correlation is {before:.2g} times what chance gives"
+        if answer.fed_back:
+            shown = f"at negative lags their correlation is {answer.before:.2g} times what chance gives"
             biased = "Noise in a closed loop biases the estimate; without a controller, look at the time stamps."
             yield Finding("warning", "feedback", f"The input seems to follow the output: {shown}. {biased}")
 

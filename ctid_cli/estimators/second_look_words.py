@@ -1,0 +1,136 @@
+"""What is odd about records and their fit, in sentences: the worst first, each with its evidence and what to do."""
+
+from collections.abc import Iterator
+
+from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.second_look import RecordLook, SecondLook
+from ctid_cli.inference.residuals import ResidualTests
+
+#: Chances of a test statistic like this without feedback, and without missing dynamics.
+FED_BACK, TOO_POOR = 1e-4, 1e-3
+#: Shares of the residuals' variance below this are not worth a pole.
+WORTH_A_POLE = 0.05
+#: Where more of the intervals are long the clock is irregular, and has no gaps.
+GAPS = 0.05
+
+
+def of_second_look(
+    look: SecondLook, options: DelayProfile, fit: MeasuredFit, tests: tuple[ResidualTests, ...]
+) -> list[str]:
+    """Everything that should be said; nothing of a record and a model that fit each other."""
+    several = len(look.records) > 1
+    words: list[str] = []
+    for k, one in enumerate(look.records):
+        test = tests[k] if len(tests) == len(look.records) else None
+        found = _of_record(one, look, options, fit, test)
+        words += [f"Experiment {k + 1}: {sentence}" if several else sentence for sentence in found]
+    diverges = any(one.growth_time > 0 for one in look.records)
+    if look.integrator > 0 and not diverges:
+        words.append(_of_integrator(look, options, fit))
+    if look.other_hold and not any(_faulty(one) or _poor_share(one) > look.other_hold for one in look.records):
+        now, other = ("held", "foh") if one.examined.record.input.hold == "zoh" else ("along straight lines", "zoh")
+        words.append(
+            f"Taken as {'straight lines between its samples' if other == 'foh' else 'held'}, not as {now}, the input "
+            f"lowers the cost by {100 * look.other_hold:.2g} %: use --hold {other}, unless you know better."
+        )
+    return words
+
+
+def _of_record(
+    one: RecordLook, look: SecondLook, options: DelayProfile, fit: MeasuredFit, test: ResidualTests | None
+) -> Iterator[str]:
+    if one.growth_time > 0:
+        yield (
+            f"The output diverges: it grows by a factor of e every {one.growth_time:.2g}, and the input does not. An "
+            "unstable plant shows its dynamics in a stabilising loop only: record the reference there too, and use "
+            "srivc or additive_srivc with instruments: closed_loop in an experiment (ctid run)."
+        )
+        return
+    yield from _of_faults(one)
+    if _fed_back(one):
+        yield (
+            f"The input answers the output{_chance(one)}, as in a closed loop, where noise biases the estimate. Record "
+            "the reference, and use srivc or additive_srivc with instruments: closed_loop in an experiment (ctid run); "
+            "without a controller, look at the time stamps."
+        )
+    elif _poor_share(one) > look.other_hold and not _faulty(one) and (test is None or not test.uncorrelated):
+        yield _of_structure(one, options, fit)
+    if one.drift and not look.integrator > 0:
+        yield (
+            f"Beside the model, the output drifts by {abs(one.drift):.2g} standard deviations of the residuals over "
+            "the record. Remove the trend, or use a part without it (--from, --to)."
+        )
+
+
+def _of_faults(one: RecordLook) -> Iterator[str]:
+    """What the sensor and the recorder did."""
+    report, empty = one.examined.report, "leave those fields of the record empty"
+    if len(one.outliers):
+        many = len(one.outliers)
+        where = ", ".join(f"{t:.6g}" for t, _ in one.outliers[:3]) + (", ..." if many > 3 else "")
+        what = f"{many} output samples are outliers" if many > 1 else "1 output sample is an outlier"
+        size = f"{'up to ' if many > 1 else ''}{one.outliers[:, 1].max():.3g} away from the neighbours"
+        yield f"{what} (t = {where}), {size}: {empty}, or use --loss tukey, which counts them for nothing."
+    if report.saturated and report.input_kind not in ("constant", "steps"):
+        share = f"{100 * report.saturated:.2g} % of the output samples sit exactly at the least or greatest value"
+        yield f"{share}, as at a limit of the sensor: {empty}, or repeat the record with a smaller input."
+    if len(one.stood_still):
+        begin, end = max(one.stood_still.tolist(), key=lambda pair: pair[1] - pair[0])
+        yield (
+            f"The output keeps one value from t = {begin:.6g} to {end:.6g}, and never does elsewhere: the recorder "
+            f"stood still; {empty}."
+        )
+    if 0 < len(report.gaps) <= GAPS * report.n_samples:
+        longest = max(report.gaps, key=lambda gap: gap.length)
+        gaps = f"{len(report.gaps)} gaps, the longest" if len(report.gaps) > 1 else "a gap"
+        yield (
+            f"The record has {gaps} of {longest.length:.4g} after t = {longest.start:.6g}, across which the input is "
+            "taken as held. If it was not, use a part without (--from, --to)."
+        )
+
+
+def _faulty(one: RecordLook) -> bool:
+    """Whether the residuals are not those of a linear model in noise."""
+    return bool(len(one.outliers) or len(one.stood_still) or one.examined.report.saturated or one.growth_time > 0)
+
+
+def _fed_back(one: RecordLook) -> bool:
+    found = one.dependence
+    tested = found is not None and found.feedback_p_value < min(FED_BACK, found.pole_p_value)
+    return tested and not _faulty(one)
+
+
+def _chance(one: RecordLook) -> str:
+    p = one.dependence.feedback_p_value if one.dependence is not None else 1.0
+    return f" (p = {p:.1g})" if p < FED_BACK else ""
+
+
+def _poor_share(one: RecordLook) -> float:
+    """Share of the residuals' variance that one more pole would explain; 0 where that may be chance."""
+    found = one.dependence
+    if found is None or not found.pole_p_value < TOO_POOR or found.pole_share < WORTH_A_POLE:
+        return 0.0
+    return found.pole_share
+
+
+def _of_structure(one: RecordLook, options: DelayProfile, fit: MeasuredFit) -> str:
+    low, high = options.delay_bounds
+    report, found = one.examined.report, f"About {100 * _poor_share(one):.2g} % of the residuals' variance"
+    if low == high and report.delay_early > low and report.suggested_delay is not None:
+        first, last = report.suggested_delay
+        late = f"the output begins to answer {report.delay_early:.3g} or more after a change of the input"
+        return f"{found} still follows the input, and {late}: the delay is too short (try --delay {first:g}:{last:g})."
+    if fit.poles_at_infinity or options.poles == 12:
+        return f"{found} still follows the input, but more poles do not help: the system may be nonlinear."
+    return f"{found} is what one more pole may explain: the structure is too poor (try --poles {options.poles + 1})."
+
+
+def _of_integrator(look: SecondLook, options: DelayProfile, fit: MeasuredFit) -> str:
+    poles = fit.model.order - 1
+    terms = f"[{{poles: {poles}, zeros: {options.zeros}, integrators: 1}}]"
+    drifts = any(one.drift for one in look.records)
+    return (
+        f"A pole has a time constant of {look.integrator:.4g}, too slow for this record: the system seems to integrate"
+        f"{', or the output drifts' if drifts else ''}, and its static gain means nothing. Use additive_srivc with "
+        f"terms: {terms} in an experiment (ctid run), or a longer record."
+    )
