@@ -175,7 +175,7 @@ def identify(
     interval = None
     if refinement.structure.delay and "delay" not in unclear:
         interval = _delay_interval(refinement, linear, uncertainty)
-    look = look_again(refinement, linear, records)
+    look = look_again(refinement, linear, records, holds=options.loss == "squares")
     judged = None if checked is None or validation is None else _validate(checked, fit, validation)
     size = fit.model.order + options.zeros + 1
     coefficients = np.full((size, size), np.nan) if singular or not answer.seen else matrix[:size, :size]

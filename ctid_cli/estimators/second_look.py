@@ -48,10 +48,11 @@ class SecondLook:
     integrator: float
 
 
-def look_again(refinement: Refinement, fit: MeasuredFit, records: Sequence[Record]) -> SecondLook:
-    """Look at the records and at what the fit leaves of them."""
+def look_again(refinement: Refinement, fit: MeasuredFit, records: Sequence[Record], *, holds: bool) -> SecondLook:
+    """Look at the records, at what the fit leaves of them, and if wanted at what it does with the other hold."""
     looks = tuple(_look(record, fit, k) for k, record in enumerate(records))
-    return SecondLook(looks, fall_with_other_hold(refinement, fit, records), _integrator(fit, records))
+    other_hold = fall_with_other_hold(refinement, fit, records) if holds else 0.0
+    return SecondLook(looks, other_hold, _integrator(fit, records))
 
 
 def _look(record: Record, fit: MeasuredFit, k: int) -> RecordLook:
@@ -63,7 +64,7 @@ def _look(record: Record, fit: MeasuredFit, k: int) -> RecordLook:
     drifts = abs(slope) > SIGNIFICANT * error and abs(drift) > DRIFT
     return RecordLook(
         examine(record),
-        np.column_stack((t[found], off)),
+        np.column_stack((t[found], np.abs(off))),
         t[faults.stood_still(y)],
         faults.growth_time(t, y, record.input.at(t)),
         drift if drifts else 0.0,

@@ -32,14 +32,16 @@ def far_off(y: Array) -> tuple[IntArray, Array]:
     step = quantum(y)
     limit = max(OUTLIER * spread, 6 * usual, 0.2 * float(y.std()), 0.0 if math.isnan(step) else 4 * step)
     found = np.flatnonzero(np.abs(rest) > limit)
-    return found, np.abs(rest[found])
+    return found, rest[found]
 
 
 def residual_outliers(e: Array) -> tuple[IntArray, Array]:
-    """Residuals that are far off and come as a surprise, too; the peaks of a smooth sequence do not."""
+    """Residuals that are far off and that others do not foretell, as they do the peaks of a smooth sequence."""
     found, off = far_off(e)
-    surprise = np.abs(fit_noise_model([e]).innovations(e))
-    sudden = surprise[found] > OUTLIER * 1.4826 * float(np.median(surprise))
+    usual = e.copy()
+    usual[found] -= off
+    surprise = fit_noise_model([usual]).innovations(usual)
+    sudden = np.abs(surprise[found] + off) > OUTLIER * 1.4826 * float(np.median(np.abs(surprise)))
     return found[sudden], off[sudden]
 
 

@@ -1,0 +1,106 @@
+"""What ``identify`` says of faults that are planted in a record, and that it says nothing where there are none."""
+
+import numpy as np
+import pytest
+
+from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.estimators.hold_comparison import fall_with_other_hold
+from ctid_cli.estimators.identification import identify
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
+
+SYSTEM = TransferFunction([2.0], [1.0, 0.8, 2.0], 0.0)
+KNOWN = DelayProfile(2, 0, (0, 0))
+NOISE = 0.1
+
+
+def record_of(model=SYSTEM, *, seed=0, n=1000, interval=0.2, hold="zoh", read_as=None, bias=0.0):
+    """A record of steps of random length, or of a random walk that is followed along straight lines."""
+    rng = np.random.default_rng(seed)
+    t = interval * np.arange(n)
+    u = np.repeat(rng.choice([-1.0, 1.0], n), rng.integers(3, 12, n))[:n] if hold == "zoh" else rng.standard_normal(n)
+    y = simulate(model, HeldSignal(t, u + bias, hold), t) + NOISE * rng.standard_normal(n)
+    return Record(t, y, HeldSignal(t, u + bias, read_as or hold))
+
+
+def changed(record, y):
+    return Record(record.t, y, record.input)
+
+
+def spoilt(record, samples, size):
+    y = record.y.copy()
+    y[samples] += size
+    return changed(record, y)
+
+
+def stopped(record, first, last):
+    y = record.y.copy()
+    y[first:last] = y[first]
+    return changed(record, y)
+
+
+def looped(gain=0.8, n=1000):
+    """A record in the loop of a proportional controller."""
+    rng = np.random.default_rng(5)
+    r = np.repeat(rng.choice([-1.0, 1.0], n // 5), 5)
+    u, y, e, pole = np.zeros(n), np.zeros(n), 0.05 * rng.standard_normal(n), np.exp(-0.2)
+    x = 0.0
+    for k in range(n):
+        y[k] = x + e[k]
+        u[k] = gain * (r[k] - y[k])
+        x = pole * x + (1 - pole) * u[k]
+    return Record.from_arrays(0.2 * np.arange(n), u, y)
+
+
+CLEAN = record_of()
+FEW = 40 + 61 * np.arange(15)
+FIRST_ORDER = DelayProfile(1, 0, (0, 0))
+FAULTS = {
+    "15 outliers": (spoilt(CLEAN, FEW, 50 * NOISE), KNOWN, "15 output samples are outliers (t = 8, 20.2, 32.4, ...)"),
+    "one outlier": (spoilt(CLEAN, [500], -20 * NOISE), KNOWN, "1 output sample is an outlier (t = 100)"),
+    "saturation": (changed(CLEAN, np.clip(CLEAN.y, -0.9, 0.9)), KNOWN, "exactly at the least or greatest value"),
+    "a recorder that stood still": (stopped(CLEAN, 300, 320), KNOWN, "keeps one value from t = 60 to 63.8"),
+    "drift": (changed(CLEAN, CLEAN.y + 2 * NOISE * np.linspace(0, 1, 1000)), KNOWN, "drifts by"),
+    "the wrong hold": (record_of(hold="foh", read_as="zoh", interval=0.8), KNOWN, "use --hold foh"),
+    "an integrator": (record_of(TransferFunction([1.0], [1.0, 1.0, 0.0])), KNOWN, "poles: 1, zeros: 0, integrators: 1"),
+    "an unstable plant": (record_of(TransferFunction([1.0], [1.0, -0.04])), FIRST_ORDER, "The output diverges"),
+    "feedback": (looped(), FIRST_ORDER, "The input answers the output"),
+    "one pole too few": (CLEAN, FIRST_ORDER, "try --poles 2"),
+    "a delay that is not searched": (record_of(TransferFunction([2.0], [1.0, 0.8, 2.0], 4.0)), KNOWN, "--delay 0:"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_planted_fault_is_named_first_and_once(fault):
+    record, options, words = FAULTS[fault]
+    warnings = identify(options, [record]).warnings
+    assert words in warnings[0]
+    assert sum(words in warning for warning in warnings) == 1
+
+
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+def test_a_clean_record_needs_no_words(hold):
+    assert identify(KNOWN, [record_of(seed=3, hold=hold)]).warnings == ()
+
+
+def test_gaps_are_named():
+    kept = np.delete(np.arange(1000), np.s_[400:430])
+    record = Record.from_arrays(CLEAN.t[kept], CLEAN.input.values[kept], CLEAN.y[kept])
+    (warning,) = (warning for warning in identify(KNOWN, [record]).warnings if "gap" in warning)
+    assert "a gap of 6.2 after t = 79.8" in warning
+
+
+def test_several_records_say_which_one():
+    warnings = identify(KNOWN, [CLEAN, spoilt(record_of(seed=1), [500], 2.0)]).warnings
+    assert warnings[0].startswith("Experiment 2: 1 output sample is an outlier")
+
+
+def test_the_other_hold_is_fitted_as_if_it_had_been_given():
+    """The fall of the cost against two fits, the second with the record as it was taken."""
+    wrong, right = (record_of(hold="foh", read_as=hold, interval=0.8) for hold in ("zoh", "foh"))
+    prepared = KNOWN.prepare([wrong])
+    fit = prepared.fit()
+    expected = 1 - KNOWN.fit([right]).cost / fit.cost
+    assert fall_with_other_hold(prepared.laid_out, fit, [wrong]) == pytest.approx(expected, rel=1e-6)
