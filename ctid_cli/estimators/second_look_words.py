@@ -8,8 +8,8 @@ from ctid_cli.inference.residuals import ResidualTests
 
 #: Chances of a test statistic like this without feedback, and without missing dynamics.
 FED_BACK, TOO_POOR = 1e-4, 1e-3
-#: Shares of the residuals' variance below this are not worth a pole.
-WORTH_A_POLE = 0.05
+#: Shares of the residuals' variance below these are not worth a pole, and may be what a nonlinear system leaves.
+WORTH_A_POLE, WORTH_A_LOOP = 0.05, 0.01
 #: Where more of the intervals are long the clock is irregular, and has no gaps.
 GAPS = 0.05
 
@@ -47,11 +47,12 @@ def _of_record(
         )
         return
     yield from _of_faults(one)
-    if _fed_back(one):
+    chance = _chance_of_feedback(one)
+    if chance < FED_BACK:
         yield (
-            f"The input answers the output{_chance(one)}, as in a closed loop, where noise biases the estimate. Record "
-            "the reference, and use srivc or additive_srivc with instruments: closed_loop in an experiment (ctid run); "
-            "without a controller, look at the time stamps."
+            f"The input answers the output (p = {chance:.1g}), as in a closed loop, where noise biases the estimate. "
+            "Record the reference, and use srivc or additive_srivc with instruments: closed_loop in an experiment "
+            "(ctid run); without a controller, look at the time stamps."
         )
     elif _poor_share(one) > look.other_hold and not _faulty(one) and (test is None or not test.uncorrelated):
         yield _of_structure(one, options, fit)
@@ -94,15 +95,13 @@ def _faulty(one: RecordLook) -> bool:
     return bool(len(one.outliers) or len(one.stood_still) or one.examined.report.saturated or one.growth_time > 0)
 
 
-def _fed_back(one: RecordLook) -> bool:
+def _chance_of_feedback(one: RecordLook) -> float:
+    """Chance of such a dependence without feedback; 1 where something else explains it."""
     found = one.dependence
-    tested = found is not None and found.feedback_p_value < min(FED_BACK, found.pole_p_value)
-    return tested and not _faulty(one)
-
-
-def _chance(one: RecordLook) -> str:
-    p = one.dependence.feedback_p_value if one.dependence is not None else 1.0
-    return f" (p = {p:.1g})" if p < FED_BACK else ""
+    if found is None or _faulty(one) or found.feedback_share < WORTH_A_LOOP:
+        return 1.0
+    # Dynamics that are missed may leave something for later inputs to tell.
+    return found.feedback_p_value if found.feedback_p_value < found.pole_p_value else 1.0
 
 
 def _poor_share(one: RecordLook) -> float:
@@ -128,9 +127,8 @@ def _of_structure(one: RecordLook, options: DelayProfile, fit: MeasuredFit) -> s
 def _of_integrator(look: SecondLook, options: DelayProfile, fit: MeasuredFit) -> str:
     poles = fit.model.order - 1
     terms = f"[{{poles: {poles}, zeros: {options.zeros}, integrators: 1}}]"
-    drifts = any(one.drift for one in look.records)
     return (
         f"A pole has a time constant of {look.integrator:.4g}, too slow for this record: the system seems to integrate"
-        f"{', or the output drifts' if drifts else ''}, and its static gain means nothing. Use additive_srivc with "
-        f"terms: {terms} in an experiment (ctid run), or a longer record."
+        f", or the output drifts, and the static gain means nothing. Use additive_srivc with terms: {terms} in an "
+        "experiment (ctid run), or a longer record."
     )

@@ -30,8 +30,9 @@ class InputDependence:
     pole_p_value: float
     #: Share of the variance of the residuals that these would explain [-].
     pole_share: float
-    #: Of the input on residuals before it.
+    #: Of the input on residuals before it, and the share of these that its moves foretell.
     feedback_p_value: float
+    feedback_share: float
 
 
 def input_dependence(e: Array, x: Array, psi: Array, t: Array, record: Record, delay: float) -> InputDependence | None:
@@ -48,7 +49,7 @@ def input_dependence(e: Array, x: Array, psi: Array, t: Array, record: Record, d
     inside = (t - delay - past * interval >= record.t[0]) & (t + future * interval <= record.t[-1])
     if future < ORDER or np.count_nonzero(inside) < 2 * (past + future + psi.shape[1]):
         return None
-    added = _behind_a_pole(x, np.geomspace(1.0, LONGEST * t.size, TRIED))[inside]
+    added = _behind_a_pole(x - x[0], np.geomspace(1.0, LONGEST * t.size, TRIED))[inside]
     e, x, psi, t = e[inside] - e[inside].mean(), x[inside], psi[inside], t[inside]
     noise = fit_noise_model([e])
     if not noise.innovation_variance > 0:
@@ -66,13 +67,16 @@ def input_dependence(e: Array, x: Array, psi: Array, t: Array, record: Record, d
     # Between its samples an input along straight lines has moved before the residual.
     first = 1 if record.input.hold == "foh" else 0
     later = dependence(e, inputs(t, range(first, first + future)), noise, known)
-    at_once = 1.0 if first else _answer_at_once(_rest(e, known), x, inputs(t, range(0, -ORDER - 1, -1)))
-    likely = min(at_once, later.p_value) if later.freedom else at_once
-    return InputDependence(pole.p_value, share, min(1.0, 2 * likely))
+    found = [(later.p_value, (later.statistic - later.freedom) / t.size)] if later.freedom else []
+    if not first:
+        z = _answer_at_once(_rest(e, known), x, inputs(t, range(0, -ORDER - 1, -1)))
+        found.append((2 * ANSWERS * float(ndtr(-z)), z * z / t.size))
+    likely, told = min(found, default=(1.0, 0.0))
+    return InputDependence(pole.p_value, share, min(1.0, len(found) * likely), told)
 
 
 def _answer_at_once(e: Array, x: Array, u: Array) -> float:
-    """Probability that the input moves with the residuals of the last instants, if it does not answer them.
+    """How far the input moves with residuals of the last instants, in standard deviations of what chance gives.
 
     What the input and the simulated output were does not tell all moves: those of a reference that is held are rare
     and large, and would drown the answer to the noise. So they are clipped. Residuals that are white and independent
@@ -86,13 +90,12 @@ def _answer_at_once(e: Array, x: Array, u: Array) -> float:
         rest = now - before @ np.linalg.lstsq(half[:, None] * before, half * now, rcond=1e-10)[0]
         scale = 1.4826 * float(np.median(np.abs(rest)))
         if not scale > 1e-9 * float(np.ptp(now)):
-            return 1.0
+            return 0.0
         weight = 1.0 / np.maximum(np.abs(rest) / scale, 1.0)
     moves = np.clip(rest / scale, -CLIPPED, CLIPPED)
     white = fit_noise_model([e]).innovations(e)
     scores = [moves * white[ORDER - k : e.size - k] for k in range(ANSWERS)]
-    z = max(abs(float(score.sum())) / float(np.sqrt(score @ score)) for score in scores)
-    return min(1.0, 2 * ANSWERS * float(ndtr(-z)))
+    return max(abs(float(score.sum())) / float(np.sqrt(score @ score)) for score in scores)
 
 
 def _behind_a_pole(x: Array, time_constants: Array) -> Array:
