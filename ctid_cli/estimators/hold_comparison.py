@@ -29,10 +29,8 @@ def fall_with_other_hold(refinement: Refinement, fit: MeasuredFit, records: Sequ
     most = MOST // len(records)
     short = [_beginning(record, most) for record in records]
     given, other = (_least(refinement, fit, [_held(record, swap) for record in short]) for swap in (False, True))
-    noise = fit_noise_model(fit.residuals)
     # Correlated samples count for fewer.
-    fewer = noise.innovation_variance / float(noise.coefficients.sum()) ** 2 / float(noise.first_autocovariances[0])
-    count = sum(record.n_samples for record in short) / max(1.0, fewer)
+    count = fit_noise_model(fit.residuals).effective_count(sum(record.n_samples for record in short))
     fall = 1.0 - other / given
     return fall if fall > WORTHWHILE and -0.5 * count * np.log1p(-fall) > DECISIVE else 0.0
 

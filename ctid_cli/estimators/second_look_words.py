@@ -15,15 +15,20 @@ GAPS = 0.05
 
 
 def of_second_look(
-    look: SecondLook, options: DelayProfile, fit: MeasuredFit, tests: tuple[ResidualTests, ...]
+    look: SecondLook, options: DelayProfile, fit: MeasuredFit, tests: tuple[ResidualTests, ...], *, answered: bool
 ) -> list[str]:
-    """Everything that should be said; nothing of a record and a model that fit each other."""
+    """Everything that should be said; nothing of a record and a model that fit each other.
+
+    Where no answer to the input is seen there is nothing to say of the model.
+    """
     several = len(look.records) > 1
     words: list[str] = []
     for k, one in enumerate(look.records):
         test = tests[k] if len(tests) == len(look.records) else None
-        found = _of_record(one, look, options, fit, test)
+        found = _of_record(one, look, options, fit, test) if answered else _of_faults(one)
         words += [f"Experiment {k + 1}: {sentence}" if several else sentence for sentence in found]
+    if not answered:
+        return words
     diverges = any(one.growth_time > 0 for one in look.records)
     if look.integrator > 0 and not diverges:
         words.append(_of_integrator(look, options, fit))
