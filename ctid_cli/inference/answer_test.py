@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.filtering.simulate import simulate
@@ -29,8 +30,8 @@ MOST_SAMPLES = 2000
 #: Share of the false alarms that is given to the test behind the whitening filter. After slow inputs it sees little;
 #: after fast ones in slow noise it alone sees anything.
 WHITENED = 0.2
-#: Decay of the transient before a series of noise begins.
-SETTLED = 1e-2
+#: Length of periodic noise over that of the record it stands for.
+PERIOD = 4
 #: Outliers are cut off at so many times the deviation from the median that nine samples in ten do not exceed.
 CUT_OFF = 5.0
 #: Fewer samples than this tell nothing.
@@ -190,21 +191,20 @@ def _unbiased(noise: Array, count: int) -> Array:
 
 
 def _drawn(noise: Array, count: int, rng: np.random.Generator) -> Array:
-    """Series of the noise, one a column."""
-    from scipy.signal import lfilter  # slow to import
-
-    radius = float(np.abs(np.roots(noise)).max(initial=0.0))
-    transient = min(int(np.log(SETTLED) / np.log(radius)), 10 * count) if radius > SETTLED else 0
-    innovations = rng.standard_normal((transient + count, SERIES))
-    drawn: Array = lfilter([1.0], noise, innovations, axis=0)[transient:]
+    """Series of the noise, one a column, cut from periodic ones that are so long that the period does not show."""
+    length = next_fast_len(PERIOD * count, real=True)
+    innovations = rfft(rng.standard_normal((length, SERIES)), axis=0)
+    drawn: Array = irfft(innovations / rfft(noise, length)[:, None], length, axis=0)[:count]
     return drawn
 
 
 def _filtered(columns: Array, noise: Array) -> Array:
     """What is new in each sample, without the transient of the filter."""
-    from scipy.signal import lfilter  # slow to import
-
-    new: Array = lfilter(noise, [1.0], columns, axis=0)[noise.size - 1 :]
+    count = len(columns)
+    length = next_fast_len(count, real=True)
+    # What wraps around falls into the transient.
+    product = rfft(columns, length, axis=0) * rfft(noise, length)[:, None]
+    new: Array = irfft(product, length, axis=0)[noise.size - 1 : count]
     return new
 
 

@@ -107,6 +107,21 @@ def test_coloured_noise_hides_neither_answer_nor_delay():
         assert 0.3 < report.explained < 0.95
 
 
+def test_an_answer_from_an_operating_point_is_seen_and_noise_is_none():
+    t = 0.1 * np.arange(300)
+    u = np.where(t >= 10, 80.0, 50.0)
+    rng = np.random.default_rng(9)
+    noise = lfilter([1], [1, -0.8], rng.standard_normal(t.size))
+    y = 20 + simulate(FIRST_ORDER, HeldSignal(t, u - 50.0), t) + noise
+    answering = Record.from_arrays(t, u, y)
+    assert check_record_quality(answering).answer_p_value < 0.05
+    assert "answer" not in found(answering, "problem")
+    alone = Record.from_arrays(t, u, 20 + noise)
+    assert check_record_quality(alone).answer_p_value > 0.05
+    assert found(alone, "problem")["answer"].startswith("The output is not seen to answer to the input (p = ")
+    assert not {"delay", "clock", "start"} & found(alone).keys()
+
+
 @pytest.mark.parametrize("start", [0.1, 20.0])
 def test_the_delay_after_a_single_step(start):
     t = 0.1 * np.arange(1000)
