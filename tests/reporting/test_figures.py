@@ -1,6 +1,7 @@
 """Figures of the studies: what is drawn follows from the theory and from the search, and the same bytes come twice."""
 
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from xml.etree import ElementTree
 
@@ -61,21 +62,25 @@ def switching():
     return computed(CASE_2, True, np.array([0.0, 4.0, 7.9, 7.98, 8.0, 8.02, 8.1, 12.0, 15.0]), max_iterations=1)
 
 
+@cache
+def drawn(number):
+    return getattr(useful_redundancy, f"figure_{number}")()
+
+
 @pytest.mark.parametrize("number", ["1", "2"])
 def test_theory_is_drawn_the_same_every_time(number):
-    draw = getattr(useful_redundancy, f"figure_{number}")
-    assert draw() == draw()
+    assert drawn(number) == getattr(useful_redundancy, f"figure_{number}")()
 
 
 def test_figure_1_names_region_and_extrema():
-    written = texts(useful_redundancy.figure_1())
+    written = texts(drawn("1"))
     region = extrema(2 * np.pi, 1, exact=True)[0]
     for text in (f"{region:.4f}", "(37)", "(50)", "local maximum", "local minimum", "global minimum", "[s]", "unit"):
         assert text in written
 
 
 def test_figure_2_names_filters_and_the_gap():
-    written = texts(useful_redundancy.figure_2())
+    written = texts(drawn("2"))
     ((low, high),) = check_filters(FilterSet(2 * np.pi, 6, 2.0).cutoffs, 15.0).gaps
     assert (f"{low:.2f}", f"{high:.2f}") == ("14.10", "14.25")
     assert f"gap, {low:.2f} to | {high:.2f} s: no filter" in written
