@@ -220,7 +220,7 @@ def test_a_delay_outside_the_range_stops_at_the_bound():
 
 # --- invariances -----------------------------------------------------------------------------------
 
-OPTIONS = DelayProfile(2, 0, (0, 3), initial_state="estimate", offset="estimate")
+OPTIONS = DelayProfile(2, 0, (0, 1.5), initial_state="estimate", offset="estimate")
 
 
 @cache
@@ -235,7 +235,7 @@ def fitted(irregular=False):
 def test_the_unit_of_time_does_not_matter(factor, irregular):
     record, fit = fitted(irregular)
     scaled = Record(record.t * factor, record.y, HeldSignal(record.input.t * factor, record.input.values))
-    other = replace(OPTIONS, delay_bounds=(0, 3 * factor)).fit(scaled).model
+    other = replace(OPTIONS, delay_bounds=(0, 1.5 * factor)).fit(scaled).model
     powers = factor ** np.arange(3)
     back = TransferFunction(other.numerator * factor**2, other.denominator * powers, other.delay / factor)
     assert_same_model(back, fit.model, 1e-8)
