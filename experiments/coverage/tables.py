@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.robust import robust_covariance
+from ctid_cli.inference.quantile import normal_quantile, student_quantile
 from ctid_cli.reporting.layout import Table
 from ctid_cli.reporting.parameter_errors import error_statistics
 from ctid_cli.reporting.results import Results
@@ -21,6 +21,8 @@ ROWS = {
     "first-order": ("c", "first order and delay"),
     "first-order-coloured": ("d", "first order and delay, ARMA noise"),
     "case1-irregular-sampled": ("e", "case 1, irregular, sampled input record"),
+    "short-prbs": ("f", "second order, PRBS, 600 samples, slow noise"),
+    "short-step": ("g", "second order, step, 600 samples, slow noise"),
 }
 
 
@@ -35,19 +37,22 @@ def coverage(results: Results) -> list[dict[str, Any]]:
     """Coverage, ratio of standard errors and bias: a line for each formula and parameter."""
     plan = build_plan(spec_from_canonical(dict(results.settings)))
     system = plan.data_cells[0].source.system
-    truth = named(system.numerator, system.denominator, system.delay)
     rows = [row for row in results.rows if row["delay"] is not None]
-    estimates = np.array([[*named(row["numerator"], row["denominator"], row["delay"]).values()] for row in rows])
+    truth = named(system.numerator, system.denominator, system.delay)
+    # A known delay is no parameter.
+    truth = {name: truth[name] for name in truth if name in rows[0]["standard_errors"]}
+    found_in = [named(row["numerator"], row["denominator"], row["delay"]) for row in rows]
+    estimates = np.array([[values[name] for name in truth] for values in found_in])
     white = np.array([[row["standard_errors"][name] for name in truth] for row in rows], dtype=float)
-    formulas = {"white": white}
+    formulas = {"white": (white, np.ones(len(rows)))}
     if plan.data_cells[0].source.noise.coloured:
         # Coloured noise is what the sandwich is meant for; the estimator stores the white formula, misused here.
-        formulas = {"sandwich": _sandwich(plan, [row["replicate"] for row in rows]), "white": white}
+        formulas = {"sandwich, t": _robust(plan, [row["replicate"] for row in rows]), **formulas}
     letter, _ = ROWS[last_part(results.experiment)]
     lines = []
-    for formula, widths in formulas.items():
+    for formula, (widths, reach) in formulas.items():
         for (name, true), found, width in zip(truth.items(), estimates.T, widths.T, strict=True):
-            statistics, mean_error = error_statistics(found - true, width), float(np.nanmean(width))
+            statistics, mean_error = error_statistics(found - true, reach * width), float(np.nanmean(width))
             lines.append(
                 {
                     "row": letter,
@@ -68,16 +73,18 @@ def coverage(results: Results) -> list[dict[str, Any]]:
     return lines
 
 
-def _sandwich(plan: Any, replicates: list[int]) -> Array:
-    """Standard errors of the sandwich, which is not stored: from the same fits, made again."""
+def _robust(plan: Any, replicates: list[int]) -> tuple[Array, Array]:
+    """Standard errors for coloured noise, which are not stored, from the same fits, made again.
+
+    And Student's quantiles over the normal one.
+    """
     (cell,), (estimator,) = plan.data_cells, plan.estimators
-    errors = []
+    errors, reach = [], []
     for replicate in replicates:
-        record = cell.dataset(replicate).record
-        fit = estimator.estimator.prepare(record).fit(None)
-        covariance, _ = robust_covariance(fit.sensitivities, fit.residuals, regular=record.interval is not None)
-        errors.append(np.sqrt(np.diag(covariance)))
-    return np.array(errors)
+        uncertainty = estimator.estimator.prepare(cell.dataset(replicate).record).fit(None).uncertainty("robust")
+        errors.append(np.sqrt(np.diag(uncertainty.covariance)))
+        reach.append(student_quantile(uncertainty.degrees_of_freedom) / normal_quantile())
+    return np.array(errors), np.array(reach)
 
 
 def markdown(found: StudyResults) -> str:
