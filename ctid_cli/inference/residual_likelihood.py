@@ -28,7 +28,9 @@ ORDERS, RISES = 8, 3
 INSIDE = 0.9999
 #: Fisher's steps end where they promise less than this of the criterion, or after so many.
 PROMISE, STEPS = 1e-10, 60
-#: A model has no more than the record's samples over this for an order.
+#: Residuals of which the sensitivities leave less than this fraction are rounding.
+ROUNDING = 1e-12
+#: The greatest order is that of the samples over this, and half of the shortest experiment.
 SAMPLES_PER_ORDER = 10
 
 
@@ -120,15 +122,17 @@ def fit_residual_noise(psi: Sequence[Array], residuals: Sequence[Array]) -> Nois
     The order is that of the least AICc among those up to 8, until it has risen three times, and the one that Akaike's
     criterion chooses for the Yule-Walker model: the noise may have a memory much longer than its first lags show.
     """
-    power = sum(float(block @ block) for block in residuals)
-    if not power > 0:
-        return fit_noise_model(residuals)
-    stacked, unit = np.concatenate(psi), np.sqrt(power)
+    stacked, errors = np.concatenate(psi), np.concatenate(residuals)
     orthonormal = np.linalg.qr(stacked / np.linalg.norm(stacked, axis=0))[0]
-    columns = np.column_stack((orthonormal, np.concatenate(residuals) / unit))
+    # What the sensitivities explain tells nothing; away from an optimum it may be most.
+    left = errors - orthonormal @ (orthonormal.T @ errors)
+    power = float(left @ left)
+    if not power > ROUNDING**2 * float(errors @ errors):
+        return fit_noise_model(residuals, max_order=0)
+    columns = np.column_stack((orthonormal, left / np.sqrt(power)))
     blocks = np.split(columns, np.cumsum([len(block) for block in psi])[:-1])
-    most = min(len(block) for block in blocks) // SAMPLES_PER_ORDER
-    guess = _partial(fit_noise_model(residuals).coefficients)[:most]
+    most = min(len(errors) // SAMPLES_PER_ORDER, min(len(block) for block in blocks) // 2)
+    guess = _partial(fit_noise_model([block[:, -1] for block in blocks]).coefficients)[:most]
     products = _products(blocks, min(most, max(ORDERS, guess.size)))
     (count, size), number = columns.shape, len(blocks)
 
