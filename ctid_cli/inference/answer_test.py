@@ -6,6 +6,7 @@ answer is seen on simulated noise, searched in the same way: the search over pol
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
@@ -27,9 +28,12 @@ TIME_CONSTANTS, FREQUENCIES, DAMPINGS = 10, 8, (0.05, 0.3, 0.9)
 FEWEST_DELAYS, MOST_DELAYS = 12, 48
 #: Of longer records means over successive samples are tested, so many that at most this number is left.
 MOST_SAMPLES = 2000
-#: Share of the false alarms that is given to the test behind the whitening filter. After slow inputs it sees little;
-#: after fast ones in slow noise it alone sees anything.
-WHITENED = 0.2
+#: Shares of the false alarms that are given to the tests of the signals as they are, of what is new in them, and of
+#: the likelihood. The second alone sees anything after fast inputs in slow noise, and the third after few steps, where
+#: the output itself looks like slow noise and what the answer leaves of it does not.
+WEIGHTS = (0.4, 0.2, 0.4)
+#: Most lags of the autoregression in the likelihood.
+MOST_LAGS = 8
 #: Length of periodic noise over that of the record it stands for.
 PERIOD = 4
 #: Outliers are cut off at so many times the deviation from the median that nine samples in ten do not exceed.
@@ -38,6 +42,8 @@ CUT_OFF = 5.0
 FEWEST_SAMPLES = 8
 #: A response of which less than this share of the power is left beside offset and free response shows nothing.
 NOTHING_LEFT = 1e-8
+#: Power of the rounding of a signal, as a share of its own.
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,7 @@ class AnswerTest:
 
     #: Greatest share of the outputs' power about their means that one response explains [-].
     explained: float
-    #: The share that noise of the outputs' colour exceeds in one record of twenty [-].
+    #: The share that noise of the outputs' colour exceeds in one record of fifty [-].
     by_chance: float
     #: Probability that such noise is explained as well as the outputs [-]; nan where it cannot be tested, because there
     #: are fewer than eight samples, or no response can be told from an offset and a free response.
@@ -62,7 +68,7 @@ class AnswerTest:
         """What was found, and what noise alone reaches."""
         return (
             f"One simple response explains at most {100 * self.explained:.2g} % of the output's variance; noise of the "
-            f"output's colour reaches {100 * self.by_chance:.2g} % in one record of twenty."
+            f"output's colour reaches {100 * self.by_chance:.2g} % in one record of fifty."
         )
 
 
@@ -77,9 +83,10 @@ def answer_test(
     """Test the answer of the outputs to the inputs, at the used samples of records of one system.
 
     Each record has an offset of its own, and a free response where it is estimated. The largest share is looked for
-    in the signals as they are, and in the signals behind the filter that makes the output white; the smaller of the
-    two p-values, weighted, is compared with that of each series of noise. Samples count in their order: on an
-    irregular clock the noise is taken as stationary in it.
+    in the signals as they are, and in the signals behind the filter that makes the output white; a third test asks how
+    much likelier the output is with the response of the largest share. The smallest of the p-values, weighted, is
+    compared with that of each series of noise. Samples count in their order: on an irregular clock the noise is taken
+    as stationary in it.
     """
     rng = np.random.default_rng(SEED)
     outputs = [_Output.of(record, use, periodic, rng) for record, use in zip(records, used, strict=True)]
@@ -90,18 +97,38 @@ def answer_test(
     for pole in _poles(float(np.median(np.diff(longest))), float(np.ptp(longest))):
         count = int(np.clip(abs(pole) * np.ptp(delays) + 1, FEWEST_DELAYS, MOST_DELAYS))
         grid = np.unique(np.linspace(*delays, count))
-        parts = [output.regressed(pole, grid, free_response) for output in outputs]
+        parts = [output.beside_own(pole, grid, free_response) for output in outputs]
         for k, kind in enumerate(zip(*parts, strict=True)):
-            products, left, power, total = (sum(terms) for terms in zip(*kind, strict=True))
-            useful = left > NOTHING_LEFT * power
+            products = sum(part.responses.T @ part.series for part in kind)
+            power = sum(np.sum(part.responses**2, axis=0) for part in kind)
+            useful = power > NOTHING_LEFT * sum(part.whole for part in kind)
             testable |= bool(useful.any())
-            fit = (products[useful] ** 2 / left[useful, None]).max(axis=0, initial=0.0)
-            share = np.divide(fit, total, out=np.zeros_like(fit), where=total > 0.0)
-            shares[k] = np.maximum(shares[k], share)
-    # The two tests have one level: the smaller of their weighted p-values is compared with that of each series.
-    smaller = np.minimum(_p_values(shares[0]) / (1.0 - WHITENED), _p_values(shares[1]) / WHITENED)
-    p_value = float(np.mean(smaller <= smaller[0])) if testable else float("nan")
-    return AnswerTest(float(shares[0, 0]), float(np.quantile(shares[0, 1:], 1.0 - LEVEL)), p_value)
+            slopes = np.divide(products, power[:, None], out=np.zeros_like(products), where=useful[:, None])
+            best = np.argmax(slopes * products, axis=0)
+            fitted, total = np.max(slopes * products, axis=0), sum(np.sum(part.series**2, axis=0) for part in kind)
+            share = np.divide(fitted, total, out=np.zeros_like(total), where=total > 0.0)
+            better = np.flatnonzero(share > shares[k])
+            shares[k, better], best = share[better], best[better]
+            if k == 0:
+                for output, part in zip(outputs, kind, strict=True):
+                    answer = part.responses[:, best] * slopes[best, better]
+                    output.residual[:, better] = part.series[:, better] - answer
+    if not testable:
+        return AnswerTest(float("nan"), float("nan"), float("nan"))
+    statistics = zip((*shares, sum(output.likelihood_gain for output in outputs)), WEIGHTS, strict=True)
+    # The tests have one level: the smallest of their weighted p-values is compared with that of each series.
+    smallest = np.min([_p_values(statistic) / weight for statistic, weight in statistics], axis=0)
+    by_chance = float(np.quantile(shares[0, 1:], 1.0 - LEVEL * WEIGHTS[0]))
+    return AnswerTest(float(shares[0, 0]), by_chance, float(np.mean(smallest <= smallest[0])))
+
+
+class _BesideOwn(NamedTuple):
+    """Responses and series without what a record's own offset and free response explain, and the responses' power."""
+
+    responses: Array
+    series: Array
+    #: Power of the responses with it.
+    whole: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +144,8 @@ class _Output:
     noise: Array
     #: The output first, about its mean, then the noise, shape (n, 1 + SERIES); and what is new in each sample of them.
     series: Array
+    #: What the best response of all has left of them.
+    residual: Array
     new: Array
 
     @classmethod
@@ -142,28 +171,42 @@ class _Output:
         series -= series.mean(axis=0)
         # Each record weighs as its noise would: by the reciprocal of its variance.
         series /= np.where(np.any(series, axis=0), series.std(axis=0), 1.0)
-        return cls(signal, clock, t, noise, series, _filtered(series, noise))
+        return cls(signal, clock, t, noise, series, np.zeros_like(series), _filtered(series, noise))
 
-    def regressed(self, pole: complex, delays: Array, free_response: bool) -> Iterator[tuple[Array, ...]]:
-        """What regression on the responses needs, of the signals as they are and of what is new in them.
-
-        Products of responses and series, and powers of the responses beside offset and free response, of the responses
-        by themselves, and of the series.
-        """
+    def beside_own(self, pole: complex, delays: Array, free_response: bool) -> Iterator[_BesideOwn]:
+        """Responses of a pole at all delays beside the series: the signals as they are, then what is new in them."""
         denominator = np.real(np.poly([pole, pole.conjugate()] if pole.imag else [pole]))
         response = simulate(TransferFunction([1.0], denominator), self.signal, self.clock)
         responses = np.interp(self.t[:, None, :] - delays[:, None], self.clock, response, left=0.0).mean(axis=2)
-        nuisances = [np.ones(len(responses))]
+        own = [np.ones(len(responses))]
         if free_response and pole:
             free = np.exp(pole * (self.t.mean(axis=1) - self.t[0, 0]))
-            nuisances += [free.real, free.imag] if pole.imag else [free.real]
-        columns = np.column_stack([*nuisances, responses])
+            own += [free.real, free.imag] if pole.imag else [free.real]
+        columns = np.column_stack([*own, responses])
         for series, seen in ((self.series, columns), (self.new, _filtered(columns, self.noise))):
-            basis, _ = np.linalg.qr(seen[:, : len(nuisances)])
-            raw = seen[:, len(nuisances) :]
-            left = raw - basis @ (basis.T @ raw)
-            total = np.sum(series**2, axis=0) - np.sum((basis.T @ series) ** 2, axis=0)
-            yield left.T @ series, np.sum(left**2, axis=0), np.sum(raw**2, axis=0), total
+            basis, _ = np.linalg.qr(seen[:, : len(own)])
+            raw = seen[:, len(own) :]
+            yield _BesideOwn(raw - basis @ (basis.T @ raw), series - basis @ (basis.T @ series), np.sum(raw**2, axis=0))
+
+    @property
+    def likelihood_gain(self) -> Array:
+        """Twice the gain in log likelihood by the best response, of each series, with autoregressive noise."""
+        order = min(self.noise.size - 1, MOST_LAGS, len(self.series) // 10)
+        return len(self.series) * (_log_innovations(self.series, order) - _log_innovations(self.residual, order))
+
+
+def _log_innovations(columns: Array, order: int) -> Array:
+    """Logarithm of the power that autoregression by least squares leaves of each column, but for a constant.
+
+    Least squares, as Yule and Walker's equations leave far too much of slow noise.
+    """
+    lagged = [columns[order - k : len(columns) - k] for k in range(order + 1)]
+    lagged = [column - column.mean(axis=0) for column in lagged]
+    gram = np.array([[np.sum(one * other, axis=0) for one in lagged] for other in lagged]).transpose(2, 0, 1)
+    # Nothing is left of a column without noise.
+    gram += np.eye(order + 1) * (ROUNDING * gram[:, :1, :1] + np.finfo(float).tiny)
+    whole = np.linalg.slogdet(gram)[1]
+    return np.asarray(whole - np.linalg.slogdet(gram[:, 1:, 1:])[1] if order else whole)
 
 
 def _poles(interval: float, length: float) -> Iterator[complex]:
