@@ -75,7 +75,8 @@ def sampled_equations(problem: SampledProblem, theta: Array) -> Equations:
     a = np.ones(n + 1)
     a[1:] = theta[:n]
     b = theta[n : p - 1].copy()
-    moments = standard_moments(a, b, delay, problem.data, False, MODAL_CONDITION_LIMIT)
+    # Not the literal False, for which numba would compile all that lies below a second time.
+    moments = standard_moments(a, b, delay, problem.data, bool(0), MODAL_CONDITION_LIMIT)
     if not np.isfinite(moments).all():
         return inadmissible(p)
     # Standard rows of the sensitivities and of the regressors: dx/da_i = -p^(n-i)/A x with the measured output in the

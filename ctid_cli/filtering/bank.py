@@ -111,9 +111,9 @@ def _chain_rows(a: Array, b: Array, delay: float, data: FilterData, want_rows: b
         mapping[n, 2 * n + 1] = fraction
         # The states step by whole intervals whatever the delay.
         step = held_step(dynamics, gain, data.interval * w0)
-        regular_chain_pass(step, output_map, shift, n, data, sink)
+        regular_chain_pass(step, output_map, shift, data, sink)
     else:
-        irregular_chain_pass(dynamics, gain, output_map, delay * w0, n, in_unit(data, w0), sink)
+        irregular_chain_pass(dynamics, gain, output_map, delay * w0, in_unit(data, w0), sink)
     _fill_derivative(a, b, mapping)
     return _to_standard(mapping, sink, want_rows)
 

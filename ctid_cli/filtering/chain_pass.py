@@ -37,15 +37,15 @@ def _advance(step: HeldStep, value: float, change: float, state: Array, followin
 
 
 @njit(cache=True, nogil=True)
-def regular_chain_pass(
-    step: HeldStep, output_map: Array, shift: int, order: int, data: FilterData, sink: RowSink
-) -> None:
+def regular_chain_pass(step: HeldStep, output_map: Array, shift: int, data: FilterData, sink: RowSink) -> None:
     """Pass over a regular clock: rows ``[z, u, change of u, w, y - x]`` at the breaks, ``shift`` samples late.
 
     The fraction of an interval that the delay leaves is in the caller's maps of z, u and its change.
     """
-    nz, ny = step.from_value.size, order
     u, y, use, block, output = data.u, data.y, data.use, sink.block, sink.output
+    # The width of the rows tells how many of them are filters of the output: none where no row is wanted.
+    nz = step.from_value.size
+    ny = max(block.shape[0] - nz - 3, 0)
     last = u.size - 1
     z, z_next = np.zeros(nz), np.zeros(nz)
     w, w_next = np.zeros(ny), np.zeros(ny)
@@ -175,12 +175,13 @@ def _longest_step(t: Array, tu: Array, delay: float) -> float:
 
 @njit(cache=True, nogil=True)
 def irregular_chain_pass(
-    dynamics: Array, gain: Array, output_map: Array, delay: float, order: int, data: FilterData, sink: RowSink
+    dynamics: Array, gain: Array, output_map: Array, delay: float, data: FilterData, sink: RowSink
 ) -> None:
     """Pass over an irregular clock: rows ``[z, u, w, y - x]``; clocks and delay in the time unit of the dynamics."""
-    nz, ny = gain.size, order
     tu, u, t, y, use = data.tu, data.u, data.t, data.y, data.use
     block, output = sink.block, sink.output
+    nz = gain.size
+    ny = max(block.shape[0] - nz - 2, 0)
     longest = _longest_step(t, tu, delay)
     table = _transitions(dynamics, gain, longest)
     output_table = table

@@ -102,7 +102,7 @@ def _response(a: Array, b: Array, delay: float, data: FilterData) -> Array:
     nothing = np.zeros((0, 0))
     sink = RowSink(nothing, nothing, nothing, np.zeros(data.t.size))
     if data.interval == 0.0:
-        irregular_chain_pass(dynamics, gain, output_map, delay * w0, 0, in_unit(data, w0), sink)
+        irregular_chain_pass(dynamics, gain, output_map, delay * w0, in_unit(data, w0), sink)
         return sink.output
     shift, fraction = split_delay(delay, data.interval)
     # x at the instant that arrives now, from the states and the held input at the break before it.
@@ -111,5 +111,5 @@ def _response(a: Array, b: Array, delay: float, data: FilterData) -> Array:
     for i in range(n):
         for j in range(n + 2):
             readout[j] += output_map[i] * arrived[i, j]
-    regular_chain_pass(held_step(dynamics, gain, data.interval * w0), readout, shift, 0, data, sink)
+    regular_chain_pass(held_step(dynamics, gain, data.interval * w0), readout, shift, data, sink)
     return sink.output

@@ -128,16 +128,16 @@ def _unused(data: FilterData, y: Array) -> FilterData:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _periodic_states(
-    modes: PooledModes, submodels: int, loop: LoopData, fraction: float, data: FilterData
+    modes: PooledModes, submodels: int, loop: LoopData, shift: int, fraction: float, data: FilterData
 ) -> ComplexArray:
-    """States that come back after one period, of an input that is already late by whole intervals."""
+    """States that come back after one period."""
     count = data.y.size
     period = data.interval * count
     sink = row_sink(modes.layout.width, np.zeros(count, np.bool_), True)
     decay = np.exp(modes.poles * period)
     initial = np.zeros((modes.poles.size, 4), np.complex128)
     states = initial.copy()
-    _submodel_pass(modes, submodels, loop, 0, fraction, _unused(data, data.y), states, sink)
+    _submodel_pass(modes, submodels, loop, shift, fraction, _unused(data, data.y), states, sink)
     # z(T) = decay z(0) + what the period adds, the same at both ends; and w(T) = decay (w(0) + T z(0)) + …
     for i in range(decay.size):
         initial[i, 0] = states[i, 0] / (1.0 - decay[i])
@@ -145,7 +145,7 @@ def _periodic_states(
     # What filters see of the output depends on the output of the model, so it comes second; and once round, back at the
     # first sample.
     states = initial.copy()
-    _submodel_pass(modes, submodels, loop, 0, fraction, _unused(data, np.append(data.y, data.y[0])), states, sink)
+    _submodel_pass(modes, submodels, loop, shift, fraction, _unused(data, np.append(data.y, data.y[0])), states, sink)
     for i in range(decay.size):
         initial[i, 2] = states[i, 2] / (1.0 - decay[i])
     return initial
@@ -165,10 +165,10 @@ def filtered_submodels(
     sink = row_sink(layout.width, data.use, want_rows)
     if modes.condition < MODAL_CONDITION_LIMIT:
         shift, fraction = split_delay(delay, data.interval)
-        states = np.zeros((modes.poles.size, 4), np.complex128)
         # A periodic input comes already late by whole intervals, and begins in its steady state.
+        shift = 0 if periodic else shift
+        states = np.zeros((modes.poles.size, 4), np.complex128)
         if periodic:
-            shift = 0
-            states = _periodic_states(modes, submodels, loop, fraction, data)
+            states = _periodic_states(modes, submodels, loop, shift, fraction, data)
         _submodel_pass(modes, submodels, loop, shift, fraction, data, states, sink)
     return modes.condition, layout.error, modes.maps, sink.rows if want_rows else sink.gram
