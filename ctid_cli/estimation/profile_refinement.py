@@ -15,8 +15,8 @@ from ctid_cli.inference.loss import Weighting
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 
-#: Random starts of a search that fits the smaller models too, besides two for each pole.
-RANDOM_STARTS = 4
+#: Random starts, so many and so many for each pole, of a search that fits the smaller models too.
+RANDOM_STARTS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,13 +61,12 @@ class Refinement:
         A profile under an unknown initial state, an offset or a period has too few basins: smaller models help then.
         """
         (poles, zeros), records = (self.structure.poles, self.structure.zeros), self.problem.records
-        random = RANDOM_STARTS + 2 * poles
         options = replace(
             self.measured.options,
             starts=starts,
             nested=nested or not self.measured.plain,
             fewer_poles=nested,
-            random_starts=random if nested else 0,
+            random_starts=RANDOM_STARTS if nested else 0,
         )
         found = best_output_error(records, poles, zeros, options)
         agreed = found.ending.optimal and (found.agree > 1 or found.tried == 1)
@@ -75,7 +74,7 @@ class Refinement:
             return found
         # Where the starts disagree others are asked.
         starts = [(found.denominator, found.delay), *starts]
-        return best_output_error(records, poles, zeros, replace(options, starts=starts, random_starts=random))
+        return best_output_error(records, poles, zeros, replace(options, starts=starts, random_starts=RANDOM_STARTS))
 
     def local(self, near: Optimum) -> Optimum:
         """The least output error in the basin of an optimum of other outputs."""

@@ -11,7 +11,7 @@ from ctid_cli.estimation.optimum.box import Box, box_of, point_of
 from ctid_cli.estimation.optimum.chain import numerators
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import Ending, Judged
-from ctid_cli.estimation.optimum.starts import SAME, Nest, random_points
+from ctid_cli.estimation.optimum.starts import SAME, Nest
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.models.transfer_function import TransferFunction
 
@@ -33,7 +33,8 @@ class SearchOptions:
     nested: bool = True
     #: Whether the least of all is returned, so that the cost never rises with the structure, though with fewer poles.
     fewer_poles: bool = True
-    #: Further starts at random; by default ten and ten for each pole, and none where smaller models are left out.
+    #: Further starts at random, so many and so many for each pole, also of the smaller models; by default ten, and none
+    #: where smaller models are left out.
     random_starts: int | None = None
     seed: int = 0
 
@@ -85,14 +86,13 @@ def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, opt
     As many zeros as poles need a known delay. Free responses begin at the first used sample of each record.
     """
     problem, box = problem_of(records, zeros, options), box_of(records, options.delays)
-    nest = Nest(problem, box)
+    random = options.random_starts
+    nest = Nest(problem, box, (10 if options.nested else 0) if random is None else random, options.seed)
     points = [point_of(np.roots(np.asarray(a, dtype=float)).astype(complex), tau, box) for a, tau in options.starts]
-    count = options.random_starts
-    if count is None:
-        count = 10 + 10 * poles if options.nested else 0
-    points += random_points(poles, box, count, np.random.default_rng(options.seed))
     if options.nested or not points:
         nest.optima(poles, zeros)
+    else:
+        points += nest.random_points(poles)
     nest.refine(poles, zeros, points)
     best: Judged | None = None
     lost = 0

@@ -24,8 +24,8 @@ MOST_DELAYS = 100
 class Nest:
     """The optima of a structure and of all that it contains, each found from those below it."""
 
-    def __init__(self, problem: Problem, box: Box) -> None:
-        self.problem, self.box = problem, box
+    def __init__(self, problem: Problem, box: Box, random_starts: int, seed: int) -> None:
+        self.problem, self.box, self.random_starts, self.seed = problem, box, random_starts, seed
         self.evaluations = 0
         self._found: dict[tuple[int, int], list[Local]] = {}
         self._ends: dict[tuple[int, int], list[float]] = {}
@@ -39,7 +39,8 @@ class Nest:
         """The lowest minima of a structure that are known, the lowest first."""
         key = poles, zeros
         if key not in self._found:
-            self.refine(poles, zeros, self._from_below(poles, zeros))
+            # A larger structure must meet whatever this one finds by itself, at random too.
+            self.refine(poles, zeros, self._from_below(poles, zeros) + self.random_points(poles))
         return self._found[key]
 
     def _spine(self, poles: int) -> Local:
@@ -140,15 +141,14 @@ class Nest:
         lowest = minima[np.argsort(errors[minima])[:KEPT]]
         return points + [trials[k] for k in lowest.tolist()]
 
-
-def random_points(poles: int, box: Box, count: int, rng: np.random.Generator) -> list[Point]:
-    """Starts drawn uniformly from the set: logarithms of frequencies and dampings, delays."""
-    points = []
-    for _ in range(count):
-        pairs = int(rng.integers(0, poles // 2 + 1))
-        w = np.exp(rng.uniform(np.log(box.slowest), np.log(box.fastest), poles - pairs))
-        zeta = np.exp(rng.uniform(np.log(box.least_damping), 0.0, pairs))
-        upper = w[:pairs] * (-zeta + 1j * np.sqrt(1 - zeta**2))
-        roots = np.concatenate((upper, upper.conj(), -w[pairs:]))
-        points.append(point_of(roots, float(rng.uniform(*box.delays)), box))
-    return points
+    def random_points(self, poles: int) -> list[Point]:
+        """Starts drawn uniformly from the set: logarithms of frequencies and dampings, delays."""
+        rng, box, points = np.random.default_rng(self.seed), self.box, []
+        for _ in range(self.random_starts * (1 + poles)):
+            pairs = int(rng.integers(0, poles // 2 + 1))
+            w = np.exp(rng.uniform(np.log(box.slowest), np.log(box.fastest), poles - pairs))
+            zeta = np.exp(rng.uniform(np.log(box.least_damping), 0.0, pairs))
+            upper = w[:pairs] * (-zeta + 1j * np.sqrt(1 - zeta**2))
+            roots = np.concatenate((upper, upper.conj(), -w[pairs:]))
+            points.append(point_of(roots, float(rng.uniform(*box.delays)), box))
+        return points
