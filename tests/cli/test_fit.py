@@ -188,6 +188,7 @@ def test_a_bad_record_is_one_sentence(case, ctid, tmp_path):
         (("--poles", 2, "--from", 90), ["record.csv", "49.9"]),
         (("--poles", 2, "--output", "z"), ["record.csv", "'z'"]),
         (("--poles", 2, "--validate", "nowhere.csv"), ["nowhere.csv"]),
+        (("--poles", 2, "--bootstrap", 5), ["--bootstrap", "at least 40", "5"]),
     ],
 )
 def test_a_bad_option_is_one_sentence(arguments, expected, ctid, record, tmp_path):
