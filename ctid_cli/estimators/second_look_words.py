@@ -23,16 +23,18 @@ def of_second_look(
     """
     several = len(look.records) > 1
     words: list[str] = []
+    # Where the residuals pass the test that is printed nothing is said to be missing.
+    passed = len(tests) == len(look.records) and all(test.uncorrelated for test in tests)
+    poor = 0.0 if passed else max(_poor_share(one) for one in look.records)
     for k, one in enumerate(look.records):
-        test = tests[k] if len(tests) == len(look.records) else None
-        found = _of_record(one, look, options, fit, test) if answered else _of_faults(one)
+        found = _of_record(one, look, options, fit, poor) if answered else _of_faults(one)
         words += [f"Experiment {k + 1}: {sentence}" if several else sentence for sentence in found]
     if not answered:
         return words
     diverges = any(one.growth_time > 0 for one in look.records)
     if look.integrator > 0 and not diverges:
         words.append(_of_integrator(look, options, fit))
-    if look.other_hold and not any(_faulty(one) or _poor_share(one) > look.other_hold for one in look.records):
+    if look.other_hold and poor <= look.other_hold and not any(_faulty(one) for one in look.records):
         now, other = ("held", "foh") if one.examined.record.input.hold == "zoh" else ("along straight lines", "zoh")
         words.append(
             f"Taken as {'straight lines between its samples' if other == 'foh' else 'held'}, not as {now}, the input "
@@ -42,7 +44,7 @@ def of_second_look(
 
 
 def _of_record(
-    one: RecordLook, look: SecondLook, options: DelayProfile, fit: MeasuredFit, test: ResidualTests | None
+    one: RecordLook, look: SecondLook, options: DelayProfile, fit: MeasuredFit, poor: float
 ) -> Iterator[str]:
     if one.growth_time > 0:
         yield (
@@ -59,7 +61,7 @@ def _of_record(
             "Record the reference, and use srivc or additive_srivc with instruments: closed_loop in an experiment "
             "(ctid run); without a controller, look at the time stamps."
         )
-    elif _poor_share(one) > look.other_hold and not _faulty(one) and (test is None or not test.uncorrelated):
+    elif poor > look.other_hold and _poor_share(one):
         yield _of_structure(one, options, fit)
     if one.drift and not look.integrator > 0:
         yield (
@@ -76,7 +78,7 @@ def _of_faults(one: RecordLook) -> Iterator[str]:
         where = ", ".join(f"{t:.6g}" for t, _ in one.outliers[:3]) + (", ..." if many > 3 else "")
         what = f"{many} output samples are outliers" if many > 1 else "1 output sample is an outlier"
         size = f"{'up to ' if many > 1 else ''}{one.outliers[:, 1].max():.3g} away from the neighbours"
-        yield f"{what} (t = {where}), {size}: {empty}, or use --loss tukey, which counts them for nothing."
+        yield f"{what} (t = {where}), {size}: leave faults of the sensor empty, or use --loss tukey."
     if report.saturated and report.input_kind not in ("constant", "steps"):
         share = f"{100 * report.saturated:.2g} % of the output samples sit exactly at the least or greatest value"
         yield f"{share}, as at a limit of the sensor: {empty}, or repeat the record with a smaller input."
@@ -110,9 +112,9 @@ def _chance_of_feedback(one: RecordLook) -> float:
 
 
 def _poor_share(one: RecordLook) -> float:
-    """Share of the residuals' variance that one more pole would explain; 0 where that may be chance."""
+    """Share of the residuals' variance that one more pole would explain; 0 where that may be chance or a fault."""
     found = one.dependence
-    if found is None or not found.pole_p_value < TOO_POOR or found.pole_share < WORTH_A_POLE:
+    if found is None or _faulty(one) or not found.pole_p_value < TOO_POOR or found.pole_share < WORTH_A_POLE:
         return 0.0
     return found.pole_share
 
