@@ -11,7 +11,9 @@ from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.hold_comparison import fall_with_other_hold
 from ctid_cli.inference import faults
 from ctid_cli.inference.input_dependence import InputDependence, input_dependence
-from ctid_cli.inference.record_check import SIGNIFICANT, Examined, examine, trend
+from ctid_cli.inference.noise_model import fit_noise_model
+from ctid_cli.inference.record_check import SIGNIFICANT, Examined, examine
+from ctid_cli.inference.residuals import dependence
 from ctid_cli.signals.record import Record
 
 #: A drift of the residuals counts from this many of their standard deviations on.
@@ -59,17 +61,33 @@ def _look(record: Record, fit: MeasuredFit, k: int) -> RecordLook:
     e, psi, use = fit.residuals[k], fit.sensitivities[k], fit.used[k]
     t, y = record.t[use], record.y[use]
     found, off = faults.residual_outliers(e)
-    slope, error, _ = trend(t, e)
-    drift = slope * float(t[-1] - t[0]) / float(e.std() or 1.0)
-    drifts = abs(slope) > SIGNIFICANT * error and abs(drift) > DRIFT
     return RecordLook(
         examine(record),
         np.column_stack((t[found], np.abs(off))),
         t[faults.stood_still(y)],
         faults.growth_time(t, y, record.input.at(t)),
-        drift if drifts else 0.0,
+        _drift(e, psi, t),
         input_dependence(e, y - e, psi, t, record, fit.model.delay),
     )
+
+
+def _drift(e: Array, psi: Array, t: Array) -> float:
+    """Change along a straight line over the record [standard deviations of the rest]; 0 where that may be chance.
+
+    What the parameters can have taken of the line is allowed for: it is freed of their sensitivities.
+    """
+    beside = np.column_stack((np.ones(t.size), psi))
+    line = ((t - t.mean()) / float(t[-1] - t[0]))[:, None]
+    both = np.column_stack((beside, line))
+    both = both / np.maximum(np.linalg.norm(both, axis=0), np.finfo(float).tiny)
+    weights = np.linalg.lstsq(both, e, rcond=None)[0]
+    rest = e - both @ weights
+    noise = fit_noise_model([rest])
+    if not noise.innovation_variance > 0:
+        return 0.0
+    drift = float(weights[-1] / np.linalg.norm(line) / rest.std())
+    significant = dependence(e, line, noise, beside).statistic > SIGNIFICANT**2
+    return drift if significant and abs(drift) > DRIFT else 0.0
 
 
 def _integrator(fit: MeasuredFit, records: Sequence[Record]) -> float:

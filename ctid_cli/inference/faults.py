@@ -12,7 +12,7 @@ OUTLIER = 10.0
 #: So many samples of one value are a recorder that stood still, if neighbours are otherwise alike this seldom.
 STILL, SELDOM_ALIKE = 6, 0.02
 #: A part of the record in which an unstable plant grows by less than this is not told from a polynomial in time.
-GROWTH = 2.5
+GROWTH = 4.0
 
 
 def outliers(y: Array) -> IntArray:
@@ -46,17 +46,20 @@ def residual_outliers(e: Array) -> tuple[IntArray, Array]:
 
 
 def saturated(y: Array) -> float:
-    """Fraction of the samples that a limit seems to have cut off."""
+    """Fraction of the samples that a limit seems to have cut off; the output may begin at rest at its least value."""
     values, counts = np.unique(y, return_counts=True)
     if values.size < 10:
         return 0.0
+    # Where no other value comes twice, single samples tell as much as runs do.
+    alone = float(np.mean(counts[1:-1] == 1)) > 1 - SELDOM_ALIKE
+    shortest, fewest = (1, 5) if alone else (5, 0.01 * y.size)
     total = 0
     for k, inner in ((0, 1), (-1, -2)):
         at = y == values[k]
         edges = np.flatnonzero(np.diff(np.concatenate(([0], at.astype(int), [0]))))
-        runs = edges[1::2] - edges[::2]
-        in_runs = int(runs[runs >= 5].sum())
-        if in_runs >= 0.01 * y.size and counts[k] > 5 * counts[inner]:
+        first, runs = edges[::2], edges[1::2] - edges[::2]
+        in_runs = int(runs[(runs >= shortest) & (first > 0)].sum())
+        if in_runs >= fewest and counts[k] > 5 * counts[inner]:
             total += in_runs
     return total / y.size
 
@@ -89,7 +92,7 @@ def growth_time(t: Array, y: Array, u: Array) -> float:
     driven, grown = sizes
     steps = np.diff(grown)
     # An exponential grows in the same ratio all the time; powers of time ever more slowly, and a late event at once.
-    even = steps[-2:].min() > 0.4 * steps[-2:].max() and steps[-2:].sum() > 0.8 * steps[:2].sum()
+    even = steps[-2:].min() > 0.5 * steps[-2:].max() and steps[-2:].sum() > 0.8 * steps[:2].sum()
     by_itself = grown[-1] - grown[-3] > max(math.log(GROWTH), 2 * (driven[-1] - driven[-3]))
     return float((t[-1] - t[0]) / 4 / (grown[-1] - grown[-3])) if even and by_itself else math.nan
 

@@ -148,7 +148,7 @@ def examine(record: Record) -> Examined:
     interval = float(np.median(steps))
     long = np.flatnonzero(steps > LONG_INTERVAL * interval)
     deviation = float(present.std())
-    slope, error, mean_error = trend(t[record.valid], present)
+    slope, error, mean_error = _trend(t[record.valid], present)
     explained = min(answer.explained, 1 - 1e-9) if answer.explained > 0 else math.nan
     starts = _start(record, answer, deviation, explained)
     seldom = moves.kind in ("constant", "steps")
@@ -218,7 +218,7 @@ def _excitation_order(record: Record, moves: InputMoves, answer: Answer) -> int:
     return int(np.count_nonzero(strength > 1e-4 * strength[-1]))
 
 
-def trend(t: Array, y: Array) -> tuple[float, float, float]:
+def _trend(t: Array, y: Array) -> tuple[float, float, float]:
     """Slope of the straight line through the samples, and the standard errors of slope and mean.
 
     They allow for the correlation of the residuals, as seen in the order of the samples.

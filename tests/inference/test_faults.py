@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from ctid_cli.inference.faults import growth_time, outliers, residual_outliers, stood_still
+from ctid_cli.inference.faults import growth_time, outliers, residual_outliers, saturated, stood_still
 
 
 def test_one_sample_in_twenty_may_be_wild():
@@ -21,6 +21,15 @@ def test_one_sample_in_twenty_may_be_wild():
 def test_peaks_of_smooth_residuals_are_no_outliers():
     e = lfilter([1.0], np.poly([0.95, 0.95, 0.9]), np.random.default_rng(1).standard_normal(400))
     assert residual_outliers(e)[0].size == 0
+
+
+def test_a_few_samples_at_one_limit_are_cut_off():
+    y = np.random.default_rng(3).standard_normal(400)
+    limit = np.sort(y)[-6]
+    assert saturated(y) == 0
+    assert saturated(np.minimum(y, limit)) == 6 / 400
+    # An output at rest before it moves may lie below all that follows.
+    assert saturated(np.concatenate((np.full(40, y.min() - 1), y))) == 0
 
 
 def test_a_run_of_one_value_is_a_recorder_that_stood_still():
