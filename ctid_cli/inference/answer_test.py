@@ -105,14 +105,14 @@ def answer_test(
             testable |= bool(useful.any())
             slopes = np.divide(products, power[:, None], out=np.zeros_like(products), where=useful[:, None])
             best = np.argmax(slopes * products, axis=0)
-            fitted, total = np.max(slopes * products, axis=0), sum(np.sum(part.series**2, axis=0) for part in kind)
+            fitted, total = np.max(slopes * products, axis=0), sum(part.total for part in kind)
             share = np.divide(fitted, total, out=np.zeros_like(total), where=total > 0.0)
             better = np.flatnonzero(share > shares[k])
             shares[k, better], best = share[better], best[better]
             if k == 0:
                 for output, part in zip(outputs, kind, strict=True):
                     answer = part.responses[:, best] * slopes[best, better]
-                    output.residual[:, better] = part.series[:, better] - answer
+                    output.residual[:, better] = part.without_own(part.series[:, better]) - answer
     if not testable:
         return AnswerTest(float("nan"), float("nan"), float("nan"))
     statistics = zip((*shares, sum(output.likelihood_gain for output in outputs)), WEIGHTS, strict=True)
@@ -123,12 +123,25 @@ def answer_test(
 
 
 class _BesideOwn(NamedTuple):
-    """Responses and series without what a record's own offset and free response explain, and the responses' power."""
+    """Responses and series of a record, and what its own offset and free response explain of them."""
 
+    #: Without what these explain, shape (n, d), and their power with it.
     responses: Array
-    series: Array
-    #: Power of the responses with it.
     whole: Array
+    #: With what these explain, shape (n, 1 + SERIES).
+    series: Array
+    #: Orthonormal columns that span offset and free response.
+    own: Array
+
+    @property
+    def total(self) -> Array:
+        """Power of the series without what is the record's own."""
+        power: Array = np.einsum("ij,ij->j", self.series, self.series)
+        return power - np.sum((self.own.T @ self.series) ** 2, axis=0)
+
+    def without_own(self, columns: Array) -> Array:
+        """Columns without offset and free response."""
+        return columns - self.own @ (self.own.T @ columns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +199,7 @@ class _Output:
         for series, seen in ((self.series, columns), (self.new, _filtered(columns, self.noise))):
             basis, _ = np.linalg.qr(seen[:, : len(own)])
             raw = seen[:, len(own) :]
-            yield _BesideOwn(raw - basis @ (basis.T @ raw), series - basis @ (basis.T @ series), np.sum(raw**2, axis=0))
+            yield _BesideOwn(raw - basis @ (basis.T @ raw), np.sum(raw**2, axis=0), series, basis)
 
     @property
     def likelihood_gain(self) -> Array:
