@@ -136,8 +136,9 @@ class _BesideOwn(NamedTuple):
     @property
     def total(self) -> Array:
         """Power of the series without what is the record's own."""
-        power: Array = np.einsum("ij,ij->j", self.series, self.series)
-        return power - np.sum((self.own.T @ self.series) ** 2, axis=0)
+        whole: Array = np.einsum("ij,ij->j", self.series, self.series)
+        along: Array = np.sum((self.own.T @ self.series) ** 2, axis=0)
+        return whole - along
 
     def without_own(self, columns: Array) -> Array:
         """Columns without offset and free response."""
