@@ -1,0 +1,257 @@
+"""Is the estimate the optimum? Random systems against an optimiser that shares no line with ctid, in the same box.
+
+    python benchmarks/bench_optimum.py [--systems 100] [--seed 1] [--starts 3]
+
+For each system the least output error of ``DelayProfile(nested=True)`` is compared with what ``scipy.optimize`` reaches
+from the true poles, from random ones, and from ctid's own estimate: variable projection on columns of modal responses,
+Jacobians by differences. The peer knows the truth and ctid does not. A line is printed for each system where ctid is
+above the peer by more than a millionth, and a summary at the end.
+"""
+
+import argparse
+import time
+import warnings
+from collections import Counter
+
+import numpy as np
+from numba import njit
+from scipy.optimize import least_squares
+
+from ctid_cli import DataError, DelayProfile, HeldSignal, Record, TransferFunction
+
+TOLERANCE = 1e-6
+
+
+# --- the peer ----------------------------------------------------------------------------------------
+
+
+@njit(cache=True)
+def modal_responses(poles, tu, u, t, delay, period):
+    """Responses of 1/(s - p) to a held input at the samples, at rest before or repeating for ever."""
+    out = np.empty((t.size, poles.size), np.complex128)
+    edges = tu + delay
+    for k in range(poles.size):
+        p, v = poles[k], 0.0 + 0.0j
+        for lap in range(2 if period > 0 else 1):
+            if period > 0:
+                # Up to the first sample, what the end of the last period has left is still held.
+                begin = t[0]
+                j = -1
+                shift = 0.0
+                while edges[0] + shift > begin:
+                    shift -= period
+                while j + 1 < tu.size and edges[j + 1] + shift <= begin:
+                    j += 1
+            else:
+                begin, j, shift = edges[0], 0, 0.0
+                if edges[0] > t[0]:
+                    begin, j = t[0], -1
+            now, i = begin, 0
+            start = v
+            last = t[0] + period if period > 0 else t[-1]
+            while True:
+                following = edges[j + 1] + shift if j + 1 < tu.size else np.inf
+                if j + 1 == tu.size and period > 0:
+                    following = edges[0] + shift + period
+                target = min(following, t[i] if i < t.size else np.inf)
+                target = min(target, last)
+                held = u[j] if j >= 0 else 0.0
+                e = np.exp(p * (target - now))
+                v = e * v + (e - 1.0) / p * held
+                now = target
+                if i < t.size and now == t[i]:
+                    out[i, k] = v
+                    i += 1
+                if now == following:
+                    j += 1
+                    if j == tu.size:
+                        j, shift = 0, shift + period
+                if (period > 0 and now >= last) or (period == 0.0 and i == t.size):
+                    break
+            if period > 0 and lap == 0:
+                v = (v - start * np.exp(p * period)) / (1.0 - np.exp(p * period))
+    return out
+
+
+class Peer:
+    """Squared error over poles and delay, everything linear eliminated."""
+
+    def __init__(self, record, options, box):
+        self.record, self.options, self.box = record, options, box
+        first = record.input.t[0] + (options.delay_bounds[1] if options.initial_state == "estimate" else 0.0)
+        self.use = record.t >= first - 1e-9
+        periodic = options.initial_state == "periodic"
+        self.period = record.duration + (record.interval or float(np.median(np.diff(record.t)))) if periodic else 0.0
+        low, high = options.delay_bounds
+        self.free_delay = low < high
+
+    def residual(self, poles, delay):
+        t, u = self.record.t, self.record.input
+        v = modal_responses(poles, u.t, u.values, t, delay, self.period)[self.use]
+        columns = []
+        slopes = np.array([np.prod(np.delete(p - poles, k)) for k, p in enumerate(poles)])
+        middle = np.exp(np.mean(np.log(np.abs(poles))))
+        for power in range(self.options.zeros + 1):
+            columns.append((v @ ((poles / middle) ** power / slopes)).real)
+        used = t[self.use]
+        if self.options.initial_state == "estimate":
+            free = np.exp(np.outer(used - used[0], poles))
+            columns += [(free @ ((poles / middle) ** k / slopes)).real for k in range(poles.size)]
+        if self.options.offset == "estimate":
+            columns.append(np.ones(used.size))
+        phi, y = np.column_stack(columns), self.record.y[self.use]
+        phi = phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
+        if not np.isfinite(phi).all():
+            # Poles that coincide have no modal responses of their own.
+            return y
+        return y - phi @ np.linalg.lstsq(phi, y, rcond=1e-13)[0]
+
+    def polished(self, poles, delay):
+        """Least squared error from given poles and delay, within the box."""
+        pairs, reals = poles[poles.imag > 0], -poles[poles.imag == 0].real
+        n, r, box = pairs.size, reals.size, self.box
+        frequencies = np.log(np.concatenate((np.abs(pairs), reals)))
+        start, low, high = [frequencies], [np.full(n + r, np.log(box.slowest))], [np.full(n + r, np.log(box.fastest))]
+        start.append(np.log(-pairs.real / np.abs(pairs)))
+        low.append(np.full(n, np.log(box.least_damping)))
+        high.append(np.zeros(n))
+        scale = np.ones(2 * n + r + self.free_delay)
+        if self.free_delay:
+            start.append(np.array([delay]))
+            low.append(self.options.delay_bounds[:1])
+            high.append(self.options.delay_bounds[1:])
+            scale[-1] = box.quarter
+        low, high = np.concatenate(low), np.concatenate(high)
+
+        def residual(x):
+            w, zeta = np.exp(x[:n]), np.minimum(np.exp(x[n + r : 2 * n + r]), 1 - 1e-9)
+            upper = w * (-zeta + 1j * np.minimum(np.sqrt(1 - zeta**2), box.nyquist / w))
+            roots = np.concatenate((upper, upper.conj(), -np.exp(x[n : n + r]))).astype(complex)
+            return self.residual(roots, float(x[-1]) if self.free_delay else delay)
+
+        begin = np.clip(np.concatenate(start), low + 1e-12, high - 1e-12)
+        ends = {"xtol": 1e-12, "ftol": 1e-12, "gtol": 1e-14, "max_nfev": 150}
+        return 2.0 * least_squares(residual, begin, bounds=(low, high), x_scale=scale, **ends).cost
+
+
+# --- systems -----------------------------------------------------------------------------------------
+
+
+def random_case(rng):
+    """A record, its true model, and the options that belong to it."""
+    n = int(rng.integers(1, 9))
+    samples = int(np.exp(rng.uniform(np.log(80), np.log(20000) if rng.random() < 0.15 else np.log(2500))))
+    treatment = str(rng.choice(["rest", "estimate", "periodic"], p=[0.5, 0.3, 0.2]))
+    offset = "estimate" if rng.random() < 0.3 else "none"
+    n = min(n, max(1, (samples // 10 - 3) // (3 if treatment == "estimate" else 2)))
+    h = 10.0 ** rng.uniform(-3, 1)
+    poles = []
+    while len(poles) < n:
+        w = np.exp(rng.uniform(np.log(6 / (samples * h)), np.log(1.0 / h)))
+        kind = rng.choice(["real", "pair", "light", "close"])
+        if kind in ("pair", "light") and n - len(poles) >= 2:
+            zeta = rng.uniform(0.1, 0.95) if kind == "pair" else 10 ** rng.uniform(-2, -1)
+            poles += [w * complex(-zeta, s * np.sqrt(1 - zeta**2)) for s in (1, -1)]
+        elif kind == "close" and n - len(poles) >= 2:
+            poles += [complex(-w), complex(-w * 1.1)]
+        else:
+            poles.append(complex(-w))
+    poles = np.array(poles)
+    zeros = int(rng.integers(0, min(n, 4)))
+    middle = np.exp(np.mean(np.log(np.abs(poles))))
+    b = np.atleast_1d(np.poly(-middle * np.exp(rng.uniform(-1.5, 1.5, zeros)) * rng.choice([1, -1], zeros)))
+    a = np.real(np.poly(poles))
+    b = b / b[-1] * a[-1]
+    kind = rng.choice(["none", "known", "searched"])
+    delay = 0.0 if kind == "none" else float(rng.uniform(0, 8 * h))
+    bounds = (delay, delay) if kind != "searched" else (0.0, 12 * h)
+    t = h * np.arange(samples)
+    if rng.random() < 0.3 and treatment != "periodic":
+        t = np.concatenate(([0.0], np.cumsum(h * rng.uniform(0.3, 1.7, samples - 1))))
+    hold = int(rng.integers(1, max(2, samples // 20)))
+    u = np.repeat(rng.choice([-1.0, 1.0], samples // hold + 1), hold)[:samples]
+    held = HeldSignal(t, u)
+    model = TransferFunction(b, a, delay)
+    period = samples * h if treatment == "periodic" else 0.0
+    v = modal_responses(poles, t, u, t, delay, period)
+    slopes = np.array([np.prod(np.delete(p - poles, k)) for k, p in enumerate(poles)])
+    x = (v @ (np.polyval(b, poles) / slopes)).real
+    if treatment == "estimate":
+        size = rng.standard_normal() * np.std(x) / np.abs(1 / slopes).sum()
+        x = x + size * (np.exp(np.outer(t, poles)) @ (1 / slopes)).real
+    x = x + (rng.uniform(-2, 2) * np.std(x) if offset == "estimate" else 0.0)
+    e = rng.standard_normal(samples)
+    if rng.random() < 0.3:
+        for k in range(1, samples):
+            e[k] += 0.8 * e[k - 1]
+    y = x + e / e.std() * x.std() * 10 ** (-rng.uniform(5, 40) / 20)
+    options = DelayProfile(n, zeros, bounds, initial_state=treatment, offset=offset, nested=True)
+    return Record(t, y, held), model, options
+
+
+def random_poles(rng, n, box):
+    pairs = int(rng.integers(0, n // 2 + 1))
+    w = np.exp(rng.uniform(np.log(box.slowest), np.log(min(box.fastest, box.nyquist)), n - pairs))
+    zeta = np.exp(rng.uniform(np.log(0.01), np.log(0.95), pairs))
+    upper = w[:pairs] * (-zeta + 1j * np.sqrt(1 - zeta**2))
+    return np.concatenate((upper, upper.conj(), -w[pairs:])).astype(complex)
+
+
+def compared(number, rng, peer_starts):
+    """One system: the status of ctid's estimate, its squared error over the peer's, and what to say of it."""
+    record, truth, options = random_case(rng)
+    began = time.process_time()
+    fit = options.fit(record)
+    spent = time.process_time() - began
+    ours, peer = fit.cost * fit.count, Peer(record, options, fit.box)
+    here = peer.residual(fit.model.poles, fit.model.delay)
+    starts = {"the truth": (truth.poles, truth.delay), "ctid's own": (fit.model.poles, fit.model.delay)}
+    for k in range(peer_starts):
+        delay = float(rng.uniform(*options.delay_bounds))
+        starts[f"random start {k}"] = (random_poles(rng, options.poles, fit.box), delay)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        reached = {name: peer.polished(*start) / ours - 1 for name, start in starts.items()}
+    least = min(reached, key=reached.get)
+    clock = "regular" if record.interval else "irregular"
+    said = (
+        f"{number}: {options.poles}/{options.zeros}, {record.n_samples} samples, {clock}, "
+        f"delay {options.delay_bounds}, state {options.initial_state}, offset {options.offset}: {fit.status.name}, "
+        f"{fit.starts.agree} of {fit.starts.tried} starts, {spent:.1f} s; best of the peer {reached[least]:+.1e} from "
+        f"{least}, truth {reached['the truth']:+.1e}, the same model {float(here @ here) / ours - 1:+.1e}"
+    )
+    return fit.status.name, reached, spent, said
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--systems", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0, help="number of the first system")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--starts", type=int, default=3, help="random starts of the peer")
+    parser.add_argument("--verbose", action="store_true", help="a line for each system")
+    asked = parser.parse_args()
+    warnings.simplefilter("error")
+    statuses, above, truth_missed, seconds = Counter(), 0, 0, 0.0
+    for number in range(asked.first, asked.first + asked.systems):
+        try:
+            status, reached, spent, said = compared(number, np.random.default_rng([asked.seed, number]), asked.starts)
+        except DataError as error:
+            statuses["refused"] += 1
+            print(f"{number}: refused: {error}", flush=True)
+            continue
+        statuses[status] += 1
+        seconds += spent
+        beaten = min(reached.values()) < -TOLERANCE
+        above += beaten
+        truth_missed += reached["the truth"] > TOLERANCE
+        if beaten or asked.verbose:
+            print(f"{'ABOVE ' if beaten else ''}{said}", flush=True)
+    print(
+        f"{asked.systems} systems: above the peer in {above}; below what the peer reaches from the truth in "
+        f"{truth_missed}; {dict(statuses)}; {seconds:.0f} CPU s"
+    )
+
+
+if __name__ == "__main__":
+    main()
