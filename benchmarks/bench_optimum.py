@@ -125,7 +125,7 @@ class Peer:
 
         def residual(x):
             w, zeta = np.exp(x[:n]), np.minimum(np.exp(x[n + r : 2 * n + r]), 1 - 1e-9)
-            upper = w * (-zeta + 1j * np.minimum(np.sqrt(1 - zeta**2), box.nyquist / w))
+            upper = w * (-zeta + 1j * np.minimum(np.sqrt(1 - zeta**2), box.imaginary / w))
             roots = np.concatenate((upper, upper.conj(), -np.exp(x[n : n + r]))).astype(complex)
             return self.residual(roots, float(x[-1]) if self.free_delay else delay)
 
@@ -191,7 +191,7 @@ def random_case(rng):
 
 def random_poles(rng, n, box):
     pairs = int(rng.integers(0, n // 2 + 1))
-    w = np.exp(rng.uniform(np.log(box.slowest), np.log(min(box.fastest, box.nyquist)), n - pairs))
+    w = np.exp(rng.uniform(np.log(box.slowest), np.log(min(box.fastest, box.imaginary)), n - pairs))
     zeta = np.exp(rng.uniform(np.log(0.01), np.log(0.95), pairs))
     upper = w[:pairs] * (-zeta + 1j * np.sqrt(1 - zeta**2))
     return np.concatenate((upper, upper.conj(), -w[pairs:])).astype(complex)

@@ -172,7 +172,7 @@ def _box_object(box: Box) -> dict[str, Any]:
     """The set of models in which the estimate is the best, null for what has no bound."""
     return {
         "poles": (box.slowest, box.fastest),
-        "imaginary_part": box.nyquist if np.isfinite(box.nyquist) else None,
+        "imaginary_part": box.imaginary if np.isfinite(box.imaginary) else None,
         "damping": box.least_damping,
         "delay": box.delays,
     }
@@ -180,7 +180,7 @@ def _box_object(box: Box) -> dict[str, Any]:
 
 def _box_text(box: Box, units: Units) -> str:
     rate = f"rad/{units.time}"
-    swing = f", imaginary parts up to {box.nyquist:.4g} {rate}" if np.isfinite(box.nyquist) else ""
+    swing = f", imaginary parts up to {box.imaginary:.4g} {rate}" if np.isfinite(box.imaginary) else ""
     poles = f"poles from {box.slowest:.4g} to {box.fastest:.4g} {rate}{swing}"
     return f"{poles}; pairs with a damping of at least {box.least_damping:g}"
 

@@ -1,13 +1,14 @@
 r"""The stated set of admissible models, and the coordinates in which it is searched.
 
 Poles have magnitudes between the reciprocal of the record's length and ten over its interval; pairs a damping of .001
-at least and, on a regular clock, no more than the Nyquist frequency for an imaginary part: beyond it samples cannot
-tell a fast oscillation from a slow decay. The delay lies between its bounds. Without such a set an optimum need not
-exist: with a free initial state an undamped or a very slow pole fits noise, ever better.
+at least and, on a regular clock, an imaginary part of .999 of the Nyquist frequency at most: beyond it samples cannot
+tell a fast oscillation from a slow decay, and at it they see no phase. The delay lies between its bounds. Without such
+a set an optimum need not exist: with a free initial state an undamped or a very slow pole fits noise, ever better.
 
 A pair has the coordinates ln w and ln zeta, which pass a damping of 1 smoothly; so two real poles near each other are a
-section too. Real poles further apart, or at a bound of the set, have ln p each, and a pair at the Nyquist frequency has
-the logarithms of its real and imaginary part: in these coordinates the set is a box wherever its border is met.
+section too. Real poles further apart, or at a bound of the set, have ln p each, and a pair with the greatest imaginary
+part has the logarithms of its real and imaginary part: in these coordinates the set is a box wherever its border is
+met.
 """
 
 from collections.abc import Sequence
@@ -23,6 +24,8 @@ from ctid_cli.filtering.filter_data import FilterData
 
 #: Fastest pole times the sampling interval, slowest times the record's length, least damping of a pair.
 FASTEST, SLOWEST, LEAST_DAMPING = 10.0, 1.0, 1e-3
+#: Greatest imaginary part of a pole over the Nyquist frequency.
+GREATEST_IMAGINARY = 0.999
 #: Real poles whose ratio is below this share a section.
 NEAR = 4.0
 #: A coordinate this close to a bound is at it.
@@ -36,7 +39,7 @@ class Box:
     slowest: float
     fastest: float
     #: Greatest imaginary part [rad/s].
-    nyquist: float = np.inf
+    imaginary: float = np.inf
     delays: tuple[float, float] = (0.0, 0.0)
     #: Sampling interval [s] where the cost has kinks at whole intervals of delay, else 0.
     cell: float = 0.0
@@ -145,10 +148,10 @@ def box_of(records: Sequence[FilterData], delays: tuple[float, float]) -> Box:
             rate = max(rate, float(np.sqrt(np.sum(np.diff(data.y) ** 2 / steps) / power)))
         cells.add(data.interval)
     quarter = min(0.5 * np.pi / rate if rate > 0 else length, delays[1] - delays[0])
-    nyquist = np.pi / interval if min(cells) > 0 else np.inf
+    greatest = GREATEST_IMAGINARY * np.pi / interval if min(cells) > 0 else np.inf
     # Clocks of different intervals have their kinks all over the place.
     cell = cells.pop() if len(cells) == 1 else 0.0
-    return Box(SLOWEST / length, FASTEST / interval, nyquist, delays, cell, max(quarter, interval))
+    return Box(SLOWEST / length, FASTEST / interval, greatest, delays, cell, max(quarter, interval))
 
 
 def admissible(poles: ComplexArray, box: Box) -> ComplexArray:
@@ -158,9 +161,9 @@ def admissible(poles: ComplexArray, box: Box) -> ComplexArray:
     damping = np.maximum(-poles.real / np.maximum(np.abs(poles), 1e-300), box.least_damping)
     swing = size * np.sqrt(np.maximum(1 - damping**2, 0.0))
     # At the greatest imaginary part the real part stays.
-    over = swing > box.nyquist
-    swing = np.where(over, box.nyquist, swing)
-    decay = np.where(over, np.maximum(size * damping, box.nyquist * box.least_damping), size * damping)
+    over = swing > box.imaginary
+    swing = np.where(over, box.imaginary, swing)
+    decay = np.where(over, np.maximum(size * damping, box.imaginary * box.least_damping), size * damping)
     return np.where(real, -size + 0j, -decay + 1j * swing * np.sign(poles.imag))
 
 
@@ -168,7 +171,7 @@ def point_of(poles: ComplexArray, delay: float, box: Box, cell: int | None = Non
     """Admissible sections with given poles."""
     moved = admissible(np.asarray(poles, dtype=complex), box)
     units = [
-        (abs(p), float(-p.real / abs(p)), bool(p.imag >= box.nyquist * (1 - TOUCH))) for p in moved[moved.imag > 0]
+        (abs(p), float(-p.real / abs(p)), bool(p.imag >= box.imaginary * (1 - TOUCH))) for p in moved[moved.imag > 0]
     ]
     reals = sorted((-moved[moved.imag == 0].real).tolist())
     # The nearest real poles first; one at a bound stays alone, so that it can be frozen there.

@@ -10,7 +10,9 @@ from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import Descent, Local
 
 #: Poles tried beside those of a smaller model, and how many of them are refined.
-FREQUENCIES, DAMPINGS, REFINED = 24, (0.05, 0.3, 0.9), 3
+FREQUENCIES, DAMPINGS, REFINED = 24, (0.02, 0.1, 0.5), 3
+#: A pair alone has minima at every peak of the noise: so much more is tried, and refined.
+DENSER, MORE = 4, 2
 #: Optima kept of each structure, and how far the best of what is not yet one may lie above and still be refined.
 KEPT = 3
 #: Squared errors that differ by less than this fraction are those of one minimum.
@@ -46,7 +48,7 @@ class Nest:
     def _spine(self, poles: int) -> Local:
         """A minimum with one zero less than poles, by adding both: with a free numerator every added pole helps."""
         if poles not in self._spines:
-            points = [] if poles > 1 else self._alone(0)
+            points = [] if poles > 1 else self._alone(0, 1)
             for added in range(1, min(poles - 1, 2) + 1):
                 before = self._spine(poles - added).point
                 points += self._extended(poles - 1, [(before.poles, before.delay.seconds)], added)
@@ -56,10 +58,10 @@ class Nest:
             self.evaluations += descent.evaluations
         return self._spines[poles]
 
-    def _alone(self, zeros: int) -> list[Point]:
-        """The best single poles."""
+    def _alone(self, zeros: int, poles: int) -> list[Point]:
+        """The best single poles, or single pairs."""
         middle = 0.5 * (self.box.delays[0] + self.box.delays[1])
-        return self._extended(zeros, [(np.zeros(0, dtype=complex), middle)], 1)
+        return self._extended(zeros, [(np.zeros(0, dtype=complex), middle)], poles, DENSER, MORE)
 
     def ends(self, poles: int, zeros: int) -> list[float]:
         """Squared errors at which the searches for a structure have ended."""
@@ -84,6 +86,8 @@ class Nest:
     def _from_below(self, poles: int, zeros: int) -> list[Point]:
         """Starts from smaller models, and along the delay."""
         first, others = [self._spine(poles).point], []
+        if poles == 2:
+            first += self._alone(zeros, 2)
         if zeros > 0:
             first.append(self.optima(poles, zeros - 1)[0].point)
         if poles > 1 and zeros > 0:
@@ -104,12 +108,14 @@ class Nest:
         point = self.optima(poles, zeros)[0].point
         return self._extended(new_zeros, [(point.poles, point.delay.seconds)], added)
 
-    def _extended(self, zeros: int, seeds: Sequence[tuple[ComplexArray, float]], added: int) -> list[Point]:
+    def _extended(
+        self, zeros: int, seeds: Sequence[tuple[ComplexArray, float]], added: int, denser: int = 1, more: int = 1
+    ) -> list[Point]:
         """The best few of all poles, or pairs, added to given ones, by elimination alone."""
         descent = self.descent(zeros)
         found: list[tuple[float, Array, Point]] = []
         for roots, delay in seeds:
-            for w in np.geomspace(self.box.slowest, self.box.fastest, FREQUENCIES + 2)[1:-1].tolist():
+            for w in np.geomspace(self.box.slowest, self.box.fastest, denser * FREQUENCIES + 2)[1:-1].tolist():
                 for zeta in DAMPINGS if added == 2 else (1.0,):
                     pole = w * complex(-zeta, np.sqrt(1 - zeta * zeta))
                     new = [pole, pole.conjugate()] if added == 2 else [complex(-w)]
@@ -119,7 +125,7 @@ class Nest:
         self.evaluations += descent.evaluations
         chosen: list[tuple[Array, Point]] = []
         for _, where, point in sorted(found, key=lambda entry: entry[0]):
-            if len(chosen) < REFINED and all(np.abs(where - other).max() > APART for other, _ in chosen):
+            if len(chosen) < more * REFINED and all(np.abs(where - other).max() > APART for other, _ in chosen):
                 chosen.append((where, point))
         return [point for _, point in chosen]
 

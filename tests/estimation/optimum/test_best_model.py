@@ -110,3 +110,15 @@ def test_given_starts_alone_are_refined_where_nothing_else_is_wanted():
     assert alone.squared_error == pytest.approx(everything.squared_error, rel=1e-9)
     assert (alone.tried, alone.agree) == (1, 1)
     assert alone.evaluations < everything.evaluations / 5
+
+
+@pytest.mark.parametrize("seed", [2, 8, 10, 14, 26, 41, 53])
+def test_a_lightly_damped_pair_is_found_without_a_smaller_model_that_shows_it(seed):
+    # In so much noise no single pole leads there, and the cost has a minimum at every peak of the noise.
+    rng = np.random.default_rng(seed)
+    w, zeta = np.exp(rng.uniform(np.log((0.05, 0.005)), np.log((5.0, 0.5))))
+    denominator = [1.0, 2 * zeta * w, w * w]
+    record = record_of(TransferFunction([w * w], denominator), rng, samples=200, noise=(0.1, 1.0, 5.0)[seed % 3])
+    found = best_output_error([filter_data(record)], 2, 0, SearchOptions(free_response=True, random_starts=0))
+    options = SearchOptions(free_response=True, starts=[(denominator, 0.0)], nested=False)
+    assert found.squared_error <= best_output_error([filter_data(record)], 2, 0, options).squared_error * (1 + 1e-9)

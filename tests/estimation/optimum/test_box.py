@@ -30,7 +30,7 @@ def test_no_step_leaves_the_set(seed, n, size):
         assert poles.size == n
         assert (np.abs(poles) >= BOX.slowest * (1 - 1e-9)).all()
         assert (np.abs(poles) <= BOX.fastest * (1 + 1e-9)).all()
-        assert (np.abs(poles.imag) <= BOX.nyquist * (1 + 1e-9)).all()
+        assert (np.abs(poles.imag) <= BOX.imaginary * (1 + 1e-9)).all()
         assert (-poles.real >= BOX.least_damping * np.abs(poles) * (1 - 1e-9)).all()
         assert 0.0 <= point.delay.seconds <= 2.0
         np.testing.assert_allclose(np.sort_complex(admissible(poles, BOX)), np.sort_complex(poles), rtol=1e-7)
