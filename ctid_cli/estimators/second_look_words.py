@@ -63,7 +63,7 @@ def _of_record(
         )
     elif poor > look.other_hold and _poor_share(one):
         yield _of_structure(one, options, fit)
-    if one.drift and not look.integrator > 0:
+    if one.drift and not (look.integrator > 0 or poor):
         yield (
             f"Beside the model, the output drifts by {abs(one.drift):.2g} standard deviations of the residuals over "
             "the record. Remove the trend, or use a part without it (--from, --to)."
