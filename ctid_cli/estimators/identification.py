@@ -1,7 +1,7 @@
 """A fit to measured records with everything that tells whether to believe it."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 
@@ -12,7 +12,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
 from ctid_cli.estimators import identification_warnings as warnings
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
-from ctid_cli.estimators.second_look import look_again
+from ctid_cli.estimators.second_look import SecondLook, look_again
 from ctid_cli.estimators.second_look_words import of_second_look
 from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.answer_test import AnswerTest, answer_test
@@ -143,13 +143,8 @@ def identify(
     has a profile-likelihood interval where the quadratic one is doubtful. Whether there is a model at all is tested
     against noise of the outputs' colour, the search over poles and delays included.
     """
-    checked = None
-    if validation is not None:
-        # Before the fit takes its time.
-        try:
-            checked = options.prepare(validation).laid_out
-        except DataError as error:
-            raise DataError(f"validation record: {error}") from None
+    # Before the fit takes its time.
+    checked = None if validation is None else _laid_out(options, validation)
     prepared = options.prepare(records)
     fit = prepared.fit()
     # What the estimate is by least squares near it: pseudo-errors where the loss is another.
@@ -175,11 +170,10 @@ def identify(
     interval = None
     if refinement.structure.delay and "delay" not in unclear:
         interval = _delay_interval(refinement, linear, uncertainty)
-    look = look_again(refinement, linear, records, holds=options.loss == "squares")
     judged = None if checked is None or validation is None else _validate(checked, fit, validation)
     size = fit.model.order + options.zeros + 1
     coefficients = np.full((size, size), np.nan) if singular or not answer.seen else matrix[:size, :size]
-    return Identification(
+    found = Identification(
         options=replace(options, covariance=covariance, bootstrap_draws=bootstrap_draws),
         fit=fit,
         answer=answer,
@@ -193,19 +187,34 @@ def identify(
         criteria=criteria_of.information_criteria(squared_error, fit.count, fit.theta.size),
         yic=criteria_of.young_information_criterion(residuals, output, fit.theta[free], matrix[np.ix_(free, free)]),
         r_t_squared=criteria_of.r_t_squared(residuals, output),
-        warnings=(
-            *warnings.of_answer(answer, options),
-            *of_second_look(look, options, fit, tests, answered=answer.seen),
-            *(warnings.of_status(fit, said=look.integrator > 0) if answer.seen else ()),
-            *(warnings.of_conditioning(fit, uncertainty.free_covariance, hessian) if answer.seen else ()),
-            *(warnings.of_short_record(uncertainty, fit.count) if answer.seen else ()),
-            *warnings.of_interval(interval, options),
-            *warnings.of_residuals(tests, len(records), FEWEST_TESTED),
-            *warnings.of_treatment(_gains(options, refinement, linear)),
-            *(warnings.of_validation(fit.r2, judged.r2) if judged is not None else ()),
-        ),
+        warnings=(),
         validation=judged,
     )
+    look = look_again(refinement, linear, records, holds=options.loss == "squares")
+    return replace(found, warnings=tuple(_warnings(found, look, hessian, _gains(options, refinement, linear))))
+
+
+def _laid_out(options: DelayProfile, validation: Record) -> Refinement:
+    try:
+        return options.prepare(validation).laid_out
+    except DataError as error:
+        raise DataError(f"validation record: {error}") from None
+
+
+def _warnings(found: Identification, look: SecondLook, hessian: Array, gains: dict[str, float]) -> Iterator[str]:
+    """What the user should know, the worst first; of a model without an answer to the input only that it is none."""
+    options, fit = found.options, found.fit
+    yield from warnings.of_answer(found.answer, options)
+    yield from of_second_look(look, options, fit, found.tests, answered=found.answer.seen)
+    if found.answer.seen:
+        yield from warnings.of_status(fit, said=look.integrator > 0)
+        yield from warnings.of_conditioning(fit, found.uncertainty.free_covariance, hessian)
+        yield from warnings.of_short_record(found.uncertainty, fit.count)
+    yield from warnings.of_interval(found.delay_interval, options)
+    yield from warnings.of_residuals(found.tests, len(fit.residuals), FEWEST_TESTED)
+    yield from warnings.of_treatment(gains)
+    if found.validation is not None:
+        yield from warnings.of_validation(fit.r2, found.validation.r2)
 
 
 # --- residuals and uncertainty ----------------------------------------------------------------------

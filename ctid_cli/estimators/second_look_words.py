@@ -23,9 +23,7 @@ def of_second_look(
     """
     several = len(look.records) > 1
     words: list[str] = []
-    # Where the residuals pass the test that is printed nothing is said to be missing.
-    passed = len(tests) == len(look.records) and all(test.uncorrelated for test in tests)
-    poor = 0.0 if passed else max(_poor_share(one) for one in look.records)
+    poor = _poorest_share(look, tests)
     for k, one in enumerate(look.records):
         found = _of_record(one, look, options, fit, poor) if answered else _of_faults(one)
         words += [f"Experiment {k + 1}: {sentence}" if several else sentence for sentence in found]
@@ -35,11 +33,7 @@ def of_second_look(
     if look.integrator > 0 and not diverges:
         words.append(_of_integrator(look, options, fit))
     if look.other_hold and poor <= look.other_hold and not any(_faulty(one) for one in look.records):
-        now, other = ("held", "foh") if one.examined.record.input.hold == "zoh" else ("along straight lines", "zoh")
-        words.append(
-            f"Taken as {'straight lines between its samples' if other == 'foh' else 'held'}, not as {now}, the input "
-            f"lowers the cost by {100 * look.other_hold:.2g} %: use --hold {other}, unless you know better."
-        )
+        words.append(_of_hold(look))
     return words
 
 
@@ -119,6 +113,12 @@ def _poor_share(one: RecordLook) -> float:
     return found.pole_share
 
 
+def _poorest_share(look: SecondLook, tests: tuple[ResidualTests, ...]) -> float:
+    """The largest share of a record; 0 where the residuals pass the test that is printed."""
+    passed = len(tests) == len(look.records) and all(test.uncorrelated for test in tests)
+    return 0.0 if passed else max(_poor_share(one) for one in look.records)
+
+
 def _of_structure(one: RecordLook, options: DelayProfile, fit: MeasuredFit) -> str:
     low, high = options.delay_bounds
     report, found = one.examined.report, f"About {100 * _poor_share(one):.2g} % of the residuals' variance"
@@ -129,6 +129,15 @@ def _of_structure(one: RecordLook, options: DelayProfile, fit: MeasuredFit) -> s
     if fit.poles_at_infinity or options.poles == 12:
         return f"{found} still follows the input, but more poles do not help: the system may be nonlinear."
     return f"{found} is what one more pole may explain: the structure is too poor (try --poles {options.poles + 1})."
+
+
+def _of_hold(look: SecondLook) -> str:
+    held = look.records[0].examined.record.input.hold == "zoh"
+    other, taken, not_as = ("foh", "straight lines between its samples", "held") if held else ("zoh", "held", "lines")
+    return (
+        f"Taken as {taken}, not as {not_as}, the input lowers the cost by {100 * look.other_hold:.2g} %: "
+        f"use --hold {other}, unless you know better."
+    )
 
 
 def _of_integrator(look: SecondLook, options: DelayProfile, fit: MeasuredFit) -> str:

@@ -1,6 +1,6 @@
 """What ``ctid fit`` answers: a fit to measured records as text and as an object for JSON."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -72,7 +72,6 @@ def identification_object(
     fit, options, criteria = result.fit, result.options, result.criteria
     interval, profile, judged = result.delay_interval, fit.profile, result.validation
     numerator = [item.estimate for item in result.estimates if item.name.startswith("b")]
-    uncertainty, draws = result.uncertainty, result.uncertainty.bootstrap
     content = {
         "model": {"numerator": numerator, "denominator": fit.model.denominator, "delay": fit.model.delay},
         "parameters": [parameter_object(item) for item in parameters_of(result, units)],
@@ -90,14 +89,7 @@ def identification_object(
         "notes": [note for measurement in measurements for note in measurement.notes],
         "derived": [picked(row, DERIVED_KEYS) for row in derived_of(result, units)],
         "answer": picked(result.answer, ("seen", "p_value", "explained", "by_chance")),
-        "covariance": {
-            "kind": uncertainty.kind,
-            "names": fit.parameter_names,
-            "values": uncertainty.covariance,
-            "effective_samples": uncertainty.effective_count,
-            "degrees_of_freedom": uncertainty.degrees_of_freedom if draws is None else None,
-            "bootstrap_draws": 0 if draws is None else len(draws.errors),
-        },
+        "covariance": _covariance_object(result),
         "delay_interval": "profile likelihood" if interval is not None else "quadratic",
         "criteria": {
             **picked(criteria, ("aic", "aicc", "bic", "fpe")),
@@ -118,9 +110,21 @@ def identification_object(
     return dict(plain(content))
 
 
+def _covariance_object(result: Identification) -> dict[str, Any]:
+    uncertainty, draws = result.uncertainty, result.uncertainty.bootstrap
+    return {
+        "kind": uncertainty.kind,
+        "names": result.fit.parameter_names,
+        "values": uncertainty.covariance,
+        "effective_samples": uncertainty.effective_count,
+        "degrees_of_freedom": uncertainty.degrees_of_freedom if draws is None else None,
+        "bootstrap_draws": 0 if draws is None else len(draws.errors),
+    }
+
+
 def identification_text(result: Identification, measurements: Sequence[Measurement], units: Units) -> str:
     """A fit for people, within 100 columns."""
-    fit, options, criteria, judged = result.fit, result.options, result.criteria, result.validation
+    fit, criteria, judged = result.fit, result.criteria, result.validation
     lines: list[str] = []
 
     def row(label: str, text: str) -> None:
@@ -129,17 +133,9 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
     for measurement, use in zip(measurements, fit.used, strict=True):
         lines.append(wrapped(_record_line(measurement, int(np.count_nonzero(use)), units)))
         lines += [wrapped(note, "  ") for note in measurement.notes]
-    loss = loss_text(fit, [item.record for item in measurements], units)
-    low, high = options.delay_bounds
-    searched = f"searched from {low:g} to {high:g} {units.time}" if low < high else f"known, {low:g} {units.time}"
-    hold = measurements[0].record.input.hold
     lines.append("")
-    row("model", f"{count(options.poles, 'pole')}, {count(options.zeros, 'zero')}; delay {searched}")
-    row("initial state", f"{TREATMENTS[options.initial_state]} (--initial-state {options.initial_state})")
-    row("offset", f"{_offset(result, units)} (--offset {options.offset})")
-    row("input", f"{'constant' if hold == 'zoh' else 'straight lines'} between its samples (--hold {hold})")
-    if loss:
-        row("loss", loss)
+    for label, text in _asked_for(result, measurements, units):
+        row(label, text)
     lines += ["", parameter_table(parameters_of(result, units)), wrapped(_covariance_line(result)), ""]
     lines += [_derived_table(derived_of(result, units)), ""]
     row("fit", f"{number(fit.fit_percent, 5)} % = {FIT_DEFINITION}")
@@ -166,6 +162,19 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
     # What the line of the residuals says need not be said again.
     told = tuple(test.sentence for test in result.tests)
     return "\n".join([*lines, *warning_lines(warning for warning in result.warnings if not warning.endswith(told))])
+
+
+def _asked_for(result: Identification, measurements: Sequence[Measurement], units: Units) -> Iterator[tuple[str, str]]:
+    """What was estimated, and how the records were taken."""
+    options, hold = result.options, measurements[0].record.input.hold
+    low, high = options.delay_bounds
+    searched = f"searched from {low:g} to {high:g} {units.time}" if low < high else f"known, {low:g} {units.time}"
+    yield "model", f"{count(options.poles, 'pole')}, {count(options.zeros, 'zero')}; delay {searched}"
+    yield "initial state", f"{TREATMENTS[options.initial_state]} (--initial-state {options.initial_state})"
+    yield "offset", f"{_offset(result, units)} (--offset {options.offset})"
+    yield "input", f"{'constant' if hold == 'zoh' else 'straight lines'} between its samples (--hold {hold})"
+    if loss := loss_text(result.fit, [item.record for item in measurements], units):
+        yield "loss", loss
 
 
 def _box_object(box: Box) -> dict[str, Any]:
