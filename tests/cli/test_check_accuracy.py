@@ -68,7 +68,7 @@ def accuracy(ctid, tmp_path):
         file = tmp_path / "spec.yaml"
         file.write_text(content, encoding="utf-8")
         done = ctid("check", "accuracy", file, *arguments, *([] if text else ["--json"]))
-        assert done.stderr == ""
+        assert all("direct: ignores the loop" in line for line in done.stderr.splitlines())
         return done.stdout if text else json.loads(done.stdout)
 
     return call

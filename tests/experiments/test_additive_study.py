@@ -37,8 +37,11 @@ def test_there_are_as_many_specifications_as_the_study_has():
 
 
 @pytest.mark.parametrize("file", FILES)
-def test_specifications_have_no_warnings(file):
-    assert published(file).warnings == ()
+def test_specifications_are_warned_of_nothing_but_what_is_their_point(file):
+    ignoring = {"closed_loop.yaml": 1, "closed_loop_coloured.yaml": 2}
+    warnings = published(file).warnings
+    assert len(warnings) == ignoring.get(file, 0)
+    assert all("ignores the loop" in warning for warning in warnings)
 
 
 @pytest.mark.parametrize("file", ["open_loop.yaml", "coverage_open_loop.yaml"])

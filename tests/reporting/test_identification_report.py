@@ -209,5 +209,5 @@ def test_starts_bounds_and_poles_at_infinity_are_said(fitted):
     assert "admissible" not in text
     lost = replace(result.fit, poles_at_infinity=2, status=Status.AT_BOUND)
     text = identification_text(replace(result, fit=lost), files, UNITS)
-    assert "poles from 0.01252 to 100 rad/ms, imaginary parts up to 31.42 rad/ms" in text
+    assert "poles from 0.01252 to 100 rad/ms, imaginary parts up to 31.38 rad/ms" in text
     assert of_status(lost)[0].startswith("2 poles run to infinity")

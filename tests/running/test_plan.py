@@ -117,7 +117,7 @@ def test_columns_of_swept_fields(plan_of):
         "starts.initial_delay=[0,3,{uniform: [0, 5]},{uniform: [0, 9]}]",
         "estimators.third={kind: svf, poles: 2, zeros: 0}",
         "monte_carlo.runs=5",
-        "estimators.known.svf_cutoff=[1,2]",
+        "estimators.known.max_iterations=[50,60]",
     ],
 )
 def test_adding_leaves_what_there_is_alone(plan_of, override):
