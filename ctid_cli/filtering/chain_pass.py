@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array
-from ctid_cli.filtering.exponential import HeldStep, exponential_minus_identity, place, row_norm
+from ctid_cli.filtering.exponential import HeldStep, exponential_minus_identity, multiply, place, row_norm
 from ctid_cli.filtering.filter_data import FilterData, clock_slack
 from ctid_cli.filtering.row_sink import BLOCK, RowSink, emit, finish
 
@@ -113,13 +113,19 @@ def _transitions(dynamics: Array, gain: Array, longest: float) -> _Transitions:
     levels = 1
     while quantum * float(BASE) ** levels <= longest and levels < 40:
         levels += 1
-    powers = np.zeros((levels, BASE, n + 2, n + 2))
+    powers, product = np.zeros((levels, BASE, n + 2, n + 2)), np.empty((n + 2, n + 2))
     for level in range(levels):
+        first = exponential_minus_identity(augmented * (quantum * float(BASE) ** level))
+        power = np.zeros((n + 2, n + 2))
         for digit in range(BASE):
-            power = exponential_minus_identity(augmented * (digit * quantum * float(BASE) ** level))
             place(powers[level, digit], 0, 0, power)
             for i in range(n + 2):
                 powers[level, digit, i, i] += 1.0
+            # (I + X)(I + Y) - I = X + Y + X Y, which keeps the digits of slow modes beside a fast one.
+            multiply(power, first, product)
+            for i in range(n + 2):
+                for j in range(n + 2):
+                    power[i, j] += first[i, j] + product[i, j]
     return _Transitions(powers, quantum, augmented)
 
 

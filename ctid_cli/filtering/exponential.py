@@ -27,7 +27,7 @@ def place(target: Array, row: int, column: int, source: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _multiply(left: Array, right: Array, out: Array) -> None:
+def multiply(left: Array, right: Array, out: Array) -> None:
     """``out = left @ right`` for small matrices, without the call into BLAS."""
     n = left.shape[0]
     for i in range(n):
@@ -70,13 +70,13 @@ def exponential_minus_identity(matrix: Array) -> Array:
     result = scaled / 12.0
     work = np.empty((n, n))
     for degree in range(11, 0, -1):
-        _multiply(scaled, result, work)
+        multiply(scaled, result, work)
         for i in range(n):
             for j in range(n):
                 result[i, j] = (scaled[i, j] + work[i, j]) / degree
     # (I + X)^2 - I = 2 X + X X.
     for _ in range(squarings):
-        _multiply(result, result, work)
+        multiply(result, result, work)
         for i in range(n):
             for j in range(n):
                 result[i, j] = 2.0 * result[i, j] + work[i, j]
