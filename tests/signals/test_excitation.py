@@ -217,6 +217,9 @@ def test_file_that_begins_late_is_zero_before_or_refused(input_file):
     assert excitation.generate(np.array([0.0, 5.0]), rng()).at([0.0, 1.0]).tolist() == [0.0, 3.0]
     with pytest.raises(DataError, match=r"begins at 1 s, and the record ends at 0\.5 s"):
         excitation.generate(np.array([0.0, 0.5]), rng())
+    # What begins with the last sample moves nothing in the record either.
+    with pytest.raises(DataError, match="begins at 1 s, and the record ends at 1 s"):
+        excitation.generate(np.array([0.0, 1.0]), rng())
 
 
 # --- options --------------------------------------------------------------------------------------
