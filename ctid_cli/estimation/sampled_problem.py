@@ -111,7 +111,11 @@ def cutoffs_of(record: Record, given: float | None) -> tuple[float, ...]:
     """Cut-offs of the state-variable filter to start from [rad/s]: the one given, or several around the bandwidth."""
     if given is not None:
         return (given,)
-    bandwidth = output_bandwidth(record)
+    return cutoffs_around(output_bandwidth(record))
+
+
+def cutoffs_around(bandwidth: float) -> tuple[float, ...]:
+    """Cut-offs to start from for a bandwidth [rad/s]."""
     return tuple(multiple * bandwidth for multiple in CUTOFFS)
 
 

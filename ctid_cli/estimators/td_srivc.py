@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple
+from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from ctid_cli.estimation.common import (
 from ctid_cli.estimation.delay_search import LEAST_CURVATURE, Descent, Minimum, bound_in_the_way, delay_step, descend
 from ctid_cli.estimation.global_look import lower_elsewhere
 from ctid_cli.estimation.iteration import GUARDED, RULES, Iterated, Steps, Variant, iterate
-from ctid_cli.estimation.sampled_problem import SampledProblem, cutoffs_of, least_squares_starts
+from ctid_cli.estimation.sampled_problem import SampledProblem, cutoffs_around, least_squares_starts
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.answer import output_bandwidth
@@ -137,7 +138,7 @@ class TdSrivc(Estimator["Searches", Fit]):
     def _estimate(self, searches: Searches, start: Start | None) -> Fit:
         delay = initial_delay(start, self.delay_bounds)
         history: list[IterationRecord] = []
-        starts = cutoffs_of(searches.record, self.svf_cutoff)
+        starts = cutoffs_around(searches.bandwidth) if self.svf_cutoff is None else (self.svf_cutoff,)
         found = self._descend(searches.first, delay, None, "search", history, starts)
         if found is None:
             raise DataError(Status.SINGULAR.value)
@@ -145,7 +146,7 @@ class TdSrivc(Estimator["Searches", Fit]):
         fit = end(searches.last, found, history)
         if self.variant == "plain" or fit.status is Status.DELAY_AT_BOUND:
             return fit
-        local = lower_elsewhere(searches.last, fit, output_bandwidth(searches.record))
+        local = lower_elsewhere(searches.last, fit, searches.bandwidth)
         return replace(fit, status=Status.LOCAL) if local else fit
 
     def _refine(self, problem: SampledProblem, found: Descent, history: list[IterationRecord]) -> Fit:
@@ -202,12 +203,18 @@ class TdSrivc(Estimator["Searches", Fit]):
         return iterate(problem, theta, Steps(self.max_iterations, self.tolerance, GUARDED))
 
 
-class Searches(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Searches:
     """Where to search first, on filtered samples if a filter is given, and where to finish."""
 
     first: SampledProblem
     last: SampledProblem
     record: Record
+
+    @cached_property
+    def bandwidth(self) -> float:
+        """Of the record [rad/s], found once for all starts."""
+        return output_bandwidth(self.record)
 
 
 class SrivcCost:

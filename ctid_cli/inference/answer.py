@@ -11,6 +11,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.inference.faults import outliers
 from ctid_cli.inference.input_moves import InputMoves, input_moves
+from ctid_cli.inference.quantile import robust_deviation
 from ctid_cli.signals.record import Record
 
 #: Share of the power of the answer that its band holds.
@@ -307,7 +308,7 @@ def _pictures(r: Array, longest: int, slowest: float, reference: slice, parts: i
         if width > max(longest // 4, 1):
             return
         z = np.convolve(r, np.full(width, 1.0 / width), mode="same")
-        quiet = min(1.4826 * float(np.median(np.abs(part))) for part in np.array_split(z[reference], parts))
+        quiet = min(robust_deviation(part) for part in np.array_split(z[reference], parts))
         if quiet > 0:
             yield _Picture(z / quiet, longest, width)
 
@@ -363,7 +364,7 @@ def _after_a_step(record: Record, moves: InputMoves, nyquist: float) -> Answer:
     if moved.size < 8:
         return Answer(nyquist)
     steps = np.abs(np.diff(y))
-    noise = 1.4826 * float(np.median(steps)) / math.sqrt(2)
+    noise = robust_deviation(steps) / math.sqrt(2)
     quantum = float(steps[steps > 0].min()) if np.any(steps > 0) else 0.0
     threshold = max(4 * noise, 1.5 * quantum, 1e-6 * float(moved.max()))
     # Three in a row: a single one is an outlier.

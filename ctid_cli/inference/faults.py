@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 
-from ctid_cli.arrays import Array, IntArray
+from ctid_cli.arrays import Array, BoolArray, IntArray
 from ctid_cli.inference.noise_model import fit_noise_model
+from ctid_cli.inference.quantile import robust_deviation
 
 #: A sample this many robust standard deviations away from its neighbours is an outlier.
 OUTLIER = 10.0
@@ -26,7 +27,7 @@ def far_off(y: Array) -> tuple[IntArray, Array]:
         return np.empty(0, dtype=np.int64), np.empty(0)
     padded = np.pad(y, 2, mode="edge")
     rest = y - np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
-    spread = 1.4826 * float(np.median(np.abs(rest)))
+    spread = robust_deviation(rest)
     # The fast part of an answer leaves its own medians behind, everywhere and not at one sample in ten.
     usual = float(np.quantile(np.abs(rest), 0.9))
     step = quantum(y)
@@ -41,7 +42,7 @@ def residual_outliers(e: Array) -> tuple[IntArray, Array]:
     usual = e.copy()
     usual[found] -= off
     surprise = fit_noise_model([usual]).innovations(usual)
-    sudden = np.abs(surprise[found] + off) > OUTLIER * 1.4826 * float(np.median(np.abs(surprise)))
+    sudden = np.abs(surprise[found] + off) > OUTLIER * robust_deviation(surprise)
     return found[sudden], off[sudden]
 
 
@@ -56,8 +57,8 @@ def saturated(y: Array) -> float:
     total = 0
     for k, inner in ((0, 1), (-1, -2)):
         at = y == values[k]
-        edges = np.flatnonzero(np.diff(np.concatenate(([0], at.astype(int), [0]))))
-        first, runs = edges[::2], edges[1::2] - edges[::2]
+        first, end = _runs(at)
+        runs = end - first
         in_runs = int(runs[(runs >= shortest) & (first > 0)].sum())
         if in_runs >= fewest and counts[k] > 5 * counts[inner]:
             total += in_runs
@@ -70,8 +71,7 @@ def stood_still(y: Array) -> IntArray:
     At rest before the first change, and at a limit of the sensor, an output may keep its value.
     """
     alike = np.diff(y) == 0
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], alike.astype(int), [0]))))
-    first, last = edges[::2], edges[1::2]
+    first, last = _runs(alike)
     long = last - first + 1 >= STILL
     elsewhere = np.count_nonzero(alike) - int((last - first)[long].sum())
     inside = long & (first > 0) & (y[first] > y.min()) & (y[first] < y.max())
@@ -79,6 +79,12 @@ def stood_still(y: Array) -> IntArray:
         inside[:] = False
     runs: IntArray = np.column_stack((first, last))[inside]
     return runs
+
+
+def _runs(marked: BoolArray) -> tuple[IntArray, IntArray]:
+    """Where runs of marked samples begin, and where the samples after them are."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], marked.astype(int), [0]))))
+    return edges[::2], edges[1::2]
 
 
 def growth_time(t: Array, y: Array, u: Array) -> float:

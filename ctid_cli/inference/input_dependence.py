@@ -7,6 +7,7 @@ from scipy.special import ndtr
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.noise_model import fit_noise_model
+from ctid_cli.inference.quantile import robust_deviation
 from ctid_cli.inference.residuals import dependence
 from ctid_cli.signals.record import Record
 
@@ -88,7 +89,7 @@ def _answer_at_once(e: Array, x: Array, u: Array) -> float:
     for _ in range(REWEIGHTED):
         half = np.sqrt(weight)
         rest = now - before @ np.linalg.lstsq(half[:, None] * before, half * now, rcond=1e-10)[0]
-        scale = 1.4826 * float(np.median(np.abs(rest)))
+        scale = robust_deviation(rest)
         if not scale > 1e-9 * float(np.ptp(now)):
             return 0.0
         weight = 1.0 / np.maximum(np.abs(rest) / scale, 1.0)

@@ -15,13 +15,12 @@ from typing import Literal
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.inference.quantile import robust_deviation
 
 #: The losses that are not squares.
 RobustKind = Literal["huber", "tukey"]
 #: Bend of Huber's loss and end of Tukey's, in standard deviations: 95 % efficient where the errors are normal.
 BEND, END = 1.345, 4.685
-#: Standard deviation of normal errors over their median absolute value.
-MAD = 1.4826
 #: Below this weight an error counts as an outlier of Huber's loss: beyond 2.69 standard deviations.
 HALF = 0.5
 
@@ -82,9 +81,8 @@ class Weighting:
 
 def scale_of(errors: Array, least: float) -> float:
     """Standard deviation from the median absolute error; errors of nothing, before a system moves, do not count."""
-    size = np.abs(errors)
-    size = size[size > least]
-    return max(MAD * float(np.median(size)), least) if size.size else least
+    moving = errors[np.abs(errors) > least]
+    return max(robust_deviation(moving), least) if moving.size else least
 
 
 def weighted(losses: Sequence[Loss], errors: Sequence[Array], parameters: int) -> Weighting:

@@ -59,14 +59,9 @@ def robust_covariance(psi: Sequence[Array], residuals: Sequence[Array], *, regul
 
 def _long_run_covariance(scores: Sequence[Array]) -> Array:
     """Covariance of the sum of the rows of independent blocks, an autoregression for every column."""
-    from scipy.signal import lfilter  # slow to import
-
     models = [fit_noise_model([block[:, j] for block in scores]) for j in range(scores[0].shape[1])]
     start = max(model.order for model in models)
-    white = [
-        np.column_stack([lfilter(m.coefficients, [1.0], block[:, j]) for j, m in enumerate(models)])[start:]
-        for block in scores
-    ]
+    white = [np.column_stack([m.innovations(block[:, j]) for j, m in enumerate(models)])[start:] for block in scores]
     used = sum(block.shape[0] for block in white)
     if used == 0:
         return np.full((len(models), len(models)), np.nan)
