@@ -108,6 +108,7 @@ CHECKS: Mapping[str, Callable[[str, Any], None]] = {
     "delay": lambda name, value: require_not_negative(name, value, "s"),
     "svf_cutoff": lambda name, value: require_positive(name, value, "rad/s"),
     "bandwidth": lambda name, value: require_positive(name, value, "rad/s"),
+    "max_delay_step": lambda name, value: require_positive(name, value, "s"),
     "max_iterations": lambda name, value: require_integer(name, value, 1),
     "max_rounds": lambda name, value: require_integer(name, value, 1),
     "filters": lambda name, value: require_integer(name, value, 2),

@@ -47,6 +47,7 @@ class Limits(NamedTuple):
     max_iterations: int
     tolerance: float
     max_rounds: int
+    max_delay_step: float
 
 
 class FilterSearch:
@@ -129,7 +130,7 @@ class FilterSearch:
                     max_iterations=self.limits.max_iterations,
                     tolerance=self.limits.tolerance,
                     smallest_step=SMALLEST_STEP * self.period,
-                    largest_step=LARGEST_STEP * (high - low),
+                    largest_step=self.limits.max_delay_step,
                     reflect=True,
                 )
                 if found is not None:

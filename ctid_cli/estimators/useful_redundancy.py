@@ -2,7 +2,7 @@ r"""Delay and coefficients by useful redundancy: Gauss-Newton paths on a set of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -11,11 +11,12 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, initial_delay, named
 from ctid_cli.estimation.delay_grid import scan
 from ctid_cli.estimation.delay_search import Descent, Minimum
-from ctid_cli.estimation.filter_search import LATTICE, FilterPath, FilterSearch, Limits
+from ctid_cli.estimation.filter_search import LARGEST_STEP, LATTICE, FilterPath, FilterSearch, Limits
 from ctid_cli.estimation.filtered_costs import Search, filtered_costs
-from ctid_cli.estimation.iteration import GAUSS_NEWTON, GUARDED, Steps
+from ctid_cli.estimation.iteration import GAUSS_NEWTON, GUARDED, Steps, Variant
 from ctid_cli.estimation.redundancy import RedundantMinimum, Visit
 from ctid_cli.estimation.sampled_problem import SampledProblem
+from ctid_cli.estimators.printed_redundancy import PrintedSearch, printed_search
 from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.inference.answer import output_bandwidth
@@ -56,7 +57,7 @@ class RedundantFit(Fit):
 
 
 @dataclass(frozen=True)
-class UsefulRedundancy(Estimator["RedundantSearch", RedundantFit]):
+class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit]):
     """Delay and coefficients by useful redundancy over a set of low-pass filters.
 
     Parameters
@@ -89,6 +90,11 @@ class UsefulRedundancy(Estimator["RedundantSearch", RedundantFit]):
         Largest number of rounds over all filters.
     hold_output : {"foh", "zoh"}, default "foh"
         Interpolation of the measured output between samples; changes the path, not the converged estimate.
+    variant : {"guarded", "plain"}, default "guarded"
+        ``plain`` is the published algorithm, slower and less certain to converge.
+    max_delay_step : float, optional
+        Longest Gauss-Newton step of the delay [s]. By default a third of the range of the delay, in ``plain`` half the
+        shortest period: the publication has such a limit, but does not print it.
 
     Raises
     ------
@@ -98,15 +104,24 @@ class UsefulRedundancy(Estimator["RedundantSearch", RedundantFit]):
     Notes
     -----
     Algorithm IV of the reference. In each round, for every filter, Gauss-Newton on the delay runs from the incumbent to
-    a minimum of the filtered cost; the candidate of least J0 becomes the incumbent, itself a candidate. J0 is the mean
-    over the filters of ``100 ||y_k - x_k|| / ||y_k - mean y_k||``, each with its own coefficients at that delay (45).
-    Those come from the filter next to it, first from the widest band to the narrowest and then back, the cheaper kept;
-    the filter of widest band starts from least squares. A path starts from these coefficients, and a second time from
-    least squares. Gauss-Newton steps are no longer than a third of the range of the delay; the publication limits
-    them, but not by how much. One that leaves the range is mirrored at its end. Where every path fails and J0 is still
-    above 25 %, each filter's path starts once more one of its periods to either side. Estimates end on the unfiltered
-    data: Gauss-Newton on the delay, then on all parameters together, from the minimum of J0, from that of the filter
-    of widest band within half the shortest period of it, and from a fifth of a period less, the lowest cost kept.
+    a minimum of the filtered cost; the candidate of least J0 becomes the incumbent. J0 is the mean over the filters of
+    ``100 ||y_k - x_k|| / ||y_k - mean y_k||``, each with its own coefficients at that delay (45).
+
+    ``guarded``: the incumbent is itself a candidate. Coefficients come from the filter next to it, first from the
+    widest band to the narrowest and then back, the cheaper kept; that of widest band starts from least squares. A path
+    starts from these coefficients, and a second time from least squares. A step that leaves the range is mirrored at
+    its end. Where every path fails and J0 is still above 25 %, each filter's path starts once more one of its periods
+    to either side. Estimates end on the unfiltered data: Gauss-Newton on the delay, then on all parameters together,
+    from the minimum of J0, from that of the filter of widest band within half the shortest period of it, and from a
+    fifth of a period less, the lowest cost kept.
+
+    ``plain``: to the letter. Each filter has one path a round and SRIVC, from least squares, for its coefficients. A
+    step is halved while it leaves the bounds or the cost of its filter does not fall. The end of least J0 is the next
+    incumbent, even where J0 was lower before, until it moves by less than ``tolerance`` of itself; then the same is
+    done once more without a filter. Three sentences of the reference are not taken at their word: footnote 6 limits
+    only increments of the delay, here decrements too; Algorithm II stops at an absolute change of its cost, which
+    depends on the unit of the output, here at a relative one; and where incumbents come back in turn the rounds have no
+    end, here they end where one does, or after ``max_rounds``.
 
     The search fails where no filter's path leads to a lower J0; :func:`~ctid_cli.filtering.check_filters` says for
     which initial errors a set of filters can be trusted.
@@ -146,6 +161,8 @@ class UsefulRedundancy(Estimator["RedundantSearch", RedundantFit]):
     tolerance: float = 1e-3
     max_rounds: int = 20
     hold_output: Hold = "foh"
+    variant: Variant = field(default="guarded", metadata={"added_later": True})
+    max_delay_step: float | None = field(default=None, metadata={"added_later": True})
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -158,10 +175,20 @@ class UsefulRedundancy(Estimator["RedundantSearch", RedundantFit]):
         """The estimator that ends the estimation on unfiltered data."""
         return TdSrivc(self.poles, self.zeros, self.delay_bounds, hold_output=self.hold_output)
 
-    def _lay_out(self, record: Record) -> RedundantSearch:
+    def _lay_out(self, record: Record) -> RedundantSearch | PrintedSearch:
         unfiltered = self.refinement._lay_out(record).last
         bandwidth = self.bandwidth or output_bandwidth(record)
         filters = FilterSet(bandwidth, self.filters, self.beta, self.order)
+        if self.variant == "plain":
+            srivc = replace(
+                self.refinement,
+                svf_cutoff=self.svf_cutoff or bandwidth,
+                max_iterations=self.max_iterations,
+                tolerance=self.tolerance,
+                variant="plain",
+            )
+            longest = self.max_delay_step or 0.5 * float(filters.periods[-1])
+            return printed_search(srivc, record, filters, longest, self.max_rounds)
         costs = filtered_costs(
             record,
             filters.lowpasses,
@@ -180,20 +207,21 @@ class UsefulRedundancy(Estimator["RedundantSearch", RedundantFit]):
                 f"{named(record)}after the greatest delay, {self.delay_bounds[1]:g} s, the record is too short for "
                 f"{many}; take a smaller beta or greatest delay, a larger bandwidth or a longer record"
             )
-        limits = Limits(self.delay_bounds, self.max_iterations, self.tolerance, self.max_rounds)
+        longest = self.max_delay_step or LARGEST_STEP * (self.delay_bounds[1] - self.delay_bounds[0])
+        limits = Limits(self.delay_bounds, self.max_iterations, self.tolerance, self.max_rounds, longest)
         return RedundantSearch(FilterSearch(usable, filters, limits), unfiltered)
 
-    def _estimate(self, laid_out: RedundantSearch, start: Start | None) -> RedundantFit:
-        search = laid_out.filtered
-        paths: list[FilterPath] = []
-        found = search.run(initial_delay(start, self.delay_bounds), paths)
-        fit = self._refine(laid_out, found, search.history(found, paths))
-        return RedundantFit(
-            **{item.name: getattr(fit, item.name) for item in fields(Fit)},
-            search=found,
-            filters=search.filters,
-            paths=tuple(paths),
-        )
+    def _estimate(self, laid_out: RedundantSearch | PrintedSearch, start: Start | None) -> RedundantFit:
+        delay = initial_delay(start, self.delay_bounds)
+        if isinstance(laid_out, PrintedSearch):
+            filters = laid_out.filters
+            fit, found, paths = laid_out.run(delay)
+        else:
+            search, paths = laid_out.filtered, []
+            filters, found = search.filters, search.run(delay, paths)
+            fit = self._refine(laid_out, found, search.history(found, paths))
+        values = {item.name: getattr(fit, item.name) for item in fields(Fit)}
+        return RedundantFit(**values, search=found, filters=filters, paths=tuple(paths))
 
     def _refine(
         self, laid_out: RedundantSearch, search: RedundantMinimum[float], history: list[IterationRecord]

@@ -46,6 +46,8 @@ class DataSet:
     def result_of(self, fit: Any, start: Any, terms: Sequence[Term] | None) -> dict[str, Any]:
         """What is stored of a fit to the record."""
         parameters, errors = additive_parameters(fit, terms)
+        # Of useful redundancy alone.
+        search = getattr(fit, "search", None)
         return {
             "status": fit.status.name,
             "message": str(fit.status.value),
@@ -59,6 +61,8 @@ class DataSet:
             "fit_percent": fit.fit_percent,
             "validation_fit_percent": self._validation_fit_percent(fit.model),
             "iterations": int(fit.iterations),
+            "search_delay": None if search is None else search.point,
+            "switches": None if search is None else len(search.switches),
             "condition_number": fit.condition_number,
         }
 

@@ -83,6 +83,10 @@ COLUMNS = (
     Column("fit_percent", "float64", "fit on the record that was estimated from", "%", of="systems"),
     Column("validation_fit_percent", "float64", "fit on the rest of a measured record", "%", of="systems"),
     Column("iterations", "Int64", "in all stages", of="systems"),
+    Column(
+        "search_delay", "float64", "where `useful_redundancy` ended its search, before refinement", "s", of="systems"
+    ),
+    Column("switches", "Int64", "how often that search went on behind another filter than before", of="systems"),
     Column("condition_number", "float64", "of the scaled normal equations", "-", of="systems"),
     Column("measures", "by name", "what was measured of the frequencies, see below", of="signals", names=measure_names),
     Column("seconds", "float64", "time of this estimate, as if it had been alone", "s", source="clock"),

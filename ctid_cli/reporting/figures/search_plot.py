@@ -78,6 +78,7 @@ def landscape(
     prepared = estimator.prepare(data_set.record)
     assert data_set.true_model is not None
     fit, search = prepared.fit(Start(delay=initial_delay)), prepared.laid_out.filtered
+    assert isinstance(search, FilterSearch)
     return Landscape(
         delays=grid,
         members=_least_costs(search.costs, grid, sweeps),
