@@ -3,17 +3,21 @@
 import os
 import re
 import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, NoReturn, get_args
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, get_args
 
 import numpy as np
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, IntArray
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import require_choice
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.table import Table
+
+if TYPE_CHECKING:
+    from pandas import DataFrame, Series
 
 Offset = Literal["none", "remove"]
 
@@ -79,21 +83,39 @@ def read_held_signal(
 
 def read_csv_table(path: str | os.PathLike[str]) -> Table:
     """Columns of a comma-separated file."""
+    file = require_file(path)
+    # Columns of numbers become numbers as they are read: as text they would take twenty times the memory.
+    frame = _parsed(path, file, na_values=[*MISSING, "NaN", "NAN", "NA"])
+    names = tuple(str(column).strip() for column in frame.columns)
+    kept = np.ones(len(frame), dtype=bool)
+    kept[_blank_rows(path, np.flatnonzero(frame.isna().all(axis="columns")))] = False
+    lines = np.flatnonzero(kept) + 2
+
+    def convert(name: str) -> Array:
+        column = frame.iloc[kept, names.index(name)]
+        if column.size == 0:
+            raise DataError(f"{file}:2: the file has a header and no data")
+        if column.dtype.kind in "iuf":
+            return column.to_numpy(dtype=float)
+        text = _parsed(path, file, dtype=str).iloc[kept, names.index(name)].str.strip()
+        return _numbers(text, lambda k: f"{file}:{lines[k]}: column {name!r} holds {text.iloc[k]!r}")
+
+    return Table(file, names, convert, lines)
+
+
+def _parsed(path: str | os.PathLike[str], file: str, **options: Any) -> "DataFrame":
+    """Rows of a file, row k from line k + 2."""
     import pandas as pd  # a second of start-up time that only a command that reads a file should pay
 
-    file = require_file(path)
     try:
         with warnings.catch_warnings():
-            # A comma at the end of every line is harmless: the nameless column is dropped.
+            # A comma at the end of every line is harmless: the nameless column is dropped. So are columns of numbers
+            # and text, which are looked at again.
             warnings.simplefilter("ignore", pd.errors.ParserWarning)
-            frame = pd.read_csv(
-                path,
-                dtype=str,
-                na_filter=False,
-                index_col=False,
-                skipinitialspace=True,
-                skip_blank_lines=False,  # so that row k stays on line k + 2
-            )
+            warnings.simplefilter("ignore", pd.errors.DtypeWarning)
+            layout: Any = {"index_col": False, "skipinitialspace": True, "skip_blank_lines": False}
+            frame: DataFrame = pd.read_csv(path, keep_default_na=False, **layout, **options)
+            return frame
     except pd.errors.EmptyDataError:
         raise DataError(f"{file}:1: the file is empty; its first line must name the columns") from None
     except pd.errors.ParserError as error:
@@ -103,23 +125,25 @@ def read_csv_table(path: str | os.PathLike[str]) -> Table:
     except OSError as error:
         raise DataError(f"{file}: cannot be read: {error.strerror}") from None
 
-    frame.columns = frame.columns.str.strip()
-    blank = (frame == "").all(axis="columns")
-    frame = frame[~blank]
-    lines = frame.index.to_numpy(dtype=np.int64) + 2
 
-    def convert(name: str) -> Array:
-        text = frame[name].str.strip()
-        numbers = pd.to_numeric(text, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
-        wrong = np.isnan(numbers) & ~text.str.lower().isin(MISSING).to_numpy(dtype=bool)
-        if wrong.any():
-            k = int(np.argmax(wrong))
-            raise DataError(f"{file}:{lines[k]}: column {name!r} holds {text.iloc[k]!r}, which is not a number")
-        if numbers.size == 0:
-            raise DataError(f"{file}:2: the file has a header and no data")
-        return numbers
+def _blank_rows(path: str | os.PathLike[str], empty: IntArray) -> list[int]:
+    """Those of the rows without a value that do not even say so."""
+    if not empty.size:
+        return []
+    rows = set(empty.tolist())
+    with open(path, encoding="utf-8") as text:
+        return [k for k, line in enumerate(text, start=-1) if k in rows and not line.strip(', "\t\r\n')]
 
-    return Table(file, tuple(str(column) for column in frame.columns), convert, lines)
+
+def _numbers(text: "Series[str]", place: Callable[[int], str]) -> Array:
+    """A column that is not numbers only."""
+    import pandas as pd
+
+    numbers = pd.to_numeric(text, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
+    wrong = np.isnan(numbers) & ~text.str.lower().isin(MISSING).to_numpy(dtype=bool)
+    if wrong.any():
+        raise DataError(f"{place(int(np.argmax(wrong)))}, which is not a number")
+    return numbers
 
 
 def require_file(path: str | os.PathLike[str]) -> str:

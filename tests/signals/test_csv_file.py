@@ -1,5 +1,7 @@
 """Files: what is read, and that every refusal names the file and the line."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -71,6 +73,25 @@ def test_ways_of_writing_the_same_file(write, text):
     assert record.t.tolist() == [0.0, 1.0]
     assert record.input.values.tolist() == [1.0, 3.0]
     assert record.y.tolist() == [2.0, 4.0]
+
+
+def test_numbers_are_not_held_as_text(write):
+    # The peak of a hundred thousand rows read as text is above 40 MB.
+    path = write("t,u,y\n" + "".join(f"{k},{k % 7},{0.5 * k}\n" for k in range(100_000)))
+    read_record(path)
+    tracemalloc.start()
+    record = read_record(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert record.n_samples == 100_000
+    assert peak < 20e6
+
+
+def test_a_word_among_many_numbers_is_still_found(write):
+    rows = [f"{k},1,{k}" for k in range(300_000)]
+    rows[290_000] = "290000,1,off"
+    with pytest.raises(DataError, match=r":290002: column 'y' holds 'off', which is not a number"):
+        read_record(write("\n".join(["t,u,y", *rows])))
 
 
 @given(st.lists(st.tuples(st.floats(-1e9, 1e9), st.floats(allow_nan=True, allow_infinity=False)), min_size=1))
