@@ -10,7 +10,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, svg
+from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, STRIPES, outline, svg
 from ctid_cli.signals.measurement import Measurement
 
 if TYPE_CHECKING:
@@ -43,8 +43,9 @@ def _draw_record(
 ) -> None:
     record, use = measurement.record, result.fit.used[k]
     residuals = result.fit.residuals[k]
-    output.plot(record.t, record.y, color=LIGHT, linewidth=2.2, label="measured")
-    output.plot(*_with_gaps(record.t, use, record.y[use] - residuals), color=DARK, linewidth=0.9, label="simulated")
+    simulated = outline(*_with_gaps(record.t, use, record.y[use] - residuals))
+    output.plot(*outline(record.t, record.y), color=LIGHT, linewidth=2.2, label="measured")
+    output.plot(*simulated, color=DARK, linewidth=0.9, label="simulated")
     weighting = result.fit.weighting
     if weighting is not None and weighting.outliers[k].any():
         little = np.flatnonzero(use)[weighting.outliers[k]]
@@ -55,10 +56,11 @@ def _draw_record(
     output.margins(x=0.0)
     low, high = output.get_ylim()
     output.set_ylim(low - 0.18 * (high - low), high)  # room for the legend below the curves
-    error.plot(*_with_gaps(record.t, use, residuals), color=DARK, linewidth=0.7)
+    error.plot(*outline(*_with_gaps(record.t, use, residuals)), color=DARK, linewidth=0.7)
     error.axhline(0.0, color="black", linewidth=0.6)
     error.set_ylabel(f"residual [{units.output}]")
-    error.set_xlabel(f"{measurement.time} [{units.time}]")
+    thinned = f"; the least and the greatest of each {record.t.size // STRIPES} samples are drawn"
+    error.set_xlabel(f"{measurement.time} [{units.time}]{thinned * (simulated[0].size < record.t.size)}")
 
 
 def _with_gaps(t: Array, use: BoolArray, values: Array) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.filtering.filter_set import FilterSet, check_filters
 from ctid_cli.filtering.filter_theory import extrema, ideal_cost
 from ctid_cli.reporting.figures.search_plot import costs_svg, landscape, trajectory_svg
-from ctid_cli.reporting.figures.style import ramp, spread
+from ctid_cli.reporting.figures.style import STRIPES, outline, ramp, spread
 from ctid_cli.studies import catalogue
 from ctid_cli.studies.catalogue import find_figures, find_study
 
@@ -261,3 +261,19 @@ def test_curves_grow_darker():
     assert lightness == sorted(lightness, reverse=True)
     assert all(a["linestyle"] != b["linestyle"] for a, b in pairwise(ramp(10)))
     assert len(ramp(1)) == 1
+
+
+def test_outline_of_a_long_curve_keeps_its_peaks_and_its_gaps():
+    t = np.arange(1_000_000.0)
+    values = np.sin(1e-4 * t)
+    values[[300_001, 700_003]] = 5.0, -7.0
+    values[400_000:500_000] = np.nan
+    few, drawn = outline(t, values)
+    assert few.size == 2 * STRIPES
+    assert (np.diff(few) >= 0).all()
+    assert np.array_equal(drawn, values[few.astype(int)], equal_nan=True)
+    assert {(300_001.0, 5.0), (700_003.0, -7.0)} <= set(zip(few, drawn, strict=True))
+    inside = (few > 405_000) & (few < 495_000)
+    assert inside.any() and np.isnan(drawn[inside]).all() and not np.isnan(drawn[few < 395_000]).any()
+    short = np.arange(4.0 * STRIPES)
+    assert outline(short, short)[0] is short
