@@ -10,6 +10,7 @@ from ctid_cli.estimation.profile_refinement import Refinement
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.hold_comparison import fall_with_other_hold
 from ctid_cli.inference import faults
+from ctid_cli.inference.beside import SideBySide, constant, rest_of
 from ctid_cli.inference.input_dependence import InputDependence, input_dependence
 from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.inference.record_check import SIGNIFICANT, Examined, examine
@@ -76,16 +77,14 @@ def _drift(e: Array, psi: Array, t: Array) -> float:
 
     What the parameters can have taken of the line is allowed for: it is freed of their sensitivities.
     """
-    beside = np.column_stack((np.ones(t.size), psi))
+    beside = SideBySide((constant(t.size), psi))
     line = ((t - t.mean()) / float(t[-1] - t[0]))[:, None]
-    both = np.column_stack((beside, line))
-    both = both / np.maximum(np.linalg.norm(both, axis=0), np.finfo(float).tiny)
-    weights = np.linalg.lstsq(both, e, rcond=None)[0]
-    rest = e - both @ weights
+    rest = rest_of(e, SideBySide((beside, line)))
     noise = fit_noise_model([rest])
     if not noise.innovation_variance > 0:
         return 0.0
-    drift = float(weights[-1] / np.linalg.norm(line) / rest.std())
+    own = rest_of(line[:, 0], beside)
+    drift = float(own @ e / (own @ own) / rest.std())
     significant = dependence(e, line, noise, beside).statistic > SIGNIFICANT**2
     return drift if significant and abs(drift) > DRIFT else 0.0
 

@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.noise_model import fit_noise_model
-from ctid_cli.inference.quantile import robust_deviation
+from ctid_cli.inference.beside import Rows, SideBySide, constant, orthonormal, rest_of, row_blocks
+from ctid_cli.inference.noise_model import autoregress, fit_noise_model
+from ctid_cli.inference.quantile import normal_tail, robust_deviation
 from ctid_cli.inference.residuals import dependence
+from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
 #: Inputs looked at, in sampling intervals: before the instant at which the model uses them, and after the residual.
@@ -47,48 +48,68 @@ def input_dependence(e: Array, x: Array, psi: Array, t: Array, record: Record, d
     """
     interval = float(np.median(np.diff(record.t)))
     past, future = min(PAST, t.size // 8), min(FUTURE, t.size // 16)
-    inside = (t - delay - past * interval >= record.t[0]) & (t + future * interval <= record.t[-1])
-    if future < ORDER or np.count_nonzero(inside) < 2 * (past + future + psi.shape[1]):
+    allowed = (t - delay - past * interval >= record.t[0]) & (t + future * interval <= record.t[-1])
+    if future < ORDER or np.count_nonzero(allowed) < 2 * (past + future + psi.shape[1]):
         return None
+    inside = slice(int(allowed.argmax()), int(allowed.size - allowed[::-1].argmax()))
     added = _behind_a_pole(x - x[0], np.geomspace(1.0, LONGEST * t.size, TRIED))[inside]
     e, x, psi, t = e[inside] - e[inside].mean(), x[inside], psi[inside], t[inside]
     noise = fit_noise_model([e])
     if not noise.innovation_variance > 0:
         return None
-    beside = np.column_stack((np.ones(t.size), psi))
+    beside = SideBySide((constant(t.size), psi))
     pole = dependence(e, added, noise, beside)
-    both = np.column_stack((beside, added))
-    share = 1.0 - _power(_rest(e, both)) / _power(_rest(e, beside))
+    share = 1.0 - _power(rest_of(e, SideBySide((beside, added)))) / _power(rest_of(e, beside))
 
-    def inputs(first: Array, steps: range) -> Array:
-        return np.column_stack([record.input.at(first + k * interval) for k in steps])
+    def inputs(first: Array, steps: range) -> _Inputs:
+        return _Inputs(record.input, first, interval * np.array(steps))
 
     earlier = inputs(t - delay, range(min(LATE, int(delay / interval)), -past, -1))
-    known = np.column_stack((beside, earlier - earlier.mean(axis=0)))
+    known = SideBySide((beside, earlier))
     # Between its samples an input along straight lines has moved before the residual.
     first = 1 if record.input.hold == "foh" else 0
     later = dependence(e, inputs(t, range(first, first + future)), noise, known)
     found = [(later.p_value, (later.statistic - later.freedom) / t.size)] if later.freedom else []
     if not first:
-        z = _answer_at_once(_rest(e, known), x, inputs(t, range(0, -ORDER - 1, -1)))
-        found.append((2 * ANSWERS * float(ndtr(-z)), z * z / t.size))
+        z = _answer_at_once(rest_of(e, known), x, inputs(t, range(0, -ORDER - 1, -1)))
+        found.append((2 * ANSWERS * normal_tail(z), z * z / t.size))
     likely, told = min(found, default=(1.0, 0.0))
     return InputDependence(pole.p_value, share, min(1.0, len(found) * likely), told)
 
 
-def _answer_at_once(e: Array, x: Array, u: Array) -> float:
+@dataclass(frozen=True, eq=False)
+class _Inputs:
+    """The input at shifted instants, about its mean."""
+
+    signal: HeldSignal
+    instants: Array
+    shifts: Array
+
+    def __len__(self) -> int:
+        return self.instants.size
+
+    def __getitem__(self, rows: slice, /) -> Array:
+        values: Array = self.signal.at(self.instants[rows, None] + self.shifts) - self.signal.mean
+        return values
+
+
+def _answer_at_once(e: Array, x: Array, u: Rows) -> float:
     """How far the input moves with residuals of the last instants, in standard deviations of what chance gives.
 
     What the input and the simulated output were does not tell all moves: those of a reference that is held are rare
     and large, and would drown the answer to the noise. So they are clipped. Residuals that are white and independent
     of the input are independent of any function of it.
     """
-    steps = range(ORDER)
-    before = np.column_stack((np.ones(e.size), u[:, 1:], *(np.roll(x, k) for k in steps)))[ORDER:]
-    now, weight, rest = u[ORDER:, 0], np.ones(e.size - ORDER), u[ORDER:, 0]
+    blocks = list(row_blocks(e.size - ORDER))
+    inputs = np.concatenate([u[rows] for rows in row_blocks(e.size)])[ORDER:]
+    outputs = np.lib.stride_tricks.sliding_window_view(x, ORDER)[1:]
+    before = SideBySide((constant(len(inputs)), inputs[:, 1:], outputs))
+    weights = orthonormal(before, 1e-10)
+    basis = np.concatenate([before[rows] @ weights for rows in blocks])
+    now, weight, rest = inputs[:, 0].copy(), np.ones(len(inputs)), inputs[:, 0]
     for _ in range(REWEIGHTED):
-        half = np.sqrt(weight)
-        rest = now - before @ np.linalg.lstsq(half[:, None] * before, half * now, rcond=1e-10)[0]
+        gram = np.sum([basis[rows].T @ (weight[rows, None] * basis[rows]) for rows in blocks], axis=0)
+        rest = now - basis @ np.linalg.lstsq(gram, basis.T @ (weight * now))[0]
         scale = robust_deviation(rest)
         if not scale > 1e-9 * float(np.ptp(now)):
             return 0.0
@@ -101,16 +122,12 @@ def _answer_at_once(e: Array, x: Array, u: Array) -> float:
 
 def _behind_a_pole(x: Array, time_constants: Array) -> Array:
     """Samples behind first-order filters with the given time constants in samples."""
-    from scipy.signal import lfilter  # slow to import
-
-    poles = np.exp(-1.0 / time_constants)
-    return np.column_stack([lfilter([1.0 - p], [1.0, -p], x) for p in poles])
-
-
-def _rest(e: Array, columns: Array) -> Array:
-    """What columns leave of residuals."""
-    rest: Array = e - columns @ np.linalg.lstsq(columns, e, rcond=None)[0]
-    return rest
+    columns = np.empty((x.size, time_constants.size))
+    for column, p in zip(columns.T, np.exp(-1.0 / time_constants), strict=True):
+        behind = (1.0 - p) * x[:, None]
+        autoregress(behind, np.array([1.0, -p]))
+        column[:] = behind[:, 0]
+    return columns
 
 
 def _power(e: Array) -> float:

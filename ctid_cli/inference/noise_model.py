@@ -4,9 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
+from numba import njit
 
 from ctid_cli.arrays import Array
+from ctid_cli.inference.beside import Rows, row_blocks
+
+#: Share of the energy of a noise that is rounding.
+ROUNDING = 1e-17
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,34 +38,53 @@ class NoiseModel:
 
     def innovations(self, v: Array) -> Array:
         """The white noise e behind successive samples of v, which is taken as zero before."""
-        from scipy.signal import lfilter  # slow to import
-
-        white: Array = lfilter(self.coefficients, [1.0], v)
+        white: Array = np.convolve(v, self.coefficients)[: v.size]
         return white
 
     def autocovariance(self, count: int) -> Array:
         """Autocovariances at the lags 0, 1 … count - 1 intervals."""
-        result = np.zeros(max(count, self.order + 1))
-        result[: self.order + 1] = self.first_autocovariances
-        if self.order:
-            from scipy.signal import lfilter, lfiltic  # slow to import
+        result = np.zeros((max(count, self.order + 1), 1))
+        result[: self.order + 1, 0] = self.first_autocovariances
+        # The Yule-Walker recursion: autocovariances beyond the order follow the noise-free difference equation.
+        autoregress(result[1:], self.coefficients)
+        return result[:count, 0]
 
-            # The Yule-Walker recursion: autocovariances beyond the order follow the noise-free difference equation.
-            state = lfiltic([1.0], self.coefficients, self.first_autocovariances[:0:-1])
-            rest = np.zeros(result.size - self.order - 1)
-            result[self.order + 1 :] = lfilter([1.0], self.coefficients, rest, zi=state)[0]
-        return result[:count]
+    def covariance_of(self, columns: Rows) -> Array:
+        r"""Covariance of the products of successive samples of v with columns.
 
-    def covariance_times(self, columns: Array) -> Array:
-        """Product of the covariance matrix of successive samples, ``R_v(t - s)``, and given columns."""
-        count = columns.shape[0]
-        covariances = self.autocovariance(count)
-        length = next_fast_len(2 * count - 1, real=True)
-        circular = np.zeros(length)
-        circular[:count] = covariances
-        circular[length - count + 1 :] = covariances[:0:-1]
-        product: Array = irfft(rfft(circular)[:, None] * rfft(columns, length, axis=0), length, axis=0)[:count]
-        return product
+        R is symmetric in time, so ``columns' R columns = s^2 sum g g'`` with ``g = c(q)^{-1} columns``, over all times,
+        those after the last row included: there the last r rows go on by themselves.
+        """
+        r = self.order
+        if not len(columns):
+            return np.zeros((0, 0))
+        width = columns[:1].shape[1]
+        before, total = np.zeros((r, width)), np.zeros((width, width))
+        for rows in row_blocks(len(columns)):
+            block = np.vstack((before, columns[rows]))
+            autoregress(block, self.coefficients)
+            total += block[r:].T @ block[r:]
+            before = block[block.shape[0] - r :]
+        if r:
+            # Each step of the recursion moves the rows on; doubling the step sums the energy of all to come.
+            step = np.eye(r, k=1)
+            step[-1] = -self.coefficients[:0:-1]
+            energy = np.outer(step[-1], step[-1])
+            while (more := step.T @ energy @ step).max() > ROUNDING * energy.max():
+                energy, step = energy + more, step @ step
+            total += before.T @ energy @ before
+        return np.asarray(self.innovation_variance * total)
+
+
+@njit(cache=True, nogil=True)
+def autoregress(columns: Array, coefficients: Array) -> None:
+    """Columns behind ``1/c(q)``, in place; the first r rows are outputs already."""
+    r = coefficients.size - 1
+    for t in range(r, columns.shape[0]):
+        # Row by row, so that all columns advance side by side in memory.
+        for i in range(1, r + 1):
+            for j in range(columns.shape[1]):
+                columns[t, j] -= coefficients[i] * columns[t - i, j]
 
 
 def fit_noise_model(blocks: Sequence[Array], max_order: int | None = None) -> NoiseModel:

@@ -1,18 +1,38 @@
-"""The quantiles on which intervals of estimates rest, and a deviation from one."""
+"""The quantiles and probabilities on which intervals and tests rest, and a deviation from one.
+
+`scipy.special` is slow to import, and most searches never ask for a probability.
+"""
+
+import math
 
 import numpy as np
-from scipy.special import ndtri, stdtrit
 
 from ctid_cli.arrays import Array
 
 
 def normal_quantile(level: float = 0.95) -> float:
     """Half the width of a two-sided interval of that probability [standard errors]."""
+    from scipy.special import ndtri
+
     return float(ndtri(0.5 + level / 2))
+
+
+def normal_tail(z: float) -> float:
+    """Probability that a standard normal variable exceeds z."""
+    return 0.5 * math.erfc(z / math.sqrt(2.0))
+
+
+def chi_square_tail(degrees_of_freedom: int, x: float) -> float:
+    """Probability that a chi-square variable exceeds x."""
+    from scipy.special import chdtrc
+
+    return float(chdtrc(degrees_of_freedom, x))
 
 
 def student_quantile(degrees_of_freedom: float, level: float = 0.95) -> float:
     """The same where the standard error itself is known only as well as these degrees of freedom tell."""
+    from scipy.special import stdtrit
+
     return float(stdtrit(degrees_of_freedom, 0.5 + level / 2))
 
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc
 
 from ctid_cli.arrays import Array
+from ctid_cli.inference.beside import Rest, Rows, SideBySide, constant, row_blocks
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
-from ctid_cli.inference.quantile import normal_quantile
+from ctid_cli.inference.quantile import chi_square_tail, normal_quantile
 
 #: Fewer residuals than this are not tested.
 FEWEST_TESTED = 20
@@ -136,40 +136,31 @@ def whiteness(e: Array, lags: int) -> tuple[Array, float, float]:
         return np.full(lags, np.nan), float("nan"), float("nan")
     autocorrelation = np.array([e[k:] @ e[:-k] for k in range(1, lags + 1)]) / power
     statistic = float(count * (count + 2) * np.sum(autocorrelation**2 / (count - np.arange(1, lags + 1))))
-    return autocorrelation, statistic, float(chdtrc(lags, statistic))
+    return autocorrelation, statistic, chi_square_tail(lags, statistic)
 
 
 def _cross_correlation(
     e: Array, u: Array, lags: int, quantile: float, psi: Array | None
 ) -> tuple[Array, float, float, int, float]:
     """Cross-correlation at -lags … lags, its band, the portmanteau statistic, its degrees of freedom and p-value."""
-    from scipy.signal import correlate  # slow to import
-
     e, u = e - e.mean(), u - u.mean()
     count = e.size
     # A constant leaves rounding behind when its mean is taken off.
     scale = float(np.sqrt((e @ e) * (u @ u)))
     if not scale > 0 or np.ptp(u) <= 1e-12 * np.abs(u).max(initial=0.0):
         return np.full(2 * lags + 1, np.nan), np.nan, np.nan, 0, np.nan
-    shifted = np.zeros((count, 2 * lags + 1))
-    for column, k in enumerate(range(-lags, lags + 1)):
-        if k >= 0:
-            shifted[k:, column] = u[: count - k]
-        else:
-            shifted[:k, column] = u[-k:]
-    cross = shifted.T @ e / scale
+    # Column k + lags is u(t - k): a look at the input between zeros, backwards.
+    shifted = np.lib.stride_tricks.sliding_window_view(np.pad(u, lags), 2 * lags + 1)[:, ::-1]
+    cross = np.sum([shifted[rows].T @ e[rows] for rows in row_blocks(count)], axis=0) / scale
 
     noise = fit_noise_model([e])
-    colour = noise.autocovariance(count) / noise.first_autocovariances[0]
-    input_autocorrelation = correlate(u, u, method="fft")[count - 1 :] / float(u @ u)
     # sum over all lags, both signs
-    spread = 2.0 * float(colour @ input_autocorrelation) - 1.0
+    spread = float(noise.covariance_of(u[:, None])[0, 0]) / (float(noise.first_autocovariances[0]) * float(u @ u))
     band = quantile * float(np.sqrt(max(spread, 0.0) / count))
 
     # Beside the constant and psi, whatever was subtracted from the noise along them does not count.
-    found = dependence(
-        e, shifted, noise, np.ones((count, 1)) if psi is None else np.column_stack((np.ones(count), psi))
-    )
+    constants = constant(count)
+    found = dependence(e, shifted, noise, constants if psi is None else SideBySide((constants, psi)))
     return cross, band, found.statistic, found.freedom, found.p_value
 
 
@@ -182,16 +173,16 @@ class Dependence(NamedTuple):
     p_value: float
 
 
-def dependence(e: Array, columns: Array, noise: NoiseModel, beside: Array) -> Dependence:
+def dependence(e: Array, columns: Rows, noise: NoiseModel, beside: Rows) -> Dependence:
     """Chi-square statistic ``c' cov(c)^+ c`` of the products c of the residuals with what others leave of columns."""
-    beside = beside / np.maximum(np.linalg.norm(beside, axis=0), np.finfo(float).tiny)
-    power = float(np.max(np.sum(columns**2, axis=0), initial=0.0))
-    columns = columns - beside @ np.linalg.lstsq(beside, columns, rcond=None)[0]
-    covariance = columns.T @ noise.covariance_times(columns) * e.size / max(e.size - beside.shape[1], 1)
+    rest, blocks = Rest.of(columns, beside), list(row_blocks(e.size))
+    power = float(np.max(np.sum([np.sum(columns[rows] ** 2, axis=0) for rows in blocks], axis=0), initial=0.0))
+    products = np.sum([rest[rows].T @ e[rows] for rows in blocks], axis=0)
+    covariance = noise.covariance_of(rest) * e.size / max(e.size - beside[:1].shape[1], 1)
     values, vectors = np.linalg.eigh(covariance)
     # What others leave of a repetition of theirs is rounding.
     least = NEGLIGIBLE_VARIANCE * max(float(values[-1]), ROUNDING * power * noise.innovation_variance)
     kept = values > least
-    statistic = float(np.sum((vectors[:, kept].T @ (columns.T @ e)) ** 2 / values[kept]))
+    statistic = float(np.sum((vectors[:, kept].T @ products) ** 2 / values[kept]))
     freedom = int(kept.sum())
-    return Dependence(statistic, freedom, float(chdtrc(freedom, statistic)) if freedom else np.nan)
+    return Dependence(statistic, freedom, chi_square_tail(freedom, statistic) if freedom else np.nan)

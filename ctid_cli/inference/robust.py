@@ -51,7 +51,7 @@ def robust_covariance(psi: Sequence[Array], residuals: Sequence[Array], *, regul
     scaled = [block * scale for block in psi]
     noise = fit_residual_noise(scaled, residuals)
     if regular:
-        sigma = sum((block.T @ noise.covariance_times(block) for block in scaled), np.zeros((size, size)))
+        sigma = sum((noise.covariance_of(block) for block in scaled), np.zeros((size, size)))
         return sandwich(inverse, scale, sigma), noise
     sigma = _long_run_covariance([block * error[:, None] for block, error in zip(scaled, residuals, strict=True)])
     return sandwich(inverse, scale, sigma, 1.0 - size / count), noise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,10 +58,15 @@ class HeldSignal:
     def __repr__(self) -> str:
         return f"HeldSignal({self.t.size} values from {self.t[0]:g} to {self.t[-1]:g} s, {self.hold})"
 
-    @property
+    @cached_property
     def slack(self) -> float:
         """Instants closer than this count as the same [s]."""
         return COINCIDENCE * float(np.diff(self.t).min()) if self.t.size > 1 else 0.0
+
+    @cached_property
+    def mean(self) -> float:
+        """Mean of the values at the breaks [input unit]."""
+        return float(self.values.mean())
 
     def at(self, times: ArrayLike) -> Array:
         """Value of the signal at given instants, from the right at a jump.

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.linalg import solve_toeplitz, toeplitz
+from scipy.linalg import matmul_toeplitz, solve_toeplitz, toeplitz
 from scipy.signal import lfilter
 
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
@@ -38,11 +38,19 @@ def test_autocovariance_is_that_of_the_impulse_response():
     np.testing.assert_array_equal(model.autocovariance(2), expected[:2])
 
 
-def test_covariance_times_columns_is_the_toeplitz_product():
+@pytest.mark.parametrize("count", [3, 37, 5000])
+def test_covariance_of_products_is_that_of_the_toeplitz_matrix(count):
     model = fit_noise_model([ar2(300)])
-    columns = np.random.default_rng(1).standard_normal((37, 2))
-    expected = toeplitz(model.autocovariance(37)) @ columns
-    np.testing.assert_allclose(model.covariance_times(columns), expected, rtol=1e-12, atol=1e-9)
+    columns = np.random.default_rng(1).standard_normal((count, 2))
+    expected = columns.T @ matmul_toeplitz(model.autocovariance(count), columns)
+    np.testing.assert_allclose(model.covariance_of(columns), expected, rtol=1e-9)
+
+
+def test_products_of_slow_noise_end_long_after_the_columns():
+    root = 0.99999
+    model = NoiseModel(np.array([1.0, -root]), np.array([1.0, root]) / (1.0 - root**2), 1.0)
+    expected = toeplitz(root ** np.arange(50)).sum() / (1.0 - root**2)
+    assert model.covariance_of(np.ones((50, 1)))[0, 0] == pytest.approx(expected, rel=1e-9)
 
 
 def test_white_noise_has_order_zero_and_no_later_autocovariance():

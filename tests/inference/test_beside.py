@@ -1,0 +1,41 @@
+"""Projections in blocks of rows against dense least squares."""
+
+import numpy as np
+import pytest
+from scipy.linalg import toeplitz
+from scipy.stats import chi2
+
+from ctid_cli.inference.beside import ROWS, Rest, SideBySide, constant, orthonormal, rest_of
+from ctid_cli.inference.noise_model import NoiseModel
+from ctid_cli.inference.residuals import dependence
+
+RNG = np.random.default_rng(5)
+
+
+def least_squares_rest(columns, beside):
+    beside = beside / np.linalg.norm(beside, axis=0)
+    return columns - beside @ np.linalg.lstsq(beside, columns, rcond=None)[0]
+
+
+@pytest.mark.parametrize("count", [40, ROWS, 2 * ROWS + 17])
+def test_the_rest_is_that_of_least_squares(count):
+    # Nearly collinear columns of very different sizes, one twice.
+    slow = np.cumsum(RNG.standard_normal(count))
+    beside = np.column_stack((slow, 1e6 * slow + RNG.standard_normal(count), slow))
+    columns = RNG.standard_normal((count, 3))
+    parts = SideBySide((constant(count), beside))
+    expected = least_squares_rest(columns, parts[:])
+    np.testing.assert_allclose(Rest.of(columns, parts)[:], expected, atol=1e-8)
+    np.testing.assert_allclose(rest_of(columns[:, 1], parts), expected[:, 1], atol=1e-8)
+    assert orthonormal(parts).shape == (4, 3)
+
+
+def test_dependence_is_the_chi_square_form_of_dense_matrices():
+    count, noise = 2 * ROWS + 5, NoiseModel(np.array([1.0, -0.6]), np.array([1.0, 0.6]) / 0.64, 1.0)
+    e, columns, beside = (RNG.standard_normal((count, width)) for width in (1, 4, 2))
+    rest = least_squares_rest(columns, beside)
+    covariance = rest.T @ toeplitz(noise.autocovariance(count)) @ rest * count / (count - 2)
+    products = columns.T @ least_squares_rest(e, beside)
+    found = dependence(e[:, 0], columns, noise, beside)
+    assert found.statistic == pytest.approx(float(products.T @ np.linalg.solve(covariance, products)), rel=1e-9)
+    assert found.p_value == pytest.approx(chi2.sf(found.statistic, 4), rel=1e-9)
