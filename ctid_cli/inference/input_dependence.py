@@ -5,11 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.beside import Rows, SideBySide, constant, orthonormal, rest_of, row_blocks
+from ctid_cli.inference.beside import SideBySide, constant, orthonormal, rest_of, row_blocks
 from ctid_cli.inference.noise_model import autoregress, fit_noise_model
 from ctid_cli.inference.quantile import normal_tail, robust_deviation
 from ctid_cli.inference.residuals import dependence
-from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
 #: Inputs looked at, in sampling intervals: before the instant at which the model uses them, and after the residual.
@@ -40,6 +39,8 @@ class InputDependence:
 def input_dependence(e: Array, x: Array, psi: Array, t: Array, record: Record, delay: float) -> InputDependence | None:
     r"""Test residuals at instants t against earlier and later inputs; None in too short a record.
 
+    Earlier and later count the samples, whose instants are those at which a controller acts.
+
     The model is contained in that with one more pole and zero, ``B (s + z) / (A (s + p))`` with z = p; its derivative
     there is the simulated output x behind ``1/(s + p)``, and a few p span what a pole could add.
 
@@ -48,65 +49,51 @@ def input_dependence(e: Array, x: Array, psi: Array, t: Array, record: Record, d
     """
     interval = float(np.median(np.diff(record.t)))
     past, future = min(PAST, t.size // 8), min(FUTURE, t.size // 16)
-    allowed = (t - delay - past * interval >= record.t[0]) & (t + future * interval <= record.t[-1])
-    if future < ORDER or np.count_nonzero(allowed) < 2 * (past + future + psi.shape[1]):
+    inside = slice(int(np.searchsorted(t, record.t[0] + delay)) + past, t.size - future)
+    if future < ORDER or inside.stop - inside.start < 2 * (past + future + psi.shape[1]):
         return None
-    inside = slice(int(allowed.argmax()), int(allowed.size - allowed[::-1].argmax()))
     added = _behind_a_pole(x - x[0], np.geomspace(1.0, LONGEST * t.size, TRIED))[inside]
-    e, x, psi, t = e[inside] - e[inside].mean(), x[inside], psi[inside], t[inside]
+    e, x, psi = e[inside] - e[inside].mean(), x[inside], psi[inside]
     noise = fit_noise_model([e])
     if not noise.innovation_variance > 0:
         return None
-    beside = SideBySide((constant(t.size), psi))
+    beside = SideBySide((constant(e.size), psi))
     pole = dependence(e, added, noise, beside)
     share = 1.0 - _power(rest_of(e, SideBySide((beside, added)))) / _power(rest_of(e, beside))
 
-    def inputs(first: Array, steps: range) -> _Inputs:
-        return _Inputs(record.input, first, interval * np.array(steps))
+    def inputs(shift: float, steps: range) -> Array:
+        """A look at the input so many samples from each residual, without a copy for every column."""
+        values = record.input.at(t - shift) - record.input.mean
+        looks = np.lib.stride_tricks.sliding_window_view(values, len(steps))
+        return looks[inside.start + min(steps) : inside.stop + min(steps), :: steps.step]
 
-    earlier = inputs(t - delay, range(min(LATE, int(delay / interval)), -past, -1))
+    earlier = inputs(delay, range(min(LATE, int(delay / interval)), -past, -1))
     known = SideBySide((beside, earlier))
     # Between its samples an input along straight lines has moved before the residual.
     first = 1 if record.input.hold == "foh" else 0
-    later = dependence(e, inputs(t, range(first, first + future)), noise, known)
-    found = [(later.p_value, (later.statistic - later.freedom) / t.size)] if later.freedom else []
+    later = dependence(e, inputs(0.0, range(first, first + future)), noise, known)
+    found = [(later.p_value, (later.statistic - later.freedom) / e.size)] if later.freedom else []
     if not first:
-        z = _answer_at_once(rest_of(e, known), x, inputs(t, range(0, -ORDER - 1, -1)))
-        found.append((2 * ANSWERS * normal_tail(z), z * z / t.size))
+        z = _answer_at_once(rest_of(e, known), x, inputs(0.0, range(0, -ORDER - 1, -1)))
+        found.append((2 * ANSWERS * normal_tail(z), z * z / e.size))
     likely, told = min(found, default=(1.0, 0.0))
     return InputDependence(pole.p_value, share, min(1.0, len(found) * likely), told)
 
 
-@dataclass(frozen=True, eq=False)
-class _Inputs:
-    """The input at shifted instants, about its mean."""
-
-    signal: HeldSignal
-    instants: Array
-    shifts: Array
-
-    def __len__(self) -> int:
-        return self.instants.size
-
-    def __getitem__(self, rows: slice, /) -> Array:
-        values: Array = self.signal.at(self.instants[rows, None] + self.shifts) - self.signal.mean
-        return values
-
-
-def _answer_at_once(e: Array, x: Array, u: Rows) -> float:
+def _answer_at_once(e: Array, x: Array, u: Array) -> float:
     """How far the input moves with residuals of the last instants, in standard deviations of what chance gives.
 
     What the input and the simulated output were does not tell all moves: those of a reference that is held are rare
     and large, and would drown the answer to the noise. So they are clipped. Residuals that are white and independent
     of the input are independent of any function of it.
     """
-    blocks = list(row_blocks(e.size - ORDER))
-    inputs = np.concatenate([u[rows] for rows in row_blocks(e.size)])[ORDER:]
+    blocks, inputs = list(row_blocks(e.size - ORDER)), u[ORDER:]
     outputs = np.lib.stride_tricks.sliding_window_view(x, ORDER)[1:]
     before = SideBySide((constant(len(inputs)), inputs[:, 1:], outputs))
     weights = orthonormal(before, 1e-10)
     basis = np.concatenate([before[rows] @ weights for rows in blocks])
-    now, weight, rest = inputs[:, 0].copy(), np.ones(len(inputs)), inputs[:, 0]
+    now = rest = inputs[:, 0]
+    weight = np.ones(now.size)
     for _ in range(REWEIGHTED):
         gram = np.sum([basis[rows].T @ (weight[rows, None] * basis[rows]) for rows in blocks], axis=0)
         rest = now - basis @ np.linalg.lstsq(gram, basis.T @ (weight * now))[0]

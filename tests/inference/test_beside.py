@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.linalg import toeplitz
+from scipy.linalg import matmul_toeplitz
 from scipy.stats import chi2
 
 from ctid_cli.inference.beside import ROWS, Rest, SideBySide, constant, orthonormal, rest_of
@@ -34,8 +34,8 @@ def test_dependence_is_the_chi_square_form_of_dense_matrices():
     count, noise = 2 * ROWS + 5, NoiseModel(np.array([1.0, -0.6]), np.array([1.0, 0.6]) / 0.64, 1.0)
     e, columns, beside = (RNG.standard_normal((count, width)) for width in (1, 4, 2))
     rest = least_squares_rest(columns, beside)
-    covariance = rest.T @ toeplitz(noise.autocovariance(count)) @ rest * count / (count - 2)
+    covariance = rest.T @ matmul_toeplitz(noise.autocovariance(count), rest) * count / (count - 2)
     products = columns.T @ least_squares_rest(e, beside)
     found = dependence(e[:, 0], columns, noise, beside)
-    assert found.statistic == pytest.approx(float(products.T @ np.linalg.solve(covariance, products)), rel=1e-9)
+    assert found.statistic == pytest.approx((products.T @ np.linalg.solve(covariance, products)).item(), rel=1e-9)
     assert found.p_value == pytest.approx(chi2.sf(found.statistic, 4), rel=1e-9)
