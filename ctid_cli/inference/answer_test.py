@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.filtering.simulate import simulate
@@ -249,6 +248,8 @@ def _unbiased(noise: Array, count: int) -> Array:
 
 def _drawn(noise: Array, count: int, rng: np.random.Generator) -> Array:
     """Series of the noise, one a column, cut from periodic ones that are so long that the period does not show."""
+    from scipy.fft import irfft, next_fast_len, rfft  # slow to import
+
     length = next_fast_len(PERIOD * count, real=True)
     innovations = rfft(rng.standard_normal((length, SERIES)), axis=0)
     drawn: Array = irfft(innovations / rfft(noise, length)[:, None], length, axis=0)[:count]
@@ -257,6 +258,8 @@ def _drawn(noise: Array, count: int, rng: np.random.Generator) -> Array:
 
 def _filtered(columns: Array, noise: Array) -> Array:
     """What is new in each sample, without the transient of the filter."""
+    from scipy.fft import irfft, next_fast_len, rfft  # slow to import
+
     count = len(columns)
     length = next_fast_len(count, real=True)
     # What wraps around falls into the transient.

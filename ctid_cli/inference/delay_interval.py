@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 
 #: The rise of the cost two standard errors away is called quadratic if its square root is right to this share.
 QUADRATIC_TOLERANCE = 0.1
@@ -88,6 +87,8 @@ class CostOfDelay:
 
 def _crossing(excess: Callable[[float], float], start: float, bound: float) -> tuple[float, bool]:
     """First point from the start towards the bound at which the excess becomes positive, or the bound and True."""
+    from scipy.optimize import brentq  # slow to import
+
     room = bound - start
     if room == 0:
         return bound, True

@@ -4,6 +4,7 @@
 """
 
 import math
+from statistics import NormalDist
 
 import numpy as np
 
@@ -12,9 +13,7 @@ from ctid_cli.arrays import Array
 
 def normal_quantile(level: float = 0.95) -> float:
     """Half the width of a two-sided interval of that probability [standard errors]."""
-    from scipy.special import ndtri
-
-    return float(ndtri(0.5 + level / 2))
+    return NormalDist().inv_cdf(0.5 + level / 2)
 
 
 def normal_tail(z: float) -> float:
