@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import OptionError
@@ -79,21 +80,34 @@ class Lowpass:
         """
         y = record.bridged_y
         if record.interval is not None and record.input_on_grid:
-            from scipy import signal  # slow to import, needed only here
-
             if self.cutoff * record.interval >= np.pi:
                 raise ValueError(
                     f"the low-pass cut-off {self.cutoff:g} rad/s is not below half the sampling frequency, "
                     f"{np.pi / record.interval:g} rad/s"
                 )
-            sections = signal.butter(self.order, self.cutoff, fs=2 * np.pi / record.interval, output="sos")
-            filtered_u = HeldSignal(record.input.t, signal.sosfilt(sections, record.input.values), record.input.hold)
-            filtered_y = signal.sosfilt(sections, y)
+            sections = self._sections(record.interval)
+            filtered_u = HeldSignal(record.input.t, _behind(sections, record.input.values.copy()), record.input.hold)
+            filtered_y = _behind(sections, y.copy())
         else:
             instants = np.union1d(record.t, record.input.t[record.input.t <= record.t[-1]])
             filtered_u = HeldSignal(instants, simulate(self.model, record.input, instants), "foh")
             filtered_y = simulate(self.model, HeldSignal(record.t, y, "foh"), record.t)
         return Record(record.t, np.where(record.valid, filtered_y, np.nan), filtered_u, name=record.name)
+
+    def _sections(self, interval: float) -> Array:
+        """The filter by bilinear transform with the cut-off in its place, in sections of second order, shape (k, 5).
+
+        Each is ``(b0 + b1/q + b2/q^2)/(1 + a1/q + a2/q^2)`` with unit gain at zero frequency.
+        """
+        warped = np.tan(0.5 * self.cutoff * interval)
+        # Pairs of poles at the angles from the imaginary axis, the most damped first; of odd orders a real one too.
+        angles = np.pi * np.arange(2 * (self.order // 2) - 1, 0, -2) / (2 * self.order)
+        sections = [np.array([warped, warped, 0.0, warped - 1.0, 0.0]) / (1.0 + warped)] * (self.order % 2)
+        square = warped**2
+        for damping in (2.0 * np.sin(angles) * warped).tolist():
+            section = np.array([square, 2.0 * square, square, 2.0 * (square - 1.0), 1.0 - damping + square])
+            sections.append(section / (1.0 + damping + square))
+        return np.array(sections)
 
     def resample(self, record: Record, per_period: float | None = None) -> Record:
         """Filter a record and keep only as many samples as its slow signals need.
@@ -137,6 +151,22 @@ class Lowpass:
             u, y = (simulate(self.model, signal, t) for signal in (record.input, output))
         covered = _covered(t, record, interval)
         return Record(t, np.where(covered, y, np.nan), HeldSignal(t, u, "foh"), name=record.name)
+
+
+@njit(cache=True, nogil=True)
+def _behind(sections: Array, x: Array) -> Array:
+    """Samples behind sections of second order in a row, from rest, in their place."""
+    states = np.zeros((sections.shape[0], 2))
+    for k in range(x.size):
+        value = x[k]
+        for i in range(sections.shape[0]):
+            # Transposed direct form: two numbers remember all that went before.
+            out = sections[i, 0] * value + states[i, 0]
+            states[i, 0] = sections[i, 1] * value - sections[i, 3] * out + states[i, 1]
+            states[i, 1] = sections[i, 2] * value - sections[i, 4] * out
+            value = out
+        x[k] = value
+    return x
 
 
 def _covered(t: Array, record: Record, longest: float) -> BoolArray:
