@@ -1,8 +1,10 @@
 """Where estimates start: what a start is called, and what it is on a data set."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from decimal import Decimal
-from typing import Literal, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 from ctid_cli.canonical import content_hash
 from ctid_cli.estimation.common import Start
@@ -10,7 +12,9 @@ from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.factoring import factored
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.streams import stream
-from ctid_cli.specification.start_sections import RelativeStart, StartsSection, UniformStart
+
+if TYPE_CHECKING:
+    from ctid_cli.specification.start_sections import StartsSection
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,9 @@ def additive_form(model: TransferFunction | AdditiveModel) -> AdditiveModel:
 
 def start_points(section: StartsSection | None) -> tuple[StartPoint, ...]:
     """The starts that a specification names."""
+    # A worker draws starts and never reads a section, which would take it half a second to import.
+    from ctid_cli.specification.start_sections import RelativeStart, UniformStart
+
     if section is None:
         return ()
     points: list[StartPoint] = []
