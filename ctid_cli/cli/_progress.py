@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 LINE_EVERY = 10.0
 #: Seconds before the bar of a single record appears: most are done sooner.
 BAR_AFTER = 1.0
+#: Seconds before a fit shows how long it takes.
+TIME_AFTER = 2.0
 #: Kernels that are ready sooner than this came from the cache [s].
 QUICK = 2.0
 
@@ -88,6 +91,45 @@ class RecordProgress(_Progress):
             self._update(done)
         elif self._is_time():
             self._say(f"{100 * done / total:.0f} % of {self.what}")
+
+
+class FitProgress(RecordProgress):
+    """The time that a fit has taken, on a terminal and where it is not done at once; then the draws of a bootstrap."""
+
+    def __init__(self, samples: int) -> None:
+        super().__init__("bootstrap", "the draws")
+        self._fitting = f"fitting {count(samples, 'sample')}"
+        self._timer = threading.Timer(TIME_AFTER, self._show_time)
+
+    def __enter__(self) -> Self:
+        if sys.stderr.isatty():
+            self._timer.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stop_time()
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show that so many of all draws are done."""
+        if done == 1:
+            self._stop_time()
+        super().__call__(done, total)
+
+    def _show_time(self) -> None:
+        from rich.console import Console
+        from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+        shown = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+        self._bar = Progress(*shown, console=Console(stderr=True), transient=True)
+        self._bar.add_task(self._fitting)
+        self._bar.start()
+
+    def _stop_time(self) -> None:
+        self._timer.cancel()
+        if self._timer.ident is not None:
+            self._timer.join()
+        super().__exit__()
+        self._bar = None
 
 
 class Reporter(_Progress):

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from ctid_cli.cli._common import From, InputColumn, InputHold, Json, OutputColumn, TimeColumn, To, guarded, write_files
-from ctid_cli.cli._progress import RecordProgress
+from ctid_cli.cli._progress import FitProgress
 from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import InitialState, LossKind, Offset
 
@@ -70,7 +70,7 @@ def fit(
     other = None if validate is None else read(validate)
     units = common_units(measurements if other is None else [*measurements, other])
     validation = None if other is None else other.record
-    with RecordProgress("bootstrap", "the draws") as progress:
+    with FitProgress(sum(item.record.n_samples for item in measurements)) as progress:
         noise: Any = ("auto",) if bootstrap is None else ("bootstrap", bootstrap, progress)
         result = identify(options, [item.record for item in measurements], validation, *noise)
     text = json.dumps(identification_object(result, measurements, units, other), allow_nan=False)

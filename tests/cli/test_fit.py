@@ -1,11 +1,15 @@
 """``ctid fit``: from files to a model, or to one sentence."""
 
+import io
 import json
+import sys
+import time
 
 import numpy as np
 import pytest
 
 from ctid_cli import HeldSignal, TransferFunction, simulate
+from ctid_cli.cli import _progress
 
 SYSTEM = TransferFunction([3.0], [1.0, 1.2, 4.0], 0.73)
 
@@ -203,3 +207,20 @@ def test_usage(ctid, arguments, tmp_path, monkeypatch):
     error = ctid(*arguments, code=2).stderr
     assert "ctid check x.csv" in error if arguments == ("fit", "x.csv") else "Error" in error
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_long_fit_shows_its_time_on_a_terminal(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setattr(_progress, "TIME_AFTER", 0.05)
+    shown = {}
+    for kind in (Terminal, io.StringIO):
+        monkeypatch.setattr(sys, "stderr", kind())
+        with _progress.FitProgress(1_000_000) as progress:
+            time.sleep(0.4)
+            progress(1, 2)
+        shown[kind] = sys.stderr.getvalue()
+    assert "fitting 1000000 samples" in shown[Terminal].replace(",", "")
+    assert "fitting" not in shown[io.StringIO]
