@@ -14,15 +14,15 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, IntArray
 from ctid_cli.filtering.exponential import HeldStep, exponential_minus_identity, multiply, place, row_norm
 from ctid_cli.filtering.filter_data import FilterData, clock_slack
 from ctid_cli.filtering.row_sink import BLOCK, RowSink, emit, finish
 
 #: Digits per level and Taylor degree of the transitions on an irregular clock.
 BASE = 16
-TAYLOR_DEGREE = 5
-QUANTUM_NORM = 2.0**-9
+TAYLOR_DEGREE = 6
+QUANTUM_NORM = 2.0**-7
 
 
 @njit(cache=True, nogil=True)
@@ -94,8 +94,11 @@ class _Transitions(NamedTuple):
     #: exp(M digit BASE^level quantum), shape (levels, BASE, n + 2, n + 2).
     powers: Array
     quantum: float
-    #: M, the dynamics with the held signal and its slope as states.
-    augmented: Array
+    #: Entries that are not zero of M, the dynamics with the held signal and its slope as states, row by row: where each
+    #: row begins, the columns, and the values.
+    starts: IntArray
+    columns: IntArray
+    values: Array
 
 
 @njit(cache=True, nogil=True)
@@ -108,7 +111,15 @@ def _transitions(dynamics: Array, gain: Array, longest: float) -> _Transitions:
     for i in range(n):
         augmented[i, n] = gain[i]
     augmented[n, n + 1] = 1.0
-    # Within a quantum the Taylor remainder, (2^-9)^6/6!, is below rounding.
+    starts = np.zeros(n + 3, dtype=np.int64)
+    columns, values = np.zeros((n + 2) * (n + 2), dtype=np.int64), np.zeros((n + 2) * (n + 2))
+    for i in range(n + 2):
+        starts[i + 1] = starts[i]
+        for j in range(n + 2):
+            if augmented[i, j] != 0.0:
+                columns[starts[i + 1]], values[starts[i + 1]] = j, augmented[i, j]
+                starts[i + 1] += 1
+    # Within a quantum the Taylor remainder, (2^-7)^7/7!, is below rounding.
     quantum = QUANTUM_NORM / row_norm(augmented)
     levels = 1
     while quantum * float(BASE) ** levels <= longest and levels < 40:
@@ -126,16 +137,17 @@ def _transitions(dynamics: Array, gain: Array, longest: float) -> _Transitions:
             for i in range(n + 2):
                 for j in range(n + 2):
                     power[i, j] += first[i, j] + product[i, j]
-    return _Transitions(powers, quantum, augmented)
+    return _Transitions(powers, quantum, starts, columns, values)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _step(table: _Transitions, step: float, state: Array, work: Array) -> None:
-    """Advance ``state = [z, v, v']`` by ``step``, in place."""
-    powers, augmented = table.powers, table.augmented
+    """Advance ``state = [z, v, v']`` of a chain by ``step``, in place."""
+    powers = table.powers
     # Digits from the lowest up; the transitions commute. The table ends at the longest step, so that only rounding can
     # ask its last level for more than one digit.
     size = state.size
+    n = size - 2
     whole = np.floor(step / table.quantum)
     rest = step - whole * table.quantum
     level = 0
@@ -145,27 +157,33 @@ def _step(table: _Transitions, step: float, state: Array, work: Array) -> None:
         if level == powers.shape[0] - 1:
             digit = min(int(whole), BASE - 1)
         if digit > 0:
-            for i in range(size):
-                total = 0.0
-                for m in range(size):
-                    total += powers[level, digit, i, m] * state[m]
-                work[i] = total
-            for i in range(size):
-                state[i] = work[i]
+            power = powers[level, digit]
+            # Zero above the first superdiagonal, but for the two columns of the signal.
+            for i in range(n):
+                total = power[i, n] * state[n] + power[i, n + 1] * state[n + 1]
+                for m in range(min(i + 2, n)):
+                    total += power[i, m] * state[m]
+                work[0, i] = total
+            state[n] += power[n, n + 1] * state[n + 1]
+            for i in range(n):
+                state[i] = work[0, i]
         whole = shifted
         level += 1
-    # What is left of a quantum: sum of (M rest)^d/d! applied to the state, term from term.
+    # What is left of a quantum: sum of (M rest)^d/d! applied to the state, term from term; M is nearly empty.
     if rest > 0.0:
-        term = state.copy()
+        starts, columns, values = table.starts, table.columns, table.values
+        term, following = work[0], work[1]
+        for i in range(size):
+            term[i] = state[i]
         for degree in range(1, TAYLOR_DEGREE + 1):
             for i in range(size):
                 total = 0.0
-                for m in range(size):
-                    total += augmented[i, m] * term[m]
-                work[i] = total * rest / degree
+                for k in range(starts[i], starts[i + 1]):
+                    total += values[k] * term[columns[k]]
+                following[i] = total * rest / degree
             for i in range(size):
-                term[i] = work[i]
-                state[i] += work[i]
+                state[i] += following[i]
+            term, following = following, term
 
 
 @njit(cache=True, nogil=True)
@@ -194,7 +212,7 @@ def irregular_chain_pass(
     if ny > 0:
         output_table = _transitions(dynamics[:ny, :ny].copy(), gain[:ny].copy(), longest)
     # z at the last break, and at the instant read; both with the input and its slope behind them, as w with y.
-    base, now, work = np.zeros(nz + 2), np.zeros(nz + 2), np.zeros(nz + 2)
+    base, now, work = np.zeros(nz + 2), np.zeros(nz + 2), np.zeros((2, nz + 2))
     filtered = np.zeros(ny + 2)
     slack = clock_slack(data)
     filled, written = 0, 0

@@ -14,6 +14,7 @@ met.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from math import copysign, exp, sqrt
 
 import numpy as np
 
@@ -76,10 +77,11 @@ class Point:
             if zeta < 0:
                 found.append(complex(-w))
             elif zeta < 1:
-                found += [w * complex(-zeta, sign * np.sqrt(1 - zeta * zeta)) for sign in (1, -1)]
+                swing = sqrt(1 - zeta * zeta)
+                found += [w * complex(-zeta, swing), w * complex(-zeta, -swing)]
             else:
                 # The product of both is w^2: the slow one without cancellation.
-                fast = w * (zeta + np.sqrt(zeta * zeta - 1))
+                fast = w * (zeta + sqrt(zeta * zeta - 1))
                 found += [complex(-fast), complex(-w * w / fast)]
         return np.array(found, dtype=complex)
 
@@ -122,12 +124,12 @@ class Point:
             zip(self.speed.tolist(), self.damping.tolist(), self.edge.tolist(), strict=True)
         ):
             if zeta < 0:
-                speed[i] = w * np.exp(step[k])
+                speed[i] = w * exp(step[k])
                 k += 1
                 continue
-            first, second = np.exp(step[k : k + 2])
+            first, second = exp(step[k]), exp(step[k + 1])
             if edge:
-                real, imaginary = zeta * w * first, np.sqrt(1 - zeta * zeta) * w * second
+                real, imaginary = zeta * w * first, sqrt(1 - zeta * zeta) * w * second
                 speed[i] = np.hypot(real, imaginary)
                 damping[i] = real / speed[i]
             else:
@@ -154,26 +156,24 @@ def box_of(records: Sequence[FilterData], delays: tuple[float, float]) -> Box:
     return Box(SLOWEST / length, FASTEST / interval, greatest, delays, cell, max(quarter, interval))
 
 
-def admissible(poles: ComplexArray, box: Box) -> ComplexArray:
-    """Poles moved to the nearest admissible ones, conjugates kept together."""
-    size = np.clip(np.abs(poles), box.slowest, box.fastest)
-    real = poles.imag == 0
-    damping = np.maximum(-poles.real / np.maximum(np.abs(poles), 1e-300), box.least_damping)
-    swing = size * np.sqrt(np.maximum(1 - damping**2, 0.0))
-    # At the greatest imaginary part the real part stays.
-    over = swing > box.imaginary
-    swing = np.where(over, box.imaginary, swing)
-    decay = np.where(over, np.maximum(size * damping, box.imaginary * box.least_damping), size * damping)
-    return np.where(real, -size + 0j, -decay + 1j * swing * np.sign(poles.imag))
+def admissible(pole: complex, box: Box) -> complex:
+    """A pole moved to the nearest admissible one."""
+    size = min(max(abs(pole), box.slowest), box.fastest)
+    if pole.imag == 0:
+        return complex(-size)
+    damping = max(-pole.real / abs(pole), box.least_damping)
+    real, imaginary = size * damping, size * sqrt(max(1 - damping * damping, 0.0))
+    if imaginary > box.imaginary:
+        # At the greatest imaginary part the real part stays.
+        real, imaginary = max(real, box.imaginary * box.least_damping), box.imaginary
+    return complex(-real, copysign(imaginary, pole.imag))
 
 
 def point_of(poles: ComplexArray, delay: float, box: Box, cell: int | None = None) -> Point:
     """Admissible sections with given poles."""
-    moved = admissible(np.asarray(poles, dtype=complex), box)
-    units = [
-        (abs(p), float(-p.real / abs(p)), bool(p.imag >= box.imaginary * (1 - TOUCH))) for p in moved[moved.imag > 0]
-    ]
-    reals = sorted((-moved[moved.imag == 0].real).tolist())
+    moved = [admissible(pole, box) for pole in poles.tolist()]
+    units = [(abs(p), -p.real / abs(p), p.imag >= box.imaginary * (1 - TOUCH)) for p in moved if p.imag > 0]
+    reals = sorted(-p.real for p in moved if p.imag == 0)
     # The nearest real poles first; one at a bound stays alone, so that it can be frozen there.
     while len(reals) > 1:
         ratios = [
@@ -184,12 +184,12 @@ def point_of(poles: ComplexArray, delay: float, box: Box, cell: int | None = Non
         if ratios[k] > NEAR:
             break
         a, b = reals[k], reals[k + 1]
-        units.append((float(np.sqrt(a * b)), float(0.5 * (a + b) / np.sqrt(a * b)), False))
+        units.append((sqrt(a * b), 0.5 * (a + b) / sqrt(a * b), False))
         del reals[k : k + 2]
     units += [(p, -1.0, False) for p in reals]
     units.sort(key=lambda unit: -unit[0])
     low, high = box.delays
-    tau = float(np.clip(delay, low, high))
+    tau = min(max(float(delay), low), high)
     if cell is None:
         cell = int(np.floor(tau / box.cell)) if box.delay_free and box.cell > 0 else -1
     return Point(

@@ -20,6 +20,9 @@ ROUNDING = 1e-10
 MOST_STEPS, MOST_REJECTIONS, MOST_NEWTON = 60, 12, 15
 #: Places that differ by less than this fraction in poles, dampings and squared error are on the way to one minimum.
 CLOSE = 0.01
+#: A search is given up for a lower known minimum once the fall that a step promises is, so many times, less than what
+#: parts them (after the first few steps), or once the squared error is still so many times higher.
+HOPELESS, FIRST_STEPS, PATIENCE, FAR = 30.0, 3, 12, 4.0
 #: Step of the differences of the gradient; eigenvalues below this fraction of the largest have no sign.
 DIFFERENCE, FLAT = 1e-4, 1e-9
 #: Differences to one side will do where the least eigenvalue exceeds their error by this factor.
@@ -120,12 +123,14 @@ class Descent:
     ) -> Local:
         """Levenberg-Marquardt steps: Moré's scaling, Nielsen's damping, held coordinates frozen.
 
-        A search that comes close to a minimum that is known ends there, any where a step promises but ``near``.
+        A search that comes close to a minimum that is known ends there, any where a step promises but ``near``, and
+        one that will not come down to the lowest known one where that shows.
         """
         here = self.local(start)
+        lowest = min((other.squared_error for other in known), default=np.inf)
         damping, factor, slow = 1e-3, 2.0, 0
         scale = np.zeros(here.gradient.size)
-        for _ in range(most_steps):
+        for taken in range(most_steps):
             here = self._faced(here)
             for other in known:
                 if _alike(here, other, self.box):
@@ -135,7 +140,12 @@ class Descent:
             scale = np.maximum(scale, _lengths(here))
             unit = scale[free]
             scaled, slope = curvature / np.outer(unit, unit), gradient / unit
-            if not free.any() or _promise(scaled, slope)[0] <= near * max(here.squared_error, self.floor):
+            promise = _promise(scaled, slope)[0] if free.any() else 0.0
+            if promise <= near * max(here.squared_error, self.floor):
+                break
+            if taken >= FIRST_STEPS and here.squared_error - HOPELESS * promise > lowest:
+                break
+            if taken >= PATIENCE and here.squared_error > FAR * lowest:
                 break
             step = np.zeros(free.size)
             for _ in range(MOST_REJECTIONS):
@@ -325,15 +335,12 @@ def _same(one: Point, other: Point) -> bool:
 
 def _alike(here: Local, other: Local, box: Box) -> bool:
     """Whether two places are so close that one minimum must be meant."""
-    if not np.array_equal(here.point.damping < 0, other.point.damping < 0):
+    near = here.squared_error < (1 + CLOSE) * other.squared_error and here.point.delay.cell == other.point.delay.cell
+    if not near or not np.array_equal(here.point.damping < 0, other.point.damping < 0):
         return False
     away = np.concatenate((here.point.speed / other.point.speed - 1, here.point.damping / other.point.damping - 1))
     later = (here.point.delay.seconds - other.point.delay.seconds) / box.quarter
-    return bool(
-        max(float(np.abs(away).max()), abs(later)) < CLOSE
-        and here.squared_error < (1 + CLOSE) * other.squared_error
-        and here.point.delay.cell == other.point.delay.cell
-    )
+    return bool(np.abs(away).max() < CLOSE and abs(later) < CLOSE)
 
 
 def _newton_step(values: Array, vectors: Array, gradient: Array) -> Array:

@@ -73,7 +73,7 @@ def _states_at_breaks(dynamics: Array, gain: Array, data: FilterData, period: fl
     regular = data.interval > 0.0
     states = np.zeros((breaks + 1, n))
     step = held_step(dynamics, gain, data.interval)
-    full, work = np.zeros(n + 2), np.zeros(n + 2)
+    full, work = np.zeros(n + 2), np.zeros((2, n + 2))
     # Twice for a periodic input: once from rest to the end of the period, where x_N is left over, and once more from
     # x0 = x_N + Phi^N x0. With X = Phi^N - I, which the exponential gives without cancellation, X x0 = -x_N.
     for turn in range(2 if period > 0.0 else 1):
@@ -109,7 +109,7 @@ def _free_states(chain: ChainState, data: FilterData) -> Array:
     regular = data.interval > 0.0
     table = _table(chain.free_dynamics, np.zeros(n), data, 0.0, 0.0)
     # The two states behind the n are an input and its slope, which stay zero: z(t) = exp(F (t - t_s)) z(t_s).
-    now, following = np.zeros(n + 2), np.zeros(n + 2)
+    now, following, work = np.zeros(n + 2), np.zeros(n + 2), np.zeros((2, n + 2))
     row = 0
     for k in range(data.t.size):
         # Before the first used sample nothing moves; after it unused samples are steps of the way too.
@@ -118,7 +118,7 @@ def _free_states(chain: ChainState, data: FilterData) -> Array:
             _advance(step.transition, now[:n], following[:n])
             now, following = following, now
         elif row > 0:
-            irregular_step(table, data.t[k] - data.t[k - 1], now, following)
+            irregular_step(table, data.t[k] - data.t[k - 1], now, work)
         if data.use[k]:
             if row == 0:
                 for i in range(n):
@@ -194,7 +194,7 @@ def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wh
     table = _table(chain.dynamics, chain.gain, data, delay.seconds, period)
     # The states at the breaks do not depend on the delay: it only chooses where they are read.
     states = _states_at_breaks(chain.dynamics, chain.gain, data, period, table)
-    now, work = np.zeros(n + 2), np.zeros(n + 2)
+    now, work = np.zeros(n + 2), np.zeros((2, n + 2))
     filled, row, j = 0, 0, -1
     for k in range(data.t.size):
         if not data.use[k]:
