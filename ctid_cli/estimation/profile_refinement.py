@@ -15,7 +15,7 @@ from ctid_cli.inference.loss import Weighting
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 
-#: Random starts, so many and so many for each pole, of a search that fits the smaller models too.
+#: Random starts, so many and so many for each pole.
 RANDOM_STARTS = 2
 
 
@@ -66,19 +66,14 @@ class Refinement:
             starts=starts,
             nested=nested or not self.measured.plain,
             fewer_poles=nested,
-            random_starts=RANDOM_STARTS if nested else 0,
+            random_starts=RANDOM_STARTS if nested or self.measured.plain else 0,
         )
-        found = best_output_error(records, poles, zeros, options)
-        agreed = found.ending.optimal and (found.agree > 1 or found.tried == 1)
-        if agreed or options.nested:
-            return found
-        # Where the starts disagree others are asked.
-        starts = [(found.denominator, found.delay), *starts]
-        return best_output_error(records, poles, zeros, replace(options, starts=starts, random_starts=RANDOM_STARTS))
+        return best_output_error(records, poles, zeros, options)
 
     def local(self, near: Optimum) -> Optimum:
         """The least output error in the basin of an optimum of other outputs."""
-        options = replace(self.measured.options, starts=[(near.denominator, near.delay)], nested=False)
+        starts = [(near.denominator, near.delay)]
+        options = replace(self.measured.options, starts=starts, nested=False, random_starts=0)
         return best_output_error(self.problem.records, near.denominator.size - 1, self.structure.zeros, options)
 
     def parameters(self, found: Optimum) -> tuple[Layout, Array]:

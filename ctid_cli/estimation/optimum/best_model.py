@@ -33,9 +33,9 @@ class SearchOptions:
     nested: bool = True
     #: Whether the least of all is returned, so that the cost never rises with the structure, though with fewer poles.
     fewer_poles: bool = True
-    #: Further starts at random, so many and so many for each pole, also of the smaller models; by default ten, and none
-    #: where smaller models are left out.
-    random_starts: int | None = None
+    #: Further starts at random, so many and so many for each pole: of the structure and of the smaller models, or, where
+    #: these are left out, only if the given starts do not agree.
+    random_starts: int = 10
     seed: int = 0
 
 
@@ -86,19 +86,26 @@ def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, opt
     As many zeros as poles need a known delay. Free responses begin at the first used sample of each record.
     """
     problem, box = problem_of(records, zeros, options), box_of(records, options.delays)
-    random = options.random_starts
-    nest = Nest(problem, box, (10 if options.nested else 0) if random is None else random, options.seed)
+    nest = Nest(problem, box, options.random_starts, options.seed)
     points = [point_of(np.roots(np.asarray(a, dtype=float)).astype(complex), tau, box) for a, tau in options.starts]
     if options.nested or not points:
         nest.optima(poles, zeros)
-    else:
-        points += nest.random_points(poles)
     nest.refine(poles, zeros, points)
+    found = _least(nest, poles, zeros, options.nested and options.fewer_poles)
+    in_doubt = found.tried > 1 and found.agree == 1 or not found.ending.optimal
+    if options.nested or not in_doubt:
+        return found
+    nest.refine(poles, zeros, nest.random_points(poles))
+    return _least(nest, poles, zeros, False)
+
+
+def _least(nest: Nest, poles: int, zeros: int, fewer_poles: bool) -> Optimum:
+    """The least squared error that a nest knows of a structure."""
     best: Judged | None = None
     lost = 0
     # With a pole at infinity a model of one pole less, whatever its zeros, is in the closure of the structure.
-    fewest = max(zeros + int(box.delay_free), 1)
-    for missing in range(poles - fewest + 1 if options.nested and options.fewer_poles else 1):
+    fewest = max(zeros + int(nest.box.delay_free), 1)
+    for missing in range(poles - fewest + 1 if fewer_poles else 1):
         descent = nest.descent(zeros)
         found = descent.settle(nest.optima(poles - missing, zeros)[0])
         nest.evaluations += descent.evaluations
