@@ -88,7 +88,7 @@ def of_short_record(uncertainty: Uncertainty, count: int) -> list[str]:
     ]
 
 
-def of_interval(interval: DelayInterval | None, options: DelayProfile) -> list[str]:
+def of_interval(interval: DelayInterval | None, options: DelayProfile, fit: MeasuredFit) -> list[str]:
     """Whether the interval of the delay ends where its search ended."""
     if interval is None:
         return []
@@ -98,6 +98,9 @@ def of_interval(interval: DelayInterval | None, options: DelayProfile) -> list[s
     if not ends:
         return []
     reached = f"the end of its search range ({' and '.join(ends)})"
+    if fit.model.delay == 0.0:
+        # The status says that none is needed; to search further still would be odd advice.
+        return [f"The record does not rule out a delay either: the interval of the delay reaches {reached}."]
     return [f"The interval of the delay reaches {reached}: delays beyond may fit as well; widen --delay."]
 
 

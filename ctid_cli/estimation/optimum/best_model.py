@@ -33,8 +33,8 @@ class SearchOptions:
     nested: bool = True
     #: Whether the least of all is returned, so that the cost never rises with the structure, though with fewer poles.
     fewer_poles: bool = True
-    #: Further starts at random, so many and so many for each pole: of the structure and of the smaller models, or, where
-    #: these are left out, only if the given starts do not agree.
+    #: Further starts at random, so many and so many for each pole, also of the smaller models. Where these are left
+    #: out: only if the given starts do not agree.
     random_starts: int = 10
     seed: int = 0
 
@@ -92,7 +92,7 @@ def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, opt
         nest.optima(poles, zeros)
     nest.refine(poles, zeros, points)
     found = _least(nest, poles, zeros, options.nested and options.fewer_poles)
-    in_doubt = found.tried > 1 and found.agree == 1 or not found.ending.optimal
+    in_doubt = (found.tried > 1 and found.agree == 1) or not found.ending.optimal
     if options.nested or not in_doubt:
         return found
     nest.refine(poles, zeros, nest.random_points(poles))
