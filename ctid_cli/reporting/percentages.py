@@ -84,7 +84,7 @@ def experiment_rows(
 
 
 def study_rows(study: Study, table: StudyTable, found: Mapping[str, Results]) -> list[Row]:
-    """Cells of one published table, published or run: by experiment, settings and method in the order of the study."""
+    """Cells of one published table, published or run: by sampling, settings and method in the order of the study."""
     random = table.initial_delays == ("random",)
     ours: dict[Place, list[Row]] = {}
     for name in table.experiments:
@@ -100,10 +100,13 @@ def study_rows(study: Study, table: StudyTable, found: Mapping[str, Results]) ->
         empty |= {"initial_delay": delay, "method": method, **NOTHING}
         rows += (row | {"published_percent": table.published.get(place)} for row in ours.get(place, [empty]))
     experiments, settings_order, methods = ([*dict.fromkeys(column)] for column in [*zip(*places, strict=True)][:3])
-    order = experiments, settings_order, [*dict.fromkeys([*study.methods, *methods])]
+    # Methods with an experiment of their own stand beside the others.
+    samplings = [study.experiments[name]["sampling"] for name in experiments]
+    order = samplings, settings_order, [*dict.fromkeys([*study.methods, *methods])]
 
     def position(row: Row) -> list[int]:
-        return [known.index(own) for known, own in zip(order, _place(study, row)[:3], strict=True)]
+        own = (row["sampling"], *_place(study, row)[1:3])
+        return [known.index(value) for known, value in zip(order, own, strict=True)]
 
     # Every row of a table carries the same keys, in the same order.
     blank = dict.fromkeys(["table", "experiment", "sampling", *settings_of(rows)])
@@ -125,6 +128,7 @@ def pooled_rows(study: Study, table: StudyTable, rows: Sequence[Row], options: S
     import pandas as pd
 
     places = {place[:2] for place in table.published}
+    count = len({(study.experiments[experiment]["sampling"], settings) for experiment, settings in places})
     shown = [row for row in rows if _place(study, row)[:2] in places]
     shown = [row for row in shown if row["initial_delay"] in (None, *table.initial_delays)]
     frame = pd.DataFrame([row | {"startless": row["initial_delay"] is None} for row in shown])
@@ -139,7 +143,7 @@ def pooled_rows(study: Study, table: StudyTable, rows: Sequence[Row], options: S
             {
                 "method": method,
                 **{name: value for name, value in zip(options, own, strict=True) if value in known[name]},
-                "cells": len(places) * (1 if startless else len(table.initial_delays)),
+                "cells": count * (1 if startless else len(table.initial_delays)),
                 "cells_run": len(run),
                 "n": n,
                 "converged": converged,

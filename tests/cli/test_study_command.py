@@ -126,8 +126,9 @@ def test_a_chaotic_iteration_is_compared_over_one_step():
     study = find_study("useful-redundancy")
     for short, overrides in study.first.items():
         plan = study.plan(short, overrides)
-        assert {cell.name for cell in plan.estimators if cell.content.get("variant") == "plain"} == {"existing"}
-        assert first_estimates._single_steps(plan) == {"existing"}
+        plain = {cell.name for cell in plan.estimators if cell.content.get("variant") == "plain"}
+        assert plain <= {"existing", "as_printed"}
+        assert first_estimates._single_steps(plan) == plain
     committed = first_estimates.read_first(study)
     assert all(found["values"] for name, found in committed.items() if " existing " in name)
 

@@ -55,9 +55,9 @@ def test_fixed_and_random_starts_go_to_their_tables_beside_the_published_values(
     row = cell([r for r in random if r["sampling"] == "regular"], 5.0, "random")
     assert (row["n"], row["percent"], row["published_percent"]) == (4, 100.0, 90.0)
     # what was not run stays in the table
-    assert len(fixed) == 48
-    assert len(random) == 8
-    assert all(r["n"] == 0 for r in fixed if r["sampling"] == "irregular" or r["method"] == "proposed")
+    assert len(fixed) == 72
+    assert len(random) == 12
+    assert all(r["n"] == 0 for r in fixed if r["sampling"] == "irregular" or r["method"] != "existing")
 
 
 def test_a_setting_that_is_not_swept_still_finds_its_row(make_results, estimate):

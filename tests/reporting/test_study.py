@@ -10,7 +10,7 @@ from ctid_cli.reporting.study import load_study
 from ctid_cli.reporting.table_blocks import study_blocks
 from ctid_cli.reporting.tables import build_tables
 from ctid_cli.storage.identity import present_versions
-from experiments.useful_redundancy.tables import failures
+from experiments.useful_redundancy.tables import failures, searches
 
 RANDOM = "uniform(0, 9)"
 
@@ -122,7 +122,7 @@ def test_methods_stand_in_the_order_of_the_study_below_each_setting(mixed):
     for number in (1, 2):
         rows, text = tabulated(mixed, number)
         regular = [row for row in rows if (row["sampling"], row["snr_db"]) == ("regular", 5.0)]
-        methods = ["existing", "proposed", "delay_profile", "profile_spectral"]
+        methods = ["existing", "as_printed", "proposed", "delay_profile", "profile_spectral"]
         assert list(dict.fromkeys(row["method"] for row in regular)) == methods
         first = text.split("15 dB")[0]
         assert sorted(methods, key=lambda method: first.index(f"{method} ")) == methods
@@ -196,7 +196,7 @@ def test_what_was_run_beyond_the_table_is_not_pooled(make_results, estimate):
     assert sum(row["n"] for row in rows) == 2
     assert all(row["n"] == 0 for row in pooled_rows(study, study.tables[1], rows))
     results.manifest["starts"]["0.0"] = 0.0
-    (existing, _) = pooled_rows(study, study.tables[1], tabulated(results, 1)[0])
+    (existing, *_) = pooled_rows(study, study.tables[1], tabulated(results, 1)[0])
     assert (existing["n"], existing["converged"]) == (1, 0)
 
 
@@ -220,3 +220,16 @@ def test_failing_estimates_are_listed_with_what_makes_them_again(mixed):
     stored = {row["id"]: row for row in mixed.rows}
     assert all(not stored[row["id"]]["converged"] for row in rows)
     assert len({row["id"] for row in rows}) == 3
+
+
+def test_searches_are_counted_by_method_and_cell(make_results, add_estimator, estimate):
+    ends = [(7.93, 1), (8.5, 0), (8.0, 3), (2.0, 0)]
+    found = [estimate(8.0 if end > 5 else end, search_delay=end, switches=count) for end, count in ends]
+    results = make_results({(5.0, "0.0"): [estimate(8.0), estimate(5.0)]})
+    add_estimator(results, "as_printed", {(5.0, "0.0"): found[:2], (5.0, RANDOM): found[2:]})
+    existing, printed = ({key: row[key] for key in row if key != "median_seconds"} for row in searches(results))
+    alike = {"experiment": results.experiment, "snr_db": 5.0, "max_delay_step": None}
+    nothing = {"search_percent": None, "switched": None, "most_switches": None}
+    assert existing == alike | {"method": "existing", "n": 2, "percent": 50.0, **nothing}
+    counts = {"search_percent": 50.0, "switched": 2, "most_switches": 3}
+    assert printed == alike | {"method": "as_printed", "n": 4, "percent": 75.0, **counts}
