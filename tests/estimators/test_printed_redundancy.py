@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from ctid_cli.errors import OptionError
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.redundancy import SearchStatus
 from ctid_cli.estimators.td_srivc import INNER_ITERATIONS
@@ -137,3 +138,25 @@ def test_every_search_ends_within_its_bounds(replicate, start):
     assert still[-1] == (search.status is SearchStatus.SETTLED)
     assert (not still[-1] and points[-1] in points[:-1]) == (search.status is SearchStatus.EXHAUSTED)
     assert search.status is not SearchStatus.MAX_ROUNDS or search.rounds == 8
+
+
+def test_longest_step_holds_for_the_guarded_variant_too():
+    record = make_record(snr_db=5, n=900)
+    steps = {}
+    for longest in (0.5, None):
+        fit = plain(variant="guarded", max_delay_step=longest).fit(record, Start(2.0))
+        steps[longest] = max(np.abs(np.diff(path.delays)).max(initial=0.0) for path in fit.paths)
+    assert steps[0.5] == pytest.approx(0.5, rel=1e-12)
+    assert 0.5 < steps[None] <= 5.0 * (1 + 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"variant": "printed"}, "variant must be 'plain' or 'guarded', not 'printed'"),
+        ({"max_delay_step": 0.0}, r"max_delay_step must be a positive number \[s\], not 0.0"),
+    ],
+)
+def test_impossible_options_are_refused(more, message):
+    with pytest.raises(OptionError, match=message):
+        plain(**more)
