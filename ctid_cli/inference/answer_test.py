@@ -190,7 +190,7 @@ class _Output:
         """Responses of a pole at all delays beside the series: the signals as they are, then what is new in them."""
         denominator = np.real(np.poly([pole, pole.conjugate()] if pole.imag else [pole]))
         response = simulate(TransferFunction([1.0], denominator), self.signal, self.clock)
-        responses = np.interp(self.t[:, None, :] - delays[:, None], self.clock, response, left=0.0).mean(axis=2)
+        responses = self._delayed(response, delays)
         own = [np.ones(len(responses))]
         if free_response and pole:
             free = np.exp(pole * (self.t.mean(axis=1) - self.t[0, 0]))
@@ -200,6 +200,17 @@ class _Output:
             basis, _ = np.linalg.qr(seen[:, : len(own)])
             raw = seen[:, len(own) :]
             yield _BesideOwn(raw - basis @ (basis.T @ raw), np.sum(raw**2, axis=0), series, basis)
+
+    def _delayed(self, response: Array, delays: Array) -> Array:
+        """A response, delayed, at the samples or as the means over successive ones, shape (n, d)."""
+        if self.t.shape[1] == 1:
+            return np.interp(self.t - delays, self.clock, response, left=0.0)
+        # Differences of its running sum at the ends: over all samples of the clock between them, also missing ones.
+        edges = np.append(self.clock, 2.0 * self.clock[-1] - self.clock[-2])
+        places = np.searchsorted(self.clock, self.t[:, [0, -1]]) + np.array([0, 1])
+        sums = np.append(0.0, np.cumsum(response))
+        first, last = (np.interp(end[:, None] - delays, edges, sums, left=0.0) for end in edges[places].T)
+        return np.asarray((last - first) / np.diff(places))
 
     @property
     def likelihood_gain(self) -> Array:

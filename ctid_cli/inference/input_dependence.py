@@ -52,14 +52,15 @@ def input_dependence(e: Array, x: Array, psi: Array, t: Array, record: Record, d
     inside = slice(int(np.searchsorted(t, record.t[0] + delay)) + past, t.size - future)
     if future < ORDER or inside.stop - inside.start < 2 * (past + future + psi.shape[1]):
         return None
-    added = _behind_a_pole(x - x[0], np.geomspace(1.0, LONGEST * t.size, TRIED))[inside]
+    behind = _behind_a_pole(x - x[0], np.geomspace(1.0, LONGEST * t.size, TRIED))
     e, x, psi = e[inside] - e[inside].mean(), x[inside], psi[inside]
     noise = fit_noise_model([e])
     if not noise.innovation_variance > 0:
         return None
     beside = SideBySide((constant(e.size), psi))
-    pole = dependence(e, added, noise, beside)
-    share = 1.0 - _power(rest_of(e, SideBySide((beside, added)))) / _power(rest_of(e, beside))
+    pole = dependence(e, behind[inside], noise, beside)
+    share = 1.0 - _power(rest_of(e, SideBySide((beside, behind[inside])))) / _power(rest_of(e, beside))
+    del behind  # as large as all that follows
 
     def inputs(shift: float, steps: range) -> Array:
         """A look at the input so many samples from each residual, without a copy for every column."""
@@ -91,12 +92,17 @@ def _answer_at_once(e: Array, x: Array, u: Array) -> float:
     outputs = np.lib.stride_tricks.sliding_window_view(x, ORDER)[1:]
     before = SideBySide((constant(len(inputs)), inputs[:, 1:], outputs))
     weights = orthonormal(before, 1e-10)
-    basis = np.concatenate([before[rows] @ weights for rows in blocks])
     now = rest = inputs[:, 0]
     weight = np.ones(now.size)
     for _ in range(REWEIGHTED):
-        gram = np.sum([basis[rows].T @ (weight[rows, None] * basis[rows]) for rows in blocks], axis=0)
-        rest = now - basis @ np.linalg.lstsq(gram, basis.T @ (weight * now))[0]
+        gram, products = np.zeros((weights.shape[1],) * 2), np.zeros(weights.shape[1])
+        for rows in blocks:
+            basis = before[rows] @ weights
+            weighted = weight[rows, None] * basis
+            gram += weighted.T @ basis
+            products += weighted.T @ now[rows]
+        moving = weights @ np.linalg.lstsq(gram, products)[0]
+        rest = np.concatenate([now[rows] - before[rows] @ moving for rows in blocks])
         scale = robust_deviation(rest)
         if not scale > 1e-9 * float(np.ptp(now)):
             return 0.0

@@ -121,6 +121,19 @@ def test_a_clock_with_holes_and_an_irregular_one():
     assert outcome(Record(t, x / x.std() + noise(rng, 400), record.input)).seen
 
 
+def test_means_of_a_delayed_response_are_those_of_its_samples():
+    rng, delays = np.random.default_rng(47), np.array([0.0, 0.3, 2.0, 700.25])
+    count, width = 3 * module.MOST_SAMPLES, 3
+    record = record_of(rng.standard_normal(count), rng.standard_normal(count))
+    output = module._Output.of(record, record.valid, False, rng)
+    response = rng.standard_normal(count)
+    shifted = np.interp(record.t[:, None] - delays, record.t, response, left=0.0)
+    expected = shifted.reshape(-1, width, delays.size).mean(axis=1)
+    # Where the response begins, its running sum begins half a sample before.
+    inside = np.arange(len(expected))[:, None] * width > delays + 1
+    np.testing.assert_allclose(output._delayed(response, delays)[inside], expected[inside], atol=1e-12)
+
+
 def test_a_long_record_is_averaged_and_a_fast_answer_is_still_seen():
     rng = np.random.default_rng(47)
     u = rng.choice([-1.0, 1.0], 9000)
