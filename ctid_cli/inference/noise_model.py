@@ -61,7 +61,7 @@ class NoiseModel:
         width = columns[:1].shape[1]
         before, total = np.zeros((r, width)), np.zeros((width, width))
         for rows in row_blocks(len(columns)):
-            block = np.vstack((before, columns[rows]))
+            block = np.ascontiguousarray(np.vstack((before, columns[rows])))
             autoregress(block, self.coefficients)
             total += block[r:].T @ block[r:]
             before = block[block.shape[0] - r :]

@@ -68,7 +68,9 @@ def data_folder(name: str) -> Path:
 def study_contents() -> dict[str, dict[str, Any]]:
     """What ``study.yaml`` says of every study that is shipped with the program, by its name."""
     files = sorted(data_folder("experiments").glob("*/study.yaml"))
-    contents = [yaml.safe_load(file.read_text(encoding="utf-8")) for file in files]
+    # Written in C where PyYAML was built with it: every run looks here for its tables.
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    contents = [yaml.load(file.read_text(encoding="utf-8"), loader) for file in files]
     return {content["study"]: content for content in contents}
 
 
