@@ -46,6 +46,20 @@ def test_help_imports_nothing_slow():
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
 
 
+def test_workers_import_nothing_slow():
+    # What a worker process is sent, and every estimator: half a second of imports each would be longer than the work.
+    code = (
+        "import importlib, pkgutil, sys, ctid_cli.estimators as package\n"
+        "import ctid_cli.running.job, ctid_cli.running.cells, ctid_cli.specification.start_points\n"
+        "for module in pkgutil.iter_modules(package.__path__, 'ctid_cli.estimators.'):\n"
+        "    importlib.import_module(module.name)\n"
+        "slow = {'scipy.' + name for name in ('signal', 'stats', 'optimize', 'special', 'fft', 'linalg', 'io')}\n"
+        "slow |= {'pandas', 'h5py', 'pydantic', 'typer', 'rich', 'matplotlib'}\n"
+        "assert not slow & set(sys.modules), slow & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
 def test_validate_counts_the_work(ctid, tiny):
     done = ctid("validate", tiny, "--set", "monte_carlo.runs=5")
     assert "ok, tiny: 10 data sets (2 data cells), 30 estimates" in done.stdout
