@@ -5,7 +5,10 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom
 
+from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.input_dependence import input_dependence
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
 N = 600
@@ -27,6 +30,20 @@ def test_false_alarms_are_as_rare_as_said(colour):
     rng = np.random.default_rng(7)
     found = [looked_at(rng, colour=colour) for _ in range(150)]
     # Both levels are approximate: no more than twice the nominal one, with a confidence of 99.9 %.
+    most = binom.ppf(0.999, len(found), 0.1)
+    assert sum(one.pole_p_value < 0.05 for one in found) <= most
+    assert sum(one.feedback_p_value < 0.05 for one in found) <= most
+
+
+def test_an_irregular_clock_with_holes_and_a_delay_gives_no_more_false_alarms():
+    rng, system = np.random.default_rng(11), TransferFunction([0.3], [1.0, 0.3], 3.3)
+    found = []
+    for _ in range(100):
+        t = np.cumsum(rng.uniform(0.1, 1.9, N))
+        u, e = np.repeat(rng.choice([-3.0, 3.0], N // 4), 4), rng.standard_normal(N)
+        x, use = simulate(system, HeldSignal(t, u), t), rng.random(N) > 0.15
+        record = Record(t, np.where(use, x + e, np.nan), HeldSignal(t, u))
+        found.append(input_dependence(e[use], x[use], x[use, None], t[use], record, 3.3))
     most = binom.ppf(0.999, len(found), 0.1)
     assert sum(one.pole_p_value < 0.05 for one in found) <= most
     assert sum(one.feedback_p_value < 0.05 for one in found) <= most
