@@ -17,7 +17,7 @@ from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "useful_redundancy"
-METHODS = ("delay_profile", "profile_spectral", "proposed", "proposed_spectral")
+METHODS = ("delay_profile", "proposed")
 BANDWIDTHS = {"case1": 2.02, "case2": 26.85}
 REPEATS = 5
 

@@ -52,7 +52,6 @@ def fit(
         raise UsageError(f"--bootstrap must be at least {LEAST_DRAWS} draws, for example 500; got {bootstrap}")
     bounds = _delay_bounds(delay)
     try:
-        # Every sample: the profile that is drawn is then the cost whose minimum the estimate is.
         options = DelayProfile(
             poles,
             zeros,
@@ -60,7 +59,6 @@ def fit(
             initial_state=initial_state,
             offset=offset,
             loss=loss,
-            search="samples",
             nested=True,
         )
     except ValueError as error:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError, OptionError
+from ctid_cli.estimation.delay_search import Descent
 from ctid_cli.estimation.iteration import Equations, Iterated, Problem
 from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.filtering.bank import standard_rows
@@ -202,7 +203,7 @@ def history_entry(stage: str, iteration: int, problem: Problem, theta: Array, sq
     return IterationRecord(stage, iteration, delay, cost, tuple(a.tolist()), tuple(b.tolist()))
 
 
-def history_of(stage: str, problem: Problem, result: Iterated | None) -> list[IterationRecord]:
+def history_of(stage: str, problem: Problem, result: Iterated | Descent | None) -> list[IterationRecord]:
     """Describe the start and the accepted steps of an iteration."""
     path = np.empty((0, 1)) if result is None else result.path
     return [history_entry(stage, k, problem, row[:-1], float(row[-1])) for k, row in enumerate(path)]

@@ -1,12 +1,12 @@
 """A global search over the delay: a coarse grid behind a narrow low-pass filter, finer ones behind wider filters."""
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array
-from ctid_cli.estimation.delay_search import Minimum, descend
+from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.estimation.delay_search import SMALLEST_STEP, DelayCost, Limits, Minimum, descend
 from ctid_cli.estimation.filtered_costs import FilteredCost
 
 #: Fewest delays of a grid over the whole range, whatever the bandwidth asks for.
@@ -23,14 +23,19 @@ DESCENT_ITERATIONS = 10
 DESCENT_TOLERANCE = 1e-4
 
 
-class GridCost(Protocol):
-    """A cost that offers starts of its own at every delay."""
+class Scan(NamedTuple):
+    """Least costs at several delays."""
 
-    def starts(self, delay: float) -> list[Array]:
-        """Parameters with the delay last from which to minimise; more may be found than one."""
+    #: ``(a_1 … a_n, b_0 … b_m, delay)`` of each, shape (K, n + m + 2).
+    thetas: Array
+    #: Infinite where nothing could be computed, shape (K,).
+    squared_errors: Array
 
-    def minimise_from(self, delay: float, starts: Sequence[Array]) -> Minimum | None:
-        """Least cost at a delay over several starts."""
+    def lowest(self, most: int) -> list[Minimum]:
+        """The lowest local minima, lowest first."""
+        return [
+            Minimum(self.thetas[k], float(self.squared_errors[k])) for k in lowest_minima(self.squared_errors, most)
+        ]
 
 
 def quarter_periods(low: float, high: float, bandwidth: float, most: int) -> Array:
@@ -51,63 +56,47 @@ def search_grid(
     low, high = bounds
     (cost, first_spacing), *finer = levels
     grid = delays = np.linspace(low, high, max(int(np.ceil((high - low) / first_spacing)) + 1, FEWEST_DELAYS))
-    found = scan(cost, delays)
-    costs = costs_of(found)
+    first = found = scan(cost, delays)
     coarser = float(delays[1] - delays[0])
     for cost, spacing in finer:
         count = int(np.ceil(REACH * coarser / spacing))
         offsets = spacing * np.arange(-count, count + 1)
         # Grids that overlap share their points.
-        centres = [minimum.delay for minimum in _hopeful(found, KEPT)]
-        places = {round(float(centre + offset) / spacing) for centre in centres for offset in offsets}
+        places = {
+            round(float(minimum.delay + offset) / spacing) for minimum in _hopeful(found, KEPT) for offset in offsets
+        }
         delays = np.unique(np.clip([place * spacing for place in sorted(places)], low, high))
         found = scan(cost, delays)
         coarser = spacing
-    minima = [_descended(cost, minimum, bounds) for minimum in _hopeful(found, MINIMA)]
-    return grid, costs, sorted(minima, key=lambda minimum: minimum.squared_error)
+    limits = Limits(low, high, DESCENT_ITERATIONS, DESCENT_TOLERANCE, SMALLEST_STEP * (high - low))
+    ends = [descend(cost, least.delay, least.theta[None], limits).minimum for least in _hopeful(found, MINIMA)]
+    return grid, first.squared_errors, sorted(ends, key=lambda end: end.squared_error)
 
 
-def scan(cost: GridCost, delays: Array) -> list[Minimum | None]:
+def scan(cost: DelayCost, delays: Array) -> Scan:
     """Least costs at given delays."""
-    found: list[Minimum | None] = [None] * delays.size
-    # Along the grid and back, so that good coefficients reach both neighbours.
+    found = Scan(np.zeros((delays.size, cost.size)), np.full(delays.size, np.inf))
+    # Along the delays and back, so that good coefficients reach both neighbours.
     for order in (range(delays.size), range(delays.size - 1, -1, -1)):
-        neighbour: Minimum | None = None
+        neighbour = np.empty((0, cost.size))
         for k in order:
-            here = found[k]
-            starts = [] if neighbour is None else [neighbour.theta]
             # The way back only hands good coefficients on to worse neighbours.
-            if here is None:
-                starts += cost.starts(float(delays[k]))
-            trial = cost.minimise_from(float(delays[k]), starts)
-            if trial is not None and (here is None or trial.squared_error < here.squared_error):
-                found[k] = here = trial
-            neighbour = here
+            trial = cost.minimise(float(delays[k]), neighbour, bool(np.isinf(found.squared_errors[k])))
+            if trial.squared_error < found.squared_errors[k]:
+                found.thetas[k], found.squared_errors[k] = trial.theta, trial.squared_error
+            neighbour = found.thetas[k : k + 1] if np.isfinite(found.squared_errors[k]) else neighbour[:0]
     return found
 
 
-def lowest_minima(found: Sequence[Minimum | None], most: int) -> list[Minimum]:
-    """The lowest local minima of a profile, lowest first."""
-    costs = costs_of(found)
-    padded = np.concatenate(([np.inf], np.where(np.isnan(costs), np.inf, costs), [np.inf]))
-    lowest = (padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]) & np.isfinite(padded[1:-1])
+def lowest_minima(costs: Array, most: int) -> IndexArray:
+    """Where the lowest local minima of a profile are, lowest first."""
+    padded = np.concatenate(([np.inf], costs, [np.inf]))
+    lowest = (costs <= padded[:-2]) & (costs <= padded[2:]) & np.isfinite(costs)
     indices = np.flatnonzero(lowest)
-    chosen = [found[k] for k in indices[np.argsort(costs[indices], kind="stable")][:most]]
-    return [minimum for minimum in chosen if minimum is not None]
+    return indices[np.argsort(costs[indices], kind="stable")][:most]
 
 
-def _hopeful(found: Sequence[Minimum | None], most: int) -> list[Minimum]:
+def _hopeful(found: Scan, most: int) -> list[Minimum]:
     """The lowest local minima, without those that are far above the least."""
-    lowest = lowest_minima(found, most)
+    lowest = found.lowest(most)
     return [minimum for minimum in lowest if minimum.squared_error <= HOPELESS * lowest[0].squared_error]
-
-
-def costs_of(found: Sequence[Minimum | None]) -> Array:
-    """Squared errors, NaN where nothing was found."""
-    return np.array([np.nan if minimum is None else minimum.squared_error for minimum in found])
-
-
-def _descended(cost: FilteredCost, minimum: Minimum, bounds: tuple[float, float]) -> Minimum:
-    effort: Any = {"max_iterations": DESCENT_ITERATIONS, "tolerance": DESCENT_TOLERANCE}
-    found = descend(cost, minimum.delay, minimum.theta, bounds, **effort)
-    return minimum if found is None or found.minimum.squared_error > minimum.squared_error else found.minimum

@@ -6,16 +6,27 @@ cost minimised over the coefficients has the gradient ``g = eps_tau' eps`` and t
 of, filtered or not, samples or spectra, is the business of the *cost*.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numba import njit
+from numba.extending import overload
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.iteration import Equations, Steps, admissible, run, solve_scaled, with_best
-from ctid_cli.inference.status import Status
+from ctid_cli.estimation.iteration import (
+    CONVERGED,
+    INADMISSIBLE,
+    MAX_ITERATIONS,
+    SINGULAR,
+    Equations,
+    Steps,
+    admissible,
+    is_tuple_of,
+    run,
+    solve_scaled,
+    with_best,
+)
 
 #: The smallest delay step, as a fraction of the range of the delay.
 SMALLEST_STEP = 1e-5
@@ -25,16 +36,15 @@ LEAST_CURVATURE = 1e-14
 LEAST_AT_BOUND = 1e-8
 
 
-@dataclass(frozen=True, eq=False)
-class Minimum:
+class Minimum(NamedTuple):
     """Least cost at one delay."""
 
     #: ``(a_1 … a_n, b_0 … b_m, delay [s])``, shape (n + m + 2,).
     theta: Array
-    #: Sum of squared output errors [output unit^2].
+    #: Sum of squared output errors [output unit^2]; infinite where nothing could be computed.
     squared_error: float
     #: Gauss-Newton step of the delay [s]; NaN where the data do not determine it.
-    step: float = float("nan")
+    step: float = np.nan
 
     @property
     def delay(self) -> float:
@@ -45,30 +55,58 @@ class Minimum:
 class DelayCost(Protocol):
     """A cost as a function of the delay, minimised over the coefficients."""
 
-    def minimise(self, delay: float, theta: Array | None) -> Minimum | None:
-        """Minimise over the coefficients at one delay, from the coefficients at the head of theta."""
+    @property
+    def size(self) -> int:
+        """Number of parameters, the delay included."""
+
+    def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
+        """Least cost at a delay over starts of any delay, shape (K, n + m + 2), and those that the cost has itself."""
 
 
-@dataclass(frozen=True, eq=False)
-class Descent:
-    """Where a descent went: its start and what it accepted, how it ended, and after how many iterations."""
+class Limits(NamedTuple):
+    """Where a descent may go, how far in one step, and when it ends."""
 
-    steps: Sequence[Minimum]
-    status: Status
+    low: float
+    high: float
+    max_iterations: int
+    tolerance: float
+    smallest_step: float
+    largest_step: float = np.inf
+    #: Whether steps beyond a bound are mirrored there, not halved.
+    reflect: bool = False
+
+
+class Descent(NamedTuple):
+    """Where a descent went: its end, the start and all it accepted, how it ended, and after how many iterations."""
+
+    minimum: Minimum
+    #: Parameters with their squared errors in the last column, shape (K, n + m + 3); none without a start.
+    path: Array
+    end: int
     iterations: int
 
-    @property
-    def minimum(self) -> Minimum:
-        """Where it ended."""
-        return self.steps[-1]
+
+def minimise(cost: Any, delay: float, starts: Array, own: bool) -> Minimum:
+    """Least cost at a delay; compiled code is told by `minimised_by` what to call."""
+    found: Minimum = cost.minimise(delay, starts, own)
+    return found
+
+
+def minimised_by(cost_type: type, kernel: Callable[..., Any]) -> None:
+    """Let compiled code minimise one type of cost."""
+
+    def least(cost: Any, delay: Any, starts: Any, own: Any) -> Any:
+        return kernel(cost, delay, starts, own)
+
+    # Inlined: what is compiled on its own takes all that it calls through the optimiser again.
+    @overload(minimise, inline="always")
+    def _minimise(cost: Any, delay: Any, starts: Any, own: Any) -> Any:
+        return least if is_tuple_of(cost_type, cost) else None
 
 
 @njit(cache=True, nogil=True)
-def delay_step(current: Equations, least_curvature: float, project_gradient: bool) -> float:
-    """Gauss-Newton step of the delay, the last parameter, with the coefficients projected out; NaN if undetermined.
-
-    At a minimum over the coefficients their gradient vanishes; elsewhere it has to be projected out as well.
-    """
+def delay_step(current: Equations, least_curvature: float) -> float:
+    """Gauss-Newton step of the delay, the last parameter, with the coefficients projected out; NaN if undetermined."""
     hessian, gradient = current.hessian, current.instrument_error
     last = gradient.size - 1
     lengths, mixed = np.diag(hessian).copy(), hessian[:, last].copy()
@@ -79,103 +117,68 @@ def delay_step(current: Equations, least_curvature: float, project_gradient: boo
     curvature = hessian[last, last] - projection[:last] @ mixed[:last]
     if not curvature > least_curvature * hessian[last, last]:
         return np.nan
-    slope = gradient[last]
-    if project_gradient:
-        slope -= projection[:last] @ gradient[:last]
-    return float(slope / curvature)
+    return float(gradient[last] / curvature)
 
 
 @njit(cache=True, nogil=True)
-def best_of(
-    problem: Any, starts: Array, poles: int, steps: Steps, project_gradient: bool
-) -> tuple[Array, float, float]:
-    """Best coefficients from the denominators of several starts: parameters, squared error and step of the delay.
-
-    The delay is the last parameter and held. Without any admissible start the squared error is infinite.
-    """
+def best_of(problem: Any, starts: Array, poles: int, steps: Steps) -> Minimum:
+    """Least cost from the denominators of several starts; the delay is the last parameter and held."""
     free = starts.shape[1] - 1
-    found, least, step = starts[0], np.inf, np.nan
+    best = Minimum(np.zeros(free + 1), np.inf, np.nan)
     for k in range(starts.shape[0]):
         # The numerator of a start is refitted: only the denominator matters.
         start = with_best(problem, admissible(problem, starts[k].copy()), poles, free)
         theta, current, _, _, _ = run(problem, start, free, steps)
-        if current.squared_error < least:
-            found, least = theta, current.squared_error
-            step = delay_step(current, LEAST_CURVATURE, project_gradient)
-    return found, least, step
+        if current.squared_error < best.squared_error:
+            best = Minimum(theta, current.squared_error, delay_step(current, LEAST_CURVATURE))
+    return best
 
 
-def best_minimum(
-    problem: Any, delay: float, starts: Sequence[Array], poles: int, steps: Steps, project_gradient: bool = True
-) -> Minimum | None:
-    """Least cost at a delay over the denominators of several starts, compiled as a whole."""
-    if not starts:
-        return None
-    thetas = np.array(starts)
-    thetas[:, -1] = delay
-    theta, squared_error, step = best_of(problem, thetas, poles, steps, project_gradient)
-    return Minimum(theta, squared_error, step) if np.isfinite(squared_error) else None
+@njit(cache=True, nogil=True)
+def _descend(cost: Any, delay: float, starts: Array, limits: Limits) -> Descent:
+    """Gauss-Newton on the delay, see `descend`."""
+    low, high = limits.low, limits.high
+    current = minimise(cost, delay, starts, starts.shape[0] == 0)
+    path = np.empty((limits.max_iterations + 1, current.theta.size + 1))
+    if not np.isfinite(current.squared_error):
+        return Descent(current, path[:0], INADMISSIBLE, 0)
+    path[0, :-1], path[0, -1] = current.theta, current.squared_error
+    for iteration in range(limits.max_iterations):
+        if not np.isfinite(current.step):
+            return Descent(current, path[: iteration + 1], SINGULAR, iteration)
+        before, step = current, min(max(current.step, -limits.largest_step), limits.largest_step)
+        start = before.theta.copy().reshape(1, -1)
+        while not current.squared_error < before.squared_error:
+            target = before.theta[-1] + step
+            if limits.reflect and not low <= target <= high:
+                target = 2.0 * (low if target < low else high) - target
+            while not low <= target <= high:
+                step *= 0.5
+                target = before.theta[-1] + step
+            if abs(step) <= limits.smallest_step:
+                return Descent(before, path[: iteration + 1], CONVERGED, iteration)
+            current = minimise(cost, target, start, False)
+            step *= 0.5
+        path[iteration + 1, :-1], path[iteration + 1, -1] = current.theta, current.squared_error
+        if 1.0 - current.squared_error / before.squared_error < limits.tolerance:
+            return Descent(current, path[: iteration + 2], CONVERGED, iteration + 1)
+    return Descent(current, path, MAX_ITERATIONS, limits.max_iterations)
 
 
-def descend(
-    cost: DelayCost,
-    delay: float,
-    theta: Array | None,
-    bounds: tuple[float, float],
-    *,
-    max_iterations: int,
-    tolerance: float,
-    smallest_step: float | None = None,
-    largest_step: float = np.inf,
-    reflect: bool = False,
-) -> Descent | None:
-    """Gauss-Newton on the delay from one start.
+def descend(cost: DelayCost, delay: float, starts: Array, limits: Limits) -> Descent:
+    """Gauss-Newton on the delay from the best of several starts, or from the cost's own if there is none.
 
     A step is halved while it leaves the bounds (unless it is mirrored) or does not lower the cost, and the search ends
     where that makes it shorter than the shortest step.
     """
-    smallest = SMALLEST_STEP * (bounds[1] - bounds[0]) if smallest_step is None else smallest_step
-    start = cost.minimise(delay, theta)
-    if start is None:
-        return None
-    steps = [start]
-    for iteration in range(max_iterations):
-        current = steps[-1]
-        if not np.isfinite(current.step):
-            return Descent(steps, Status.SINGULAR, iteration)
-        accepted = _lower(cost, current, bounds, smallest, largest_step, reflect)
-        if accepted is None:
-            return Descent(steps, Status.CONVERGED, iteration)
-        steps.append(accepted)
-        if 1.0 - accepted.squared_error / current.squared_error < tolerance:
-            return Descent(steps, Status.CONVERGED, iteration + 1)
-    return Descent(steps, Status.MAX_ITERATIONS, max_iterations)
-
-
-def _lower(
-    cost: DelayCost, current: Minimum, bounds: tuple[float, float], smallest: float, largest: float, reflect: bool
-) -> Minimum | None:
-    """A lower cost in the direction of the step; None where that is too short."""
-    low, high = bounds
-    step = current.step if abs(current.step) <= largest else float(np.copysign(largest, current.step))
-    while True:
-        target = current.delay + step
-        if reflect and not low <= target <= high:
-            target = 2.0 * (low if target < low else high) - target
-        while not low <= target <= high:
-            step *= 0.5
-            target = current.delay + step
-        if abs(step) <= smallest:
-            return None
-        trial = cost.minimise(target, current.theta)
-        if trial is not None and trial.squared_error < current.squared_error:
-            return trial
-        step *= 0.5
+    execute = _descend if isinstance(cost, tuple) else _descend.py_func
+    found: Descent = execute(cost, delay, starts, limits)
+    return found
 
 
 def bound_in_the_way(current: Equations, delay: float, bounds: tuple[float, float]) -> float | None:
     """The bound that keeps the delay, the last parameter, from a lower cost."""
-    target = delay + delay_step(current, LEAST_AT_BOUND, False)
+    target = delay + delay_step(current, LEAST_AT_BOUND)
     if target < bounds[0]:
         return bounds[0]
     return bounds[1] if target > bounds[1] else None

@@ -1,155 +1,148 @@
-"""Output-error costs of low-pass-filtered data as functions of the delay, for searches that evaluate many of them."""
+"""Output-error costs of a record behind low-pass filters as functions of the delay: compiled, on spectra."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
-from ctid_cli.arrays import Array
-from ctid_cli.estimation.delay_search import DelayCost, Minimum, best_minimum
-from ctid_cli.estimation.iteration import GUARDED, Steps
-from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, least_squares_starts
-from ctid_cli.estimation.spectral_problem import (
-    SpectralProblem,
-    enough_bins,
-    spectral_least_squares_start,
-    spectral_problem,
-)
-from ctid_cli.filtering.filter_data import FilterData, filter_data
+from ctid_cli.arrays import Array, ComplexArray, IntArray
+from ctid_cli.estimation.delay_search import Minimum, best_of, minimised_by
+from ctid_cli.estimation.iteration import Steps
+from ctid_cli.estimation.spectral_problem import SpectralProblem, spectral_least_squares_start
 from ctid_cli.filtering.lowpass import Lowpass
-from ctid_cli.filtering.spectra import RecordSpectra, lowpass_weight, record_spectra
+from ctid_cli.filtering.spectra import HeldSpectrum, lowpass_weight, record_spectra, window_spectrum
 from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
-Search = Literal["time", "spectral"]
-
-#: Highest frequency of a spectral search, as a multiple of the highest cut-off: a filter of order 10 passes 3e-4 of the
-#: power there.
+#: Highest frequency, as a multiple of the highest cut-off: a filter of order 10 passes 3e-4 of the power there.
 HIGHEST = 1.5
-#: A cost of fewer samples for each parameter says nothing about the delay.
-SAMPLES_PER_PARAMETER = 3
+#: Frequencies above the last one whose weight exceeds this fraction of the greatest are left out.
+NEGLIGIBLE_WEIGHT = 1e-6
 
 
-#: Cost of a filter in which nothing can be computed [%].
-NOTHING = 100.0
-#: How hard to work at each delay, unless a search asks for something else.
-EFFORT = Steps(max_iterations=10, tolerance=1e-2, rule=GUARDED, halvings=3)
+class FilteredCosts(NamedTuple):
+    """What compiled searches need of a record behind filters, the spectra of which they share."""
+
+    #: Frequencies [rad/s], shape (K,).
+    frequencies: Array
+    outputs: ComplexArray
+    input: HeldSpectrum
+    #: ``|L|^2`` of each filter, shape (filters, K), and at how many frequencies it matters, shape (filters,).
+    weights: Array
+    reach: IntArray
+    #: Cut-off of the state-variable filter of the least-squares start [rad/s], shape (filters,).
+    svf_cutoffs: Array
+    #: Mean square of the filtered output less its mean [output unit^2], shape (filters,).
+    spreads: Array
+    poles: int
+    zeros: int
+    #: How hard to work at each delay.
+    steps: Steps
+
+    @property
+    def size(self) -> int:
+        """Number of parameters, the delay included."""
+        return self.poles + self.zeros + 2
+
+    def behind(self, k: int) -> "FilteredCost":
+        """The cost of one filter."""
+        return FilteredCost(self, k)
 
 
-class FilteredCost(DelayCost, ABC):
-    """A cost of filtered data, minimised by the compiled guarded iteration, that offers starts of its own.
+class FilteredCost(NamedTuple):
+    """The cost behind one filter of several."""
 
-    ``spread`` is the sum of squared deviations of the filtered output from its mean [output unit^2], or its equivalent;
-    ``mean_factor`` turns a squared error of this cost into a mean square over the used part of the record.
-    """
+    costs: FilteredCosts
+    filter: int
 
-    spread: float
-    mean_factor: float
-    #: Whether the gradient in the coefficients is projected out of the delay's step.
-    project_gradient: bool
+    @property
+    def size(self) -> int:
+        """Number of parameters, the delay included."""
+        return self.costs.size
 
-    def __init__(self, structure: Structure, svf_cutoff: float, effort: Steps) -> None:
-        self.structure = structure
-        self.svf_cutoff = svf_cutoff
-        self.effort = effort
-
-    @abstractmethod
-    def problem(self, delay: float) -> SampledProblem | SpectralProblem:
-        """The coefficients at one delay."""
-
-    @abstractmethod
-    def starts(self, delay: float) -> list[Array]:
-        """Least-squares start at a delay, if there is one."""
-
-    def percent(self, minimum: Minimum | None) -> float:
-        """``100 ||y - x|| / ||y - mean y||`` of the filtered data [%]; 100 where nothing can be computed."""
-        return NOTHING if minimum is None else 100.0 * float(np.sqrt(minimum.squared_error / self.spread))
-
-    def minimise_from(self, delay: float, starts: Sequence[Array]) -> Minimum | None:
-        """Least cost at a delay over several starts, each (a_1 … a_n, b_0 … b_m, any delay)."""
-        return best_minimum(
-            self.problem(delay), delay, starts, self.structure.poles, self.effort, self.project_gradient
-        )
-
-    def minimise(self, delay: float, theta: Array | None) -> Minimum | None:
-        """Minimise over the coefficients at one delay."""
-        return self.minimise_from(delay, self.starts(delay) if theta is None else [theta])
+    def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
+        """Least cost at a delay over starts of any delay and, if asked for, from least squares."""
+        found: Minimum = _minimise(self, delay, starts, own)
+        return found
 
 
-class SampledCost(FilteredCost):
-    """Cost of the samples of a filtered record."""
-
-    project_gradient = True
-
-    def __init__(self, data: FilterData, structure: Structure, svf_cutoff: float, effort: Steps = EFFORT) -> None:
-        super().__init__(structure, svf_cutoff, effort)
-        self.data = data
-        y = data.y_used
-        self.spread = float(np.sum((y - y.mean()) ** 2))
-        self.mean_factor = 1.0 / max(data.count, 1)
-
-    def problem(self, delay: float) -> SampledProblem:
-        """The coefficients at one delay."""
-        return at_known_delay(self.data, self.structure)
-
-    def starts(self, delay: float) -> list[Array]:
-        """Least-squares start at a delay, if there is one."""
-        return least_squares_starts(self.data, self.structure, delay, [self.svf_cutoff])
-
-
-class SpectralCost(FilteredCost):
-    """Cost of a record's spectra behind a low-pass filter, the initial and the final state projected out."""
-
-    mean_factor = 1.0
-    project_gradient = False
-
-    def __init__(
-        self, spectra: RecordSpectra, lowpass: Lowpass, structure: Structure, svf_cutoff: float, effort: Steps = EFFORT
-    ) -> None:
-        super().__init__(structure, svf_cutoff, effort)
-        self.spectra = spectra
-        self.weight = lowpass_weight(spectra.frequencies, lowpass)
-        sides = np.where(spectra.frequencies > 0, 2.0, 0.0)
-        self.spread = float(np.sum(sides * self.weight * np.abs(spectra.outputs) ** 2))
-
-    def problem(self, delay: float) -> SpectralProblem:
-        """The coefficients at one delay."""
-        return spectral_problem(self.spectra, self.structure, delay, self.weight)
-
-    def starts(self, delay: float) -> list[Array]:
-        """Least-squares start at a delay, if there is one."""
-        start = spectral_least_squares_start(self.problem(delay), delay, self.svf_cutoff)
-        return [] if start is None else [start]
+def percents(squared_errors: Array, spreads: Array | float) -> Array:
+    """``100 ||y - x|| / ||y - mean y||`` of filtered data [%]; 100 where nothing could be computed."""
+    return np.where(np.isfinite(squared_errors), 100.0 * np.sqrt(squared_errors / spreads), 100.0)
 
 
 def filtered_costs(
     record: Record,
     lowpasses: Sequence[Lowpass],
     structure: Structure,
-    bounds: tuple[float, float],
+    greatest_delay: float,
     *,
-    search: Search,
     start: float,
-    svf_cutoff: float | Sequence[float],
-    hold_output: Hold = "foh",
-    effort: Steps = EFFORT,
-) -> list[FilteredCost | None]:
-    """Costs of one record behind several filters."""
-    cutoffs = np.broadcast_to(np.asarray(svf_cutoff, dtype=float), (len(lowpasses),)).tolist()
-    spectra: RecordSpectra | None = None
-    if search == "spectral":
-        highest = HIGHEST * max(lowpass.cutoff for lowpass in lowpasses)
-        spectra = record_spectra(record, start, highest, bounds[1])
-    joint = replace(structure, delay=True)
-    costs: list[FilteredCost | None] = []
-    for lowpass, cutoff in zip(lowpasses, cutoffs, strict=True):
-        if spectra is not None and enough_bins(lowpass_weight(spectra.frequencies, lowpass), joint):
-            costs.append(SpectralCost(spectra, lowpass, structure, cutoff, effort))
-        else:
-            data = filter_data(lowpass.resample(record), start, hold_output)
-            enough = data.count >= SAMPLES_PER_PARAMETER * joint.size and np.ptp(data.y_used) > 0.0
-            costs.append(SampledCost(data, structure, cutoff, effort) if enough else None)
-    return costs
+    svf_cutoffs: Array,
+    steps: Steps,
+) -> FilteredCosts:
+    """Costs of one record behind filters; samples earlier than ``start`` after the first input are not used."""
+    highest = HIGHEST * max(lowpass.cutoff for lowpass in lowpasses)
+    spectra = record_spectra(record, start, highest, greatest_delay)
+    w = spectra.frequencies
+    weights = np.array([lowpass_weight(w, lowpass) for lowpass in lowpasses])
+    reach = (weights >= NEGLIGIBLE_WEIGHT * weights.max(axis=1, keepdims=True)).sum(axis=1)
+    spreads = weights @ (np.where(w > 0.0, 2.0, 0.0) * np.abs(spectra.outputs) ** 2)
+    sizes = structure.poles, structure.zeros
+    return FilteredCosts(w, spectra.outputs, spectra.input, weights, reach, svf_cutoffs, spreads, *sizes, steps)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _least(costs: FilteredCosts, k: int, inputs: ComplexArray, delay: float, starts: Array, own: bool) -> Minimum:
+    """Least cost of one filter over the denominators of starts, with the spectrum of the delayed input."""
+    reach = costs.reach[k]
+    problem = SpectralProblem(
+        costs.frequencies[:reach],
+        costs.outputs[:reach],
+        inputs[:reach],
+        costs.weights[k, :reach],
+        costs.poles,
+        costs.zeros,
+    )
+    count = starts.shape[0]
+    tried = np.empty((count + 1, starts.shape[1]))
+    tried[:count] = starts
+    if own:
+        solved, tried[count] = spectral_least_squares_start(problem, costs.svf_cutoffs[k])
+        count += solved
+    tried[:, -1] = delay
+    return best_of(problem, tried[:count], costs.poles, costs.steps)
+
+
+@njit(cache=True, nogil=True)
+def _minimise(cost: FilteredCost, delay: float, starts: Array, own: bool) -> Minimum:
+    """See `FilteredCost.minimise`."""
+    costs, k = cost.costs, cost.filter
+    inputs = window_spectrum(costs.input, delay, np.ones(costs.reach[k] - 1))
+    return _least(costs, k, inputs, delay, starts, own)
+
+
+minimised_by(FilteredCost, _minimise)
+
+
+@njit(cache=True, nogil=True)
+def minima_behind_all(costs: FilteredCosts, delay: float) -> tuple[Array, Array]:
+    """Coefficients and squared error behind every filter, the narrowest band first.
+
+    Good coefficients are handed from filter to filter, down to the narrowest band and up again.
+    """
+    many = costs.reach.size
+    thetas, squared_errors = np.zeros((many, costs.poles + costs.zeros + 2)), np.full(many, np.inf)
+    inputs = window_spectrum(costs.input, delay, np.ones(costs.reach.max() - 1))
+    for k in range(many - 1, -1, -1):
+        # Least squares on a narrow band is hopeless in noise: the next wider band knows the system better.
+        known = k + 1 < many and np.isfinite(squared_errors[k + 1])
+        found = _least(costs, k, inputs, delay, thetas[k + 1 : k + 1 + known], not known)
+        thetas[k], squared_errors[k] = found.theta, found.squared_error
+    for k in range(1, many):
+        if np.isfinite(squared_errors[k - 1]):
+            found = _least(costs, k, inputs, delay, thetas[k - 1 : k], False)
+            if found.squared_error < squared_errors[k]:
+                thetas[k], squared_errors[k] = found.theta, found.squared_error
+    return thetas, squared_errors

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from ctid_cli.arrays import Array
 from ctid_cli.estimation.delay_grid import lowest_minima, quarter_periods
-from ctid_cli.estimation.delay_search import Minimum
 from ctid_cli.estimation.iteration import GUARDED, Steps, iterate, with_best
 from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.inference.fit import Fit
@@ -22,12 +22,13 @@ def lower_elsewhere(problem: SampledProblem, fit: Fit, bandwidth: float) -> bool
     n, m = problem.poles, problem.zeros
     held = problem._replace(free_delay=False)
 
-    def looked_at(delay: float) -> Minimum:
-        trial = with_best(held, np.concatenate((fit.model.denominator[1:], np.zeros(m + 1), [delay])), n, n + m + 1)
-        return Minimum(trial, held.equations(trial).squared_error)
+    def looked_at(delay: float) -> Array:
+        there = np.concatenate((fit.model.denominator[1:], np.zeros(m + 1), [delay]))
+        return np.asarray(with_best(held, there, n, n + m + 1))
 
     delays = quarter_periods(problem.low, problem.high, bandwidth, MOST_DELAYS)
-    minima = lowest_minima([looked_at(delay) for delay in delays.tolist()], MINIMA)
-    refined = (iterate(problem, minimum.theta, EFFORT) for minimum in minima)
+    thetas = [looked_at(delay) for delay in delays.tolist()]
+    lowest = lowest_minima(np.array([held.equations(theta).squared_error for theta in thetas]), MINIMA)
+    refined = (iterate(problem, thetas[k], EFFORT) for k in lowest)
     bound = (1.0 - LOWER) * fit.cost * fit.count
     return any(found is not None and found.equations.squared_error < bound for found in refined)

@@ -131,14 +131,16 @@ def admissible(problem: Any, theta: Array) -> Array:
     return inside
 
 
+def is_tuple_of(python_type: type, numba_type: Any) -> bool:
+    """Whether what numba compiles for is a NamedTuple of one class."""
+    return isinstance(numba_type, types.BaseNamedTuple) and getattr(numba_type, "instance_class", None) is python_type
+
+
 def compiled_as(problem_type: type, kernel: Callable[..., Any]) -> None:
     """Let compiled code iterate on one type of problem, whose denominator stands at the head of theta.
 
     numba dispatches on the type of a NamedTuple and caches that; a kernel passed as an argument would not be cached.
     """
-
-    def is_meant(problem: Any) -> bool:
-        return isinstance(problem, types.BaseNamedTuple) and getattr(problem, "instance_class", None) is problem_type
 
     # The annotations belong to the signature that numba compares.
     def moments(problem: Any, theta: Any) -> Any:
@@ -149,11 +151,11 @@ def compiled_as(problem_type: type, kernel: Callable[..., Any]) -> None:
 
     @overload(equations)
     def _equations(problem: Any, theta: Any) -> Any:
-        return moments if is_meant(problem) else None
+        return moments if is_tuple_of(problem_type, problem) else None
 
     @overload(admissible)
     def _admissible(problem: Any, theta: Any) -> Any:
-        return stable if is_meant(problem) else None
+        return stable if is_tuple_of(problem_type, problem) else None
 
 
 @njit(cache=True, nogil=True)

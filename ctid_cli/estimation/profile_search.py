@@ -2,13 +2,12 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.delay_grid import costs_of, lowest_minima, quarter_periods, scan, search_grid
-from ctid_cli.estimation.delay_search import Minimum, best_minimum
+from ctid_cli.estimation.delay_grid import lowest_minima, quarter_periods, scan, search_grid
+from ctid_cli.estimation.delay_search import Minimum, best_of
 from ctid_cli.estimation.filtered_costs import filtered_costs
 from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps
 from ctid_cli.estimation.measured_records import MeasuredRecords
@@ -16,8 +15,6 @@ from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.sampled_problem import CUTOFFS, at_known_delay, least_squares_starts
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.sensitivity import Structure
-
-ProfileSearch = Literal["time", "spectral", "samples"]
 
 #: Local minima of the profile that are refined.
 MINIMA = 3
@@ -37,6 +34,8 @@ LEVEL_RATIO = 3.0
 MOST_FIRST_DELAYS = 30
 MOST_LEVELS = 4
 LEVEL_ORDER = 10
+#: Real equations inside the pass band of a level for every parameter, those of the transient included.
+EQUATIONS_PER_PARAMETER = 4
 LEVEL_EFFORT = Steps(max_iterations=6, tolerance=2e-2, rule=GAUSS_NEWTON, halvings=3)
 
 
@@ -46,7 +45,7 @@ class Profile:
 
     #: Grid [s], shape (K,).
     delays: Array
-    #: Mean squared output error [output unit^2]; NaN where the equations were singular, shape (K,).
+    #: Mean squared output error [output unit^2]; infinite where the equations were singular, shape (K,).
     costs: Array
     #: Frequency below which the output has 95 % of its power [rad/s]; the spacing is at most a quarter of its period.
     bandwidth: float
@@ -79,57 +78,64 @@ class RecordsCost:
         found = found or [np.asarray(np.poly(np.full(n, -0.5 * self.bandwidth))[1:], dtype=float)]
         return [np.concatenate((a, np.zeros(m + 1), [delay])) for a in found]
 
-    def minimise_from(self, delay: float, starts: Sequence[Array]) -> Minimum | None:
+    @property
+    def size(self) -> int:
+        """Number of parameters, the delay included."""
+        return self.coefficients.size + 1
+
+    def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
         """Least cost at a delay over the denominators of several starts."""
         measured, n = self.measured, self.coefficients.poles
+        tried = np.vstack((starts, *(self.starts(delay) if own else ())))
         if measured.plain:
-            problem = at_known_delay(measured.data[0], self.coefficients)
-            return best_minimum(problem, delay, starts, n, GRID_EFFORT)
-        best: Minimum | None = None
-        for start in starts:
+            tried[:, -1] = delay
+            least: Minimum = best_of(at_known_delay(measured.data[0], self.coefficients), tried, n, GRID_EFFORT)
+            return least
+        best = Minimum(np.zeros(self.size), np.inf)
+        for start in tried:
             poles = np.roots(np.concatenate(([1.0], start[:n]))).astype(complex)
             found = local_minimum(measured.problem, poles, delay, (delay, delay), *ROUGH)
-            if best is None or found.squared_error < best.squared_error:
+            if found.squared_error < best.squared_error:
                 theta = np.concatenate((found.point.denominator[1:], start[n:-1], [delay]))
                 best = Minimum(theta, found.squared_error)
         return best
 
 
-def search_delay(measured: MeasuredRecords, search: ProfileSearch, svf_cutoff: float | None) -> Iterator[Found]:
+def search_delay(measured: MeasuredRecords, svf_cutoff: float | None) -> Iterator[Found]:
     """Look for the delay; what comes later is for where refining what came before led nowhere."""
     bandwidth = svf_cutoff or measured.bandwidth
     cost = RecordsCost(measured, bandwidth, (1.0,) if measured.structure.delay else CUTOFFS)
     treatment = measured.treatment
     # What filters see must be the answer to the input alone.
     at_rest = treatment.initial_state == "rest" and treatment.offset != "estimate"
-    if search != "samples" and at_rest and len(measured.records) == 1 and measured.structure.delay:
-        yield _search_levels(cost, search)
+    if at_rest and len(measured.records) == 1 and measured.structure.delay:
+        yield _search_levels(cost)
     yield _search_samples(cost)
 
 
-def _search_levels(cost: RecordsCost, search: Literal["time", "spectral"]) -> Found:
+def _search_levels(cost: RecordsCost) -> Found:
     """Search behind low-pass filters."""
     measured, bandwidth = cost.measured, cost.bandwidth
-    treatment = measured.treatment
-    cutoffs = _cutoffs(treatment.delay_bounds, bandwidth)
-    costs = filtered_costs(
-        measured.records[0],
-        [Lowpass(cutoff, LEVEL_ORDER) for cutoff in cutoffs],
-        cost.coefficients,
-        treatment.delay_bounds,
-        search=search,
-        start=0.0,
-        svf_cutoff=cutoffs,
-        hold_output=treatment.hold_output,
-        effort=LEVEL_EFFORT,
-    )
-    if costs[-1] is None:
+    bounds = measured.treatment.delay_bounds
+    record, cutoffs = measured.records[0], _cutoffs(bounds, bandwidth)
+    present = record.t[record.valid]
+    # Two real equations for every frequency of the observed window that passes.
+    equations = np.minimum(cutoffs * (present[-1] - max(present[0], record.input.t[0])) / np.pi, present.size)
+    cutoffs = cutoffs[equations >= EQUATIONS_PER_PARAMETER * (cost.size + cost.coefficients.poles)]
+    if not cutoffs.size:
         return [], None
-    usable = [(level, cutoff) for level, cutoff in zip(costs, cutoffs, strict=True) if level is not None]
-    levels = [(level, 0.5 * np.pi / cutoff) for level, cutoff in usable]
-    delays, found, minima = search_grid(levels, treatment.delay_bounds)
-    first, cutoff = usable[0]
-    profile = Profile(delays, found * first.mean_factor, bandwidth, cutoff)
+    costs = filtered_costs(
+        record,
+        [Lowpass(cutoff, LEVEL_ORDER) for cutoff in cutoffs.tolist()],
+        cost.coefficients,
+        bounds[1],
+        start=0.0,
+        svf_cutoffs=cutoffs,
+        steps=LEVEL_EFFORT,
+    )
+    levels = [(costs.behind(k), 0.5 * np.pi / cutoff) for k, cutoff in enumerate(cutoffs.tolist())]
+    delays, found, minima = search_grid(levels, bounds)
+    profile = Profile(delays, found, bandwidth, float(cutoffs[0]))
     interval = measured.data[0].interval
     if interval > 0.0:
         # On a regular clock the cost has a kink at every interval, and local minima between them that a model too small
@@ -140,12 +146,12 @@ def _search_levels(cost: RecordsCost, search: Literal["time", "spectral"]) -> Fo
     return minima, profile
 
 
-def _cutoffs(bounds: tuple[float, float], bandwidth: float) -> list[float]:
+def _cutoffs(bounds: tuple[float, float], bandwidth: float) -> Array:
     """Cut-off frequencies of the levels of a search [rad/s], lowest first."""
     cutoffs = [bandwidth]
     while (bounds[1] - bounds[0]) * cutoffs[0] / (0.5 * np.pi) > MOST_FIRST_DELAYS and len(cutoffs) < MOST_LEVELS:
         cutoffs.insert(0, cutoffs[0] / LEVEL_RATIO)
-    return cutoffs
+    return np.array(cutoffs)
 
 
 def _search_samples(cost: RecordsCost) -> Found:
@@ -154,34 +160,31 @@ def _search_samples(cost: RecordsCost) -> Found:
     low, high = measured.treatment.delay_bounds
     delays = quarter_periods(low, high, cost.bandwidth, MOST_DELAYS) if low < high else np.array([low])
     found = scan(cost, delays)
-    costs = costs_of(found)
-    if np.isnan(costs).all():
-        return [], None
     count = sum(data.count for data in measured.data)
-    chosen = lowest_minima(found, MINIMA)
-    if delays.size == 1:
+    chosen = found.lowest(MINIMA)
+    if not chosen or delays.size == 1:
         return chosen, None
     # Held inputs that change on the sampling clock put a kink into the cost at every sampling interval, and local
     # minima between the kinks: a fine grid around those of the coarse one resolves a quarter of an interval.
     spacing = float(delays[1] - delays[0])
     interval = min(float(np.median(np.diff(record.t))) for record in measured.records)
     parts = int(np.clip(np.ceil(4.0 * spacing / interval), 4, FINEST))
-    profile = Profile(delays, costs / count, cost.bandwidth)
+    profile = Profile(delays, found.squared_errors / count, cost.bandwidth)
     return _local_grid(cost, chosen, spacing, parts, MINIMA) or chosen, profile
 
 
 def _local_grid(cost: RecordsCost, centres: Sequence[Minimum], reach: float, parts: int, most: int) -> list[Minimum]:
     """The lowest minima on fine grids of all samples around given ones."""
     low, high = cost.measured.treatment.delay_bounds
-    fine: list[tuple[float, Minimum | None]] = []
+    fine: list[Minimum] = []
     for centre in centres:
         for side in (-1, 1):
-            start = centre.theta
+            start = centre.theta[None]
             for part in range(0 if side > 0 else 1, parts + 1):
                 delay = centre.delay + side * part * reach / parts
                 if low <= delay <= high:
-                    found = cost.minimise_from(delay, [start])
-                    start = start if found is None else found.theta
-                    fine.append((delay, found))
-    fine.sort(key=lambda entry: entry[0])
-    return lowest_minima([minimum for _, minimum in fine], most)
+                    found = cost.minimise(delay, start, False)
+                    start = start if np.isinf(found.squared_error) else found.theta[None]
+                    fine.append(found._replace(theta=np.append(found.theta[:-1], delay)))
+    fine.sort(key=lambda minimum: minimum.delay)
+    return [fine[k] for k in lowest_minima(np.array([minimum.squared_error for minimum in fine]), most)]

@@ -18,34 +18,27 @@ from numba import njit
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.estimation.iteration import Equations, compiled_as, inadmissible, solve_scaled
 from ctid_cli.estimation.stability import reflect_unstable, with_stable_denominator
-from ctid_cli.filtering.filter_data import plain_array
-from ctid_cli.filtering.spectra import RecordSpectra
-from ctid_cli.inference.sensitivity import Structure
 
-#: Frequencies above the last one whose weight exceeds this fraction of the greatest are left out.
-NEGLIGIBLE_WEIGHT = 1e-6
-#: Real equations inside the pass band for every parameter, those of the transient included.
-EQUATIONS_PER_PARAMETER = 4
 #: A column of the transient that the earlier ones explain but for this fraction of its power adds nothing.
 DEPENDENT = 1e-14
 
-#: The signals by which ``(jw)^r/A`` is multiplied to form a column: of the transient, of dx/da, dx/db and dx/dtau, of
-#: the regressor, and the output error.
-ONE, MODEL, INPUT, DRIVE, OUTPUT, ERROR = range(6)
+#: The signals by which ``(jw)^r/A`` is multiplied to form a column: of the transient, of dx/da, dx/db and dx/dtau, and
+#: the output error.
+ONE, OUTPUT, INPUT, DRIVE, ERROR = range(5)
 #: Number of their pairs.
-PAIRS = 21
+PAIRS = 15
 
 
 class SpectralProblem(NamedTuple):
     """Coefficients at a held delay: ``theta = (a_1 … a_n, b_0 … b_m, delay)``.
 
     ``d eps/d tau = jw B/A U``. The end values of the delayed input, which enter the derivative of its finite spectrum
-    as well, are a constant: the transient takes them.
+    as well, are a constant: the transient takes them. The regressors are the sensitivities: steps are Gauss-Newton's.
     """
 
     frequencies: Array
     outputs: ComplexArray
-    #: At the delay, as far as the weight reaches, shape (K,).
+    #: At the delay, shape (K,).
     inputs: ComplexArray
     weight: Array
     poles: int
@@ -58,50 +51,12 @@ class SpectralProblem(NamedTuple):
 
     def equations(self, theta: Array) -> Equations:
         """Second moments of the iteration, the transient projected out."""
-        moments: Equations = _spectral_equations(self, theta)
+        moments: Equations = spectral_equations(self, theta)
         return moments
 
     def admissible(self, theta: Array) -> Array:
         """Reflect unstable denominators."""
         return with_stable_denominator(theta, self.poles)
-
-
-def spectral_problem(spectra: RecordSpectra, structure: Structure, delay: float, weight: Array) -> SpectralProblem:
-    """The coefficients of a record's spectra at a delay, with the weights of a filter."""
-    inputs = np.array(spectra.inputs(delay, used_bins(weight)))
-    weight = plain_array(weight)
-    return SpectralProblem(spectra.frequencies, spectra.outputs, inputs, weight, structure.poles, structure.zeros)
-
-
-def used_bins(weight: Array) -> int:
-    """Number of frequencies, from the lowest, beyond which the weight is negligible."""
-    return int(np.flatnonzero(weight >= NEGLIGIBLE_WEIGHT * weight.max())[-1]) + 1
-
-
-def enough_bins(weight: Array, structure: Structure) -> bool:
-    """Whether a filter passes enough frequencies for an estimate."""
-    passed = int((weight >= 0.5 * weight.max()).sum())
-    return 2 * passed >= EQUATIONS_PER_PARAMETER * (structure.size + structure.poles)
-
-
-def spectral_least_squares_start(problem: SpectralProblem, delay: float, svf_cutoff: float) -> Array | None:
-    """Least-squares estimate with the state-variable filter ``1/(p + w)^n``."""
-    n, m = problem.poles, problem.zeros
-    filter_denominator = np.asarray(np.poly(np.full(n, -svf_cutoff)), dtype=np.float64)
-    # With a zero numerator the "output error" is y itself, and with F for A the regressors are the filtered signals:
-    # A Y = B U + T divided by F reads Y = -sum (a_i - f_i) (jw)^(n-i)/F Y + B/F U + T/F.
-    gram, _ = _projected_moments(
-        problem.frequencies, problem.outputs, problem.inputs, problem.weight, filter_denominator, np.zeros(m + 1)
-    )
-    regressors = np.arange(n + m + 1)
-    regressors[:n] += n + m + 2
-    normal = gram[regressors[:, None], regressors]
-    lengths = np.diag(normal).copy()
-    solved, coefficients = solve_scaled(normal, gram[regressors, -1], lengths, lengths, n + m + 1)
-    if not solved:
-        return None
-    stable = reflect_unstable(np.concatenate(([1.0], filter_denominator[1:] + coefficients[:n])))
-    return np.concatenate((stable[1:], coefficients[n:], [delay]))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -116,7 +71,7 @@ def _at(coefficients: Array, w: float) -> complex:
 @njit(cache=True, nogil=True)
 def _lane(left: int, right: int) -> int:
     """Place of a pair of signals, ``left <= right``, among the pairs in lexical order."""
-    return left * (11 - left) // 2 + right
+    return left * (9 - left) // 2 + right
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -185,25 +140,22 @@ def _transient(w: Array, power: Array, remainder: ComplexArray, n: int) -> tuple
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _projected_moments(
-    frequencies: Array, outputs: ComplexArray, inputs: ComplexArray, weight: Array, a: Array, b: Array
-) -> tuple[Array, float]:
-    """Moments of the columns (dx/da, dx/db, dx/dtau, phi_1 … phi_n, eps), the transient projected out of all.
+def _projected_moments(problem: SpectralProblem, a: Array, b: Array, measured: bool) -> tuple[Array, float]:
+    """Moments of the columns (dx/da, dx/db, dx/dtau, eps), the transient projected out of all.
 
-    Every column is ``(jw)^r/A`` times a signal: dx/da takes the model's output and phi the measured one, dx/db the
-    input, dx/dtau ``jw B U``. All products of columns are therefore sums of powers of w times few products of signals,
-    as in a Hankel matrix. Only as many frequencies are used as ``inputs`` holds. Also returns the power of the model's
-    output.
+    Every column is ``(jw)^r/A`` times a signal: dx/da takes the model's output, or the measured one, dx/db the input,
+    dx/dtau ``jw B U``. All products of columns are therefore sums of powers of w times few products of signals, as in a
+    Hankel matrix. Also returns the power of the model's output.
     """
+    frequencies, inputs = problem.frequencies, problem.inputs
     n, m, count = a.size - 1, b.size - 1, inputs.size
     # In units of the highest frequency powers of w stay below one.
     unit = frequencies[count - 1] if frequencies[count - 1] > 0.0 else 1.0
-    size = 2 * n + m + 3
+    size = n + m + 3
     den, num, scale = np.ones(n + 1), np.empty(m + 1), np.ones(size)
     for i in range(1, n + 1):
         den[i] = a[i] / unit**i
         scale[i - 1] = unit ** (-i)
-        scale[n + m + 1 + i] = scale[i - 1]
     for j in range(m + 1):
         scale[n + j] = unit ** (m - n - j)
         num[j] = b[j] * scale[n + j]
@@ -217,28 +169,27 @@ def _projected_moments(
         gain = 1.0 / (at.real * at.real + at.imag * at.imag)
         inverse[k] = at.conjugate() * gain
         # A frequency above zero stands for its negative too.
-        side[k] = weight[k] if w[k] == 0.0 else 2.0 * weight[k]
+        side[k] = problem.weight[k] if w[k] == 0.0 else 2.0 * problem.weight[k]
         power[k] = side[k] * gain
         drive[k] = _at(num, w[k]) * inputs[k]
-        remainder[k] = at * outputs[k] - drive[k]
+        remainder[k] = at * problem.outputs[k] - drive[k]
     factor, polynomial = _transient(w, power, remainder, n)
 
     # Power sums of the products of all pairs of signals.
     sums = np.zeros((2 * n - 1, PAIRS))
-    signals, re, im = np.ones(6, np.complex128), np.empty(PAIRS), np.empty(PAIRS)
+    signals, re, im = np.ones(5, np.complex128), np.empty(PAIRS), np.empty(PAIRS)
     output_power = 0.0
     for k in range(count):
         explained = _at(polynomial, w[k])
         response = (drive[k] + explained) * inverse[k]
         output_power += side[k] * (response.real * response.real + response.imag * response.imag)
-        signals[MODEL] = response
+        signals[OUTPUT] = problem.outputs[k] if measured else response
         signals[INPUT] = inputs[k]
         signals[DRIVE] = 1j * w[k] * drive[k]
-        signals[OUTPUT] = outputs[k]
         signals[ERROR] = remainder[k] - explained
         lane = 0
-        for i in range(6):
-            for j in range(i, 6):
+        for i in range(5):
+            for j in range(i, 5):
                 re[lane] = signals[i].real * signals[j].real + signals[i].imag * signals[j].imag
                 im[lane] = signals[i].real * signals[j].imag - signals[i].imag * signals[j].real
                 lane += 1
@@ -252,10 +203,7 @@ def _projected_moments(
     # Signal, power of jw and sign of every column.
     signal, exponent, sign = np.empty(size, np.int64), np.zeros(size, np.int64), np.ones(size)
     for i in range(n):
-        phi = n + m + 2 + i
-        signal[i], signal[phi] = MODEL, OUTPUT
-        exponent[i] = exponent[phi] = n - 1 - i
-        sign[i] = sign[phi] = -1.0
+        signal[i], exponent[i], sign[i] = OUTPUT, n - 1 - i, -1.0
     for j in range(m + 1):
         signal[n + j], exponent[n + j] = INPUT, m - j
     signal[n + m + 1], sign[n + m + 1] = DRIVE, -1.0
@@ -278,22 +226,40 @@ def _projected_moments(
 
 
 @njit(cache=True, nogil=True)
-def _spectral_equations(problem: SpectralProblem, theta: Array) -> Equations:
+def spectral_equations(problem: SpectralProblem, theta: Array) -> Equations:
     """Second moments of the iteration, the delay included."""
-    n, m = problem.poles, problem.zeros
-    p = n + m + 2
+    n, p = problem.poles, problem.poles + problem.zeros + 2
     if not np.isfinite(theta).all():
         return inadmissible(p)
     a = np.ones(n + 1)
     a[1:] = theta[:n]
-    b = theta[n : p - 1].copy()
-    gram, power = _projected_moments(problem.frequencies, problem.outputs, problem.inputs, problem.weight, a, b)
+    gram, power = _projected_moments(problem, a, theta[n : p - 1].copy(), False)
     if not np.isfinite(gram).all():
         return inadmissible(p)
-    # The columns of the sensitivities come first; the regressors are the same but for the denominator's n.
-    hessian, mixed, gradient = gram[:p, :p].copy(), gram[:p, :p].copy(), gram[:p, -1].copy()
-    mixed[:, :n] = gram[:p, p : p + n]
-    return Equations(mixed, gradient, hessian, gram[-1, -1], power)
+    hessian = gram[:p, :p].copy()
+    return Equations(hessian, gram[:p, p].copy(), hessian, gram[p, p], power)
 
 
-compiled_as(SpectralProblem, _spectral_equations)
+compiled_as(SpectralProblem, spectral_equations)
+
+
+@njit(cache=True, nogil=True)
+def spectral_least_squares_start(problem: SpectralProblem, svf_cutoff: float) -> tuple[bool, Array]:
+    """Least-squares estimate with the state-variable filter ``1/(p + w)^n``, the delay left at zero."""
+    n, m = problem.poles, problem.zeros
+    p = n + m + 2
+    svf = np.zeros(n + 1)
+    svf[0] = 1.0
+    for i in range(n):
+        for k in range(i + 1, 0, -1):
+            svf[k] += svf_cutoff * svf[k - 1]
+    # A Y = B U + T divided by F reads Y = -sum (a_i - f_i) (jw)^(n-i)/F Y + B/F U + T/F: with F for A and a zero
+    # numerator the "output error" is y itself, and with the measured output for the model's the columns are these.
+    gram, _ = _projected_moments(problem, svf, np.zeros(m + 1), True)
+    theta = np.zeros(p)
+    lengths = np.diag(gram).copy()
+    solved, coefficients = solve_scaled(gram, gram[:, p].copy(), lengths, lengths, p - 1)
+    if solved:
+        theta[: p - 1] = coefficients[: p - 1]
+        theta[:n] = reflect_unstable(svf + np.concatenate((np.zeros(1), coefficients[:n])))[1:]
+    return solved, theta

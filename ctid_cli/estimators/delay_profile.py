@@ -15,7 +15,7 @@ from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimation.output_error import Layout, sensitivities
 from ctid_cli.estimation.profile_refinement import Refinement
-from ctid_cli.estimation.profile_search import Profile, ProfileSearch, search_delay
+from ctid_cli.estimation.profile_search import Profile, search_delay
 from ctid_cli.estimation.robust_fit import RobustFit, robust_fit
 from ctid_cli.inference.bootstrap import Progress
 from ctid_cli.inference.fit import Fit
@@ -171,10 +171,6 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
     loss : {"squares", "huber", "tukey"}, default "squares"
         What output errors count: their squares; their squares up to 1.345 standard deviations and their sizes beyond
         (Huber); or nothing from 4.685 standard deviations on (Tukey's biweight), for records with outliers.
-    search : {"time", "spectral", "samples"}, default "time"
-        What the search over the delay looks at: low-pass-filtered signals resampled at a lower rate, the spectra of
-        the record, or every sample. The first two need one record at rest without an estimated offset; every sample
-        is looked at otherwise. The estimate itself always comes from every sample.
     svf_cutoff : float, optional
         Cut-off of the state-variable filter of the starts [rad/s]; by default from the bandwidth of the output.
     nested : bool, default False
@@ -221,7 +217,6 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
     initial_state: InitialState = "rest"
     offset: Offset = "none"
     loss: LossKind = "squares"
-    search: ProfileSearch = "time"
     svf_cutoff: float | None = None
     nested: bool = False
     hold_output: Hold = "foh"
@@ -250,7 +245,7 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
         return Refinement(measured)
 
     def _estimate(self, refinement: Refinement, start: Start | None) -> MeasuredFit:
-        for minima, profile in search_delay(refinement.measured, self.search, self.svf_cutoff):
+        for minima, profile in search_delay(refinement.measured, self.svf_cutoff):
             if minima:
                 a = [np.concatenate(([1.0], minimum.theta[: self.poles])) for minimum in minima]
                 starts = [(each, minimum.delay) for each, minimum in zip(a, minima, strict=True)]

@@ -13,9 +13,10 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.common import history_entry
-from ctid_cli.estimation.delay_search import Descent, Minimum, descend
+from ctid_cli.estimation.common import history_of
+from ctid_cli.estimation.delay_search import SMALLEST_STEP, Descent, Limits, Minimum, descend
 from ctid_cli.estimation.filter_search import FilterPath
+from ctid_cli.estimation.filtered_costs import percents
 from ctid_cli.estimation.redundancy import START, RedundantMinimum, SearchStatus, Visit
 from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.estimators.td_srivc import SrivcCost, TdSrivc
@@ -24,9 +25,6 @@ from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.status import Status
 from ctid_cli.signals.record import Record
-
-#: Cost of a filter behind which SRIVC finds no model [%]: that of a model which explains nothing.
-NOTHING = 100.0
 
 
 class FilteredMember(SrivcCost):
@@ -37,19 +35,15 @@ class FilteredMember(SrivcCost):
         super().__init__(options, problem, (options.svf_cutoff,))
         y = problem.data.y_used
         self.spread = float(np.sum((y - y.mean()) ** 2))
-        self._known: dict[float, Minimum | None] = {}
+        self._known: dict[float, Minimum] = {}
 
-    def minimise(self, delay: float, theta: Array | None) -> Minimum | None:
+    def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
         """SRIVC at one delay, from given coefficients or by the whole of Algorithm I."""
-        if theta is not None:
-            return super().minimise(delay, theta)
+        if not own:
+            return super().minimise(delay, starts, own)
         if delay not in self._known:
-            self._known[delay] = super().minimise(delay, None)
+            self._known[delay] = super().minimise(delay, starts, own)
         return self._known[delay]
-
-    def percent(self, minimum: Minimum | None) -> float:
-        """``100 ||y - x|| / ||y - mean y||`` of the filtered data [%]."""
-        return NOTHING if minimum is None else 100.0 * float(np.sqrt(minimum.squared_error / self.spread))
 
 
 class Path(NamedTuple):
@@ -71,7 +65,8 @@ class PrintedRounds:
 
     def reference_cost(self, delay: float) -> float:
         """J0 (45) at a delay, every filter with its own coefficients [%]."""
-        return float(np.mean([member.percent(member.minimise(delay, None)) for member in self.members]))
+        errors = [member.minimise(delay, np.empty((0, member.size)), True).squared_error for member in self.members]
+        return float(percents(np.array(errors), np.array([member.spread for member in self.members])).mean())
 
     def run(self, delay: float) -> tuple[RedundantMinimum[float], list[Path]]:
         """From the incumbent along every path, and on from the end of least J0, lower than before or not."""
@@ -79,7 +74,7 @@ class PrintedRounds:
         incumbents, status = [delay], SearchStatus.MAX_ROUNDS
         for number in range(1, self.max_rounds + 1):
             descents = [self._descend(member, delay) for member in self.members]
-            followed = [Path(number, k, descent) for k, descent in enumerate(descents) if descent is not None]
+            followed = [Path(number, k, descent) for k, descent in enumerate(descents) if descent.path.size]
             if not followed:
                 raise DataError(Status.SINGULAR.value)
             ends = [path.descent.minimum.delay for path in followed]
@@ -100,35 +95,29 @@ class PrintedRounds:
             incumbents.append(delay)
         return RedundantMinimum(delay, costs[least], number, status, tuple(visits)), paths
 
-    def _descend(self, member: FilteredMember, delay: float) -> Descent | None:
+    def _descend(self, member: FilteredMember, delay: float) -> Descent:
         """Algorithm II without its step 3."""
-        return descend(
-            member,
-            delay,
-            None,
-            self.options.delay_bounds,
-            max_iterations=self.options.max_iterations,
-            tolerance=self.options.tolerance,
-            largest_step=self.max_delay_step,
-        )
+        low, high = self.options.delay_bounds
+        effort = self.options.max_iterations, self.options.tolerance
+        limits = Limits(low, high, *effort, SMALLEST_STEP * (high - low), self.max_delay_step)
+        return descend(member, delay, np.empty((0, member.size)), limits)
 
     def told(self, paths: Sequence[Path]) -> list[FilterPath]:
         """The paths as they stand in a fit."""
         told = []
-        for number, k, descent in paths:
-            costs = np.array([self.members[k].percent(step) for step in descent.steps])
-            thetas = np.array([step.theta for step in descent.steps])
-            told.append(FilterPath(number, k, thetas[:, -1], costs, thetas[:, :-1]))
+        for number, k, (_, path, _, _) in paths:
+            costs = percents(path[:, -1], self.members[k].spread)
+            told.append(FilterPath(number, k, path[:, -2], costs, path[:, :-2]))
         return told
 
     def history(self, stage: str, found: RedundantMinimum[float], paths: Sequence[Path]) -> list[IterationRecord]:
         """The steps of the paths that led from incumbent to incumbent."""
         taken = {(visit.round, visit.path) for visit in found.trajectory}
         return [
-            history_entry(stage.format(k + 1), i, self.members[k].problem, step.theta, step.squared_error)
+            entry
             for number, k, descent in paths
             if (number, k) in taken
-            for i, step in enumerate(descent.steps)
+            for entry in history_of(stage.format(k + 1), self.members[k].problem, descent)
         ]
 
 
@@ -146,7 +135,7 @@ class PrintedSearch:
         refined, last = self.unfiltered.run(found.point)
         history = self.filtered.history("filter {}", found, paths)
         history += self.unfiltered.history("refine", refined, last)
-        end = replace(last[-1].descent, iterations=found.rounds + sum(path.descent.iterations for path in last))
+        end = last[-1].descent._replace(iterations=found.rounds + sum(path.descent.iterations for path in last))
         problem = self.unfiltered.members[0].problem._replace(free_delay=True)
         return self.unfiltered.options._finish(problem, end, history), found, self.filtered.told(paths)
 

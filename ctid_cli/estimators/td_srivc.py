@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -23,9 +23,18 @@ from ctid_cli.estimation.common import (
     history_of,
     initial_delay,
 )
-from ctid_cli.estimation.delay_search import LEAST_CURVATURE, Descent, Minimum, bound_in_the_way, delay_step, descend
+from ctid_cli.estimation.delay_search import (
+    LEAST_CURVATURE,
+    SMALLEST_STEP,
+    Descent,
+    Limits,
+    Minimum,
+    bound_in_the_way,
+    delay_step,
+    descend,
+)
 from ctid_cli.estimation.global_look import lower_elsewhere
-from ctid_cli.estimation.iteration import GUARDED, RULES, Iterated, Steps, Variant, iterate
+from ctid_cli.estimation.iteration import ENDS, GUARDED, INADMISSIBLE, RULES, Iterated, Steps, Variant, iterate
 from ctid_cli.estimation.sampled_problem import SampledProblem, cutoffs_around, least_squares_starts
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
@@ -139,8 +148,9 @@ class TdSrivc(Estimator["Searches", Fit]):
         delay = initial_delay(start, self.delay_bounds)
         history: list[IterationRecord] = []
         starts = cutoffs_around(searches.bandwidth) if self.svf_cutoff is None else (self.svf_cutoff,)
-        found = self._descend(searches.first, delay, None, "search", history, starts)
-        if found is None:
+        none = np.empty((0, searches.first.free))
+        found = self._descend(searches.first, delay, none, "search", history, starts)
+        if found.end == INADMISSIBLE:
             raise DataError(Status.SINGULAR.value)
         end = self._finish if self.lowpass is None else self._refine
         fit = end(searches.last, found, history)
@@ -151,31 +161,31 @@ class TdSrivc(Estimator["Searches", Fit]):
 
     def _refine(self, problem: SampledProblem, found: Descent, history: list[IterationRecord]) -> Fit:
         """Go on from a delay and coefficients that a search on filtered data has found."""
-        refined = self._descend(problem, found.minimum.delay, found.minimum.theta, "refine", history)
-        if refined is not None:
-            found = replace(refined, iterations=found.iterations + refined.iterations)
+        refined = self._descend(problem, found.minimum.delay, found.minimum.theta[None], "refine", history)
+        if refined.end != INADMISSIBLE:
+            found = refined._replace(iterations=found.iterations + refined.iterations)
         return self._finish(problem, found, history)
 
     def _descend(
         self,
         problem: SampledProblem,
         delay: float,
-        theta: Array | None,
+        thetas: Array,
         stage: str,
         history: list[IterationRecord],
         svf_cutoffs: tuple[float, ...] = (),
-    ) -> Descent | None:
+    ) -> Descent:
         """Search from a delay; the accepted steps go to the history."""
         cost = SrivcCost(self, problem, svf_cutoffs)
-        effort: Any = {"max_iterations": self.max_iterations, "tolerance": cost.tolerance}
-        found = descend(cost, delay, theta, self.delay_bounds, **effort)
-        for k, step in enumerate(found.steps if found is not None else ()):
-            history.append(history_entry(stage, k, problem, step.theta, step.squared_error))
+        low, high = self.delay_bounds
+        limits = Limits(low, high, self.max_iterations, cost.tolerance, SMALLEST_STEP * (high - low))
+        found = descend(cost, delay, thetas, limits)
+        history += history_of(stage, problem, found)
         return found
 
     def _finish(self, problem: SampledProblem, found: Descent, history: list[IterationRecord]) -> Fit:
         """Polish with joint iterations on coefficients and delay, mind the bounds, and report."""
-        theta, status, iterations = found.minimum.theta, found.status, found.iterations
+        theta, status, iterations = found.minimum.theta, ENDS[found.end], found.iterations
         if self.variant == "guarded":
             # From the right basin they converge in a few steps.
             polished = self._iterated(problem, theta)
@@ -227,16 +237,19 @@ class SrivcCost:
         # The guarded variant ends with joint iterations: its search only has to find the basin.
         self.tolerance = options.tolerance if options.variant == "plain" else max(options.tolerance, SEARCH_TOLERANCE)
 
-    def minimise(self, delay: float, theta: Array | None) -> Minimum | None:
-        """SRIVC at one delay, from given coefficients or from the least-squares starts."""
+    @property
+    def size(self) -> int:
+        """Number of parameters, the delay included."""
+        return self.problem.free + 1
+
+    def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
+        """SRIVC at one delay, from given coefficients and, if asked for, from the least-squares starts."""
         problem, refit = self.problem, self.options.variant == "guarded"
-        cutoffs = self.svf_cutoffs if theta is None else ()
-        starts = least_squares_starts(problem.data, problem.structure, delay, cutoffs, refit)
-        starts += [] if theta is None else [theta]
+        cutoffs = self.svf_cutoffs if own else ()
+        tried = [*least_squares_starts(problem.data, problem.structure, delay, cutoffs, refit), *starts]
         steps = Steps(INNER_ITERATIONS, self.tolerance, RULES[self.options.variant])
-        tried = (iterate(problem, np.append(start[:-1], delay), steps) for start in starts)
-        results = [result for result in tried if result is not None]
-        if not results:
-            return None
-        best = min(results, key=lambda result: result.equations.squared_error)
-        return Minimum(best.theta, best.equations.squared_error, delay_step(best.equations, LEAST_CURVATURE, False))
+        ends = (iterate(problem, np.append(start[:-1], delay), steps) for start in tried)
+        best = min((end for end in ends if end is not None), key=lambda end: end.equations.squared_error, default=None)
+        if best is None:
+            return Minimum(np.zeros(self.size), np.inf)
+        return Minimum(best.theta, best.equations.squared_error, delay_step(best.equations, LEAST_CURVATURE))

@@ -11,21 +11,23 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, initial_delay, named
 from ctid_cli.estimation.delay_grid import scan
 from ctid_cli.estimation.delay_search import Descent, Minimum
-from ctid_cli.estimation.filter_search import LARGEST_STEP, LATTICE, FilterPath, FilterSearch, Limits
-from ctid_cli.estimation.filtered_costs import Search, filtered_costs
-from ctid_cli.estimation.iteration import GAUSS_NEWTON, GUARDED, Steps, Variant
+from ctid_cli.estimation.filter_search import LARGEST_STEP, LATTICE, FilterPath, FilterSearch
+from ctid_cli.estimation.filtered_costs import filtered_costs
+from ctid_cli.estimation.iteration import CONVERGED, GAUSS_NEWTON, Steps, Variant
 from ctid_cli.estimation.redundancy import RedundantMinimum, Visit
 from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.estimators.printed_redundancy import PrintedSearch, printed_search
 from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.inference.answer import output_bandwidth
-from ctid_cli.inference.fit import Fit, IterationRecord
+from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
+#: How hard to work at each trial delay.
+EFFORT = Steps(6, 1e-2, GAUSS_NEWTON, 2)
 #: Points of the lattice by which one start of the refinement is shorter than the best delay behind the widest band.
 SHORTER = 2
 
@@ -78,9 +80,6 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
         Order of the Butterworth filters.
     svf_cutoff : float, optional
         Cut-off of the state-variable filter of the starts [rad/s]; by default the bandwidth.
-    search : {"time", "spectral"}, default "time"
-        Whether the search runs on samples of the filtered signals or on their spectra. The final estimate always
-        comes from the unfiltered samples.
     max_iterations : int, default 10
         Largest number of Gauss-Newton iterations on each path.
     tolerance : float, default 1e-3
@@ -156,7 +155,6 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
     beta: float = 10.0
     order: int = 10
     svf_cutoff: float | None = None
-    search: Search = "time"
     max_iterations: int = 10
     tolerance: float = 1e-3
     max_rounds: int = 20
@@ -193,23 +191,21 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
             record,
             filters.lowpasses,
             Structure(self.poles, self.zeros),
-            self.delay_bounds,
-            search=self.search,
+            self.delay_bounds[1],
             start=self.delay_bounds[1],
-            svf_cutoff=self.svf_cutoff or bandwidth,
-            hold_output=self.hold_output,
-            effort=Steps(6, 1e-2, GAUSS_NEWTON if self.search == "spectral" else GUARDED, 2),
+            svf_cutoffs=np.full(self.filters, self.svf_cutoff or bandwidth),
+            steps=EFFORT,
         )
-        usable = [cost for cost in costs if cost is not None]
-        if len(usable) < len(costs):
-            many = f"{len(costs) - len(usable)} of {len(costs)} filters, whose periods reach {filters.periods[0]:.3g} s"
+        passed = int((costs.frequencies <= bandwidth).sum())
+        if 2 * passed - 1 <= costs.size + self.poles:
             raise DataError(
-                f"{named(record)}after the greatest delay, {self.delay_bounds[1]:g} s, the record is too short for "
-                f"{many}; take a smaller beta or greatest delay, a larger bandwidth or a longer record"
+                f"{named(record)}fewer than {passed} periods of the bandwidth, {bandwidth:.3g} rad/s, are left after "
+                f"the greatest delay, {self.delay_bounds[1]:g} s: too few to estimate from; take a smaller greatest "
+                "delay, a larger bandwidth or a longer record"
             )
         longest = self.max_delay_step or LARGEST_STEP * (self.delay_bounds[1] - self.delay_bounds[0])
-        limits = Limits(self.delay_bounds, self.max_iterations, self.tolerance, self.max_rounds, longest)
-        return RedundantSearch(FilterSearch(usable, filters, limits), unfiltered)
+        search = FilterSearch(costs, filters, self.delay_bounds, self.max_iterations, self.tolerance, longest)
+        return RedundantSearch(search, unfiltered, {})
 
     def _estimate(self, laid_out: RedundantSearch | PrintedSearch, start: Start | None) -> RedundantFit:
         delay = initial_delay(start, self.delay_bounds)
@@ -218,33 +214,31 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
             fit, found, paths = laid_out.run(delay)
         else:
             search, paths = laid_out.filtered, []
-            filters, found = search.filters, search.run(delay, paths)
-            fit = self._refine(laid_out, found, search.history(found, paths))
+            filters, found = search.filters, search.run(delay, self.max_rounds, paths)
+            if found.point not in laid_out.refined:
+                laid_out.refined[found.point] = self._refine(laid_out, found.point)
+            fit = laid_out.refined[found.point]
+            history = (*search.history(found, paths), *fit.history)
+            fit = replace(fit, iterations=found.rounds + fit.iterations, history=history)
         values = {item.name: getattr(fit, item.name) for item in fields(Fit)}
         return RedundantFit(**values, search=found, filters=filters, paths=tuple(paths))
 
-    def _refine(
-        self, laid_out: RedundantSearch, search: RedundantMinimum[float], history: list[IterationRecord]
-    ) -> Fit:
+    def _refine(self, laid_out: RedundantSearch, point: float) -> Fit:
         """Go on from the minimum of J0, and from where the filter of widest band fits best within half a period."""
-        filtered = laid_out.filtered
+        search = laid_out.filtered
         # J0 is flat around its minimum where noise, or a model with too long a delay, weighs on the narrow filters.
-        nearby = search.point + filtered.period * np.linspace(-0.5, 0.5, 1 + round(1 / LATTICE))
-        delays = np.unique(np.clip(nearby, *self.delay_bounds))
-        found = [minimum for minimum in scan(filtered.costs[-1], delays) if minimum is not None]
-        widest = filtered.at(search.point)[1][-1]
-        starts: list[Minimum] = []
-        if widest is not None:
-            starts.append(replace(widest, theta=np.append(widest.theta[:-1], search.point)))
-        if found:
-            least = int(np.argmin([minimum.squared_error for minimum in found]))
-            # Where the delay is too long a pole makes up for it by running to infinity, and does not come back.
-            starts += [found[least], found[max(least - SHORTER, 0)]]
-        if not starts:
+        nearby = point + search.period * np.linspace(-0.5, 0.5, 1 + round(1 / LATTICE))
+        found = scan(search.costs.behind(self.filters - 1), np.unique(np.clip(nearby, *self.delay_bounds)))
+        least = int(np.argmin(found.squared_errors))
+        # Where the delay is too long a pole makes up for it by running to infinity, and does not come back.
+        starts = found.thetas[[least, max(least - SHORTER, 0)]]
+        here = search.at(point)
+        if np.isfinite(here.squared_errors[-1]):
+            starts = np.vstack((here.thetas[-1:], starts))
+        if not np.isfinite(found.squared_errors[least]):
             raise DataError(Status.SINGULAR.value)
-        ends = [Descent([start], Status.CONVERGED, search.rounds) for start in starts]
-        fits = [self.refinement._refine(laid_out.unfiltered, end, list(history)) for end in ends]
-        return min(fits, key=lambda fit: fit.cost)
+        ends = [Descent(Minimum(theta, np.nan), np.empty((0, 1)), CONVERGED, 0) for theta in starts]
+        return min((self.refinement._refine(laid_out.unfiltered, end, []) for end in ends), key=lambda fit: fit.cost)
 
 
 class RedundantSearch(NamedTuple):
@@ -252,3 +246,5 @@ class RedundantSearch(NamedTuple):
 
     filtered: FilterSearch
     unfiltered: SampledProblem
+    #: What was refined from which minimum of J0 [s].
+    refined: dict[float, Fit]

@@ -5,18 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
-
-#: A resampled record has this many samples, but no fewer and no more than so many for each period of the cut-off.
-ENOUGH_SAMPLES = 500
-FEWEST_PER_PERIOD = 5.0
-MOST_PER_PERIOD = 16.0
 
 
 @dataclass(frozen=True)
@@ -109,49 +104,6 @@ class Lowpass:
             sections.append(section / (1.0 + damping + square))
         return np.array(sections)
 
-    def resample(self, record: Record, per_period: float | None = None) -> Record:
-        """Filter a record and keep only as many samples as its slow signals need.
-
-        Parameters
-        ----------
-        record : Record
-            The record, of any clock; it is not changed.
-        per_period : float, optional
-            Samples for each period of the cut-off frequency, never more than the record has. By default 16 on a record
-            of up to 31 periods, fewer on a longer one, and no fewer than 5.
-
-        Returns
-        -------
-        Record
-            Filtered input and output on one regular clock, linear between its samples; masked where the original has
-            a hole longer than one of its intervals.
-
-        Notes
-        -----
-        The held input and the linearly interpolated output pass through the analogue filter exactly, from rest.
-        Straight lines between 5 samples for each period lose up to 12 % of the amplitude at the cut-off and 3 % at half
-        of it; between 16, 1.3 % and 0.3 %: good enough to search on, not to estimate from. A filter of low order passes
-        frequencies that so few samples cannot show.
-        """
-        first, last = min(record.t[0], record.input.t[0]), record.t[-1]
-        period = 2.0 * np.pi / self.cutoff
-        if per_period is None:
-            per_period = float(np.clip(ENOUGH_SAMPLES * period / (last - first), FEWEST_PER_PERIOD, MOST_PER_PERIOD))
-        most = period / per_period
-        output = HeldSignal(record.t, record.bridged_y, "foh")
-        if record.interval is not None and record.input_on_grid and record.input.t[0] == record.t[0]:
-            # Whole intervals of a regular clock: the recursion has constant coefficients.
-            every = max(1, int(most / record.interval + 1e-9))
-            t = record.t[::every]
-            interval = every * record.interval
-            u, y = (simulate(self.model, signal, record.t)[::every] for signal in (record.input, output))
-        else:
-            interval = max(most, float(np.median(np.diff(record.t))), (last - first) / record.n_samples)
-            t = first + interval * np.arange(int((last - first) / interval + 1e-9) + 1)
-            u, y = (simulate(self.model, signal, t) for signal in (record.input, output))
-        covered = _covered(t, record, interval)
-        return Record(t, np.where(covered, y, np.nan), HeldSignal(t, u, "foh"), name=record.name)
-
 
 @njit(cache=True, nogil=True)
 def _behind(sections: Array, x: Array) -> Array:
@@ -167,15 +119,3 @@ def _behind(sections: Array, x: Array) -> Array:
             value = out
         x[k] = value
     return x
-
-
-def _covered(t: Array, record: Record, longest: float) -> BoolArray:
-    """Whether instants lie between two neighbouring samples, or in a hole no longer than given."""
-    places = np.flatnonzero(record.valid)
-    present = record.t[places]
-    before = np.searchsorted(present, t, side="right") - 1
-    after = np.searchsorted(present, t, side="left")
-    inside = (before >= 0) & (after < present.size)
-    left, right = np.maximum(before, 0), np.minimum(after, present.size - 1)
-    short = present[right] - present[left] <= longest * (1.0 + 1e-9)
-    return np.asarray(inside & (short | (places[right] - places[left] <= 1)))

@@ -30,8 +30,6 @@ STRETCHES = 128
 SHORTEST_STRETCH = 8
 #: Sampling intervals are sorted into this many groups of like ones to find what interpolation does to the output.
 STEP_GROUPS = 64
-#: Delays whose spectra are remembered.
-REMEMBERED = 256
 
 
 class RecordSpectra:
@@ -58,27 +56,21 @@ class RecordSpectra:
         self.damping: Array = _damping(record, window, self.frequencies)
         joined = _held_spectrum(output, start, end - start, 0.0, count)
         #: Spectrum of the output [output unit], shape (K,).
-        self.outputs: ComplexArray = _window_spectrum(joined, 0.0, 1.0 / self.damping[-count:])[self._first :]
-        self._input = _held_spectrum(record.input, start, end - start, greatest_delay, count)
-        self._remembered: dict[float, ComplexArray] = {}
+        self.outputs: ComplexArray = window_spectrum(joined, 0.0, 1.0 / self.damping[-count:])[self._first :]
+        #: The input, laid out for its spectrum at any delay.
+        self.input = _held_spectrum(record.input, start, end - start, greatest_delay, count)
 
     @property
     def duration(self) -> float:
         """Length of the window [s]."""
         return self.window[1] - self.window[0]
 
-    def inputs(self, delay: float, count: int | None = None) -> ComplexArray:
+    def inputs(self, delay: float) -> ComplexArray:
         """Spectrum of the delayed input over the window."""
         if not 0.0 <= delay <= self.greatest_delay:
             raise ValueError(f"the delay must lie between 0 and {self.greatest_delay:g} s, not {delay:g} s")
-        needed = self.frequencies.size if count is None else count
-        known = self._remembered.get(delay)
-        if known is None or known.size < needed:
-            known = _window_spectrum(self._input, delay, np.ones(needed - 1 + self._first))[self._first :]
-            if len(self._remembered) >= REMEMBERED:
-                del self._remembered[next(iter(self._remembered))]
-            self._remembered[delay] = known
-        return known[:needed]
+        ones = np.ones(self.frequencies.size - 1 + self._first)
+        return np.asarray(window_spectrum(self.input, delay, ones)[self._first :])
 
 
 def record_spectra(
@@ -127,7 +119,7 @@ def _damping(record: Record, window: tuple[float, float], frequencies: Array) ->
     return damping
 
 
-class _HeldSpectrum(NamedTuple):
+class HeldSpectrum(NamedTuple):
     """A held signal laid out for its spectrum over a window, at any delay.
 
     Integration by parts leaves sums over the breaks: of the jumps of the value for a constant hold, of the jumps of
@@ -149,7 +141,7 @@ class _HeldSpectrum(NamedTuple):
 
 def _held_spectrum(
     signal: HeldSignal, start: float, duration: float, greatest_delay: float, count: int
-) -> _HeldSpectrum:
+) -> HeldSpectrum:
     """Lay out a signal for ``count`` frequencies."""
     times, values, foh = signal.t - start, plain_array(signal.values), signal.hold == "foh"
     steps = np.diff(times)
@@ -167,7 +159,7 @@ def _held_spectrum(
     stretch = max(SHORTEST_STRETCH, (early + times.size - late) // STRETCHES)
     marks = np.union1d(np.arange(0, early + 1, stretch), np.arange(late, times.size + 1, stretch)).astype(np.int64)
     sums = _partial_sums(times, jumps, marks, 2 * np.pi / duration, count)
-    return _HeldSpectrum(times, values, slopes, jumps, integral, foh, marks, sums, duration)
+    return HeldSpectrum(times, values, slopes, jumps, integral, foh, marks, sums, duration)
 
 
 @njit(cache=True, nogil=True)
@@ -224,7 +216,7 @@ def _last_at(grid: Array | IntArray, value: float) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _window_spectrum(held: _HeldSpectrum, delay: float, gain: Array) -> ComplexArray:
+def window_spectrum(held: HeldSpectrum, delay: float, gain: Array) -> ComplexArray:
     """Spectrum at zero frequency and at as many above it as there are gains, of the signal later by ``delay``.
 
     The gain multiplies what happens inside the window, as opposed to its ends.

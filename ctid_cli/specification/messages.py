@@ -39,6 +39,7 @@ SENTENCES = {
     "too_long": "must be a list of at most {max_length}, not {shown}{meaning}",
     "model_type": "must be a mapping with the keys {keys}, not {shown}",
     "extra_forbidden": "there is no such key here{near} allowed: {keys}",
+    "search_retired": "is no longer needed: there is one search now; delete this line",
     "missing": "is missing; add it{meaning}",
     "no_kind": "must be one of {allowed}, not {shown}",
     "kind_missing": "is missing; allowed: {allowed}",
@@ -74,6 +75,8 @@ def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Located:
         path, kind, value = (*path, "kind"), "no_kind" if "kind" in value else "kind_missing", value.get("kind")
     elif kind == "float_type" and type(value) is int:
         kind, value = "finite_number", float("inf")  # an integer beyond all floating-point numbers
+    elif kind == "extra_forbidden" and path == ("search",) and "delay_bounds" in descriptions:
+        kind = "search_retired"
     if kind not in SENTENCES:
         return path, error["msg"], at_key
     words = _words(path, descriptions) | {"shown": shown(value)} | context

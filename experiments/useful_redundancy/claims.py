@@ -9,7 +9,7 @@ from ctid_cli.reporting.study import load_study
 from ctid_cli.studies.claim import Claim, within
 
 #: Methods that must find the delay nearly always, wherever they start, and in how many of 100 data sets [%].
-RELIABLE = ("proposed", "proposed_spectral", "delay_profile", "profile_spectral")
+RELIABLE = ("proposed", "delay_profile")
 ALWAYS = 99.0
 
 

@@ -21,7 +21,7 @@ def scaled_solve(matrix, right, rows, columns):
 
 def delay_step(equations, least_curvature=delay_search.LEAST_CURVATURE):
     """The step where the coefficients are at their minimum, or None."""
-    step = delay_search.delay_step(equations, least_curvature, False)
+    step = delay_search.delay_step(equations, least_curvature)
     return None if np.isnan(step) else step
 
 
@@ -57,11 +57,19 @@ class CoefficientProblem(Coefficients):
         self.data = data
 
 
+def spectral_at(spectra, structure, delay, weight):
+    """The coefficients of a record's spectra at a delay."""
+    inputs = spectra.inputs(delay)
+    return spectral_problem.SpectralProblem(
+        spectra.frequencies, spectra.outputs, inputs, weight, structure.poles, structure.zeros
+    )
+
+
 class SpectralCoefficientProblem(Coefficients):
     """Coefficients from spectra at a delay."""
 
     def __init__(self, spectra, structure, delay, weight):
-        super().__init__(spectral_problem.spectral_problem(spectra, structure, delay, weight), delay)
+        super().__init__(spectral_at(spectra, structure, delay, weight), delay)
 
 
 class DelayProblem:
@@ -84,8 +92,7 @@ class SpectralDelayProblem:
     def equations(self, theta):
         if not self.bounds[0] <= theta[-1] <= self.bounds[1]:
             return None
-        at_delay = spectral_problem.spectral_problem(self.spectra, self.structure, float(theta[-1]), self.weight)
-        found = at_delay.equations(theta)
+        found = spectral_at(self.spectra, self.structure, float(theta[-1]), self.weight).equations(theta)
         return found if np.isfinite(found.squared_error) else None
 
     def admissible(self, theta):
@@ -131,11 +138,11 @@ def iterate(problem, theta, *, on_step=None, **options):
 
 def best_coefficients(data, structure, delay, starts, *, gauss_newton=False, **effort):
     """Coefficients, squared error and step of the delay, or None."""
-    starts = [np.append(start, 0.0) for start in np.atleast_2d(starts)]
+    starts = np.array([np.append(start, float(delay)) for start in np.atleast_2d(starts)])
     rule = "gauss_newton" if gauss_newton else "guarded"
     problem = sampled_problem.at_known_delay(data, structure)
-    found = delay_search.best_minimum(problem, delay, starts, structure.poles, steps(variant=rule, **effort))
-    if found is None:
+    found = delay_search.best_of(problem, starts, structure.poles, steps(variant=rule, **effort))
+    if np.isinf(found.squared_error):
         return None
     return found.theta[:-1], found.squared_error, None if np.isnan(found.step) else found.step
 
@@ -150,7 +157,7 @@ def refit_numerator(data, structure, theta, delay):
 
 
 def spectral_refit_numerator(spectra, structure, theta, delay, weight):
-    problem = spectral_problem.spectral_problem(spectra, structure, delay, weight)
+    problem = spectral_at(spectra, structure, delay, weight)
     return _refitted(problem, structure, theta, delay)
 
 
@@ -160,6 +167,6 @@ def least_squares_start(data, structure, delay, svf_cutoff):
 
 
 def spectral_least_squares_start(spectra, structure, delay, svf_cutoff, weight):
-    problem = spectral_problem.spectral_problem(spectra, structure, delay, weight)
-    theta = spectral_problem.spectral_least_squares_start(problem, delay, svf_cutoff)
-    return None if theta is None else theta[:-1]
+    problem = spectral_at(spectra, structure, delay, weight)
+    solved, theta = spectral_problem.spectral_least_squares_start(problem, svf_cutoff)
+    return theta[:-1] if solved else None

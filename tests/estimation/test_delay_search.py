@@ -2,14 +2,15 @@
 
 import math
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.estimation.delay_search import Minimum, bound_in_the_way, descend
-from ctid_cli.estimation.iteration import Equations
+from ctid_cli.estimation.delay_search import Limits, Minimum, bound_in_the_way, descend
+from ctid_cli.estimation.iteration import ENDS, INADMISSIBLE, Equations
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.sensitivity import Structure
@@ -18,7 +19,7 @@ from ctid_cli.models.transfer_function import TransferFunction
 from tests.estimation.adapters import CoefficientProblem, DelayProblem, delay_step, iterate
 from tests.estimators.records import CASE_1, CASE_2, make_record, theta_of
 
-THETA = np.array([3.0, 4.0])
+START = np.array([[3.0, 4.0]])
 BOUNDS = (0.0, 10.0)
 #: A hundred-thousandth of the range.
 SMALLEST = 1e-4
@@ -31,11 +32,11 @@ class Artificial:
         self.cost, self.formula = cost, step
         self.asked, self.starts = [], []
 
-    def minimise(self, delay, theta):
+    def minimise(self, delay, starts, own):
         self.asked.append(delay)
-        self.starts.append(theta)
+        self.starts.append((starts.tolist(), own))
         value = self.cost(delay)
-        return None if value is None else Minimum(np.array([value, delay]), value, self.formula(delay))
+        return Minimum(np.array([value, delay]), value, self.formula(delay))
 
 
 def quadratic(at, floor=1.0):
@@ -56,9 +57,12 @@ def waves(at=5.0, frequency=4.0):
     return Artificial(cost, step)
 
 
-def search(cost, delay, theta=THETA, bounds=BOUNDS, *, max_iterations=50, tolerance=1e-9, **more):
-    found = descend(cost, delay, theta, bounds, max_iterations=max_iterations, tolerance=tolerance, **more)
-    return found, [] if found is None else list(found.steps)
+def search(
+    cost, delay, starts=START, bounds=BOUNDS, *, max_iterations=50, tolerance=1e-9, largest_step=math.inf, reflect=False
+):
+    found = descend(cost, delay, starts, Limits(*bounds, max_iterations, tolerance, SMALLEST, largest_step, reflect))
+    end = SimpleNamespace(minimum=found.minimum, status=ENDS[found.end], iterations=found.iterations)
+    return end, [Minimum(row[:-1], row[-1]) for row in found.path]
 
 
 def test_newton_step_on_a_parabola_needs_one_step():
@@ -67,19 +71,19 @@ def test_newton_step_on_a_parabola_needs_one_step():
     assert (found.minimum.delay, found.status, found.iterations) == (3.0, Status.CONVERGED, 1)
     assert cost.asked == [7.0, 3.0]
     assert [minimum.delay for minimum in seen] == [7.0, 3.0]
-    assert seen[-1] is found.minimum
+    assert (seen[-1].delay, seen[-1].squared_error) == (3.0, 1.0)
     assert found.minimum.squared_error == 1.0
 
 
 def test_coefficients_are_handed_on():
     cost = quadratic(3.0)
     search(cost, 7.0, largest_step=2.0)
-    assert cost.starts[0] is THETA
     # Each trial starts from the coefficients of the last accepted delay.
-    assert [theta.tolist() for theta in cost.starts[1:]] == [[17.0, 7.0], [5.0, 5.0]]
+    assert cost.starts == [([[3.0, 4.0]], False), ([[17.0, 7.0]], False), ([[5.0, 5.0]], False)]
+    # Without any the cost starts from its own.
     cost = quadratic(3.0)
-    search(cost, 7.0, None)
-    assert cost.starts[0] is None
+    search(cost, 7.0, START[:0])
+    assert cost.starts[0] == ([], True)
 
 
 @pytest.mark.parametrize(("start", "at"), [(0.0, 7.25), (9.5, 1.0)])
@@ -123,7 +127,7 @@ def test_step_that_does_not_lower_the_cost_is_halved():
 
 
 def test_step_where_nothing_can_be_computed_is_halved():
-    cost = Artificial(lambda d: None if d > 4.0 else (d - 3.9) ** 2 + 1.0, lambda d: 8.0 if d < 1.0 else 3.9 - d)
+    cost = Artificial(lambda d: math.inf if d > 4.0 else (d - 3.9) ** 2 + 1.0, lambda d: 8.0 if d < 1.0 else 3.9 - d)
     found, _ = search(cost, 0.5)
     assert cost.asked[:3] == [0.5, 8.5, 4.5]
     assert cost.asked[3] == 2.5
@@ -171,7 +175,7 @@ def test_never_leaves_the_bounds_nor_rises(start, at, gain, largest_step, reflec
     assert all(0.0 <= delay <= 10.0 for delay in cost.asked)
     costs = [minimum.squared_error for minimum in seen]
     assert all(after < before for before, after in pairwise(costs))
-    assert (seen[0].delay, seen[-1]) == (start, found.minimum)
+    assert (seen[0].delay, seen[-1].delay) == (start, found.minimum.delay)
     assert len(seen) == found.iterations + 1
     nearest = min(max(at, 0.0), 10.0)
     assert abs(found.minimum.delay - nearest) <= max(abs(start - nearest), SMALLEST)
@@ -200,10 +204,9 @@ def test_delay_that_is_not_determined_is_singular(after):
 
 
 def test_nothing_at_the_start_is_no_search():
-    cost = Artificial(lambda d: None, lambda d: 1.0)
-    found, seen = search(cost, 5.0)
-    assert found is None
-    assert (seen, cost.asked) == ([], [5.0])
+    cost = Artificial(lambda d: math.inf, lambda d: 1.0)
+    found = descend(cost, 5.0, START, Limits(*BOUNDS, 50, 1e-9, SMALLEST, math.inf, False))
+    assert (found.end, found.path.shape, cost.asked) == (INADMISSIBLE, (0, 3), [5.0])
 
 
 def test_search_stops_after_max_iterations():

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from ctid_cli.estimation.spectral_problem import enough_bins, used_bins
 from ctid_cli.estimation.stability import reflect_unstable
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
@@ -39,7 +38,7 @@ def spectra_of(model, greatest_delay=12.0, **options):
 
 
 def explicit(spectra, weight, a, b, delay):
-    """Columns (dx/da, dx/db, dx/dtau, phi, eps) and the output, stacked as real numbers, the transient projected out.
+    """Columns (dx/da, dx/db, dx/dtau, eps) and the output, stacked as real numbers, the transient projected out.
 
     An orthogonal decomposition in the parameters' own units, independent of the normal equations of the problem.
     """
@@ -59,7 +58,6 @@ def explicit(spectra, weight, a, b, delay):
     columns = [-(jw ** (n - i)) * x / denominator for i in range(1, n + 1)]
     columns += [jw ** (m - j) * u / denominator for j in range(m + 1)]
     columns += [-jw * forced]
-    columns += [-(jw ** (n - i)) * y / denominator for i in range(1, n + 1)]
     columns = stacked(root[:, None] * np.column_stack([*columns, y - x]))
     return columns - basis @ (basis.T @ columns), stacked(root * x)
 
@@ -81,20 +79,17 @@ def test_moments_are_products_of_projected_columns(model, lowpass, keep_mean):
     n, p = model.order, theta.size
     columns, x = explicit(spectra, weight, np.append(1.0, theta[:n]), theta[n:-1], 7.9)
     scale = np.linalg.norm(columns, axis=0)
-    regressor = np.arange(p)
-    regressor[:n] += p
     for size, problem in (
         (p, SpectralDelayProblem(spectra, structure_of(model), (0.0, 9.0), weight)),
         (p - 1, SpectralCoefficientProblem(spectra, structure_of(model), 7.9, weight)),
     ):
         equations = problem.equations(theta[:size])
-        psi, phi = columns[:, :size] / scale[:size], columns[:, regressor[:size]] / scale[:size]
+        psi = columns[:, :size] / scale[:size]
         left, both = scale[:size], np.outer(scale[:size], scale[:size])
         eps = columns[:, -1]
         # The lowest frequencies alone carry what lies beyond 1e-6 of the greatest weight.
         tolerance = 1e-9 if lowpass is None else 1e-5
         assert_close(equations.hessian / both, psi.T @ psi, tolerance)
-        assert_close(equations.instrument_regressor / both, psi.T @ phi, tolerance)
         assert_close(equations.instrument_error / left, psi.T @ eps, tolerance)
         assert equations.squared_error == pytest.approx(eps @ eps, rel=tolerance)
         assert equations.output_power == pytest.approx(x @ x, rel=tolerance)
@@ -240,12 +235,9 @@ def test_units_do_not_matter(model):
     power = output**2
     assert other.squared_error == pytest.approx(power * plain.squared_error, rel=1e-9)
     assert other.output_power == pytest.approx(power * plain.output_power, rel=1e-9)
-    both, root = np.outer(scale, scale), np.sqrt(np.diag(plain.hessian))
-    for actual, expected in (
-        (other.hessian, plain.hessian),
-        (other.instrument_regressor, plain.instrument_regressor),
-    ):
-        assert_close(actual * both / power / np.outer(root, root), expected / np.outer(root, root))
+    root = np.sqrt(np.diag(plain.hessian))
+    lengths = np.outer(root, root)
+    assert_close(other.hessian * np.outer(scale, scale) / power / lengths, plain.hessian / lengths)
     assert_close(other.instrument_error * scale / power / root, plain.instrument_error / root)
     cutoff = SVF_CUTOFF[model]
     start = spectral_least_squares_start(spectra, structure_of(model), 8.0, cutoff, weight)
@@ -293,36 +285,6 @@ def test_numerator_is_the_best_for_its_denominator():
     refitted = spectral_refit_numerator(spectra, Structure(4, 1), theta, 8.0, weight)
     np.testing.assert_allclose(refitted[4:], expected, rtol=1e-5)
     assert np.array_equal(refitted[:4], theta[:4])
-
-
-def test_narrow_filters_touch_few_bins():
-    _, spectra = spectra_of(CASE_1, snr_db=5)
-    weight = lowpass_weight(spectra.frequencies, Lowpass(0.5, 10))
-    count = used_bins(weight)
-    assert spectra.frequencies[count - 1] < 1.0 < spectra.frequencies[-1] / 2
-    assert weight[count - 1] >= 1e-6 > weight[count]
-    cut = np.where(np.arange(weight.size) < count, weight, 0.0)
-    theta = theta_of(CASE_1)
-    full, sliced = (
-        SpectralCoefficientProblem(spectra, Structure(2, 0), 8.0, each).equations(theta) for each in (weight, cut)
-    )
-    assert np.array_equal(full.hessian, sliced.hessian)
-    assert full.squared_error == sliced.squared_error
-    columns, _ = explicit(spectra, weight, np.append(1.0, theta[:2]), theta[2:], 8.0)
-    assert full.squared_error == pytest.approx(columns[:, -1] @ columns[:, -1], rel=1e-3)
-
-
-def test_rule_for_the_number_of_bins():
-    # Two real equations each; four for every parameter and every coefficient of the transient.
-    def weight(passed):
-        return np.where(np.arange(100) < passed, 1.0, 0.4)
-
-    assert not enough_bins(weight(9), Structure(2, 0))  # 3 + 2 unknowns
-    assert enough_bins(weight(10), Structure(2, 0))
-    assert not enough_bins(weight(11), Structure(2, 0, delay=True))
-    assert enough_bins(weight(12), Structure(2, 0, delay=True))
-    assert not enough_bins(weight(19), Structure(4, 1))  # 6 + 4 unknowns
-    assert enough_bins(weight(20), Structure(4, 1))
 
 
 def test_with_fewer_bins_than_transient_coefficients_nothing_is_left():

@@ -158,17 +158,6 @@ def test_without_the_mean_an_offset_has_no_effect():
     np.testing.assert_allclose(moved.outputs, without.outputs, rtol=0, atol=1e-11)
 
 
-def test_first_frequencies_alone_and_remembered_delays():
-    record = noisy_record()
-    spectra, fresh = (record_spectra(record, 9.0, 6.0, 9.0) for _ in range(2))
-    assert np.array_equal(spectra.outputs, fresh.outputs)
-    delays = np.linspace(0, 9, 300)  # more than are remembered
-    few = [spectra.inputs(delay, 4).copy() for delay in delays]
-    for delay, values in zip(delays, few, strict=True):
-        np.testing.assert_allclose(spectra.inputs(delay)[:4], values, rtol=0, atol=1e-15)
-        assert np.array_equal(spectra.inputs(delay), fresh.inputs(delay))
-
-
 def test_nothing_above_half_the_sampling_frequency():
     spectra = record_spectra(noisy_record(), 1.0, 1e6, 1.0)
     assert 62.0 < spectra.frequencies[-1] <= np.pi / 0.05

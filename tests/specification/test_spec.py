@@ -78,6 +78,9 @@ BROKEN = {
     "unknown key names the known ones": (
         "cutoff: 0.2,", "cutoff: 0.2, ripple: 3,", 15, 28, "estimators.one.lowpass.ripple", "allowed: cutoff, order"
     ),
+    "option of earlier versions": (
+        "zeros: 0", "zeros: 0\n    search: time", 14, 5, "estimators.one.search", "no longer needed"
+    ),
     "missing key": ("interval: 0.05, ", "", 7, 1, "sampling.interval", "is missing; add it: Sampling interval [s]."),
     "missing nested key": ("cutoff: 0.2, ", "", 15, 5, "estimators.one.lowpass.cutoff", "[rad/s]"),
     "missing kind": ("  kind: prbs\n", "", 3, 1, "excitation.kind", "prbs, multisine, gaussian, step"),

@@ -11,9 +11,8 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.common import Start
-from ctid_cli.estimation.delay_search import Minimum
 from ctid_cli.estimation.filter_search import FilterSearch
-from ctid_cli.estimation.filtered_costs import FilteredCost
+from ctid_cli.estimation.filtered_costs import FilteredCosts, percents
 from ctid_cli.estimators.useful_redundancy import RedundantFit, UsefulRedundancy
 from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, pointed, ramp, spread, svg
 from ctid_cli.simulation.dataset import DataSet
@@ -82,45 +81,39 @@ def landscape(
     return Landscape(
         delays=grid,
         members=_least_costs(search.costs, grid, sweeps),
-        evaluated=np.array([search.reference_cost(delay) for delay in grid]),
+        evaluated=np.array([search.at(search.on_lattice(delay)).mean for delay in grid.tolist()]),
         true_delay=data_set.true_model.delay,
         fit=fit,
         legs=_legs(search, fit),
     )
 
 
-def _least_costs(costs: Sequence[FilteredCost], delays: Array, sweeps: int) -> Array:
-    best: list[list[Minimum | None]] = [[None] * len(costs) for _ in delays]
+def _least_costs(costs: FilteredCosts, delays: Array, sweeps: int) -> Array:
+    many, size = costs.reach.size, costs.size
+    thetas, least = np.zeros((delays.size, many, size)), np.full((delays.size, many), np.inf)
     for sweep in range(sweeps):
-        before: list[Minimum | None] = [None] * len(costs)
+        before = None
         for i in range(delays.size) if sweep % 2 == 0 else reversed(range(delays.size)):
-            _improve(best[i], before, costs, float(delays[i]), first=sweep == 0)
-            before = best[i]
-    return np.array([[cost.percent(minimum) for cost, minimum in zip(costs, row, strict=True)] for row in best])
-
-
-def _improve(
-    here: list[Minimum | None], before: list[Minimum | None], costs: Sequence[FilteredCost], delay: float, first: bool
-) -> None:
-    """Try at one delay what was found at the delay before and for the neighbouring filters, the widest band last."""
-    for k in reversed(range(len(costs))):
-        known = [before[k], *here[k + 1 : k + 2], *here[max(k - 1, 0) : k]]
-        starts = [minimum.theta for minimum in known if minimum is not None]
-        # Least squares on a narrow band is hopeless in noise.
-        if first and (k == len(costs) - 1 or not starts):
-            starts += costs[k].starts(delay)
-        found, old = costs[k].minimise_from(delay, starts), here[k]
-        if found is not None and (old is None or found.squared_error < old.squared_error):
-            here[k] = found
+            # What was found at the delay before and for the neighbouring filters, the widest band first.
+            for k in reversed(range(many)):
+                known = [] if before is None else [(before, k)]
+                known += [(i, near) for near in (k + 1, k - 1) if 0 <= near < many]
+                starts = np.array([thetas[place] for place in known if np.isfinite(least[place])]).reshape(-1, size)
+                # Least squares on a narrow band is hopeless in noise.
+                own = sweep == 0 and (k == many - 1 or not starts.size)
+                found = costs.behind(k).minimise(float(delays[i]), starts, own)
+                if found.squared_error < least[i, k]:
+                    thetas[i, k], least[i, k] = found.theta, found.squared_error
+            before = i
+    return percents(least, costs.spreads)
 
 
 def _legs(search: FilterSearch, fit: RedundantFit) -> tuple[Leg, ...]:
     assert fit.search is not None
     legs = []
     for visit in fit.search.trajectory[1:]:
-        place = visit.round, visit.path, visit.point
-        path = next(path for path in fit.paths if (path.round, path.filter, float(path.delays[-1])) == place)
-        costs = np.array([search.reference_cost(float(delay)) for delay in path.delays])
+        path = search.led_here(visit, fit.paths)
+        costs = np.array([search.at(search.on_lattice(delay)).mean for delay in path.delays.tolist()])
         legs.append(Leg(path.filter, path.delays, costs, visit in fit.switches))
     return tuple(legs)
 
@@ -169,7 +162,9 @@ def trajectory_svg(result: Landscape, title: str, detail: tuple[float, float]) -
         _name_filters(panels[1, 0], result)
         count = sum(leg.switched for leg in result.legs)
         switches = {0: "no switch", 1: "one switch"}.get(count, f"{count} switches")
-        way = f"search from {result.legs[0].delays[0]:g} s: {switches}, ends at {result.legs[-1].delays[-1]:.4f} s"
+        assert result.fit.search is not None
+        first, end = result.legs[0].delays[0], result.fit.search.point
+        way = f"search from {first:g} s: {switches}, ends at {end:.4f} s"
         figure.suptitle(f"{title}\n{way}; refined on unfiltered data: {result.fit.model.delay:.4f} s")
         above, below = (axes.get_legend_handles_labels() for axes in panels[:, 0])
         handles, labels = (a + b for a, b in zip(above, below, strict=True))
