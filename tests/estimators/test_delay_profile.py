@@ -194,10 +194,10 @@ def test_the_search_finds_what_one_beside_the_truth_finds(model, poles, zeros, r
 
 
 def test_records_too_short_for_filters_are_searched_on_every_sample():
-    record = record_of(noise=0.02, n=40)
+    record = record_of(noise=0.02, n=23)
     fit = DelayProfile(2, 0, (0, 1)).fit(record)
     assert fit.profile.cutoff is None
-    assert abs(fit.model.delay - SYSTEM.delay) < 0.05
+    assert abs(fit.model.delay - SYSTEM.delay) < 0.1
 
 
 def test_a_delay_outside_the_range_stops_at_the_bound():

@@ -116,8 +116,8 @@ def test_costs_of_case_1_have_their_minimum_at_the_true_delay(name, request):
 def test_least_costs_are_not_above_those_of_the_search(quiet):
     # Where the search's iterations end well, they end in the same minimum: up to half a cell of its lattice, 0.16 s, on
     # which J0 falls by up to 8 % a second.
-    before = quiet.delays < 8
-    assert quiet.reference[before] == pytest.approx(quiet.evaluated[before], rel=0.02, abs=1.3)
+    valley = (quiet.delays > 4.2) & (quiet.delays < 8)
+    assert quiet.reference[valley] == pytest.approx(quiet.evaluated[valley], rel=0.02, abs=1.3)
     assert (quiet.reference <= quiet.evaluated + 2.0).all()
 
 

@@ -30,7 +30,7 @@ class Leg:
     """An accepted solver path: from one incumbent to the next."""
 
     filter: int
-    #: Gauss-Newton steps [s], the incumbent it started from first, shape (K,).
+    #: Gauss-Newton steps [s], from one incumbent to the next, shape (K,).
     delays: Array
     #: J0 there, as the search evaluates it [%], shape (K,).
     costs: Array
@@ -113,8 +113,9 @@ def _legs(search: FilterSearch, fit: RedundantFit) -> tuple[Leg, ...]:
     legs = []
     for visit in fit.search.trajectory[1:]:
         path = search.led_here(visit, fit.paths)
-        costs = np.array([search.at(search.on_lattice(delay)).mean for delay in path.delays.tolist()])
-        legs.append(Leg(path.filter, path.delays, costs, visit in fit.switches))
+        delays = np.append(path.delays[:-1], visit.point)
+        costs = np.array([search.at(search.on_lattice(delay)).mean for delay in delays.tolist()])
+        legs.append(Leg(path.filter, delays, costs, visit in fit.switches))
     return tuple(legs)
 
 
@@ -162,9 +163,7 @@ def trajectory_svg(result: Landscape, title: str, detail: tuple[float, float]) -
         _name_filters(panels[1, 0], result)
         count = sum(leg.switched for leg in result.legs)
         switches = {0: "no switch", 1: "one switch"}.get(count, f"{count} switches")
-        assert result.fit.search is not None
-        first, end = result.legs[0].delays[0], result.fit.search.point
-        way = f"search from {first:g} s: {switches}, ends at {end:.4f} s"
+        way = f"search from {result.legs[0].delays[0]:g} s: {switches}, ends at {result.legs[-1].delays[-1]:.4f} s"
         figure.suptitle(f"{title}\n{way}; refined on unfiltered data: {result.fit.model.delay:.4f} s")
         above, below = (axes.get_legend_handles_labels() for axes in panels[:, 0])
         handles, labels = (a + b for a, b in zip(above, below, strict=True))
