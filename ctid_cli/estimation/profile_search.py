@@ -8,7 +8,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.delay_grid import lowest_minima, quarter_periods, scan, search_grid
 from ctid_cli.estimation.delay_search import Minimum, best_of
-from ctid_cli.estimation.filtered_costs import filtered_costs
+from ctid_cli.estimation.filtered_costs import HIGHEST, filtered_costs
 from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.search import local_minimum
@@ -120,9 +120,10 @@ def _search_levels(cost: RecordsCost) -> Found:
     record, cutoffs = measured.records[0], _cutoffs(bounds, bandwidth)
     present = record.t[record.valid]
     # Two real equations for every frequency of the observed window that passes.
-    equations = np.minimum(cutoffs * (present[-1] - max(present[0], record.input.t[0])) / np.pi, present.size)
+    equations = cutoffs * (present[-1] - max(present[0], record.input.t[0])) / np.pi
     cutoffs = cutoffs[equations >= EQUATIONS_PER_PARAMETER * (cost.size + cost.coefficients.poles)]
-    if not cutoffs.size:
+    # Near half the sampling frequency lines between the samples are no picture of the output.
+    if not cutoffs.size or HIGHEST * bandwidth * float(np.median(np.diff(present))) > np.pi:
         return [], None
     costs = filtered_costs(
         record,
