@@ -85,6 +85,10 @@ class FilterSearch:
             )
         return self._known[delay]
 
+    def reference_cost(self, delay: float) -> float:
+        """J0 at the nearest point of the lattice [%]."""
+        return self.at(self.on_lattice(delay)).mean
+
     def run(self, delay: float, max_rounds: int, paths: list[FilterPath]) -> RedundantMinimum[float]:
         """Rounds over all filters, and a look at the next valleys before a poor incumbent is settled for."""
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -76,15 +76,16 @@ def landscape(
     grid = np.asarray(delays, dtype=float)
     prepared = estimator.prepare(data_set.record)
     assert data_set.true_model is not None
-    fit, search = prepared.fit(Start(delay=initial_delay)), prepared.laid_out.filtered
-    assert isinstance(search, FilterSearch)
+    fit, reference_cost = prepared.fit(Start(delay=initial_delay)), prepared.laid_out.filtered.reference_cost
+    ours = replace(estimator, variant="guarded").prepare(data_set.record).laid_out.filtered
+    assert isinstance(ours, FilterSearch)
     return Landscape(
         delays=grid,
-        members=_least_costs(search.costs, grid, sweeps),
-        evaluated=np.array([search.at(search.on_lattice(delay)).mean for delay in grid.tolist()]),
+        members=_least_costs(ours.costs, grid, sweeps),
+        evaluated=np.array([reference_cost(delay) for delay in grid.tolist()]),
         true_delay=data_set.true_model.delay,
         fit=fit,
-        legs=_legs(search, fit),
+        legs=_legs(reference_cost, fit),
     )
 
 
@@ -108,13 +109,15 @@ def _least_costs(costs: FilteredCosts, delays: Array, sweeps: int) -> Array:
     return percents(least, costs.spreads)
 
 
-def _legs(search: FilterSearch, fit: RedundantFit) -> tuple[Leg, ...]:
+def _legs(reference_cost: Callable[[float], float], fit: RedundantFit) -> tuple[Leg, ...]:
     assert fit.search is not None
     legs = []
     for visit in fit.search.trajectory[1:]:
-        path = search.led_here(visit, fit.paths)
+        followed = [path for path in fit.paths if (path.round, path.filter) == (visit.round, visit.path)]
+        # The candidates of our search lie on a lattice, the ends of its paths do not.
+        path = min(followed, key=lambda path: abs(path.delays[-1] - visit.point))
         delays = np.append(path.delays[:-1], visit.point)
-        costs = np.array([search.at(search.on_lattice(delay)).mean for delay in delays.tolist()])
+        costs = np.array([reference_cost(delay) for delay in delays.tolist()])
         legs.append(Leg(path.filter, delays, costs, visit in fit.switches))
     return tuple(legs)
 
