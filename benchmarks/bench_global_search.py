@@ -17,7 +17,7 @@ from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "useful_redundancy"
-METHODS = ("delay_profile", "proposed")
+METHODS = ("delay_profile", "redundancy")
 BANDWIDTHS = {"case1": 2.02, "case2": 26.85}
 REPEATS = 5
 
@@ -48,7 +48,7 @@ def main():
                     f"{fit.model.delay:10.4f}{fit.cost:12.5g}"
                 )
             if sampling == "regular":
-                poles, zeros = estimators["proposed"].poles, estimators["proposed"].zeros
+                poles, zeros = estimators["redundancy"].poles, estimators["redundancy"].zeros
                 starts = int(np.ceil(15.0 * bandwidth / (0.5 * np.pi)))
                 seconds, theta = timed(multi_start, record, poles, (0.0, 15.0), starts, exact_zoh, zeros)
                 print(

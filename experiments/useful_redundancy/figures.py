@@ -206,7 +206,7 @@ def _computed(case: Case, noise: bool) -> Landscape:
 def published_search(case: Case, noise: bool) -> tuple[UsefulRedundancy, DataSet]:
     """Our search of a case, or the printed one without noise, and the first data set on which ours switches."""
     plan = find_study("useful-redundancy").plan(case.experiment)
-    ours = next(cell.estimator for cell in plan.estimators if cell.name == "proposed")
+    ours = next(cell.estimator for cell in plan.estimators if cell.name == "redundancy")
     drawn = next(cell for cell in plan.data_cells if cell.swept["snr_db"] == SNR)
     made = map(drawn.dataset, range(plan.runs))
     data_set = next(item for item in made if ours.fit(item.record, Start(delay=0.0)).switches)

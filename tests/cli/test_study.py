@@ -40,7 +40,7 @@ def test_one_data_set_fills_its_cells(ctid, out, case, sampling, tables):
         for table, delay in zip(tables, (0, "random"), strict=True)
         for method in methods
     ]
-    published = [method for method in methods if method in ("existing", "proposed")]
+    published = [method for method in methods if method in ("existing", "redundancy")]
     assert "existing" in published
     for row in mine:
         assert row["n"] == 1

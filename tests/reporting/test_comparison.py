@@ -78,7 +78,7 @@ def test_the_same_tables_agree_cell_by_cell_also_by_way_of_a_file(tmp_path):
         row(95, initial_delay="random"),
         row(99, initial_delay=None, method="delay_profile"),
         row(99, initial_delay=None, method="delay_profile", table=2),
-        row(None, n=0, method="proposed"),
+        row(None, n=0, method="redundancy"),
         row(3, beta=[1, 2], robust=True, window="hann"),
     ]
     comparison = compare(rows, read_tables(written(tmp_path, rows)), STUDY, "tables.csv")
@@ -120,29 +120,29 @@ def test_one_small_difference_among_many_cells_is_sampling_error():
     assert len(compare(fresh[3:4], committed, STUDY).mismatches) == 1
 
 
-def test_the_proposed_method_must_not_fall_below_the_paper_but_may_exceed_it():
-    low = compare([row(80, method="proposed", published_percent=100.0)], None, STUDY)
+def test_our_method_must_not_fall_below_the_paper_but_may_exceed_it():
+    low = compare([row(80, method="redundancy", published_percent=100.0)], None, STUDY)
     (cell,) = low.mismatches
     assert (cell["against"], cell["reference_n"], cell["reference_converged"]) == ("paper", 100, 100)
     assert "Lower than in the paper:" in write_comparison(low)
-    high = compare([row(100, method="proposed", published_percent=60.0)], None, STUDY)
+    high = compare([row(100, method="redundancy", published_percent=60.0)], None, STUDY)
     assert high.mismatches == []
     assert [cell["differs"] for cell in high.differences] == [True]
     assert "For information" in write_comparison(high)
 
 
 def test_the_existing_method_differs_from_the_paper_for_information_only():
-    rows = [row(0, published_percent=100.0), row(100, method="proposed", published_percent=99.0)]
+    rows = [row(0, published_percent=100.0), row(100, method="redundancy", published_percent=99.0)]
     comparison = compare(rows, None, STUDY)
     assert [(cell["method"], cell["decisive"]) for cell in comparison.cells] == [
         ("existing", False),
-        ("proposed", True),
+        ("redundancy", True),
     ]
     assert (comparison.mismatches, [cell["method"] for cell in comparison.differences]) == ([], ["existing"])
     # each is a family of its own
     assert all(cell["adjusted_p_value"] == cell["p_value"] for cell in comparison.cells)
     text = write_comparison(comparison)
-    assert "No difference beyond sampling error in 1 comparison: 1 cell of proposed with the paper" in text
+    assert "No difference beyond sampling error in 1 comparison: 1 cell of redundancy with the paper" in text
     assert "no committed tables here" in text
 
 
@@ -150,13 +150,13 @@ def test_cells_that_only_one_side_has_are_counted_but_no_mismatch():
     fresh = [
         row(90),
         row(0, n=0, initial_delay=1.0),
-        row(0, n=0, initial_delay=3.0, method="proposed", published_percent=100.0),
+        row(0, n=0, initial_delay=3.0, method="redundancy", published_percent=100.0),
         row(50, method="delay_profile", initial_delay=None),
     ]
     committed = [
         row(90),
         row(90, initial_delay=1.0),
-        row(0, n=0, initial_delay=3.0, method="proposed"),
+        row(0, n=0, initial_delay=3.0, method="redundancy"),
         row(90, initial_delay=5.0),
         row(90, table=3, experiment="useful-redundancy/case2-regular"),
     ]
@@ -267,5 +267,5 @@ def test_a_check_says_what_it_could_have_found():
     assert f"differs by {change:.0f} percentage points is detected with 80 % probability" in text
     assert "in 1 cell no difference could have been detected" in text
     # a higher percentage than the paper's is no mismatch, so that only a lower one is looked for
-    above = compare([row(0, method="proposed", published_percent=0.0)], None, STUDY)
+    above = compare([row(0, method="redundancy", published_percent=0.0)], None, STUDY)
     assert above.cells[0]["detectable"] is None

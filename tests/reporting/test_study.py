@@ -50,7 +50,7 @@ def test_the_proposed_method_reached_99_or_100_percent_everywhere(empty):
     published = {number: [] for number in empty}
     for number, table in empty.items():
         for row in table.records:
-            if row["method"] == "proposed":
+            if row["method"] == "redundancy":
                 published[number].append((row["sampling"], row["snr_db"], row["published_percent"]))
     assert {number: len(values) for number, values in published.items()} == {1: 24, 2: 4, 3: 24, 4: 4}
     below = {(number, *value) for number, values in published.items() for value in values if value[2] != 100}
@@ -103,11 +103,11 @@ def test_unknown_names_are_refused(tmp_path, name):
 
 @pytest.fixture
 def mixed(make_results, add_estimator, estimate):
-    """Of one experiment: the existing method in part, the proposed one, and two that take no start."""
+    """Of one experiment: the existing method in part, ours, and two that take no start."""
     good, bad = estimate(8.0), estimate(5.0, "STALLED")
     results = make_results({(5.0, "0.0"): [good, bad, bad, bad], (5.0, RANDOM): [good, bad], (15.0, "0.0"): [good]})
     add_estimator(results, "profile_spectral", {(5.0, None): [good, good, good, bad], (15.0, None): [good] * 4})
-    add_estimator(results, "proposed", {(5.0, "0.0"): [good] * 4, (5.0, RANDOM): [good] * 3 + [bad]})
+    add_estimator(results, "redundancy", {(5.0, "0.0"): [good] * 4, (5.0, RANDOM): [good] * 3 + [bad]})
     add_estimator(results, "delay_profile", {(5.0, None): [good] * 4, (15.0, None): [good] * 3 + [bad]})
     return results
 
@@ -122,7 +122,7 @@ def test_methods_stand_in_the_order_of_the_study_below_each_setting(mixed):
     for number in (1, 2):
         rows, text = tabulated(mixed, number)
         regular = [row for row in rows if (row["sampling"], row["snr_db"]) == ("regular", 5.0)]
-        methods = ["existing", "as_printed", "proposed", "delay_profile", "profile_spectral"]
+        methods = ["existing", "as_printed", "redundancy", "delay_profile", "profile_spectral"]
         assert list(dict.fromkeys(row["method"] for row in regular)) == methods
         first = text.split("15 dB")[0]
         assert sorted(methods, key=lambda method: first.index(f"{method} ")) == methods
@@ -155,7 +155,7 @@ def test_without_such_an_estimator_nothing_is_said_about_it(make_results, estima
 def test_all_methods_fit_100_columns_also_with_many_data_sets(make_results, add_estimator, estimate, number):
     found = [estimate(8.0)] * 299 + [estimate(3.0)]
     results = make_results({(5.0, "0.0"): found, (5.0, RANDOM): found})
-    for method in ("proposed", "proposed_spectral"):
+    for method in ("redundancy", "proposed_spectral"):
         add_estimator(results, method, {(5.0, "0.0"): found, (5.0, RANDOM): found})
     for method in ("delay_profile", "profile_spectral"):
         add_estimator(results, method, {(5.0, None): found})
@@ -210,7 +210,7 @@ def test_failing_estimates_are_listed_with_what_makes_them_again(mixed):
     rows = list(failures(mixed))
     assert [(r["method"], r["snr_db"], r["initial_delay"], r["replicate"], r["delay"]) for r in rows] == [
         ("profile_spectral", 5.0, None, 3, 5.0),
-        ("proposed", 5.0, "random", 3, 5.0),
+        ("redundancy", 5.0, "random", 3, 5.0),
         ("delay_profile", 15.0, None, 3, 5.0),
     ]
     assert {(r["experiment"], r["sampling"], r["seed"], r["status"], r["true_delay"]) for r in rows} == {
