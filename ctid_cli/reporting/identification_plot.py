@@ -96,9 +96,16 @@ def _draw_profile(axes: Any, result: Identification, units: Units) -> None:
     if profile is None:
         axes.plot([delay], [result.fit.cost], "o", color=DARK, label=f"known delay {delay:.4g} {units.time}")
     else:
-        axes.plot(profile.delays, profile.costs, ".-", color=DARK, linewidth=0.8, markersize=4, label="profile")
+        behind = "" if profile.cutoff is None else f" below {profile.cutoff:.3g} rad/{units.time}"
+        axes.plot(
+            profile.delays, profile.costs, ".-", color=DARK, linewidth=0.8, markersize=4, label=f"profile{behind}"
+        )
         label = f"minimum at {delay:.4g} {units.time}"
-        axes.plot([delay], [result.fit.cost], "v", color="black", markersize=7, label=label)
+        if profile.cutoff is None:
+            axes.plot([delay], [result.fit.cost], "v", color="black", markersize=7, label=label)
+        else:
+            # The cost of the estimate is that of all frequencies.
+            axes.axvline(delay, color="black", linewidth=0.8, label=label)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.35 * (high - low))
     axes.legend(loc="upper right", fontsize=8)

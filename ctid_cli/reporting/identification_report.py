@@ -101,7 +101,7 @@ def identification_object(
         "condition_number": fit.condition_number,
         "iterations": fit.iterations,
         "residual_tests": [picked(test, TEST_KEYS) for test in result.tests],
-        "profile": None if profile is None else {"delays": profile.delays, "costs": profile.costs},
+        "profile": profile and picked(profile, ("delays", "costs", "cutoff")),
         "validation": judged and _validation_object(judged, validation),
         "records": [_record_object(item, use) for item, use in zip(measurements, fit.used, strict=True)],
         "units": asdict(units),
