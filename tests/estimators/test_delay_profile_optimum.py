@@ -101,7 +101,7 @@ def test_more_poles_or_zeros_never_cost_more(seed, pair, initial_state, offset, 
     zeros, samples = int(rng.integers(0, poles)), int(rng.choice([80, 90, 100]))
     model, noise = random_model(rng, poles, zeros, 0.5 * delay), float(rng.choice([0.1, 0.5, 1.0]))
     record = record_of(model, rng, samples=samples, noise=noise, regular=seed % 4 > 0, offset=2.0 * (offset != "none"))
-    treatment = {"initial_state": initial_state, "offset": offset, "search": "samples", "nested": True}
+    treatment = {"initial_state": initial_state, "offset": offset, "nested": True}
     larger, smaller = (DelayProfile(n, m, (0.0, delay), **treatment).fit(record).cost for n, m in pair)
     assert larger <= smaller * (1 + 1e-6)
 
