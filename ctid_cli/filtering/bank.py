@@ -25,7 +25,7 @@ from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.filtering.chain_pass import irregular_chain_pass, regular_chain_pass
 from ctid_cli.filtering.exponential import held_readout, held_step, place
 from ctid_cli.filtering.filter_data import FilterData, in_unit, plain_array, split_delay
-from ctid_cli.filtering.modal_pass import modal_pass
+from ctid_cli.filtering.modal_pass import irregular_modal_pass, regular_modal_pass
 from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT, add_mode, modal_condition, pole_slopes
 from ctid_cli.filtering.realisation import chain, horner, scaled_roots
 from ctid_cli.filtering.row_sink import RowSink, row_sink
@@ -172,7 +172,10 @@ def standard_moments(a: Array, b: Array, delay: float, data: FilterData, want_ro
     condition, poles, residues, mapping = modal_map(a, b)
     if condition < limit:
         sink = row_sink(mapping.shape[1], data.use, want_rows)
-        modal_pass(poles, residues, delay, data, sink)
+        if data.interval > 0.0:
+            regular_modal_pass(poles, residues, delay, data, sink)
+        else:
+            irregular_modal_pass(poles, residues, delay, data, sink)
         return _to_standard(mapping, sink, want_rows)
     return _chain_rows(a, b, delay, data, want_rows)
 

@@ -1,7 +1,4 @@
-"""One block of the pass over a sum of submodels: modes, integrals, and the noise-free loop.
-
-Recursions run along contiguous memory with their state in registers.
-"""
+"""One block of the pass over a sum of submodels: modes, integrals, and the noise-free loop."""
 
 from typing import NamedTuple
 
@@ -9,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
-from ctid_cli.filtering.modal_pass import put
+from ctid_cli.filtering.mode_blocks import Clock, Source, Span, mode_block, value_block
 from ctid_cli.filtering.submodel_map import PooledModes
 
 
@@ -27,128 +24,6 @@ class LoopData(NamedTuple):
     def closed(self) -> bool:
         """Whether there is feedback."""
         return self.reference.size > 0
-
-
-class Clock(NamedTuple):
-    """A regular clock, and the weights of each mode over an interval and over the part of it that the delay leaves."""
-
-    interval: float
-    #: The delay is ``(shift - fraction) interval``.
-    shift: int
-    fraction: float
-    #: In the order of :class:`StepWeights`, shape (modes, 6).
-    whole: ComplexArray
-    part: ComplexArray
-
-
-class Source(NamedTuple):
-    """An input, held or joined by straight lines, and the rows of its block that it fills."""
-
-    values: Array
-    foh: bool
-    #: First of the rows of the modes, of their squares (-1: none), of the integrals, and of the input itself.
-    single: int
-    double: int
-    integrals: int
-    value: int
-
-
-class Span(NamedTuple):
-    """A block: sample k of ``length`` sees the input from break ``first + k`` on, the first ``skip`` none."""
-
-    first: int
-    skip: int
-    length: int
-
-
-@njit(cache=True, nogil=True)
-def _mode_block(
-    clock: Clock, mode: int, source: Source, span: Span, state: ComplexArray, row: int, paired: bool, block: Array
-) -> None:
-    """Advance one mode, and its square, over a block; column k receives the read-out at sample k.
-
-    In real arithmetic, so that the state stays in registers: decay d, mixed m, and as weights of the value and of its
-    change b and c of the mode, f and g of its square. ``row`` is the mode's among those of all modes.
-    """
-    weights, part, fraction, u = clock.whole[mode], clock.part[mode], clock.fraction, source.values
-    foh, last = source.foh, u.size - 1
-    double = source.double >= 0
-    single_row, double_row = source.single + row, source.double + row
-    z_re, z_im = state[0].real, state[0].imag
-    w_re, w_im = 0.0, 0.0
-    if double:
-        w_re, w_im = state[1].real, state[1].imag
-    d_re, d_im = weights[0].real, weights[0].imag
-    m_re, m_im = weights[1].real, weights[1].imag
-    b_re, b_im = weights[2].real, weights[2].imag
-    c_re, c_im = weights[3].real, weights[3].imag
-    f_re, f_im = weights[4].real, weights[4].imag
-    g_re, g_im = weights[5].real, weights[5].imag
-    # Nothing has arrived yet.
-    for k in range(span.skip):
-        put(block, single_row, k, 0.0j, paired)
-        if double:
-            put(block, double_row, k, 0.0j, paired)
-    for k in range(span.skip, span.length):
-        j = span.first + k
-        value = u[j]
-        change = u[j + 1] - value if foh and j < last else 0.0
-        # Read out a fraction of an interval after the break, then advance from the break itself.
-        z_now, w_now = complex(z_re, z_im), complex(w_re, w_im)
-        if fraction > 0.0:
-            rise = fraction * change
-            if double:
-                w_now = (part[0] * w_now + part[1] * z_now) + (part[4] * value + part[5] * rise)
-            z_now = part[0] * z_now + (part[2] * value + part[3] * rise)
-        put(block, single_row, k, z_now, paired)
-        if double:
-            put(block, double_row, k, w_now, paired)
-        # The square first: it is driven by the mode before its step.
-        if double:
-            new_re = (d_re * w_re - d_im * w_im) + (m_re * z_re - m_im * z_im) + (f_re * value + g_re * change)
-            w_im = (d_re * w_im + d_im * w_re) + (m_re * z_im + m_im * z_re) + (f_im * value + g_im * change)
-            w_re = new_re
-        # z+ = d z + b value + c change.
-        new_re = (d_re * z_re - d_im * z_im) + (b_re * value + c_re * change)
-        z_im = (d_re * z_im + d_im * z_re) + (b_im * value + c_im * change)
-        z_re = new_re
-    state[0] = complex(z_re, z_im)
-    if double:
-        state[1] = complex(w_re, w_im)
-
-
-@njit(cache=True, nogil=True)
-def output_block(
-    weights: ComplexArray,
-    values: Array,
-    before: float,
-    begun: bool,
-    foh: bool,
-    state: ComplexArray,
-    row: int,
-    paired: bool,
-    count: int,
-    block: Array,
-) -> None:
-    """Advance the mode ``e``, driven by samples that are joined by straight lines, or held; read it at the samples.
-
-    The step up to a sample needs the sample before it: of the last block, and of none at the very first.
-    """
-    e_re, e_im = state[2].real, state[2].imag
-    d_re, d_im = weights[0].real, weights[0].imag
-    b_re, b_im = weights[2].real, weights[2].imag
-    c_re, c_im = weights[3].real, weights[3].imag
-    # Decay d and the weights b of the earlier sample, c of the change to this one; rows of the state are read after it.
-    for k in range(count):
-        if begun:
-            change = values[k] - before if foh else 0.0
-            new_re = (d_re * e_re - d_im * e_im) + (b_re * before + c_re * change)
-            e_im = (d_re * e_im + d_im * e_re) + (b_im * before + c_im * change)
-            e_re = new_re
-        begun = True
-        before = values[k]
-        put(block, row, k, complex(e_re, e_im), paired)
-    state[2] = complex(e_re, e_im)
 
 
 @njit(cache=True, nogil=True)
@@ -201,16 +76,11 @@ def input_block(
     block: Array,
 ) -> None:
     """Advance all modes and integrals of an input over a block, and write it at the samples too."""
-    u, last = source.values, source.values.size - 1
     for i in range(first.size - 1):
-        _mode_block(clock, i, source, span, states[i], first[i], modes.poles[i].imag != 0.0, block)
+        mode_block(clock, i, source, span, states[i], first[i], modes.poles[i].imag != 0.0, block)
     if integrals.size:
         _integrator_block(clock, source, span, integrals, block)
-    # The input as it arrives at the samples.
-    for k in range(span.length):
-        j = span.first + k
-        change = clock.fraction * (u[j + 1] - u[j]) if source.foh and 0 <= j < last else 0.0
-        block[source.value, k] = u[j] + change if j >= 0 else 0.0
+    value_block(clock, source, span, block)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -6,18 +6,18 @@ other submodels leave of the output, ``y - sum of the other x_l``. In open loop 
 the input of the noise-free loop of the *model* with the controller, driven by the reference; the loop is simulated
 within the pass, and a further ``z_u = 1/(s - p) u`` of the measured input makes the model outputs.
 
-Everything is done block by block, mode by mode, see :mod:`ctid_cli.filtering.submodel_blocks`.
+Everything is done block by block, mode by mode, see :mod:`ctid_cli.filtering.mode_blocks`.
 """
 
 import numpy as np
 from numba import njit
 
-from ctid_cli.arrays import Array, BoolArray, ComplexArray, IntArray
+from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.filtering.filter_data import FilterData, split_delay
-from ctid_cli.filtering.modal_pass import all_weights, first_rows
+from ctid_cli.filtering.mode_blocks import Clock, Source, Span, all_weights, first_rows, keep_used, output_block
 from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT
 from ctid_cli.filtering.row_sink import BLOCK, RowSink, emit, finish, row_sink
-from ctid_cli.filtering.submodel_blocks import Clock, LoopData, Source, Span, input_block, loop_block, output_block
+from ctid_cli.filtering.submodel_blocks import LoopData, input_block, loop_block
 from ctid_cli.filtering.submodel_map import PooledModes, pooled_modes
 
 
@@ -45,19 +45,6 @@ def _model_outputs(modes: PooledModes, first: IntArray, count: int, block: Array
     if modes.direct != 0.0:
         for k in range(count):
             outputs[modes.direct_owner, k] += modes.direct * block[layout.u_value, k]
-
-
-@njit(cache=True, nogil=True)
-def _keep_used(use: BoolArray, start: int, count: int, block: Array) -> int:
-    """Move the columns of the used samples to the front of a block; returns their number."""
-    kept = 0
-    for k in range(count):
-        if use[start + k]:
-            if kept < k:
-                for i in range(block.shape[0]):
-                    block[i, kept] = block[i, k]
-            kept += 1
-    return kept
 
 
 @njit(cache=True, nogil=True)
@@ -115,7 +102,7 @@ def _submodel_pass(
         # The next block's first step starts from here.
         for i in range(submodels):
             before[i] = outputs[i, count - 1]
-        written = emit(sink, _keep_used(data.use, start, count, block), written)
+        written = emit(sink, keep_used(data.use, start, count, block), written)
     finish(sink, 0, written)
 
 
