@@ -13,10 +13,10 @@ from ctid_cli.filtering.filter_data import FilterData, clock_slack, split_delay
 from ctid_cli.filtering.mode_blocks import (
     Clock,
     Source,
-    Span,
     StepWeights,
     all_weights,
     first_rows,
+    held_block,
     keep_used,
     mode_block,
     output_block,
@@ -34,7 +34,7 @@ def regular_modal_pass(
     """Pass over a regular clock, block by block and mode by mode; ``x = sum Re(residue z)`` is the model output."""
     first = first_rows(poles)
     n = first[poles.size]
-    y, block, error = data.y, sink.block, 3 * n + 1
+    y, block, errors = data.y, sink.block, sink.block[3 * n + 1]
     shift, fraction = split_delay(delay, data.interval)
     whole, part = all_weights(poles, data.interval), all_weights(poles, data.interval * fraction)
     clock = Clock(data.interval, shift, fraction, whole, part)
@@ -43,23 +43,22 @@ def regular_modal_pass(
     written = 0
     for start in range(0, y.size, BLOCK):
         count = min(BLOCK, y.size - start)
-        span = Span(start - shift, min(max(shift - start, 0), count), count)
+        held = held_block(source, start - shift, count)
         outputs, before = y[start : start + count], y[max(start - 1, 0)]
-        value_block(clock, source, span, block)
+        value_block(clock, source, held, count, block)
         for k in range(count):
-            block[error, k] = outputs[k]
+            errors[k] = outputs[k]
         for i in range(poles.size):
             row, paired, re, im = first[i], poles[i].imag != 0.0, residues[i].real, residues[i].imag
-            mode_block(clock, i, source, span, states[i], row, paired, block)
+            mode_block(clock, i, source, held, count, states[i], row, paired, block)
             output_block(
                 whole[i], outputs, before, start > 0, data.y_foh, states[i], 2 * n + 1 + row, paired, count, block
             )
-            if paired:
-                for k in range(count):
-                    block[error, k] -= re * block[row, k] - im * block[row + 1, k]
-            else:
-                for k in range(count):
-                    block[error, k] -= re * block[row, k]
+            rows_re, rows_im = block[row], block[row + 1]
+            if not paired:
+                im = 0.0
+            for k in range(count):
+                errors[k] -= re * rows_re[k] - im * rows_im[k]
         written = emit(sink, keep_used(data.use, start, count, block), written)
     finish(sink, 0, written)
 

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
-from ctid_cli.filtering.mode_blocks import Clock, Source, Span, mode_block, value_block
+from ctid_cli.filtering.mode_blocks import Clock, Source, held_block, mode_block, value_block
 from ctid_cli.filtering.submodel_map import PooledModes
 
 
@@ -42,26 +42,19 @@ def _integrate(states: Array, interval: float, value: float, change: float) -> N
 
 
 @njit(cache=True, nogil=True)
-def _integrator_block(clock: Clock, source: Source, span: Span, integrals: Array, block: Array) -> None:
+def _integrator_block(clock: Clock, source: Source, held: Array, count: int, integrals: Array, block: Array) -> None:
     """Advance the integrals of the input over a block; read them at the samples, as the modes."""
-    u, fraction, row = source.values, clock.fraction, source.integrals
+    fraction, row = clock.fraction, source.integrals
     now = np.zeros(integrals.size)
-    for k in range(span.length):
-        if k < span.skip:
-            for m in range(now.size):
-                block[row + m, k] = 0.0
-            continue
-        j = span.first + k
-        value = u[j]
-        change = u[j + 1] - value if source.foh and j < u.size - 1 else 0.0
+    for k in range(count):
         # Read on a copy, a fraction of an interval further on; then advance from the break itself.
         for m in range(now.size):
             now[m] = integrals[m]
         if fraction > 0.0:
-            _integrate(now, fraction * clock.interval, value, fraction * change)
+            _integrate(now, fraction * clock.interval, held[0, k], fraction * held[1, k])
         for m in range(now.size):
             block[row + m, k] = now[m]
-        _integrate(integrals, clock.interval, value, change)
+        _integrate(integrals, clock.interval, held[0, k], held[1, k])
 
 
 @njit(cache=True, nogil=True)
@@ -70,17 +63,22 @@ def input_block(
     first: IntArray,
     clock: Clock,
     source: Source,
-    span: Span,
+    arrived: int,
+    count: int,
     states: ComplexArray,
     integrals: Array,
     block: Array,
 ) -> None:
-    """Advance all modes and integrals of an input over a block, and write it at the samples too."""
+    """Advance all modes and integrals of an input over a block, and write it at the samples too.
+
+    ``arrived`` is the break whose input the first sample sees.
+    """
+    held = held_block(source, arrived, count)
     for i in range(first.size - 1):
-        mode_block(clock, i, source, span, states[i], first[i], modes.poles[i].imag != 0.0, block)
+        mode_block(clock, i, source, held, count, states[i], first[i], modes.poles[i].imag != 0.0, block)
     if integrals.size:
-        _integrator_block(clock, source, span, integrals, block)
-    value_block(clock, source, span, block)
+        _integrator_block(clock, source, held, count, integrals, block)
+    value_block(clock, source, held, count, block)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

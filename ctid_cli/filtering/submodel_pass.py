@@ -14,7 +14,7 @@ from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.filtering.filter_data import FilterData, split_delay
-from ctid_cli.filtering.mode_blocks import Clock, Source, Span, all_weights, first_rows, keep_used, output_block
+from ctid_cli.filtering.mode_blocks import Clock, Source, all_weights, first_rows, keep_used, output_block
 from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT
 from ctid_cli.filtering.row_sink import BLOCK, RowSink, emit, finish, row_sink
 from ctid_cli.filtering.submodel_blocks import LoopData, input_block, loop_block
@@ -77,13 +77,12 @@ def _submodel_pass(
     written = 0
     for start in range(0, data.y.size, BLOCK):
         count = min(BLOCK, data.y.size - start)
-        span = Span(start - shift, min(max(shift - start, 0), count), count)
         if closed:
             # From the states at the start of the block, which the next call advances.
             loop_block(modes, clock, loop, start, count, states, integrals[0], memory, v)
-        input_block(modes, first, clock, instruments, span, states, integrals[0], block)
+        input_block(modes, first, clock, instruments, start - shift, count, states, integrals[0], block)
         if closed:
-            input_block(modes, first, clock, measured, span, states[:, 3:], integrals[1], block)
+            input_block(modes, first, clock, measured, start - shift, count, states[:, 3:], integrals[1], block)
         _model_outputs(modes, first, count, block, outputs)
         # eps = y - sum of x_i.
         for k in range(count):

@@ -19,6 +19,8 @@ KEPT = 3
 SAME = 1e-6
 #: Starts whose poles differ by less than this in logarithms are one.
 APART = 0.7
+#: Poles are fast whose magnitude times the sampling interval exceeds this.
+FAST = 0.25
 #: Most delays of a profile.
 MOST_DELAYS = 100
 
@@ -71,10 +73,13 @@ class Nest:
         """Search from points, and keep the lowest minima."""
         descent, kept = self.descent(zeros), self._found.setdefault((poles, zeros), [])
         ends = self._ends.setdefault((poles, zeros), [])
-        for point in points:
-            local = descent.descend(point, kept)
+        queue, cells = list(points), set[int]()
+        while queue:
+            local = descent.descend(queue.pop(0), kept)
             ends.append(local.squared_error)
             kept.append(local)
+            if not queue:
+                queue = self._beside(min(kept, key=lambda local: local.squared_error).point, cells)
         kept.sort(key=lambda local: local.squared_error)
         distinct: list[Local] = []
         for local in kept:
@@ -82,6 +87,25 @@ class Nest:
                 distinct.append(local)
         self._found[poles, zeros] = distinct[:KEPT]
         self.evaluations += descent.evaluations
+
+    def _beside(self, point: Point, cells: set[int]) -> list[Point]:
+        """Starts in the cells of the delay beside that of a minimum, where they are not yet among these cells.
+
+        Beside a fast pole each cell has a smooth cost of its own, and a minimum in one says nothing of the next.
+        """
+        low, high = self.box.delays
+        if point.delay.cell < 0 or point.speed[0] * self.box.cell < FAST:
+            return []
+        own, width = point.delay.cell, self.box.cell
+        cells.add(own)
+        points: list[Point] = []
+        for cell in (own - 1, own + 1):
+            if cell not in cells and (cell + 1) * width > low and cell * width < high:
+                cells.add(cell)
+                # From the middle a step may jump into the cell of the minimum: once more from the border, inwards.
+                border = max(own, cell) * width
+                points += [point_of(point.poles, tau, self.box, cell) for tau in ((cell + 0.5) * width, border)]
+        return points
 
     def _from_below(self, poles: int, zeros: int) -> list[Point]:
         """Starts from smaller models, and along the delay."""

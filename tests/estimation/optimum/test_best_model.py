@@ -122,3 +122,18 @@ def test_a_lightly_damped_pair_is_found_without_a_smaller_model_that_shows_it(se
     found = best_output_error([filter_data(record)], 2, 0, SearchOptions(free_response=True, random_starts=0))
     options = SearchOptions(free_response=True, starts=[(denominator, 0.0)], nested=False)
     assert found.squared_error <= best_output_error([filter_data(record)], 2, 0, options).squared_error * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("seed", [11, 35, 60])
+def test_a_delay_is_found_across_a_kink(seed):
+    # A pole as fast as the clock: each cell of the delay has a minimum of its own.
+    rng = np.random.default_rng(seed)
+    hold, t = int(rng.integers(1, 6)), np.arange(120.0)
+    held = HeldSignal(t, np.repeat(rng.choice([-1.0, 1.0], 120 // hold + 1), hold)[:120])
+    pole = rng.uniform(0.4, 1.2)
+    model = TransferFunction([pole], [1.0, pole], rng.uniform(2, 8))
+    record = Record(t, simulate(model, held, t), held)
+    start = [1.0, 0.3], model.delay + 1.0
+    options = SearchOptions(delays=(0.0, 12.0), nested=False, random_starts=2, starts=[start])
+    found = best_output_error([filter_data(record)], 1, 0, options)
+    assert found.delay == pytest.approx(model.delay, abs=1e-6)

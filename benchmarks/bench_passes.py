@@ -1,0 +1,93 @@
+"""One pass over a record, ns a sample, beside the same pass written in C and compiled on the spot.
+
+    python benchmarks/bench_passes.py
+
+Ours also finds the poles, the partial fractions and the map to the standard rows; the reference is given the poles.
+Where no C compiler is found only our times are printed.
+"""
+
+import os
+
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+import ctypes
+import shutil
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from bench_srivc_iteration import CASES, noisy_record
+
+from ctid_cli.filtering.bank import modal_map, second_moments
+from ctid_cli.filtering.filter_data import filter_data, split_delay
+from ctid_cli.filtering.mode_blocks import all_weights
+
+REPEATS = 200
+
+
+def compiled(compiler, modes, folder):
+    """The reference for so many pairs of poles."""
+    library = Path(folder) / f"pass{modes}.so"
+    source = Path(__file__).with_name("pass_reference.c")
+    flags = ["-O3", "-march=native", "-ffast-math", "-shared", "-fPIC", f"-DMODES={modes}"]
+    subprocess.run([compiler, *flags, "-o", library, source, "-lm"], check=True)
+    return ctypes.CDLL(str(library))
+
+
+def reference(library, data, poles, residues, delay):
+    """A call of the reference, and what it fills."""
+    gram = np.zeros((6 * poles.size + 2,) * 2)
+
+    def address(array):
+        return ctypes.c_void_p(array.ctypes.data)
+
+    clock = [address(data.u), address(data.y), ctypes.c_long(data.y.size)]
+    if data.interval:
+        shift, fraction = split_delay(delay, data.interval)
+        weights = [all_weights(poles, data.interval), all_weights(poles, data.interval * fraction)]
+        late = [ctypes.c_long(shift), ctypes.c_int(fraction > 0)]
+        arguments = [*clock, *late, *map(address, weights), address(residues), address(gram)]
+        return lambda kept=weights: library.regular(*arguments), gram
+    rest = [ctypes.c_double(delay), address(poles), address(residues), address(gram)]
+    return lambda: library.irregular(address(data.t), *clock, *rest), gram
+
+
+def fastest(*calls):
+    """Least time of each call [s]; they take turns, so that a disturbance meets all of them."""
+    times = np.empty((REPEATS, len(calls)))
+    for row in times:
+        for k, call in enumerate(calls):
+            begun = time.perf_counter()
+            call()
+            row[k] = time.perf_counter() - begun
+    return times.min(axis=0)
+
+
+def main():
+    compiler = shutil.which("cc")
+    print(f"{'system':8}{'clock':11}{'delay':16}{'ours':>7}{'C':>7}{'ratio':>7}   ns a sample")
+    with tempfile.TemporaryDirectory() as folder:
+        for name, system, samples, interval, _ in CASES:
+            a, b = system.denominator, system.numerator
+            _, poles, residues, mapping = modal_map(a, b)
+            library = compiled(compiler, poles.size, folder) if compiler else None
+            for regular, clock in ((True, "regular"), (False, "irregular")):
+                data = filter_data(noisy_record(system, samples, interval, regular))
+                for delay, said in ((8.0, "whole intervals"), (8.0 + 0.37 * interval, "off the clock")):
+                    calls = [lambda: second_moments(data, a, b, delay)]  # noqa: B023
+                    if library:
+                        call, gram = reference(library, data, poles, residues, delay)
+                        calls.append(call)
+                        call()
+                        both = mapping @ np.triu(gram) @ mapping.T
+                        theirs = both + both.T - mapping @ np.diag(np.diag(gram)) @ mapping.T
+                        np.testing.assert_allclose(theirs, calls[0](), rtol=1e-6, atol=1e-9 * np.abs(theirs).max())
+                    times = 1e9 * fastest(*calls) / samples
+                    others = f"{times[1]:7.1f}{times[0] / times[1]:7.2f}" if library else ""
+                    print(f"{name:8}{clock:11}{said:16}{times[0]:7.1f}{others}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
