@@ -1,7 +1,7 @@
 """The best output-error model of a record within the stated set, and how far that may be trusted."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,11 +9,16 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.estimation.optimum.box import Box, box_of, point_of
 from ctid_cli.estimation.optimum.chain import numerators
+from ctid_cli.estimation.optimum.pilot import part_of
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import Ending, Judged
 from ctid_cli.estimation.optimum.starts import SAME, Nest
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.models.transfer_function import TransferFunction
+
+#: A model found from a part of the records is one of all of them if its mean squared error there is at most so many
+#: times that in the part, and so large a share of the output's variance is explained.
+AS_GOOD, EXPLAINED = 1.5, 0.05
 
 
 @dataclass(frozen=True)
@@ -86,6 +91,10 @@ def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, opt
     As many zeros as poles need a known delay. Free responses begin at the first used sample of each record.
     """
     problem, box = problem_of(records, zeros, options), box_of(records, options.delays)
+    if options.nested and (part := part_of(problem, options.delays[1])) is not None:
+        found = _from_part(problem, part, box, poles, options)
+        if found is not None:
+            return found
     nest = Nest(problem, box, options.random_starts, options.seed)
     points = [point_of(np.roots(np.asarray(a, dtype=float)).astype(complex), tau, box) for a, tau in options.starts]
     if options.nested or not points:
@@ -97,6 +106,19 @@ def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, opt
         return found
     nest.refine(poles, zeros, nest.random_points(poles))
     return _least(nest, poles, zeros, False)
+
+
+def _from_part(problem: Problem, part: Problem, box: Box, poles: int, options: SearchOptions) -> Optimum | None:
+    """The search of a part, followed on the whole records; None where they say more, or something else, than it."""
+    zeros, fewer = problem.zeros, options.fewer_poles
+    pilot = Nest(part, box_of(part.records, options.delays), options.random_starts, options.seed)
+    expected = _least(pilot, poles, zeros, fewer)
+    found = _least(Nest(problem, box, options.random_starts, options.seed, pilot), poles, zeros, fewer)
+    count, part_count = (sum(data.count for data in one.records) for one in (problem, part))
+    power = sum(data.count * float(np.var(data.y_used)) for data in problem.records)
+    if found.squared_error > min(AS_GOOD * expected.squared_error * count / part_count, (1 - EXPLAINED) * power):
+        return None
+    return replace(found, tried=expected.tried, agree=expected.agree)
 
 
 def _least(nest: Nest, poles: int, zeros: int, fewer_poles: bool) -> Optimum:

@@ -130,7 +130,7 @@ def project(problem: Problem, speed: Array, damping: Array, delay: Delay) -> Pro
     F, g = chain_dynamics(speed, damping)
     chain = ChainState(F, g, F, g if problem.free_response else np.zeros(0))
     rows = np.stack(
-        [rows_of(chain, delay, data, period) for data, period in zip(problem.records, problem.periods, strict=True)]
+        [rows_of(chain, delay, data, period, False) for data, period in zip(problem.records, problem.periods, strict=True)]
     )
     found: Projected = _eliminated(rows, g.size, problem.zeros, problem.free_response, problem.offset)
     return found
@@ -183,7 +183,7 @@ def slopes(
     frees = projected.free if problem.free_response else [None] * len(problem.records)
     chains = [twice(F, g, projected.output, projected.direct, free) for free in frees]
     each = zip(chains, problem.records, problem.periods, strict=True)
-    rows = np.stack([rows_of(chain, delay, data, period) for chain, data, period in each])
+    rows = np.stack([rows_of(chain, delay, data, period, False) for chain, data, period in each])
     free = problem.zeros, problem.free_response, problem.offset, delay_free
     found: Slopes = _kaufman(rows, F, g, projected, logarithmic_slopes(speed, damping, F), free)
     return found

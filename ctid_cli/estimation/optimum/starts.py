@@ -28,8 +28,10 @@ MOST_DELAYS = 100
 class Nest:
     """The optima of a structure and of all that it contains, each found from those below it."""
 
-    def __init__(self, problem: Problem, box: Box, random_starts: int, seed: int) -> None:
+    def __init__(self, problem: Problem, box: Box, random_starts: int, seed: int, pilot: "Nest | None" = None) -> None:
         self.problem, self.box, self.random_starts, self.seed = problem, box, random_starts, seed
+        #: The same for a part of the records, from whose optima the searches start.
+        self.pilot = pilot
         self.evaluations = 0
         self._found: dict[tuple[int, int], list[Local]] = {}
         self._ends: dict[tuple[int, int], list[float]] = {}
@@ -43,9 +45,24 @@ class Nest:
         """The lowest minima of a structure that are known, the lowest first."""
         key = poles, zeros
         if key not in self._found:
-            # A larger structure must meet whatever this one finds by itself, at random too.
-            self.refine(poles, zeros, self._from_below(poles, zeros) + self.random_points(poles))
+            if self.pilot is not None:
+                self.refine(poles, zeros, self._from_pilot(self.pilot, poles, zeros))
+            else:
+                # A larger structure must meet whatever this one finds by itself, at random too.
+                self.refine(poles, zeros, self._from_below(poles, zeros) + self.random_points(poles))
         return self._found[key]
+
+    def _from_pilot(self, pilot: "Nest", poles: int, zeros: int) -> list[Point]:
+        """What a part of the records says, and the models that the structure contains exactly."""
+        there = pilot.optima(poles, zeros)[0].point
+        points = [point_of(there.poles, there.delay.seconds, self.box)]
+        if zeros > 0:
+            points.append(self.optima(poles, zeros - 1)[0].point)
+        if poles > 1 and zeros > 0:
+            within = self.optima(poles - 1, zeros - 1)[0].point
+            added = [-np.sqrt(self.box.slowest * self.box.fastest)]
+            points.append(point_of(np.concatenate((within.poles, added)), within.delay.seconds, self.box))
+        return points
 
     def _spine(self, poles: int) -> Local:
         """A minimum with one zero less than poles, by adding both: with a free numerator every added pole helps."""

@@ -159,21 +159,26 @@ def absorb(triangle: Array, block: Array, count: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _read(rows: Array, chain: ChainState, delay: Delay, interval: float) -> Array:
-    """``[z, u]`` at the instants read, from ``[z, u, change of u]`` at the breaks before them; the rest stays."""
+def _readout(chain: ChainState, delay: Delay, interval: float) -> Array:
+    """``[z, u]`` at the instants read, from ``[z, u, change of u]`` at the breaks before them, transposed."""
     n = chain.gain.size
     readout = np.zeros((n + 1, n + 2))
     fraction = place_of(delay, interval)[1] if interval > 0.0 else 0.0
     place(readout, 0, 0, held_readout(chain.dynamics, chain.gain, interval, fraction))
     readout[n, n], readout[n, n + 1] = 1.0, fraction
-    result = np.empty((rows.shape[0], rows.shape[1] - 1))
-    result[:, : n + 1] = np.ascontiguousarray(rows[:, : n + 2]) @ np.ascontiguousarray(readout.T)
-    result[:, n + 1 :] = rows[:, n + 2 :]
-    return result
+    return np.ascontiguousarray(readout.T)
 
 
 @njit(cache=True, nogil=True)
-def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, whole: bool = False) -> Array:
+def _read(rows: Array, readout: Array, result: Array) -> None:
+    """Write rows of a block, or of the triangle, with the read-out in the place of what it is read from."""
+    n = readout.shape[1] - 1
+    result[:, : n + 1] = np.ascontiguousarray(rows[:, : n + 2]) @ readout
+    result[:, n + 1 :] = rows[:, n + 2 :]
+
+
+@njit(cache=True, nogil=True)
+def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, whole: bool) -> Array:
     """Rows ``[z, u, free response, 1, y]`` that have the second moments of those of all used samples, or these.
 
     On a regular clock z is left at the break before the instant that is read: the way from there is one map for all
@@ -182,7 +187,8 @@ def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wh
     n, free = chain.gain.size, chain.free_start.size
     q = n + free + 4
     triangle, block = np.zeros((q, q)), np.zeros((q, BLOCK))
-    every = np.zeros((np.count_nonzero(data.use) if whole else 0, q))
+    every = np.zeros((np.count_nonzero(data.use) if whole else q, q - 1))
+    readout = _readout(chain, delay, data.interval)
     tu, u, breaks = data.tu, data.u, data.tu.size
     alone = _free_states(chain, data)
     regular = data.interval > 0.0
@@ -236,13 +242,16 @@ def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wh
         for i in range(free):
             block[n + 2 + i, filled] = alone[row, i]
         block[q - 2, filled], block[q - 1, filled] = 1.0, data.y[k]
-        if whole:
-            every[row] = block[:, filled]
         row += 1
         filled += 1
-        # R <- qr[R; block]: memory is that of one block, however long the record.
-        if filled == BLOCK:
-            absorb(triangle, block, filled)
+        if filled == BLOCK or row == every.shape[0] * whole:
+            if whole:
+                _read(np.ascontiguousarray(block[:, :filled].T), readout, every[row - filled : row])
+            else:
+                # R <- qr[R; block]: memory is that of one block, however long the record.
+                absorb(triangle, block, filled)
             filled = 0
-    absorb(triangle, block, filled)
-    return _read(every if whole else triangle, chain, delay, data.interval)
+    if not whole:
+        absorb(triangle, block, filled)
+        _read(triangle, readout, every)
+    return every

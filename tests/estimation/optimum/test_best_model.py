@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ctid_cli.estimation.optimum import pilot
 from ctid_cli.estimation.optimum.best_model import SearchOptions, best_output_error
 from ctid_cli.estimation.optimum.search import Ending
 from ctid_cli.filtering.filter_data import filter_data
@@ -137,3 +138,31 @@ def test_a_delay_is_found_across_a_kink(seed):
     options = SearchOptions(delays=(0.0, 12.0), nested=False, random_starts=2, starts=[start])
     found = best_output_error([filter_data(record)], 1, 0, options)
     assert found.delay == pytest.approx(model.delay, abs=1e-6)
+
+
+@pytest.mark.parametrize(("delay", "free_response"), [(0.0, False), (0.7, True)])
+def test_a_long_record_is_searched_by_a_part_of_it(monkeypatch, delay, free_response):
+    rng = np.random.default_rng(9)
+    data = filter_data(record_of(random_model(rng, 3, 1, delay), rng, samples=1500, noise=0.3, regular=delay == 0.0))
+    options = SearchOptions(delays=(0.0, 2 * delay), free_response=free_response, random_starts=2)
+    whole = best_output_error([data], 3, 1, options)
+    monkeypatch.setattr(pilot, "LONG", 1000)
+    monkeypatch.setattr(pilot, "PART", 400)
+    part = best_output_error([data], 3, 1, options)
+    assert part.squared_error == pytest.approx(whole.squared_error, rel=1e-9)
+    assert part.evaluations < 0.2 * whole.evaluations
+
+
+def test_a_part_that_tells_too_little_is_not_trusted(monkeypatch):
+    # A quick start and a long slow end: the liveliest part has not met the slow pole.
+    rng = np.random.default_rng(1)
+    t = np.arange(3000.0)
+    u = np.where(t < 300, np.repeat(rng.choice([-1.0, 1.0], 1000), 3), 1.0)
+    model = TransferFunction([0.5, 0.004], [1.0, 0.502, 0.001])
+    record = Record(t, simulate(model, HeldSignal(t, u), t) + 1e-3 * rng.standard_normal(t.size), HeldSignal(t, u))
+    options = SearchOptions(random_starts=2)
+    whole = best_output_error([filter_data(record)], 2, 1, options)
+    monkeypatch.setattr(pilot, "LONG", 1000)
+    monkeypatch.setattr(pilot, "PART", 200)
+    part = best_output_error([filter_data(record)], 2, 1, options)
+    assert part.squared_error <= whole.squared_error * (1 + 1e-6)
