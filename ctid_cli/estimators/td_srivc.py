@@ -154,7 +154,7 @@ class TdSrivc(Estimator["Searches", Fit]):
             raise DataError(Status.SINGULAR.value)
         end = self._finish if self.lowpass is None else self._refine
         fit = end(searches.last, found, history)
-        if self.variant == "plain" or fit.status is Status.DELAY_AT_BOUND:
+        if self.variant == "plain" or fit.status in (Status.DELAY_AT_BOUND, Status.SINGULAR):
             return fit
         local = lower_elsewhere(searches.last, fit, searches.bandwidth)
         return replace(fit, status=Status.LOCAL) if local else fit
