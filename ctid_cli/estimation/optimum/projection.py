@@ -129,9 +129,8 @@ def project(problem: Problem, speed: Array, damping: Array, delay: Delay) -> Pro
     """Eliminate numerator, free responses and offsets for given sections, fastest first."""
     F, g = chain_dynamics(speed, damping)
     chain = ChainState(F, g, F, g if problem.free_response else np.zeros(0))
-    rows = np.stack(
-        [rows_of(chain, delay, data, period, False) for data, period in zip(problem.records, problem.periods, strict=True)]
-    )
+    each = zip(problem.records, problem.periods, strict=True)
+    rows = np.stack([rows_of(chain, delay, data, period, False) for data, period in each])
     found: Projected = _eliminated(rows, g.size, problem.zeros, problem.free_response, problem.offset)
     return found
 
