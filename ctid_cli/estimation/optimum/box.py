@@ -29,6 +29,8 @@ FASTEST, SLOWEST, LEAST_DAMPING = 10.0, 1.0, 1e-3
 GREATEST_IMAGINARY = 0.999
 #: Real poles whose ratio is below this share a section.
 NEAR = 4.0
+#: What is just beyond an edge, as a fraction of the shortest interval; closer ones count as one instant.
+JUST_BEYOND = 1e-6
 #: A coordinate this close to a bound is at it.
 TOUCH = 1e-9
 
@@ -47,6 +49,9 @@ class Box:
     #: Delay [s] that counts as a step of one, a quarter period of what the output holds.
     quarter: float = 1.0
     least_damping: float = LEAST_DAMPING
+    #: Least delay [s] at which derivatives are taken on an irregular clock. Without a delay all samples may coincide
+    #: with edges of the input, where only what comes later counts.
+    beyond_edges: float = 0.0
 
     @property
     def delay_free(self) -> bool:
@@ -153,7 +158,10 @@ def box_of(records: Sequence[FilterData], delays: tuple[float, float]) -> Box:
     greatest = GREATEST_IMAGINARY * np.pi / interval if min(cells) > 0 else np.inf
     # Clocks of different intervals have their kinks all over the place.
     cell = cells.pop() if len(cells) == 1 else 0.0
-    return Box(SLOWEST / length, FASTEST / interval, greatest, delays, cell, max(quarter, interval))
+    beyond = 0.0 if cell else JUST_BEYOND * min(float(np.diff(data.t).min()) for data in records)
+    return Box(
+        SLOWEST / length, FASTEST / interval, greatest, delays, cell, max(quarter, interval), beyond_edges=beyond
+    )
 
 
 def admissible(pole: complex, box: Box) -> complex:

@@ -95,7 +95,10 @@ class Descent:
         """Gradient and curvature at a point; the delay counts in quarter periods."""
         projected = self.value(point) if projected is None else projected
         self.evaluations += 1
-        found = slopes(self.problem, point.speed, point.damping, point.delay, projected, self.box.delay_free)
+        delay = point.delay
+        if self.box.delay_free and delay.seconds < self.box.beyond_edges:
+            delay = delay._replace(seconds=self.box.beyond_edges)
+        found = slopes(self.problem, point.speed, point.damping, delay, projected, self.box.delay_free)
         inner = np.eye(found.gradient.size)
         n = point.poles.size
         inner[:n, :n] = point.jacobian()
