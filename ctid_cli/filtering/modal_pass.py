@@ -20,7 +20,6 @@ from ctid_cli.filtering.mode_blocks import (
     keep_used,
     mode_block,
     output_block,
-    put,
     step_weights,
     value_block,
 )
@@ -90,6 +89,16 @@ def _longest_lag(t: Array, delay: float, slack: float) -> int:
 
 
 @njit(cache=True, nogil=True)
+def _put(block: Array, row: int, column: int, value: complex, paired: bool) -> int:
+    """Write the state of a mode, that of a pair with its imaginary part below the real one; returns the next row."""
+    block[row, column] = value.real
+    if not paired:
+        return row + 1
+    block[row + 1, column] = value.imag
+    return row + 2
+
+
+@njit(cache=True, nogil=True)
 def irregular_modal_pass(
     poles: ComplexArray, residues: ComplexArray, delay: float, data: FilterData, sink: RowSink
 ) -> None:
@@ -134,15 +143,15 @@ def irregular_modal_pass(
                         z_now, w_now = _advance(step_weights(poles[i], step), z_now, w_now, u[j], change)
                     x += residues[i].real * z_now.real - residues[i].imag * z_now.imag
                     paired = poles[i].imag != 0.0
-                    put(block, n + row, filled, w_now, paired)
-                    row = put(block, row, filled, z_now, paired)
+                    _put(block, n + row, filled, w_now, paired)
+                    row = _put(block, row, filled, z_now, paired)
             else:
                 for i in range(2 * n):
                     block[i, filled] = 0.0
             block[2 * n, filled] = value
             row = 2 * n + 1
             for i in range(modes):
-                row = put(block, row, filled, e[i], poles[i].imag != 0.0)
+                row = _put(block, row, filled, e[i], poles[i].imag != 0.0)
             block[row, filled] = y[k] - x
             filled += 1
             if filled == BLOCK:

@@ -87,16 +87,6 @@ def first_rows(poles: ComplexArray) -> IntArray:
     return first
 
 
-@njit(cache=True, nogil=True)
-def put(block: Array, row: int, column: int, value: complex, paired: bool) -> int:
-    """Write the state of a mode, that of a pair with its imaginary part below the real one; returns the next row."""
-    block[row, column] = value.real
-    if not paired:
-        return row + 1
-    block[row + 1, column] = value.imag
-    return row + 2
-
-
 class Clock(NamedTuple):
     """A regular clock, and the weights of each mode over an interval and over the part of it that the delay leaves."""
 

@@ -69,14 +69,7 @@ def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Located:
     path = tuple(part for part in error["loc"] if not str(part).startswith(TAG) and part != "[key]")
     kind, value, context = error["type"], error["input"], error.get("ctx", {})
     at_key = context.get("at_key", False) or kind in ("missing", "extra_forbidden") or "[key]" in parts
-    if kind == "no_kind" and not isinstance(value, Mapping):
-        kind, context = "no_form", {"allowed": f"a mapping with a 'kind' (one of {context['allowed']})"}
-    elif kind == "no_kind":
-        path, kind, value = (*path, "kind"), "no_kind" if "kind" in value else "kind_missing", value.get("kind")
-    elif kind == "float_type" and type(value) is int:
-        kind, value = "finite_number", float("inf")  # an integer beyond all floating-point numbers
-    elif kind == "extra_forbidden" and path == ("search",) and "delay_bounds" in descriptions:
-        kind = "search_retired"
+    path, kind, value, context = _told(path, kind, value, context, descriptions)
     if kind not in SENTENCES:
         return path, error["msg"], at_key
     words = _words(path, descriptions) | {"shown": shown(value)} | context
@@ -84,6 +77,22 @@ def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Located:
         words["allowed"] = context["expected"].replace(" or ", ", ")
     hints = [tag.removeprefix(TAG) for tag in parts if tag.startswith(HINT)]
     return path, SENTENCES[kind].format(**words) + _hint(kind, value, words) + "".join(hints), at_key
+
+
+def _told(
+    path: KeyPath, kind: str, value: Any, context: dict[str, Any], descriptions: Mapping[str, str]
+) -> tuple[KeyPath, str, Any, dict[str, Any]]:
+    """What is to be told of an error, where pydantic's own type, or place, says too little."""
+    if kind == "no_kind" and not isinstance(value, Mapping):
+        return path, "no_form", value, {"allowed": f"a mapping with a 'kind' (one of {context['allowed']})"}
+    if kind == "no_kind":
+        return (*path, "kind"), "no_kind" if "kind" in value else "kind_missing", value.get("kind"), context
+    if kind == "float_type" and type(value) is int:
+        # An integer beyond all floating-point numbers.
+        return path, "finite_number", float("inf"), context
+    if kind == "extra_forbidden" and path == ("search",) and "delay_bounds" in descriptions:
+        return path, "search_retired", value, context
+    return path, kind, value, context
 
 
 def _words(path: KeyPath, descriptions: Mapping[str, str]) -> dict[str, Any]:

@@ -181,20 +181,7 @@ def point_of(poles: ComplexArray, delay: float, box: Box, cell: int | None = Non
     """Admissible sections with given poles."""
     moved = [admissible(pole, box) for pole in poles.tolist()]
     units = [(abs(p), -p.real / abs(p), p.imag >= box.imaginary * (1 - TOUCH)) for p in moved if p.imag > 0]
-    reals = sorted(-p.real for p in moved if p.imag == 0)
-    # The nearest real poles first; one at a bound stays alone, so that it can be frozen there.
-    while len(reals) > 1:
-        ratios = [
-            b / a if a > box.slowest * (1 + TOUCH) and b < box.fastest * (1 - TOUCH) else np.inf
-            for a, b in pairwise(reals)
-        ]
-        k = int(np.argmin(ratios))
-        if ratios[k] > NEAR:
-            break
-        a, b = reals[k], reals[k + 1]
-        units.append((sqrt(a * b), 0.5 * (a + b) / sqrt(a * b), False))
-        del reals[k : k + 2]
-    units += [(p, -1.0, False) for p in reals]
+    units += _real_sections(sorted(-p.real for p in moved if p.imag == 0), box)
     units.sort(key=lambda unit: -unit[0])
     low, high = box.delays
     tau = min(max(float(delay), low), high)
@@ -206,6 +193,24 @@ def point_of(poles: ComplexArray, delay: float, box: Box, cell: int | None = Non
         np.array([unit[2] for unit in units]),
         Delay(tau, cell),
     )
+
+
+def _real_sections(reals: list[float], box: Box) -> list[tuple[float, float, bool]]:
+    """Sections of real poles, given in rising order: the nearest first share one, others have their own."""
+    sections = []
+    # One at a bound stays alone, so that it can be frozen there.
+    while len(reals) > 1:
+        ratios = [
+            b / a if a > box.slowest * (1 + TOUCH) and b < box.fastest * (1 - TOUCH) else np.inf
+            for a, b in pairwise(reals)
+        ]
+        k = int(np.argmin(ratios))
+        if ratios[k] > NEAR:
+            break
+        a, b = reals[k], reals[k + 1]
+        sections.append((sqrt(a * b), 0.5 * (a + b) / sqrt(a * b), False))
+        del reals[k : k + 2]
+    return sections + [(p, -1.0, False) for p in reals]
 
 
 def moved_by(point: Point, step: Array, box: Box) -> Point:

@@ -135,20 +135,17 @@ class Descent:
         scale = np.zeros(here.gradient.size)
         for taken in range(most_steps):
             here = self._faced(here)
-            for other in known:
-                if _alike(here, other, self.box):
-                    return other
+            there = next((other for other in known if _alike(here, other, self.box)), None)
+            if there is not None:
+                return there
             free = ~frozen(here.point, here.gradient, self.box)
             gradient, curvature = here.gradient[free], here.curvature[np.ix_(free, free)]
             scale = np.maximum(scale, _lengths(here))
             unit = scale[free]
             scaled, slope = curvature / np.outer(unit, unit), gradient / unit
             promise = _promise(scaled, slope)[0] if free.any() else 0.0
-            if promise <= near * max(here.squared_error, self.floor):
-                break
-            if taken >= FIRST_STEPS and here.squared_error - HOPELESS * promise > lowest:
-                break
-            if taken >= PATIENCE and here.squared_error > FAR * lowest:
+            arrived = promise <= near * max(here.squared_error, self.floor)
+            if arrived or _hopeless(taken, here.squared_error, promise, lowest):
                 break
             step = np.zeros(free.size)
             for _ in range(MOST_REJECTIONS):
@@ -344,6 +341,12 @@ def _alike(here: Local, other: Local, box: Box) -> bool:
     away = np.concatenate((here.point.speed / other.point.speed - 1, here.point.damping / other.point.damping - 1))
     later = (here.point.delay.seconds - other.point.delay.seconds) / box.quarter
     return bool(np.abs(away).max() < CLOSE and abs(later) < CLOSE)
+
+
+def _hopeless(taken: int, squared_error: float, promise: float, lowest: float) -> bool:
+    """Whether a search will not come down to the lowest known minimum."""
+    too_flat = taken >= FIRST_STEPS and squared_error - HOPELESS * promise > lowest
+    return too_flat or (taken >= PATIENCE and squared_error > FAR * lowest)
 
 
 def _newton_step(values: Array, vectors: Array, gradient: Array) -> Array:
