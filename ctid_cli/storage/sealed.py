@@ -69,7 +69,8 @@ def seal_image(
 def read_sealed(path: Path) -> SealedRuns:
     """Read a sealed file and compare it with its checksum."""
     with _checked(path) as (file, checksum):
-        manifest = json.loads(bytes(file["manifest"][()]).decode("utf-8"))
+        # A text; once it was an array of bytes.
+        manifest = json.loads(bytes(file["manifest"][()]))
         origins = tuple(Origin.of(**entry) for entry in json.loads(str(file.attrs["origins"])))
         return SealedRuns(manifest, origins, _results(file["estimates"]), checksum)
 
@@ -129,8 +130,8 @@ def _write_plan(file: h5py.File, manifest: Manifest, origins: Sequence[Origin]) 
     # The order of swept fields in the manifest is that of the specification, and columns follow it.
     texts = {"spec": canonical_json(manifest["spec"]), "manifest": json.dumps(manifest, allow_nan=False)}
     for name, text in texts.items():
-        # A byte array, because HDF5 strings end at their first zero byte, and attributes have a length limit.
-        file.create_dataset(name, data=np.frombuffer(text.encode("utf-8"), dtype=np.uint8), track_times=False)
+        # A dataset, because attributes have a length limit; an HDF5 string ends at a zero byte, and JSON holds none.
+        file.create_dataset(name, data=_encode([text]).reshape(()), track_times=False)
 
 
 def _write_track(group: h5py.Group, packed: Mapping[str, Any]) -> None:
@@ -167,9 +168,9 @@ def _write_column(group: h5py.Group, column: columns.Column, rows: Sequence[Any]
             _write_named(group, name, column.names(rows), [row or {} for row in rows])
         case _:
             # "random" is no number: where the search started is in start_delay, and the label in start.
-            written = _write(group, name, _floats([None if isinstance(row, str) else row for row in rows]))
-            if column.unit:
-                written.attrs["unit"] = column.unit
+            _write(group, name, _floats([None if isinstance(row, str) else row for row in rows]))
+    attributes = {"meaning": column.meaning.replace("`", ""), "unit": column.unit}
+    group[name].attrs.update({key: text for key, text in attributes.items() if text})
 
 
 def _write_lists(group: h5py.Group, name: str, rows: Sequence[Any]) -> None:
@@ -183,7 +184,8 @@ def _write_lists(group: h5py.Group, name: str, rows: Sequence[Any]) -> None:
 
 def _write_named(group: h5py.Group, name: str, parts: list[str], rows: Sequence[Mapping[str, Any]]) -> None:
     shape = (len(rows), len(parts))
-    _write(group, name, _floats([row.get(part) for row in rows for part in parts]).reshape(shape))
+    values = _floats([row.get(part) for row in rows for part in parts]).reshape(shape)
+    _write(group, name, values).attrs["columns"] = ", ".join(parts)
     present = np.array([part in row for row in rows for part in parts], dtype=np.uint8)
     _write(group, f"{name}_present", present.reshape(shape))
     _write(group, f"{name.removesuffix('s')}_names", _encode(parts))

@@ -50,7 +50,8 @@ def test_the_sealed_file_explains_itself_to_other_programs(place: Path) -> None:
         assert file.attrs["experiment"] == "toys"
         assert (file.attrs["seed"], file.attrs["runs"], file.attrs["format_version"]) == (7, 6, 1)
         assert file.attrs["code_version"] == ORIGIN.code_version
-        assert json.loads(bytes(file["spec"][()]).decode()) == PLAN.spec.canonical()
+        assert json.loads(file["spec"].asstr()[()]) == PLAN.spec.canonical()
+        assert json.loads(file["manifest"].asstr()[()])["experiment"] == "toys"
         group = file["estimates"]
         status = group["status"].asstr()[()]
         assert status.tolist().count("FAILED") == 4
@@ -61,9 +62,16 @@ def test_the_sealed_file_explains_itself_to_other_programs(place: Path) -> None:
         assert group["delay"].attrs["unit"] == "s"
         assert set(np.unique(group["swept/level"][()])) == {5.0, 15.5}
         assert group["standard_error_names"].asstr()[()].tolist() == ["b0", "delay"]
+        assert group["standard_errors"].attrs["columns"] == "b0, delay"
+        assert group["status"].attrs["meaning"] == "how the estimate ended"
         everything: list[str] = []
         file.visit(everything.append)
         assert not [name for name in everything if any(word in name for word in ("second", "time", "host", "session"))]
+        attributes = [value for name in ("/", *everything) for value in file[name].attrs.values()]
+        assert {type(value) for value in attributes} == {str, np.int64}
+        texts = [file[name] for name in everything if getattr(file[name], "dtype", np.dtype("f8")).kind in "SO"]
+        assert len(texts) > 5
+        assert all(h5py.check_string_dtype(text.dtype).encoding == "utf-8" for text in texts)
 
 
 def test_rows_are_sorted_as_the_specification_is_written(place: Path) -> None:
