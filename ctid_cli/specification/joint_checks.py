@@ -1,4 +1,4 @@
-"""What is wrong with a specification although every section is right by itself, and what is unwise in it."""
+"""What is wrong with a specification although every section is right by itself."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -17,7 +17,7 @@ from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.dataset import LoopOptions, located
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import Section, Variant, over, variants
-from ctid_cli.specification.signal_checks import signal_complaints, signal_warnings, world_complaints
+from ctid_cli.specification.signal_checks import signal_complaints, world_complaints
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.start_points import additive_form
 from ctid_cli.specification.start_sections import RelativeStart, StartsSection, UniformStart
@@ -30,7 +30,7 @@ MAX_TRIALS = 64
 
 
 @dataclass(frozen=True, eq=False)
-class _Extent:
+class Extent:
     """How long a record is, and how many of its samples are left after a delay."""
 
     interval: float
@@ -41,9 +41,11 @@ class _Extent:
 
     @property
     def duration(self) -> float:
+        """Time from the first sample to the last [s]."""
         return self.interval * (self.samples - 1)
 
     def samples_after(self, delay: float) -> int:
+        """How many samples a delay [s] leaves."""
         if self.times is not None:
             return int(np.count_nonzero(self.times >= delay))
         return max(self.samples - math.ceil(delay / self.interval), 0)
@@ -58,65 +60,38 @@ def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool
     if spec.signal is not None:
         yield from too_long or signal_complaints(spec)
         return
-    extents = _extents(spec, samplings) if files_are_good else []
+    records = extents(spec, samplings) if files_are_good else []
     open_loop = spec.loop is None and not broken & {"loop", "data", "excitation"}
-    yield from _estimator_complaints(spec, extents, open_loop=open_loop)
+    yield from _estimator_complaints(spec, records, open_loop=open_loop)
     if spec.starts is not None:
         yield from _start_complaints(spec, spec.starts, broken)
     yield from _success_complaints(spec)
     if spec.loop is not None and spec.data is None:
         yield from _loop_complaints(spec, spec.loop)
     if files_are_good:
-        yield from too_long or _simulation_complaints(spec, extents)
-
-
-def joint_warnings(spec: Spec) -> list[Complaint]:
-    """What is allowed but unwise."""
-    if spec.signal is not None:
-        return signal_warnings(spec)
-    warnings: list[Complaint] = []
-    if spec.system is not None and spec.sampling is not None:
-        fastest = float(np.abs(variants(spec.system)[0].options.poles).max(initial=0.0))
-        warnings += over({(): variants(spec.sampling)}, partial(_slow, fastest))
-    if spec.data is not None and spec.monte_carlo is not None and spec.monte_carlo.runs > 1:
-        warnings.append((("monte_carlo", "runs"), "a measured record is one data set; it is run once"))
-    if spec.loop is not None:
-        for name, section in spec.estimators.items():
-            warnings += over({(): variants(section)}, partial(_of_open_loop, ("estimators", name)))
-    if spec.starts is not None:
-        taken = {variants(section)[0].options.start_from for section in spec.estimators.values()}
-        for name, kind in (("initial_delay", "delay"), ("parameters", "parameters")):
-            if getattr(spec.starts, name) and kind not in taken:
-                warnings.append((("starts", name), "no estimator here uses a start of this kind; each is run once"))
-    return warnings
+        yield from too_long or _simulation_complaints(spec, records)
 
 
 # --------------------------------------------------------------------------------------------------------------------
 # Length of the records
 
 
-def _extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
+def extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
+    """How long the records are: the measured one, or one for each sampling."""
     if spec.measured is not None:
         record = spec.measured.dataset(0).record
         interval = record.duration / max(record.n_samples - 1, 1)
-        return [Variant({}, {}, _Extent(interval, record.n_samples, (record.t - record.t[0])[record.valid]))]
+        return [Variant({}, {}, Extent(interval, record.n_samples, (record.t - record.t[0])[record.valid]))]
     # Random intervals stand for themselves at their mean.
     plans = [
-        (case, _Extent(_mean_interval(case.options), case.options.samples, None, case.options)) for case in samplings
+        (case, Extent(mean_interval(case.options), case.options.samples, None, case.options)) for case in samplings
     ]
     return [Variant({}, case.swept, extent) for case, extent in plans]
 
 
-def _mean_interval(sampling: Any) -> float:
+def mean_interval(sampling: Any) -> float:
+    """Time from one sample to the next [s], on average."""
     return float(sampling.interval) if hasattr(sampling, "interval") else 0.5 * float(sampling.low + sampling.high)
-
-
-def _slow(fastest: float, sampling: Any) -> Iterator[Complaint]:
-    interval = _mean_interval(sampling)
-    if interval * fastest > math.pi:
-        slow = f"sampling every {interval:g} s is slower than twice the fastest pole ({fastest:.4g} rad/s)"
-        key: KeyPath = ("sampling", "interval") if hasattr(sampling, "interval") else ("sampling",)
-        yield key, f"{slow}; intervals below {math.pi / fastest:.4g} s see it"
 
 
 def _too_long(at: KeyPath, sampling: Any) -> Iterator[Complaint]:
@@ -124,7 +99,7 @@ def _too_long(at: KeyPath, sampling: Any) -> Iterator[Complaint]:
         yield at, f"more than {MAX_SAMPLES} samples in a record are not supported"
 
 
-def _of_record(at: KeyPath, options: Any, extent: _Extent) -> Iterator[Complaint]:
+def _of_record(at: KeyPath, options: Any, extent: Extent) -> Iterator[Complaint]:
     """Say that an estimator has too few samples of a record."""
     bounds = getattr(options, "delay_bounds", None)
     key = "delay" if bounds is None else "delay_bounds"
@@ -144,13 +119,13 @@ def _of_record(at: KeyPath, options: Any, extent: _Extent) -> Iterator[Complaint
 # Estimators, starts and success
 
 
-def _estimator_complaints(spec: Spec, extents: Sequence[Variant], *, open_loop: bool) -> Iterator[Complaint]:
+def _estimator_complaints(spec: Spec, records: Sequence[Variant], *, open_loop: bool) -> Iterator[Complaint]:
     """What each estimator of a system has against the record, the loop and the initial delays."""
     for name, section in spec.estimators.items():
         if section.kind in KINDS["frequency_estimator"]:
             continue
         at, cases = ("estimators", name), variants(section)
-        yield from over({(): cases, ("sampling",): extents}, partial(_of_record, at))
+        yield from over({(): cases, ("sampling",): records}, partial(_of_record, at))
         if open_loop:
             yield from over({(): cases}, partial(_of_instruments, at))
         if spec.starts is not None:
@@ -161,12 +136,6 @@ def _of_instruments(at: KeyPath, options: Any) -> Iterator[Complaint]:
     if getattr(options, "instruments", None) == "closed_loop":
         give = "give loop, or data.reference and loop.controller for a measured record"
         yield (*at, "instruments"), f"closed-loop instruments need the reference and the controller; {give}"
-
-
-def _of_open_loop(at: KeyPath, options: Any) -> Iterator[Complaint]:
-    if getattr(options, "instruments", "open_loop") == "open_loop":
-        ignored = "ignores the loop, through which noise reaches the input and biases the estimate"
-        yield at, f"{ignored}; use srivc or additive_srivc with instruments: closed_loop, unless that is the point"
 
 
 def _of_delays(name: str, delays: Sequence[float | UniformStart], options: Any) -> Iterator[Complaint]:
@@ -293,9 +262,9 @@ def _of_stability(system: Any, loop: LoopOptions, sampling: Any) -> Iterator[Com
         yield path, f"the loop with the true system is unstable: {largest}; lower the gain"
 
 
-def _simulation_complaints(spec: Spec, extents: Sequence[Variant]) -> Iterator[Complaint]:
+def _simulation_complaints(spec: Spec, records: Sequence[Variant]) -> Iterator[Complaint]:
     """What the sections that data are simulated from have against each other."""
-    yield from over({("system",): variants(spec.system), ("sampling",): extents}, _of_delay)
+    yield from over({("system",): variants(spec.system), ("sampling",): records}, _of_delay)
     if spec.generator is None:
         return
     place, section = spec.generator
@@ -303,7 +272,7 @@ def _simulation_complaints(spec: Spec, extents: Sequence[Variant]) -> Iterator[C
 
     # Some faults show only where an excitation meets a sampling scheme: a step after the end, a tone that the clock
     # cannot carry. One data set of each pair tells; pairs beyond the first ones repeat what these say.
-    def tried(excitation: Any, extent: _Extent) -> Iterator[Complaint]:
+    def tried(excitation: Any, extent: Extent) -> Iterator[Complaint]:
         clock = getattr(excitation, "clock_period", None)
         if clock is not None and extent.duration / clock > MAX_SAMPLES:
             message = f"a record of {extent.duration:g} s has more than {MAX_SAMPLES} clock periods of {clock:g} s"
@@ -316,9 +285,9 @@ def _simulation_complaints(spec: Spec, extents: Sequence[Variant]) -> Iterator[C
             yield place, str(error)
 
     if spec.data is None:
-        yield from over({place: variants(section), ("sampling",): extents}, tried, MAX_TRIALS)
+        yield from over({place: variants(section), ("sampling",): records}, tried, MAX_TRIALS)
 
 
-def _of_delay(system: Any, extent: _Extent) -> Iterator[Complaint]:
+def _of_delay(system: Any, extent: Extent) -> Iterator[Complaint]:
     if system.delay >= extent.duration:
         yield ("system", "delay"), f"{system.delay:g} s is not shorter than the record ({extent.duration:g} s)"

@@ -9,7 +9,8 @@ from pydantic import ValidationError, create_model
 from ctid_cli.errors import DataError, Problem, SpecError
 from ctid_cli.signals.csv_file import read_held_signal
 from ctid_cli.simulation.dataset import file_sha256, joined, located
-from ctid_cli.specification.joint_checks import joint_complaints, joint_warnings
+from ctid_cli.specification.joint_checks import joint_complaints
+from ctid_cli.specification.joint_warnings import joint_warnings
 from ctid_cli.specification.messages import Complaint, Located, explained, shown
 from ctid_cli.specification.option_sections import EstimatorSection
 from ctid_cli.specification.sections import replaced, variants
