@@ -12,7 +12,7 @@ from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.dataset import located
 from ctid_cli.specification.joint_checks import MAX_TRIALS, Extent, extents, mean_interval
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.sections import over, variants
+from ctid_cli.specification.sections import Variant, over, variants
 from ctid_cli.specification.signal_checks import signal_warnings
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.yaml_source import KeyPath
@@ -52,7 +52,7 @@ def _simulation_warnings(spec: Spec) -> list[Complaint]:
     warnings: list[Complaint] = []
     samplings = variants(spec.sampling)
     if spec.excitation is not None:
-        told = {("excitation",): variants(spec.excitation), ("sampling",): samplings}
+        told: dict[KeyPath, list[Variant]] = {("excitation",): variants(spec.excitation), ("sampling",): samplings}
         warnings += over(told, partial(_of_sampled_input, spec), MAX_TRIALS)
     # A system of one's own need not have poles.
     systems = [case for case in variants(spec.system) if hasattr(case.options, "poles")]
@@ -60,7 +60,7 @@ def _simulation_warnings(spec: Spec) -> list[Complaint]:
         return warnings
     fastest = float(np.abs(systems[0].options.poles).max(initial=0.0))
     warnings += over({(): samplings}, partial(_of_slow_sampling, fastest))
-    lengths = {("system",): systems, ("sampling",): extents(spec, samplings)}
+    lengths: dict[KeyPath, list[Variant]] = {("system",): systems, ("sampling",): extents(spec, samplings)}
     warnings += over(
         lengths, partial(_of_short_record, "duration" if hasattr(spec.sampling, "duration") else "samples")
     )
