@@ -36,7 +36,7 @@ class KernelsCompiled:
 
 @dataclass(frozen=True)
 class DataSetDone:
-    """The estimates of one data set are safely stored."""
+    """Estimates of one data set are safely stored: all of them, or those of one estimator."""
 
     done: int
     total: int
@@ -45,7 +45,7 @@ class DataSetDone:
 
 @dataclass(frozen=True)
 class WorkerDied:
-    """A worker process died; its data sets are repeated one at a time to find out which of them did it."""
+    """A worker process died; the estimates of its data set are repeated one by one to find out which of them did it."""
 
     data_sets: int
     reason: str
