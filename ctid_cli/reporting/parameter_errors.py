@@ -1,8 +1,8 @@
-"""Errors of the parameters of submodels over the data sets of an experiment, beside what theory predicts.
+"""Errors of parameters over the data sets of an experiment; of submodels, beside what theory predicts.
 
 Every estimate with a value for each parameter of the system counts, whether its iterations converged or not. An
-estimate that failed, or cannot be written as a sum of such submodels, has no error; how many these are, and how many
-did not converge, stands beside every number.
+estimate that failed, or cannot be written in these parameters, has no error; how many these are, and how many did not
+converge, stands beside every number.
 
 Attributes of ``ParameterErrors``
 ---------------------------------
@@ -18,8 +18,8 @@ Attributes of ``ParameterErrors``
 """
 
 import operator
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import reduce
 from types import SimpleNamespace
 from typing import Any
@@ -28,20 +28,19 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
-from ctid_cli.inference.quantile import normal_quantile
+from ctid_cli.inference import monte_carlo
+from ctid_cli.inference.monte_carlo import Sample
 from ctid_cli.reporting.expected_accuracy import long_record_variances
-from ctid_cli.reporting.results import Results, lookup
+from ctid_cli.reporting.results import Group, Results, lookup
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.columns import FAILURES
-from ctid_cli.storage.manifest import true_parameters
-from ctid_cli.storage.summary import wilson_interval
-
-#: Standard errors on either side of an estimate that make a 95 % interval.
-QUANTILE = normal_quantile()
+from ctid_cli.storage.manifest import found_values, true_values
 
 #: Errors of one parameter over the data sets of one cell.
 ParameterErrors = SimpleNamespace
+#: Estimated values and standard errors of one estimate by name.
+Pair = tuple[dict[str, float | None], dict[str, float | None]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +48,7 @@ class ParameterEstimates:
     """What one estimator found on the data sets of one data cell."""
 
     experiment: str
-    estimator: str
-    start: str
+    group: Group
     settings: Mapping[str, Any]
     samples: int
     names: tuple[str, ...]
@@ -64,7 +62,23 @@ class ParameterEstimates:
     not_converged: int
     replicates: tuple[int, ...]
     #: N times the variance that theory predicts for long records; None where there is no theory, shape (p,).
-    theory: Array | None
+    theory: Array | None = None
+
+    @property
+    def estimator(self) -> str:
+        """Name of the estimator."""
+        return self.group.estimator
+
+    @property
+    def start(self) -> str:
+        """Label of the start."""
+        return self.group.start
+
+    def sample(self, k: int, bound: float = np.nan) -> Sample:
+        """Errors of one of the parameters, where it has a value."""
+        errors = self.values[:, k] - self.truth[k]
+        counted = np.isfinite(errors)
+        return Sample(errors[counted], self.standard_errors[counted, k], bound)
 
     @property
     def runs(self) -> int:
@@ -86,50 +100,79 @@ class PairedRatio:
 
 
 def parameter_estimates(results: Results) -> list[ParameterEstimates]:
-    """Sort the estimates of an experiment by estimator, data cell and start."""
+    """The estimates of an experiment on a sum of submodels, by estimator, data cell and start, beside theory."""
     manifest = results.manifest
-    # By place, not by hash: a later version may write the same specification with more defaults.
-    cells = {cell["hash"]: k for k, cell in enumerate(manifest["data_cells"])}
-    places = {(part["name"], *part["swept"].items()): k for k, part in enumerate(manifest["estimators"])}
-    across = results.swept("estimators")
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for row in results.rows:
-        own = ((name, row[name]) for name in across if row.get(name) is not None)
-        groups.setdefault((row["cell"], row["start"], row["estimator"], *own), []).append(row)
-    if groups and any(true_parameters(cell) is None for cell in manifest["data_cells"]):
+    if results.rows and "additive" not in (manifest["data_cells"][0]["content"].get("system") or {}):
         wanted = "errors of parameters need data that are simulated from a sum of submodels (system: additive)"
         raise UsageError(f"{results.experiment}: {wanted}")
+    groups = estimates_by_group(results)
     variances = long_record_variances(build_plan(spec_from_canonical(results.settings))) if groups else {}
-    return [
-        _estimates(results, cells[cell], start, part, variances.get((cells[cell], places[tuple(part)])), rows)
-        for (cell, start, *part), rows in groups.items()
-    ]
+    # By place, not by hash: a later version may write the same specification with more defaults.
+    cells = {cell["hash"]: k for k, cell in enumerate(manifest["data_cells"])}
+    options = results.swept("estimators")
+    parts = [(part["name"], tuple(part["swept"].get(name) for name in options)) for part in manifest["estimators"]]
+    found = []
+    for one in groups:
+        theory = variances.get((cells[one.group.cell], parts.index((one.group.estimator, one.group.options))))
+        found.append(replace(one, theory=None if theory is None else np.array([theory[name] for name in one.names])))
+    return found
+
+
+def estimates_by_group(results: Results) -> list[ParameterEstimates]:
+    """Estimates of the parameters of simulated systems, by estimator, data cell and start."""
+    groups = results.groups()
+    cells = {cell["hash"]: cell for cell in results.manifest["data_cells"]}
+    truths = {name: true_values(cell) for name, cell in cells.items()}
+    found = {group: [found_values(row, truths[group.cell]) for row in rows] for group, rows in groups.items()}
+    pooled: dict[tuple[Any, ...], list[Pair]] = {}
+    for group, pairs in found.items():
+        pooled.setdefault((group.estimator, group.options), []).extend(pairs)
+    given = {part for part, pairs in pooled.items() if _is_given(pairs)}
+    estimates = []
+    for group, rows in groups.items():
+        true = dict(truths[group.cell])
+        if (group.estimator, group.options) in given:
+            true.pop("delay", None)
+        estimates.append(_estimates(results, cells[group.cell], group, rows, true, found[group]))
+    return estimates
+
+
+def _is_given(pairs: list[Pair]) -> bool:
+    """Whether a delay is no estimate: the same in all data sets, and without a standard error."""
+    delays = {values.get("delay") for values, _ in pairs} - {None}
+    return len(delays) <= 1 and all(errors.get("delay") is None for _, errors in pairs)
 
 
 def _estimates(
-    results: Results, place: int, start: str, part: list[Any], theory: dict[str, float] | None, rows: list[Any]
+    results: Results,
+    cell: Mapping[str, Any],
+    group: Group,
+    rows: list[Any],
+    true: Mapping[str, float],
+    pairs: list[Pair],
 ) -> ParameterEstimates:
-    """What an estimator, its name and swept options in ``part``, found in a data cell."""
-    cell = results.manifest["data_cells"][place]
-    truth = true_parameters(cell) or {}
-    values = _matrix([row["parameters"] for row in rows], truth)
-    # All parameters count the same data sets.
-    values[~np.isfinite(values).all(axis=1)] = np.nan
+    """What an estimator found in a data cell."""
+    values, errors = (
+        np.array([[side[name] for name in true] for side in sides], dtype=float) for sides in zip(*pairs, strict=True)
+    )
+    # All parameters count the same data sets, but for those that the model does not have at all.
+    known = np.isfinite(values)
+    values[~known[:, known.any(axis=0)].all(axis=1)] = np.nan
     failed = sum(row["status"] in FAILURES for row in rows)
+    options = dict(zip(results.swept("estimators"), group.options, strict=True))
+    swept = {name: value for name, value in cell["swept"].items() if name != "samples"}
     return ParameterEstimates(
         experiment=results.experiment,
-        estimator=part[0],
-        start=start,
-        settings={name: value for name, value in cell["swept"].items() if name != "samples"} | dict(part[1:]),
-        samples=int(lookup(cell["content"], "sampling.samples")),
-        names=tuple(truth),
-        truth=np.array([*truth.values()]),
+        group=group,
+        settings=swept | {name: value for name, value in options.items() if value is not None},
+        samples=int(lookup(cell["content"], "sampling.samples") or 0),
+        names=tuple(true),
+        truth=np.array([*true.values()]),
         values=values,
-        standard_errors=_matrix([row["standard_errors"] for row in rows], truth),
+        standard_errors=errors,
         failed=failed,
         not_converged=sum(row["status"] != "CONVERGED" for row in rows) - failed,
         replicates=tuple(row["replicate"] for row in rows),
-        theory=None if theory is None else np.array([theory[name] for name in truth]),
     )
 
 
@@ -142,56 +185,39 @@ def _errors_of(group: ParameterEstimates, k: int) -> ParameterErrors:
     """Errors of one of the parameters."""
     shared = ("experiment", "estimator", "start", "samples", "settings", "runs", "failed", "not_converged")
     theory = None if group.theory is None else float(group.theory[k])
-    found = error_statistics(group.values[:, k] - group.truth[k], group.standard_errors[:, k])
-    mse, mse_error = (None if found[name] is None else group.samples * found[name] for name in ("mse", "mse_error"))
+    sample = group.sample(k)
+    mse, bias, deviation = monte_carlo.mean_square(sample), monte_carlo.bias(sample), monte_carlo.deviation(sample)
+    coverage = monte_carlo.coverage(sample)
+    n_mse, n_mse_error = (None if part is None else group.samples * part for part in mse[:2])
     return ParameterErrors(
         **{name: getattr(group, name) for name in shared},
         parameter=group.names[k],
         true=float(group.truth[k]),
-        n_mse=mse,
+        counted=sample.errors.size,
+        mse=mse.value,
+        n_mse=n_mse,
         theory=theory,
-        ratio=_quotient(mse, theory),
-        ratio_error=_quotient(mse_error, theory),
-        **found,
+        ratio=_quotient(n_mse, theory),
+        ratio_error=_quotient(n_mse_error, theory),
+        bias=bias.value,
+        deviation=deviation.value,
+        bias_per_deviation=_quotient(bias.value, deviation.value),
+        bias_per_error=_quotient(bias.value, bias.error),
+        with_error=int(np.isfinite(sample.widths).sum()),
+        covered=int(monte_carlo.covered(sample).sum()),
+        coverage=coverage.value,
+        low=coverage.low,
+        high=coverage.high,
+        error_ratio=monte_carlo.error_ratio(sample).value,
     )
 
 
-def error_statistics(errors: Array, widths: Array) -> dict[str, Any]:
-    """What the errors of estimates and their standard errors tell, shapes (R,); NaN where there is none."""
-    complete = np.isfinite(errors)
-    error, width = errors[complete], widths[complete]
-    counted, with_error = len(error), int(np.isfinite(width).sum())
-    (mse, scatter), (bias, deviation) = _mean_and_deviation(error**2), _mean_and_deviation(error)
-    # A standard error that could not be computed covers nothing.
-    covered = int((np.abs(error) <= QUANTILE * width).sum())
-    shares = (covered / counted, *wilson_interval(covered, counted)) if with_error else ()
-    coverage, low, high = (100.0 * share for share in shares) if shares else (None, None, None)
-    return {
-        "counted": counted,
-        "mse": mse,
-        "mse_error": None if scatter is None else scatter / np.sqrt(counted),
-        "bias": bias,
-        "deviation": deviation,
-        "bias_per_deviation": _quotient(bias, deviation),
-        "bias_per_error": _quotient(bias, None if deviation is None else deviation / np.sqrt(counted)),
-        "with_error": with_error,
-        "covered": covered,
-        "coverage": coverage,
-        "low": low,
-        "high": high,
-        "error_ratio": _quotient(float(np.sqrt(np.nanmean(width**2))) if with_error else None, deviation),
-    }
-
-
 def mse_ratio(one: Sequence[ParameterEstimates], other: Sequence[ParameterEstimates], parameter: str) -> PairedRatio:
-    r"""Mean-square error of one estimator over that of another.
+    """Mean-square error of one estimator over that of another.
 
     Both estimators see the same noise, so their errors go together, and the ratio is known better than either error.
     Longer records begin with the shorter ones of the same data set, so that their errors go together too: a data set,
-    at all its lengths, is what the jack-knife leaves out. With the ratio r of all n data sets and ``r_(i)`` that of all
-    but data set i,
-
-    .. math:: s^2 = \frac{n-1}{n} \sum_i \left(r_{(i)} - \frac1n \sum_j r_{(j)}\right)^2.
+    at all its lengths, is what the jackknife leaves out.
     """
     import pandas as pd
 
@@ -207,25 +233,13 @@ def mse_ratio(one: Sequence[ParameterEstimates], other: Sequence[ParameterEstima
     # N times the squared error by data set, summed over its lengths, where all of them have one.
     sides = [reduce(operator.add, map(squares, side)) for side in (one, other)]
     parts = pd.concat(sides, axis=1).dropna().sort_index().to_numpy()
-    n = len(parts)
-    if n < 2:
+    if len(parts) < 2:
         both = f"{one[0].experiment}: {one[0].estimator} and {other[0].estimator}"
-        raise UsageError(f"{both} have {n} estimates on the same data sets, too few for a ratio")
-    above, below = parts.sum(axis=0)
-    without = (above - parts[:, 0]) / (below - parts[:, 1])
-    error = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
-    return PairedRatio(parameter, tuple(group.samples for group in one), float(above / below), error, n)
-
-
-def _mean_and_deviation(values: Array) -> tuple[float | None, float | None]:
-    n = values.size
-    return float(values.mean()) if n else None, float(np.std(values, ddof=1)) if n > 1 else None
+        raise UsageError(f"{both} have {len(parts)} estimates on the same data sets, too few for a ratio")
+    ratio = monte_carlo.of_means(operator.truediv, *parts.T)
+    assert ratio.value is not None
+    return PairedRatio(parameter, tuple(group.samples for group in one), ratio.value, ratio.error or 0.0, len(parts))
 
 
 def _quotient(one: float | None, other: float | None) -> float | None:
     return float(one / other) if one is not None and other else None
-
-
-def _matrix(rows: Iterable[Mapping[str, float | None] | None], names: Collection[str]) -> Array:
-    """Values by row and name; NaN where there is none."""
-    return np.array([[(row or {}).get(name) for name in names] for row in rows], dtype=float).reshape(-1, len(names))

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ctid_cli.reporting.results import Results, lookup
+from ctid_cli.reporting.results import Group, Results, lookup
 from ctid_cli.reporting.study import Place, Study, StudyTable
 from ctid_cli.simulation.frequency_measures import base_name, measure_names
 from ctid_cli.storage.columns import reserved_names
@@ -51,36 +51,45 @@ def settings_of(rows: Iterable[Mapping[str, Any]]) -> list[str]:
     return list(dict.fromkeys(key for row in rows for key in row if key not in others))
 
 
-def experiment_rows(
+def labelled_groups(
     results: Results, table: int | str | None = None, fields: Mapping[str, str] | None = None
-) -> list[Row]:
-    """Cells of one experiment: every combination of swept fields, estimator and start that was planned."""
+) -> Iterator[tuple[Group, Row]]:
+    """Every combination of swept fields, estimator and start that was planned, with the keys that all its rows have."""
     manifest = results.manifest
     down, across = results.swept("data_cells"), results.swept("estimators")
     fields = fields or ({} if is_of_signal(manifest) else ALWAYS)
     constant = {name: lookup(results.settings, path) for name, path in fields.items()}
     # Several sets of initial parameters are told apart by their names, as initial delays are by their values.
     given = {label for label, delay in manifest["starts"].items() if delay is None and label != "none"}
-    by = ["cell", "estimator", *across, "start"]
-    counted = {tuple(map(group.pop, by)): group for group in results.summaries(by)}
-    measured = _measured(results, by)
-    lacking = dict.fromkeys(itertools.chain(*measured.values()))
-    rows = []
     for cell, estimator in itertools.product(manifest["data_cells"], manifest["estimators"]):
         own = {name: estimator["swept"].get(name) for name in across}
         for start in estimator["starts"]:
-            place = (cell["hash"], estimator["name"], *own.values(), start)
-            rows.append(
+            yield (
+                Group(cell["hash"], estimator["name"], tuple(own.values()), start),
                 {"table": table or results.experiment, "experiment": results.experiment, "sampling": results.sampling}
                 | constant
                 | {name: cell["swept"].get(name) for name in down}
                 | ({"start": start if start in given else None} if len(given) > 1 else {})
                 | own
-                | {"initial_delay": manifest["starts"].get(start), "method": estimator["name"], **NOTHING}
-                | counted.get(place, {})
-                | measured.get(place, lacking)
+                | {"initial_delay": manifest["starts"].get(start), "method": estimator["name"]},
             )
-    return rows
+
+
+def experiment_rows(
+    results: Results, table: int | str | None = None, fields: Mapping[str, str] | None = None
+) -> list[Row]:
+    """Cells of one experiment."""
+    across = results.swept("estimators")
+    counted = {
+        Group(row.pop("cell"), row.pop("estimator"), tuple(map(row.pop, across)), row.pop("start")): row
+        for row in results.summaries(["cell", "estimator", *across, "start"])
+    }
+    measured = _measured(results)
+    lacking = dict.fromkeys(itertools.chain(*measured.values()))
+    return [
+        labels | NOTHING | counted.get(group, {}) | measured.get(group, lacking)
+        for group, labels in labelled_groups(results, table, fields)
+    ]
 
 
 def study_rows(study: Study, table: StudyTable, found: Mapping[str, Results]) -> list[Row]:
@@ -155,16 +164,15 @@ def pooled_rows(study: Study, table: StudyTable, rows: Sequence[Row], options: S
     return pooled
 
 
-def _measured(results: Results, by: Sequence[str]) -> dict[tuple[Any, ...], dict[str, float | None]]:
+def _measured(results: Results) -> dict[Group, dict[str, float | None]]:
     """What the estimates of a group measured together, where they are frequencies of a signal."""
     import pandas as pd
 
-    groups: dict[tuple[Any, ...], list[Mapping[str, float | None]]] = {}
-    for row in results.rows:
-        if "measures" in row:
-            groups.setdefault(tuple(row.get(name) for name in by), []).append(row["measures"] or {})
-    names = measure_names(one for group in groups.values() for one in group)
-    return {place: _together(pd.DataFrame(group, columns=names).astype(float)) for place, group in groups.items()}
+    if not is_of_signal(results.manifest):
+        return {}
+    groups = {group: [row["measures"] or {} for row in rows] for group, rows in results.groups().items()}
+    names = measure_names(one for rows in groups.values() for one in rows)
+    return {group: _together(pd.DataFrame(rows, columns=names).astype(float)) for group, rows in groups.items()}
 
 
 def _together(group: pd.DataFrame) -> dict[str, float | None]:

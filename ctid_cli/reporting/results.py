@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ctid_cli.errors import UsageError
 from ctid_cli.storage.columns import FAILURES
@@ -15,6 +15,16 @@ from ctid_cli.storage.manifest import Manifest
 from ctid_cli.storage.store import Stored, read_stored
 from ctid_cli.storage.summary import summarise
 from ctid_cli.text import did_you_mean
+
+
+class Group(NamedTuple):
+    """Estimates that differ by their data sets only."""
+
+    cell: str
+    estimator: str
+    #: Values of the swept options of the estimators.
+    options: tuple[Any, ...]
+    start: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +69,15 @@ class Results:
     def swept(self, part: str) -> list[str]:
         """Names of the fields swept over ``data_cells`` or ``estimators``."""
         return list(dict.fromkeys(name for item in self.manifest[part] for name in item["swept"]))
+
+    def groups(self) -> dict[Group, list[dict[str, Any]]]:
+        """Stored estimates by data cell, estimator and start."""
+        across = self.swept("estimators")
+        found: dict[Group, list[dict[str, Any]]] = {}
+        for row in self.rows:
+            group = Group(row["cell"], row["estimator"], tuple(row.get(name) for name in across), row["start"])
+            found.setdefault(group, []).append(row)
+        return found
 
     def summaries(self, by: Sequence[str]) -> list[dict[str, Any]]:
         """Counts and percentages in groups, as plain Python."""

@@ -6,7 +6,8 @@ a row of the table of estimates holds.
 """
 
 import hashlib
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -113,17 +114,47 @@ def swept_names(manifest: Manifest) -> list[str]:
     return list(dict.fromkeys(name for part in parts for name in part["swept"]))
 
 
-def true_delay(cell: Mapping[str, Any]) -> float | None:
-    """Delay of the system that a data cell simulates."""
-    system = cell["content"].get("system")
-    return None if not system else float(system.get("delay") or 0.0)
+def true_values(cell: Mapping[str, Any]) -> dict[str, float]:
+    """True values of the system that a data cell simulates, by name; empty for a measured record or a signal.
 
-
-def true_parameters(cell: Mapping[str, Any]) -> dict[str, float] | None:
-    """Parameters of the submodels of the system that a data cell simulates."""
+    ``a1`` ..., ``b0`` ..., ``delay`` of a transfer function, in descending powers with a monic denominator; the
+    parameters of the submodels of a sum, and its delay; the truth that a system of one's own gives.
+    """
     from ctid_cli.models.additive import AdditiveModel, Submodel
+    from ctid_cli.models.transfer_function import TransferFunction
 
     system = cell["content"].get("system")
-    if not system or "additive" not in system:
-        return None
-    return AdditiveModel([Submodel(**item) for item in system["additive"]]).sorted().parameters
+    if not system:
+        return {}
+    if "additive" in system:
+        values = AdditiveModel([Submodel(**item) for item in system["additive"]]).sorted().parameters
+    elif "denominator" in system:
+        model = TransferFunction(system["numerator"], system["denominator"])
+        values = {f"a{k}": float(value) for k, value in enumerate(model.denominator[1:], start=1)}
+        values |= {f"b{k}": float(value) for k, value in enumerate(model.numerator)}
+    else:
+        return dict(system.get("truth") or {})
+    return values | {"delay": float(system.get("delay") or 0.0)}
+
+
+def found_values(
+    row: Mapping[str, Any], names: Iterable[str]
+) -> tuple[dict[str, float | None], dict[str, float | None]]:
+    """Estimated values and standard errors under the names of the true ones.
+
+    Coefficients go together by their power of s: of a model with more zeros than the system, ``b1`` may be what is
+    ``b0`` in truth. Those of a model with another number of poles have nothing to be compared with.
+    """
+    wanted, errors = list(names), dict(row.get("standard_errors") or {})
+    values = dict(row.get("parameters") or {}) | {"delay": row.get("delay")}
+    b, a = row.get("numerator"), row.get("denominator")
+    poles, zeros = (sum(re.fullmatch(rf"{letter}\d+", name) is not None for name in wanted) for letter in "ab")
+    if a is not None and b is not None and poles == len(a) - 1 > 0:
+        values |= {f"a{k}": value for k, value in enumerate(a[1:], start=1)}
+        # A leading zero is dropped by the model; names keep their powers.
+        own = max(len(b), sum(re.fullmatch(r"b\d+", name) is not None for name in errors))
+        padded = dict(enumerate(b, start=own - len(b)))
+        shift = own - zeros
+        values |= {f"b{k}": padded.get(k + shift, 0.0) for k in range(zeros)}
+        errors |= {f"b{k}": errors.get(f"b{k + shift}") for k in range(zeros)} if shift else {}
+    return {name: values.get(name) for name in wanted}, {name: errors.get(name) for name in wanted}

@@ -26,8 +26,7 @@ from ctid_cli.storage.manifest import (
     row_columns,
     slots,
     swept_names,
-    true_delay,
-    true_parameters,
+    true_values,
 )
 from ctid_cli.storage.summary import is_converged
 
@@ -57,14 +56,14 @@ class Stored:
     def row(self, slot: Slot) -> dict[str, Any]:
         """The estimate row of one place, with ``true_delay`` and ``converged``."""
         row = assemble(slot, self.manifest, self.results[slot.key], self.seconds.get(slot.key))
-        delay, parameters = self._truths[slot.key.data_hash]
-        converged = is_converged(row, self.manifest["success"], delay, parameters)
-        return row | {"converged": converged, "true_delay": delay}
+        true = self._truths[slot.key.data_hash]
+        converged = is_converged(row, self.manifest["success"], true)
+        return row | {"converged": converged, "true_delay": true.get("delay")}
 
     @cached_property
-    def _truths(self) -> dict[str, tuple[float | None, dict[str, float] | None]]:
-        """True delay [s] and true parameters of every data cell."""
-        return {cell["hash"]: (true_delay(cell), true_parameters(cell)) for cell in self.manifest["data_cells"]}
+    def _truths(self) -> dict[str, dict[str, float]]:
+        """True values by name of every data cell."""
+        return {cell["hash"]: true_values(cell) for cell in self.manifest["data_cells"]}
 
     def rows(self) -> list[dict[str, Any]]:
         """All estimate rows, in the order of the sealed file."""

@@ -4,7 +4,7 @@ An estimate has *converged* if it satisfies every condition of the specification
 
 - ``delay_relative_error``: the estimated delay differs from the true one by at most this fraction of it;
 - ``fit_percent``: the fit on the record it was estimated from is at least this [%];
-- ``parameter_relative_error``: every parameter of the submodels differs from the true one by at most this fraction;
+- ``parameter_relative_error``: every parameter but the delay differs from the true one by at most this fraction;
 - ``band`` [rad/s] and ``by`` [s]: every frequency of a signal came into the band around the true one to stay there,
   counted from the start, and after its last step from that.
 
@@ -15,31 +15,28 @@ counts in every percentage. Without ``success``, or without true values to compa
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from ctid_cli.inference.monte_carlo import wilson_interval
 from ctid_cli.simulation.frequency_measures import is_settled
 from ctid_cli.storage import columns
+from ctid_cli.storage.manifest import found_values
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-def is_converged(
-    row: Mapping[str, Any],
-    success: Mapping[str, Any] | None,
-    true_delay: float | None,
-    true_parameters: Mapping[str, float] | None = None,
-) -> bool | None:
-    """Whether an estimate satisfies the success rule."""
+def is_converged(row: Mapping[str, Any], success: Mapping[str, Any] | None, truth: Mapping[str, float]) -> bool | None:
+    """Whether an estimate satisfies the success rule, from the true values by name."""
     rule = success or {}
     conditions = []
-    if rule.get("delay_relative_error") is not None and true_delay is not None:
-        conditions.append(_near(row["delay"], true_delay, rule["delay_relative_error"]))
-    if rule.get("parameter_relative_error") is not None and true_parameters is not None:
-        found, tolerance = row.get("parameters") or {}, rule["parameter_relative_error"]
-        conditions.append(all(_near(found.get(name), true, tolerance) for name, true in true_parameters.items()))
+    if rule.get("delay_relative_error") is not None and "delay" in truth:
+        conditions.append(_near(row["delay"], truth["delay"], rule["delay_relative_error"]))
+    others = truth.keys() - {"delay"}
+    if rule.get("parameter_relative_error") is not None and others:
+        found, tolerance = found_values(row, truth)[0], rule["parameter_relative_error"]
+        conditions.append(all(_near(found[name], truth[name], tolerance) for name in others))
     if rule.get("band") is not None:
         conditions.append(is_settled(row.get("measures"), rule["band"], rule.get("by")))
     if rule.get("fit_percent") is not None:
@@ -51,31 +48,6 @@ def is_converged(
 
 def _near(value: float | None, true: float, tolerance: float) -> bool:
     return value is not None and abs(value - true) <= tolerance * abs(true)
-
-
-def wilson_interval(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval for a proportion.
-
-    With z the normal quantile and p = k / n, the limits are
-    ``(p + z^2 / 2n -+ z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)``. They stay inside [0, 1] and are useful for
-    few trials and for proportions of 0 and 1.
-    """
-    if not 0 <= k <= n:
-        raise ValueError(f"successes must lie between 0 and the number of trials; got {k} of {n}")
-    if n == 0:
-        return math.nan, math.nan
-    # SciPy is slow to load, and most who read results need no interval.
-    from ctid_cli.inference.quantile import normal_quantile
-
-    z = normal_quantile(level)
-    p = k / n
-    centre = p + z**2 / (2 * n)
-    half = z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
-    scale = 1 + z**2 / n
-    # Rounding would otherwise leave 0 or 1 by a hair.
-    low = 0.0 if k == 0 else (centre - half) / scale
-    high = 1.0 if k == n else (centre + half) / scale
-    return low, high
 
 
 def summarise(estimates: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:

@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.arrays import Array
+from ctid_cli.inference import monte_carlo
+from ctid_cli.inference.monte_carlo import Sample
 from ctid_cli.inference.quantile import normal_quantile, student_quantile
 from ctid_cli.reporting.layout import Table
-from ctid_cli.reporting.parameter_errors import error_statistics
+from ctid_cli.reporting.parameter_errors import estimates_by_group
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import spec_from_canonical
@@ -26,47 +28,44 @@ ROWS = {
 }
 
 
-def named(numerator: Any, denominator: Any, delay: float) -> dict[str, float]:
-    """Coefficients of the monic denominator, of the numerator, and the delay [s]."""
-    names = [f"a{k}" for k in range(1, len(denominator))] + [f"b{k}" for k in range(len(numerator))]
-    return dict(zip(names, [*denominator[1:], *numerator], strict=True)) | {"delay": delay}
-
-
 @cache
 def coverage(results: Results) -> list[dict[str, Any]]:
     """Coverage, ratio of standard errors and bias: a line for each formula and parameter."""
     plan = build_plan(spec_from_canonical(dict(results.settings)))
-    system = plan.data_cells[0].source.system
-    rows = [row for row in results.rows if row["delay"] is not None]
-    truth = named(system.numerator, system.denominator, system.delay)
-    # A known delay is no parameter.
-    truth = {name: truth[name] for name in truth if name in rows[0]["standard_errors"]}
-    found_in = [named(row["numerator"], row["denominator"], row["delay"]) for row in rows]
-    estimates = np.array([[values[name] for name in truth] for values in found_in])
-    white = np.array([[row["standard_errors"][name] for name in truth] for row in rows], dtype=float)
-    formulas = {"white": (white, np.ones(len(rows)))}
+    (found,) = estimates_by_group(results)
+    with_value = np.flatnonzero(np.isfinite(found.values).all(axis=1))
+    # Standard errors by formula, and how many of them the interval reaches, over the normal quantile.
+    formulas = {"white": (found.standard_errors[with_value], np.ones(with_value.size))}
     if plan.data_cells[0].source.noise.coloured:
         # Coloured noise is what the sandwich is meant for; the estimator stores the white formula, misused here.
-        formulas = {"sandwich, t": _robust(plan, [row["replicate"] for row in rows]), **formulas}
+        formulas = {"sandwich, t": _robust(plan, [found.replicates[k] for k in with_value]), **formulas}
     letter, _ = ROWS[last_part(results.experiment)]
     lines = []
     for formula, (widths, reach) in formulas.items():
-        for (name, true), found, width in zip(truth.items(), estimates.T, widths.T, strict=True):
-            statistics, mean_error = error_statistics(found - true, reach * width), float(np.nanmean(width))
+        for name, true, values, width in zip(
+            found.names, found.truth, found.values[with_value].T, widths.T, strict=True
+        ):
+            sample, mean_error = Sample(values - true, reach * width), float(np.nanmean(width))
+            percent, bias, deviation = (
+                measure(sample) for measure in (monte_carlo.coverage, monte_carlo.bias, monte_carlo.deviation)
+            )
             lines.append(
                 {
                     "row": letter,
                     "formula": formula,
                     "parameter": name,
                     "true": float(true),
-                    "runs": found.size,
-                    "not_converged": sum(row["status"] != "CONVERGED" for row in rows),
-                    **{name: statistics[name] for name in ("covered", "low", "high", "bias")},
-                    "percent": statistics["coverage"],
-                    "standard_deviation": statistics["deviation"],
+                    "runs": values.size,
+                    "not_converged": found.not_converged,
+                    "covered": int(monte_carlo.covered(sample).sum()),
+                    "low": percent.low,
+                    "high": percent.high,
+                    "bias": bias.value,
+                    "percent": percent.value,
+                    "standard_deviation": deviation.value,
                     "mean_standard_error": mean_error,
-                    "standard_error_ratio": mean_error / statistics["deviation"],
-                    "bias_in_monte_carlo_errors": statistics["bias_per_error"],
+                    "standard_error_ratio": mean_error / deviation.value,
+                    "bias_in_monte_carlo_errors": bias.value / bias.error,
                     "misused": formula != next(iter(formulas)),
                 }
             )

@@ -7,7 +7,7 @@ from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.identity import Origin
-from ctid_cli.storage.manifest import Key, true_parameters
+from ctid_cli.storage.manifest import Key, true_values
 from ctid_cli.storage.store import Stored
 
 #: Two modes, two numbers of samples, and an estimator of each form.
@@ -74,7 +74,8 @@ def ideal_results(plan, folder, *, bias=None, width=None, seed=1):
     their standard errors.
     """
     variances = long_record_variances(plan)
-    truth = true_parameters(plan.manifest()["data_cells"][0])
+    truth = true_values(plan.manifest()["data_cells"][0])
+    del truth["delay"]
     rng = np.random.default_rng(seed)
     found = {}
     for k, cell in enumerate(plan.data_cells):

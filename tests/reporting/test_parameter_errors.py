@@ -9,6 +9,7 @@ import pytest
 
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.asymptotic import limiting_accuracy
+from ctid_cli.inference.monte_carlo import wilson_interval
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.reporting.expected_accuracy import long_record_variances
 from ctid_cli.reporting.parameter_errors import mse_ratio, parameter_errors, parameter_estimates
@@ -16,7 +17,6 @@ from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
-from ctid_cli.storage.summary import wilson_interval
 from tests.reporting.ideal_results import TWO_MODES, estimate, ideal_results, plan_of, results_of
 
 NAMES = ("g1_a1", "g1_a2", "g1_b0", "g2_a1", "g2_a2", "g2_b0")

@@ -2,13 +2,13 @@ import json
 
 import pytest
 
+from ctid_cli.inference.monte_carlo import wilson_interval
 from ctid_cli.reporting.layout import Report, csv_text, write_reports
 from ctid_cli.reporting.percentages import experiment_rows, settings_of, study_rows
 from ctid_cli.reporting.results import differences
 from ctid_cli.reporting.study import load_study
 from ctid_cli.reporting.table_blocks import study_blocks
 from ctid_cli.reporting.tables import experiment_report
-from ctid_cli.storage.summary import wilson_interval
 
 RANDOM = "uniform(0, 9)"
 

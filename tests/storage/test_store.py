@@ -15,7 +15,7 @@ from ctid_cli.storage.columns import failed, no_result
 from ctid_cli.storage.folder import experiment_folders
 from ctid_cli.storage.identity import origin_of
 from ctid_cli.storage.journal import open_journal, read_journal
-from ctid_cli.storage.manifest import slots, true_parameters
+from ctid_cli.storage.manifest import slots, true_values
 from ctid_cli.storage.sealed import read_sealed, seal_image
 from ctid_cli.storage.store import experiment_status, find_estimate, load_estimates, read_stored
 from ctid_cli.storage.summary import export_rows
@@ -202,13 +202,17 @@ def test_parameters_of_submodels_are_sealed(tmp_path: Path) -> None:
     assert not any("parameters" in row for row in read_stored(tmp_path).rows())
 
 
-def test_true_parameters_are_those_of_the_sorted_submodels(tmp_path: Path) -> None:
+def test_true_values_are_those_of_the_estimated_form(tmp_path: Path) -> None:
     plain = FakePlan(Toy(), runs=1, levels=(1,)).manifest()  # type: ignore[arg-type]
     manifest = additive(plain)
-    assert true_parameters(plain["data_cells"][0]) is None
-    truth = true_parameters(manifest["data_cells"][0])
-    assert truth == {"g1_a1": 2.0, "g1_b0": 3.0, "g2_a1": 0.1, "g2_b0": 2.0}
-    assert true_parameters({"content": {"data": {}}}) is None
+    # Monic, and sums of submodels by rising natural frequency.
+    fraction = {"numerator": [0, 2.0], "denominator": [0.25, 0.7, 1.0], "delay": 8.0}
+    assert true_values({"content": {"system": fraction}}) == {"a1": 2.8, "a2": 4.0, "b0": 8.0, "delay": 8.0}
+    truth = true_values(manifest["data_cells"][0])
+    assert truth == {"g1_a1": 2.0, "g1_b0": 3.0, "g2_a1": 0.1, "g2_b0": 2.0, "delay": 0.0}
+    own = {"kind": "./tank.py:Tank", "area": 2.0, "truth": {"outflow": 0.4}}
+    assert true_values({"content": {"system": own}}) == {"outflow": 0.4}
+    assert true_values({"content": {"data": {}}}) == {}
     manifest["success"] = {"parameter_relative_error": 0.1}
     near, far = truth, truth | {"g2_b0": 2.3}
     results = {

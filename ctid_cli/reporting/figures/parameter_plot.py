@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ctid_cli.inference.monte_carlo import QUANTILE
 from ctid_cli.reporting.figures.style import BAND, DARK, MARK, MIDDLE, svg
-from ctid_cli.reporting.parameter_errors import QUANTILE, ParameterErrors
+from ctid_cli.reporting.parameter_errors import ParameterErrors
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -1,0 +1,227 @@
+"""What simulated data sets tell of an estimator, and how well so many of them tell it.
+
+The Monte Carlo standard errors are those of T. P. Morris, I. R. White and M. J. Crowther, Using simulation studies to
+evaluate statistical methods, Statistics in Medicine 38 (2019) 2074-2102, Table 6, with one change. Their formula for an
+empirical standard deviation holds for normal errors only: of exponential errors its 95 % intervals hold the truth in
+67 % of the cases, however many the data sets. The jackknife needs no such assumption, and is the same as their
+formulas for bias, mean square error and coverage. Intervals of what is positive are symmetric in its logarithm, and
+those of quantiles go from one order statistic to another.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.inference.quantile import normal_quantile, student_quantile
+
+#: Standard errors on either side of an estimate that make a 95 % interval.
+QUANTILE = normal_quantile()
+#: Standard deviation of normal values over the median of their sizes.
+NORMAL_MAD = 1.4826
+
+
+class Measured(NamedTuple):
+    """A measure, its Monte Carlo standard error, and its 95 % interval; None for what so few data sets do not tell."""
+
+    value: float | None = None
+    error: float | None = None
+    low: float | None = None
+    high: float | None = None
+
+
+class Sample(NamedTuple):
+    """Errors of one parameter over the data sets that have a value for it."""
+
+    #: Shape (n,).
+    errors: Array
+    #: Standard errors that the estimator gave; NaN where it gave none, shape (n,).
+    widths: Array
+    #: Least variance that an unbiased estimator can have; NaN where it is not known.
+    bound: float = math.nan
+
+
+def wilson_interval(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
+    """Wilson's score interval for a proportion.
+
+    With z the normal quantile and p = k / n, the limits are
+    ``(p + z^2 / 2n -+ z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)``. They stay inside [0, 1] and are useful for
+    few trials and for proportions of 0 and 1.
+    """
+    if not 0 <= k <= n:
+        raise ValueError(f"successes must lie between 0 and the number of trials; got {k} of {n}")
+    if n == 0:
+        return math.nan, math.nan
+    z = normal_quantile(level)
+    p = k / n
+    centre = p + z**2 / (2 * n)
+    half = z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
+    scale = 1 + z**2 / n
+    # Rounding would otherwise leave 0 or 1 by a hair.
+    low = 0.0 if k == 0 else (centre - half) / scale
+    high = 1.0 if k == n else (centre + half) / scale
+    return low, high
+
+
+def share(hits: BoolArray) -> Measured:
+    """How many of the data sets do [%], with Wilson's interval."""
+    n, k = hits.size, int(hits.sum())
+    if not n:
+        return Measured()
+    p, (low, high) = k / n, wilson_interval(k, n)
+    return Measured(100 * p, 100 * math.sqrt(p * (1 - p) / n), 100 * low, 100 * high)
+
+
+def of_means(statistic: Callable[..., Array], *columns: Array, positive: bool = True) -> Measured:
+    r"""A function of means over the data sets, with the error of the jackknife.
+
+    With ``r_(i)`` the value of all n data sets but i,
+
+    .. math:: s^2 = \frac{n-1}{n} \sum_i \left(r_{(i)} - \frac1n \sum_j r_{(j)}\right)^2.
+    """
+    n = columns[0].size
+    if not n:
+        return Measured()
+    sums = [column.sum() for column in columns]
+    with np.errstate(all="ignore"):  # what has no value is None
+        value = float(statistic(*(total / n for total in sums)))
+        if n == 1:
+            return Measured(_finite(value))
+        without = statistic(*((total - column) / (n - 1) for total, column in zip(sums, columns, strict=True)))
+        error = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
+        reach = student_quantile(n - 1) * error
+        if positive and value:
+            factor = float(np.exp(reach / value))
+            ends = (value / factor, value * factor)
+        else:
+            ends = (value - reach, value + reach)
+    return Measured(*map(_finite, (value, error, *ends)))
+
+
+def quantile(values: Array, level: float = 0.5) -> Measured:
+    """A quantile between the order statistics that hold it with 95 %, whatever the distribution; values may be inf.
+
+    The number of values below it is binomial. The error is that of a normal interval as wide.
+    """
+    from scipy.special import bdtr
+
+    n = values.size
+    if not n:
+        return Measured()
+    ordered, below = np.sort(values), bdtr(np.arange(float(n)), n, level)
+    first, last = int(np.searchsorted(below, 0.025, "right")) - 1, int(np.searchsorted(below, 0.975))
+    low = _finite(float(ordered[first])) if first >= 0 else None
+    high = _finite(float(ordered[last])) if last < n else None
+    error = None if low is None or high is None else (high - low) / (2 * QUANTILE)
+    before, part = divmod((n - 1) * level, 1.0)
+    k = int(before)
+    # Nothing is interpolated between values of which one is infinite, unless the quantile is a value itself.
+    value = float(ordered[k] if part == 0.0 else (1.0 - part) * ordered[k] + part * ordered[k + 1])
+    return Measured(_finite(value), error, low, high)
+
+
+def bias(sample: Sample) -> Measured:
+    """Mean error."""
+    return of_means(lambda mean: mean, sample.errors, positive=False)
+
+
+def deviation(sample: Sample) -> Measured:
+    """Standard deviation of the estimates."""
+    centred, n = _centred(sample)
+    return of_means(lambda m, s: _scatter(m, s, n), centred, centred**2) if n > 1 else Measured()
+
+
+def mean_square(sample: Sample) -> Measured:
+    """Mean square error."""
+    return of_means(lambda mean: mean, sample.errors**2)
+
+
+def root_mean_square(sample: Sample) -> Measured:
+    """Root of the mean square error."""
+    return of_means(np.sqrt, sample.errors**2)
+
+
+def robust_deviation(sample: Sample) -> Measured:
+    """Standard deviation from the median distance to the median, which outliers hardly change."""
+    if not sample.errors.size:
+        return Measured()
+    return quantile(NORMAL_MAD * np.abs(sample.errors - np.median(sample.errors)))
+
+
+def standard_error(sample: Sample) -> Measured:
+    """Root mean square of the standard errors that the estimator gave."""
+    return of_means(np.sqrt, sample.widths[np.isfinite(sample.widths)] ** 2)
+
+
+def error_ratio(sample: Sample) -> Measured:
+    """The same over the standard deviation of the estimates: below 1, intervals are too short."""
+    known, (centred, n) = np.isfinite(sample.widths), _centred(sample)
+    squares = np.where(known, sample.widths, 0.0) ** 2
+    if n < 2:
+        return Measured()
+    return of_means(
+        lambda m, s, w, share: np.sqrt(w / share) / _scatter(m, s, n), centred, centred**2, squares, known.astype(float)
+    )
+
+
+def covered(sample: Sample) -> BoolArray:
+    """Which 95 % intervals hold the true value; a standard error that could not be computed covers nothing."""
+    return np.abs(sample.errors) <= QUANTILE * sample.widths
+
+
+def coverage(sample: Sample) -> Measured:
+    """How many of the 95 % intervals hold the true value [%]."""
+    return share(covered(sample)) if np.isfinite(sample.widths).any() else Measured()
+
+
+def efficiency(sample: Sample) -> Measured:
+    """Least possible variance over the mean square error [%]."""
+    return of_means(lambda mean: 100.0 * sample.bound / mean, sample.errors**2)
+
+
+def _centred(sample: Sample) -> tuple[Array, int]:
+    n = sample.errors.size
+    return (sample.errors - sample.errors.mean() if n else sample.errors), n
+
+
+def _scatter(mean: Array, square: Array, n: int) -> Array:
+    # Rounding may leave the variance of equal values below zero.
+    return np.sqrt(np.maximum(square - mean**2, 0.0) * n / (n - 1))
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+@dataclass(frozen=True)
+class Measure:
+    """What can be asked for by name."""
+
+    meaning: str
+    #: ``""`` stands for that of the parameter, ``^2`` for its square.
+    unit: str
+    #: What it is computed from: errors of parameters, or what an estimate has one of.
+    source: Literal["errors", "converged", "status", "cpu_seconds"]
+    compute: Callable[..., Measured]
+
+
+#: All measures by name.
+MEASURES: Mapping[str, Measure] = {
+    "percent": Measure("estimates that meet the success rule", "%", "converged", share),
+    "bias": Measure("mean error", "", "errors", bias),
+    "deviation": Measure("empirical standard deviation", "", "errors", deviation),
+    "mse": Measure("mean square error", "^2", "errors", mean_square),
+    "rmse": Measure("root mean square error", "", "errors", root_mean_square),
+    "median_bias": Measure("median error", "", "errors", lambda sample: quantile(sample.errors)),
+    "robust_deviation": Measure("1.4826 times the median distance to the median", "", "errors", robust_deviation),
+    "standard_error": Measure("root mean square of the model's standard errors", "", "errors", standard_error),
+    "error_ratio": Measure("the model's standard error over the empirical deviation", "-", "errors", error_ratio),
+    "coverage": Measure("95 % intervals that hold the true value", "%", "errors", coverage),
+    "efficiency": Measure("least possible variance over the mean square error", "%", "errors", efficiency),
+    "failures": Measure("estimates with each status but success", "%", "status", share),
+    "cpu": Measure("median CPU time of one estimate", "s", "cpu_seconds", quantile),
+    "cpu_90": Measure("CPU time that 90 % of the estimates stay below", "s", "cpu_seconds", lambda s: quantile(s, 0.9)),
+}

@@ -1,0 +1,115 @@
+"""Measures of the estimates of an experiment, each with its Monte Carlo error: what tables, figures and pages read.
+
+Keys of a row
+-------------
+- ``table``, ``experiment``, ``sampling``, one key per swept field, ``initial_delay``, ``method``: as in percentages.
+- ``measure``: as it was asked for; ``parameter``: what it is about, None for the estimate as a whole, the status where
+  failures are counted; ``unit``.
+- ``value`` with its Monte Carlo standard error ``error`` and 95 % interval from ``low`` to ``high``; None where the
+  data sets do not tell.
+- ``n``: data sets; ``failed``: those without a result; ``without_value``: those that ``value`` could not count, with
+  those that failed.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ctid_cli.arrays import Array
+from ctid_cli.errors import UsageError
+from ctid_cli.inference.monte_carlo import MEASURES, Measure, Measured
+from ctid_cli.inference.status import Status
+from ctid_cli.reporting.estimate import Units
+from ctid_cli.reporting.parameter_errors import ParameterEstimates, estimates_by_group
+from ctid_cli.reporting.percentages import Row, labelled_groups
+from ctid_cli.reporting.results import Results
+from ctid_cli.storage.columns import FAILURES
+from ctid_cli.storage.manifest import true_values
+from ctid_cli.text import did_you_mean
+
+#: Statuses of estimates with which nothing is wrong.
+SUCCESSES = {Status.CONVERGED.name, Status.LEAST_SQUARES.name, "VALID"}
+#: What is measured where the specification does not say.
+DEFAULT = ("bias", "rmse")
+
+#: A parameter or status, what was measured of it, its unit, and how many estimates have no value.
+Found = tuple[str | None, Measured, str, int]
+
+
+def measure_rows(results: Results, names: Sequence[str]) -> list[Row]:
+    """Measures by name, of every combination of swept fields, estimator and start that was planned."""
+    wanted = {name: _known(name, results) for name in names}
+    groups = results.groups()
+    of_errors = any(measure.source == "errors" for measure in wanted.values())
+    estimates = {one.group: one for one in estimates_by_group(results)} if of_errors else {}
+    statuses = sorted({row["status"] for row in results.rows} - SUCCESSES) or ["FAILED"]
+    rows = []
+    for group, labels in labelled_groups(results):
+        members = groups.get(group, [])
+        counts = {"n": len(members), "failed": sum(row["status"] in FAILURES for row in members)}
+        for name, measure in wanted.items():
+            if not members:
+                found: Iterator[Found] = iter([(None, Measured(), measure.unit, 0)])
+            elif measure.source == "errors":
+                found = _of_errors(measure, estimates[group])
+            else:
+                found = _of_estimates(measure, members, statuses)
+            rows += [
+                labels
+                | {"parameter": parameter, "measure": name, "unit": unit, **measured._asdict()}
+                | counts
+                | {"without_value": without}
+                for parameter, measured, unit, without in found
+            ]
+    return rows
+
+
+def default_measures(results: Results) -> Sequence[str]:
+    """What the specification asks for, or else bias and root mean square error."""
+    asked: Sequence[str] = results.settings.get("measures") or DEFAULT
+    return asked
+
+
+def _known(name: str, results: Results) -> Measure:
+    if name not in MEASURES:
+        hint = did_you_mean(name, MEASURES) or "."
+        raise UsageError(f"there is no measure {name!r}{hint} Known: {', '.join(MEASURES)}")
+    measure = MEASURES[name]
+    if measure.source == "errors" and not any(map(true_values, results.manifest["data_cells"])):
+        others = ", ".join(key for key, item in MEASURES.items() if item.source != "errors")
+        reason = "needs true values, and only a simulated system has them"
+        raise UsageError(f"{results.experiment}: {name} {reason}; use {others}")
+    if measure.source == "converged" and not results.settings.get("success"):
+        reason = "needs a rule by which an estimate counts as converged, and the specification has no success section"
+        raise UsageError(f"{results.experiment}: {name} {reason}; use {', '.join(DEFAULT)}")
+    return measure
+
+
+def _of_errors(measure: Measure, estimates: ParameterEstimates) -> Iterator[Found]:
+    """A measure of every parameter."""
+    for k, name in enumerate(estimates.names):
+        sample, own = estimates.sample(k), parameter_unit(name, estimates.names)
+        unit = {"": own, "^2": f"({own})^2"}.get(measure.unit, measure.unit)
+        yield name, measure.compute(sample), unit, estimates.runs - sample.errors.size
+
+
+def parameter_unit(name: str, names: Sequence[str]) -> str:
+    """Unit of one of the parameters of a system; ``-`` of those that are not known here."""
+    if re.fullmatch(r"[ab]\d+|delay", name):
+        poles, coefficients = (sum(other[0] == letter and other != "delay" for other in names) for letter in "ab")
+        return Units().of(name, poles, coefficients - 1)
+    return Units().of_submodel(name) if re.fullmatch(r"g\d+_[ab]\d+", name) else "-"
+
+
+def _of_estimates(measure: Measure, rows: Sequence[Mapping[str, Any]], statuses: Sequence[str]) -> Iterator[Found]:
+    """A measure of what an estimate has one of."""
+    if measure.source == "status":
+        found = np.array([row["status"] for row in rows])
+        for status in statuses:
+            yield status, measure.compute(found == status), measure.unit, 0
+        return
+    known = [row[measure.source] for row in rows if row.get(measure.source) is not None]
+    values: Array = np.array(known, dtype=bool if measure.source == "converged" else float)
+    yield None, measure.compute(values), measure.unit, len(rows) - len(known)

@@ -1,0 +1,105 @@
+"""Measures of experiments: who counts, under which names, and what is refused."""
+
+import numpy as np
+import pytest
+
+from ctid_cli.errors import UsageError
+from ctid_cli.reporting.measures import default_measures, measure_rows
+from ctid_cli.reporting.percentages import experiment_rows
+
+DELAYS = (8.1, 7.9, 8.4)
+
+
+@pytest.fixture
+def results(make_results, estimate):
+    found = [estimate(delay) for delay in DELAYS]
+    return make_results({(5.0, "0.0"): [*found, estimate(None, status="FAILED")], (15.0, "0.0"): found})
+
+
+def rows_of(results, *names):
+    return [row for row in measure_rows(results, names) if (row["snr_db"], row["initial_delay"]) == (5.0, 0.0)]
+
+
+def test_a_row_says_of_what_and_of_how_many(results):
+    (row,) = (row for row in rows_of(results, "bias") if row["parameter"] == "delay")
+    assert row == {
+        "table": "useful-redundancy/case1-regular",
+        "experiment": "useful-redundancy/case1-regular",
+        "sampling": "regular",
+        "snr_db": 5.0,
+        "initial_delay": 0.0,
+        "method": "existing",
+        "parameter": "delay",
+        "measure": "bias",
+        "unit": "s",
+        "n": 4,
+        "failed": 1,
+        "without_value": 1,
+        "value": pytest.approx(np.mean(DELAYS) - 8.0),
+        "error": pytest.approx(np.std(DELAYS, ddof=1) / np.sqrt(3)),
+        "low": pytest.approx(-0.49183, abs=1e-4),  # Student's quantile is 4.303
+        "high": pytest.approx(0.75849, abs=1e-4),
+    }
+    units = {row["parameter"]: row["unit"] for row in rows_of(results, "mse")}
+    assert units == {"a1": "(1/s)^2", "a2": "(1/s^2)^2", "b0": "(out/in/s^2)^2", "delay": "(s)^2"}
+
+
+def test_measures_come_for_every_planned_cell_in_the_order_asked_for(results):
+    rows = measure_rows(results, ["rmse", "percent"])
+    places = [tuple(row[key] for key in ("snr_db", "initial_delay")) for row in experiment_rows(results)]
+    assert list(dict.fromkeys((row["snr_db"], row["initial_delay"]) for row in rows)) == places
+    assert [row["measure"] for row in rows_of(results, "rmse", "percent")] == ["rmse"] * 4 + ["percent"]
+    empty = [row for row in rows if row["initial_delay"] == "random"]
+    assert {(row["n"], row["value"], row["parameter"]) for row in empty} == {(0, None, None)}
+
+
+def test_percentages_are_those_of_the_table(results):
+    (row,), (cell, *_) = rows_of(results, "percent"), experiment_rows(results)
+    assert [row[key] for key in ("value", "low", "high", "n")] == [cell[key] for key in ("percent", "low", "high", "n")]
+
+
+def test_coefficients_go_together_by_their_power(make_results, estimate):
+    # b0 p + b1 against b0 in truth; names of standard errors count the zeros where the leading one was dropped.
+    errors = {"a1": 0.1, "a2": 0.2, "b0": 9.0, "b1": 0.4, "delay": 0.01}
+    two = [estimate(8.1, numerator=b, standard_errors=errors) for b in ((0.5, 8.3), (7.9,), (8.1,))]
+    found = {row["parameter"]: row for row in rows_of(make_results({(5.0, "0.0"): two}), "bias", "coverage")}
+    assert found["b0"]["value"] == 100.0
+    assert found["b0"]["without_value"] == 0
+    bias = {row["parameter"]: row["value"] for row in rows_of(make_results({(5.0, "0.0"): two}), "bias")}
+    assert bias == pytest.approx({"a1": 0.0, "a2": 0.0, "b0": 0.1, "delay": 0.1})
+    # Of a model with another number of poles only the delay has a true value.
+    three = [estimate(8.1, denominator=(1.0, 2.0, 3.0, 4.0))] * 2
+    found = rows_of(make_results({(5.0, "0.0"): three}), "bias")
+    assert {row["parameter"]: row["without_value"] for row in found} == {"a1": 2, "a2": 2, "b0": 2, "delay": 0}
+
+
+def test_a_delay_that_was_given_is_no_estimate(make_results, estimate):
+    given = [estimate(8.0, numerator=(b,), standard_errors={"b0": 0.1}) for b in (8.1, 7.9)]
+    assert [row["parameter"] for row in rows_of(make_results({(5.0, "0.0"): given}), "bias")] == ["a1", "a2", "b0"]
+
+
+def test_failures_are_counted_by_kind(make_results, estimate):
+    found = [estimate(8.0), estimate(None, status="FAILED"), estimate(8.1, status="MAX_ITERATIONS"), estimate(8.0)]
+    results = make_results({(5.0, "0.0"): found, (15.0, "0.0"): found[:1]})
+    rows = [row for row in measure_rows(results, ["failures"]) if row["n"]]
+    assert [(row["snr_db"], row["parameter"], row["value"]) for row in rows] == [
+        *((5.0, "FAILED", 25.0), (5.0, "MAX_ITERATIONS", 25.0)),
+        *((15.0, "FAILED", 0.0), (15.0, "MAX_ITERATIONS", 0.0)),
+    ]
+
+
+def test_what_cannot_be_measured_is_refused_in_a_sentence(results, make_results, estimate):
+    with pytest.raises(UsageError, match=r"no measure 'rsme'; did you mean 'rmse'\? Known: percent, bias"):
+        measure_rows(results, ["bias", "rsme"])
+    without = make_results({(5.0, "0.0"): [estimate(8.0)]}, success=None)
+    with pytest.raises(UsageError, match=r"percent needs a rule .* no success section; use bias, rmse"):
+        measure_rows(without, ["percent"])
+    for cell in without.manifest["data_cells"]:
+        cell["content"].pop("system")
+    with pytest.raises(UsageError, match=r"bias needs true values.*use percent, failures, cpu"):
+        measure_rows(without, ["bias"])
+
+
+def test_the_specification_sets_the_default(results, make_results):
+    assert default_measures(results) == ("bias", "rmse")
+    assert default_measures(make_results({}, measures=["coverage"])) == ["coverage"]
