@@ -147,8 +147,6 @@ def _closed_loop(plant: SampledModel, law: SampledModel, r: Array, v: Array, bef
 
 def loop_radius(model: AdditiveModel | TransferFunction, controller: Controller, interval: float) -> float:
     """Largest magnitude of the poles of the sampled loop: it is stable below 1."""
-    from scipy.linalg import block_diag  # slow to import
-
     sampled = sampled_model(model, interval)
     discrete = _realised(controller)
     _require_solvable(sampled, discrete)
@@ -157,12 +155,17 @@ def loop_radius(model: AdditiveModel | TransferFunction, controller: Controller,
     # Without reference and noise u = Cc s - Dc x and x = C z + D u.
     u = np.hstack((-Dc @ C, Cc)) / (1.0 + Dc * D)
     x = np.hstack((C, np.zeros((1, len(Ac))))) + D @ u
-    dynamics = block_diag(A, Ac) + np.vstack((B @ u, -Bc @ x))
+    n = len(A)
+    dynamics = np.vstack((B @ u, -Bc @ x))
+    dynamics[:n, :n] += A
+    dynamics[n:, n:] += Ac
     return float(np.abs(np.linalg.eigvals(dynamics)).max(initial=0.0))
 
 
 def _realised(controller: Controller) -> DiscreteController:
     """The controller with a state space."""
+    if isinstance(controller, DiscreteController):
+        return controller
     return DiscreteController(controller.numerator, controller.denominator)
 
 

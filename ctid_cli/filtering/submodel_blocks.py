@@ -1,4 +1,4 @@
-"""One block of the pass over a sum of submodels: modes, integrals, and the noise-free loop."""
+"""Parts of the pass over a sum of submodels: a block of modes and integrals, and the input of the noise-free loop."""
 
 from typing import NamedTuple
 
@@ -81,75 +81,65 @@ def input_block(
     value_block(clock, source, held, count, block)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def loop_block(
-    modes: PooledModes,
-    clock: Clock,
-    loop: LoopData,
-    start: int,
-    count: int,
-    states: ComplexArray,
-    integrals: Array,
-    memory: Array,
-    v: Array,
-) -> None:
-    """Input of the noise-free loop over a block; the states of the model are left as they are for the caller's pass.
-
-    ``memory`` is the state of the controller in its transposed direct form II.
-    """
-    part, fraction, shift, order = clock.part, clock.fraction, clock.shift, memory.size
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def loop_input(modes: PooledModes, clock: Clock, loop: LoopData) -> Array:
+    """Input of the noise-free loop of the model, at rest before the first sample; nothing in open loop, shape (N,)."""
+    shift, order = clock.shift, loop.numerator.size - 1
     reference, numerator, denominator, at_controller = loop
-    origin, direct = modes.origin, modes.direct
-    z_re, z_im = states[:, 0].real.copy(), states[:, 0].imag.copy()
-    r_re, r_im = modes.residues.real.copy(), modes.residues.imag.copy()
+    v = np.zeros(reference.size)
+    z_re, z_im = np.zeros(modes.poles.size), np.zeros(modes.poles.size)
+    integrals = np.zeros(modes.origin.size)
     d_re, d_im = clock.whole[:, 0].real.copy(), clock.whole[:, 0].imag.copy()
     b_re, b_im = clock.whole[:, 2].real.copy(), clock.whole[:, 2].imag.copy()
-    s = integrals.copy()
-    now = np.zeros(s.size)
-    # The controller's direct part and, if the model has one without delay, the model's close an algebraic loop.
-    own = direct if shift == 0 else 0.0
+    # x is read a fraction of an interval after the break: its weights there, and what the held input has added by then.
+    late = modes.residues * clock.part[:, 0]
+    gain = (modes.residues * clock.part[:, 2]).real.sum() + modes.direct
+    origin = np.zeros(integrals.size)
+    for m in range(integrals.size + 1):
+        # What becomes of one in an integral, or in the input.
+        unit = np.zeros(integrals.size)
+        unit[m : m + 1] = 1.0
+        _integrate(unit, clock.fraction * clock.interval, 1.0 if m == unit.size else 0.0, 0.0)
+        if m < unit.size:
+            origin[m] = modes.origin @ unit
+        else:
+            gain += modes.origin @ unit
+    # What the states make of the next output need not wait for the input of this sample, which then adds to it.
+    ahead = late * clock.whole[:, 0]
+    r_re, r_im = ahead.real.copy(), ahead.imag.copy()
+    free, last, kick = 0.0, 0.0, (late * clock.whole[:, 2]).real.sum()
+    # The controller in its transposed direct form II, with a zero behind its states. Its direct part and, if the model
+    # has one without delay, the model's close an algebraic loop.
+    memory = np.zeros(order + 1)
+    own = modes.direct if shift == 0 else 0.0
     first = numerator[0]
     closing = 1.0 / (1.0 + first * own)
-    for k in range(start, start + count):
+    for k in range(v.size):
         # x_k as far as the inputs before sample k make it.
-        j = k - shift
-        x = 0.0
-        before = v[j] if 0 <= j < k else 0.0
-        if j >= 0:
-            for m in range(s.size):
-                now[m] = s[m]
-            if fraction > 0.0:
-                for i in range(z_re.size):
-                    z_now = part[i, 0] * complex(z_re[i], z_im[i]) + part[i, 2] * before
-                    x += r_re[i] * z_now.real - r_im[i] * z_now.imag
-                _integrate(now, fraction * clock.interval, before, 0.0)
-            else:
-                for i in range(z_re.size):
-                    x += r_re[i] * z_re[i] - r_im[i] * z_im[i]
-            for m in range(s.size):
-                x += origin[m] * now[m]
-            if j < k:
-                x += direct * before
+        arrived = v[k - shift] if 0 < shift <= k else 0.0
+        x = (free + gain * arrived) + kick * last
+        for m in range(integrals.size):
+            x += origin[m] * integrals[m]
         # v_k = C (r - x), or r - C x: solved for v_k where it acts on x_k itself.
-        held = memory[0] if order else 0.0
-        if at_controller:
-            error = reference[k] - x
-            value = (held + first * error) * closing
-        else:
-            error = -x
-            value = (held + first * error + reference[k]) * closing
+        error = reference[k] - x if at_controller else -x
+        value = memory[0] + first * error
+        if not at_controller:
+            value += reference[k]
+        value *= closing
         v[k] = value
-        # Whole intervals of the model on copies of its states, driven by the input that arrives.
-        if j >= 0:
-            driven = value if j == k else before
-            for i in range(z_re.size):
-                re = z_re[i]
-                z_re[i] = (d_re[i] * re - d_im[i] * z_im[i]) + b_re[i] * driven
-                z_im[i] = (d_re[i] * z_im[i] + d_im[i] * re) + b_im[i] * driven
-            _integrate(s, clock.interval, driven, 0.0)
+        # The model over a whole interval, driven by the input that arrives.
+        last = value if shift == 0 else arrived
+        free = 0.0
+        for i in range(z_re.size):
+            re, im = z_re[i], z_im[i]
+            free += r_re[i] * re - r_im[i] * im
+            z_re[i] = (d_re[i] * re - d_im[i] * im) + b_re[i] * last
+            z_im[i] = (d_re[i] * im + d_im[i] * re) + b_im[i] * last
+        if integrals.size:
+            _integrate(integrals, clock.interval, last, 0.0)
         # The controller's state sees the whole error, with what v_k itself has added to x_k.
         error -= own * value
-        response = held + first * error
+        response = memory[0] + first * error
         for m in range(order):
-            following = memory[m + 1] if m + 1 < order else 0.0
-            memory[m] = numerator[m + 1] * error - denominator[m + 1] * response + following
+            memory[m] = numerator[m + 1] * error - denominator[m + 1] * response + memory[m + 1]
+    return v

@@ -40,7 +40,8 @@ def _product(left: Array, right: Array, count: int) -> Array:
 class RowLayout(NamedTuple):
     """Places of the rows of the compiled pass.
 
-    They are ``z, w, integrals of v, v, e, y - x``, and in closed loop ``z_u, integrals of u, u``; the first of each.
+    They are ``z, w, integrals of v, v, y - x, e``, and in closed loop ``z_u, integrals of u, u``; the first of each.
+    psi is made of those before y - x, so that only the products of the rows up to it with all are summed.
     """
 
     #: Rows of z, as many as of w, e and z_u: one for a real pole, two for a pair.
@@ -96,13 +97,13 @@ class _Part(NamedTuple):
 @njit(cache=True, nogil=True)
 def _row_layout(degrees: IntArray, closed: bool) -> RowLayout:
     n, integrals = degrees[:, 0].sum(), degrees[:, 2].sum()
-    error = 3 * n + integrals + 1
+    error = 2 * n + integrals + 1
     # In open loop the rows of z and w are those of the measured input too, and what follows them is shared.
-    u_modes = error + 1 if closed else 0
+    u_modes = error + 1 + n if closed else 0
     u_integrals = u_modes + (n if closed else 2 * n)
     u_value = u_integrals + integrals
-    width = max(error, u_value) + 1
-    return RowLayout(n, integrals, 2 * n + integrals, error, u_modes, u_integrals, u_value, width)
+    width = max(error + n, u_value) + 1
+    return RowLayout(n, integrals, error - 1, error, u_modes, u_integrals, u_value, width)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -128,7 +129,7 @@ def _map_pole(part: _Part, pole: complex, slope: complex, curvature: complex, ro
             add_mode(maps, a_row, layout.modes + row, paired, -f / squared)
             add_mode(maps, a_row, row, paired, -(f_slope - f * curvature) / squared)
             # phi_a = -p^k/A of what the others leave of the output.
-            add_mode(maps, phi + a_row, layout.value + 1 + row, paired, -(power / reciprocal / slope))
+            add_mode(maps, phi + a_row, layout.error + 1 + row, paired, -(power / reciprocal / slope))
         if k <= zeros:
             # psi_b and phi_b = p^k/(p^l A) of v and of u.
             add_mode(maps, part.first_b + k, row, paired, power / slope)

@@ -4,7 +4,7 @@ All submodels are driven by one held input, so their modes are *pooled*: for eac
 advances ``z = 1/(s - p) v`` and ``w = 1/(s - p)^2 v`` of the instrument source v, and ``e = 1/(s - p)`` of what the
 other submodels leave of the output, ``y - sum of the other x_l``. In open loop v is the input u. In closed loop v is
 the input of the noise-free loop of the *model* with the controller, driven by the reference; the loop is simulated
-within the pass, and a further ``z_u = 1/(s - p) u`` of the measured input makes the model outputs.
+before the pass, and a further ``z_u = 1/(s - p) u`` of the measured input makes the model outputs.
 
 Everything is done block by block, mode by mode, see :mod:`ctid_cli.filtering.mode_blocks`.
 """
@@ -17,7 +17,7 @@ from ctid_cli.filtering.filter_data import FilterData, split_delay
 from ctid_cli.filtering.mode_blocks import Clock, Source, all_weights, first_rows, keep_used, output_block
 from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT
 from ctid_cli.filtering.row_sink import BLOCK, RowSink, emit, finish, row_sink
-from ctid_cli.filtering.submodel_blocks import LoopData, input_block, loop_block
+from ctid_cli.filtering.submodel_blocks import LoopData, input_block, loop_input
 from ctid_cli.filtering.submodel_map import PooledModes, pooled_modes
 
 
@@ -67,19 +67,16 @@ def _submodel_pass(
     closed = loop.reference.size > 0
     whole, part = all_weights(poles, data.interval), all_weights(poles, data.interval * fraction)
     clock = Clock(data.interval, shift, fraction, whole, part)
-    v = np.zeros(data.y.size if closed else 0)
+    v = loop_input(modes, clock, loop)
     # The rows of psi, driven by v, and those of phi and the model output, driven by u: in open loop the same.
     foh = data.input_foh and not closed
     instruments = Source(v if closed else data.u, foh, 0, layout.modes, 2 * layout.modes, layout.value)
     measured = Source(data.u, foh, layout.u_modes, -1, layout.u_integrals, layout.u_value)
-    integrals, memory = np.zeros((2, layout.integrals)), np.zeros(loop.numerator.size - 1)
+    integrals = np.zeros((2, layout.integrals))
     outputs, before = np.zeros((submodels, BLOCK)), np.zeros(submodels)
     written = 0
     for start in range(0, data.y.size, BLOCK):
         count = min(BLOCK, data.y.size - start)
-        if closed:
-            # From the states at the start of the block, which the next call advances.
-            loop_block(modes, clock, loop, start, count, states, integrals[0], memory, v)
         input_block(modes, first, clock, instruments, start - shift, count, states, integrals[0], block)
         if closed:
             input_block(modes, first, clock, measured, start - shift, count, states[:, 3:], integrals[1], block)
@@ -95,7 +92,7 @@ def _submodel_pass(
             for k in range(count):
                 outputs[i, k] += block[layout.error, k]
         for i in range(poles.size):
-            row, paired, left = layout.value + 1 + first[i], poles[i].imag != 0.0, outputs[modes.owner[i]]
+            row, paired, left = layout.error + 1 + first[i], poles[i].imag != 0.0, outputs[modes.owner[i]]
             last = before[modes.owner[i]]
             output_block(clock.whole[i], left, last, start > 0, data.y_foh, states[i], row, paired, count, block)
         # The next block's first step starts from here.
@@ -144,11 +141,11 @@ def filtered_submodels(
     """Rows of the pass, or their moments, and what makes psi, phi and the model output of them: one compiled entry.
 
     The condition of the partial fractions, above whose limit there is no pass; the row of the output error; the maps,
-    shape (2 p + 1, q); and rows or moments.
+    shape (2 p + 1, q); and rows, or the moments of those up to the error with all, shape (row + 1, q).
     """
     modes = pooled_modes(theta, degrees, loop.reference.size > 0)
     layout, submodels = modes.layout, degrees.shape[0]
-    sink = row_sink(layout.width, data.use, want_rows)
+    sink = row_sink(layout.width, data.use, want_rows, layout.error + 1)
     if modes.condition < MODAL_CONDITION_LIMIT:
         shift, fraction = split_delay(delay, data.interval)
         # A periodic input comes already late by whole intervals, and begins in its steady state.

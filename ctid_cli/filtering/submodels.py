@@ -110,13 +110,15 @@ class SubmodelFilter:
                 psi.T @ phi, psi.T @ error, psi.T @ psi, float(error @ error), float(output @ output)
             )
         row, maps, gram = fast
-        products = maps[:p] @ gram
+        # psi and the model output are made of the rows before that of the error.
+        leading = row + 1
+        products = maps[:p, :leading] @ gram
         return SubmodelMoments(
             products @ maps[p : 2 * p].T,
             products[:, row].copy(),
             products @ maps[:p].T,
             float(gram[row, row]),
-            float(maps[2 * p] @ gram @ maps[2 * p]),
+            float(maps[2 * p, :leading] @ gram @ maps[2 * p]),
         )
 
     def rows(self, theta: Array) -> tuple[Array, Array, Array, Array] | None:

@@ -52,7 +52,7 @@ class ParameterAccuracy:
         own = len(self.names) - int(self.names[-1] == "delay")
         size, delays = additive.theta.size, len(self.names) - own
         jacobian = np.zeros((size + delays, len(self.names)))
-        jacobian[:size, :own] = factored_jacobian(self.model, terms, own - self.model.order)
+        jacobian[:size, :own] = factored_jacobian(self.model, additive, own - self.model.order)
         jacobian[size:, own:] = np.eye(delays)
         names, values = additive.names + self.names[own:], np.concatenate([additive.theta, self.values[own:]])
         return ParameterAccuracy(additive, names, values, jacobian @ self.covariance @ jacobian.T)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -137,10 +138,12 @@ class Submodel(ContinuousModel):
         """Number of poles, integrators included, minus the declared number of zeros."""
         return int(self.order - (self.numerator.size - 1))
 
-    @property
+    @cached_property
     def poles(self) -> ComplexArray:
         """Roots of ``A_i`` and l times zero [rad/s], fastest first, shape (n + l,)."""
-        return sorted_roots(np.concatenate((self.denominator, np.zeros(self.integrators))))
+        poles = sorted_roots(np.concatenate((self.denominator, np.zeros(self.integrators))))
+        poles.setflags(write=False)
+        return poles
 
     @property
     def is_stable(self) -> bool:

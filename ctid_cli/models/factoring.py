@@ -63,10 +63,8 @@ def factored(model: TransferFunction, terms: Sequence[Term] | None = None) -> Ad
     return AdditiveModel(submodels, model.delay).sorted()
 
 
-def factored_jacobian(
-    model: TransferFunction, terms: Sequence[Term] | None = None, coefficients: int | None = None
-) -> Array:
-    r"""Derivatives of the parameters of :func:`factored` by the coefficients ``a_1 … a_n, b_m … b_0`` of the fraction.
+def factored_jacobian(model: TransferFunction, parts: AdditiveModel, coefficients: int | None = None) -> Array:
+    r"""Derivatives of the parameters of ``factored(model)`` by the coefficients ``a_1 … a_n, b_m … b_0`` of the model.
 
     Factoring undoes the sum of submodels whose numerators have full length, so they are the inverse of those of the
     sum. This holds for numerators of any length: of a full one the last ``coefficients`` are those of the model, or as
@@ -74,7 +72,7 @@ def factored_jacobian(
     """
     n = model.order
     away = int(np.flatnonzero(model.denominator)[-1])
-    there = np.delete(unfactored_jacobian(factored(model, terms)), np.s_[away:n], axis=0)
+    there = np.delete(unfactored_jacobian(parts), np.s_[away:n], axis=0)
     # Units of the coefficients may differ by hundreds of decades.
     rows = np.abs(there).max(axis=1, keepdims=True)
     columns = np.abs(there / rows).max(axis=0)

@@ -24,7 +24,7 @@ def additive_parameters(fit: Any, terms: Sequence[Term] | None) -> tuple[dict[st
     try:
         with np.errstate(all="ignore"):  # what overflows is refused
             model = factored(fit.model, terms)
-            jacobian = factored_jacobian(fit.model, terms)
+            jacobian = factored_jacobian(fit.model, model)
     except (DataError, np.linalg.LinAlgError):
         return None, {}
     a, b = fit.model.denominator, fit.model.numerator

@@ -141,7 +141,7 @@ def test_accuracy_is_that_of_the_unfactored_model():
     size = fraction.order + fraction.numerator.size
     coefficients = np.diag(np.concatenate((fraction.denominator[1:], fraction.numerator)) ** 2 * 1e-8)
     assert coefficients.shape == (size, size)
-    back = factored_jacobian(fraction)
+    back = factored_jacobian(fraction, factored(fraction))
     rows = by_name(factored(fraction), back @ coefficients @ back.T)
     whole = {row.name: row for row in derived_parameters(fraction, coefficients)}
     for submodel, number in ((1, 2), (2, 1)):

@@ -253,7 +253,7 @@ def test_the_two_forms_tell_the_same_of_one_submodel():
 def test_factoring_passes_the_covariance_on_by_its_derivatives():
     model = unfactored(TWO_MODES)
     accuracy = limiting_accuracy(model, INTERVAL, PID, **CLOSED)
-    jacobian = factored_jacobian(model)
+    jacobian = factored_jacobian(model, factored(model))
     expected = jacobian @ accuracy.covariance @ jacobian.T
     assert largest_relative_error(accuracy.factored().covariance, expected) < 1e-9
 

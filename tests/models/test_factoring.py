@@ -189,7 +189,7 @@ def test_factored_jacobian_is_that_of_central_differences(name):
     model = MODELS[name]
     fraction = unfactored(model)
     n, x = fraction.order, coefficients(fraction)
-    jacobian = factored_jacobian(fraction, model.terms)
+    jacobian = factored_jacobian(fraction, factored(fraction, model.terms))
 
     def function(x):
         return factored(TransferFunction(x[n:], np.append(1.0, x[:n])), model.terms).theta
@@ -208,7 +208,7 @@ def test_jacobians_are_inverse_to_each_other(name):
     # From coefficients to submodels and back: the identity, but for integrators, which are held at the origin.
     model = BEAM if name == "beam" else MODELS[name]
     fraction = unfactored(model)
-    there = factored_jacobian(fraction, model.terms)
+    there = factored_jacobian(fraction, factored(fraction, model.terms))
     back = unfactored_jacobian(factored(fraction, model.terms))
     product = back @ there
     n, b = fraction.order, fraction.numerator.size
@@ -225,7 +225,7 @@ def test_jacobians_are_inverse_to_each_other(name):
 
 def test_zero_integrator_columns():
     fraction = unfactored(MODELS["two integrators"])
-    jacobian = factored_jacobian(fraction)
+    jacobian = factored_jacobian(fraction, factored(fraction))
     assert not jacobian[:, [3, 4]].any()
     assert jacobian[:, :3].any(axis=0).all()
 
@@ -244,7 +244,5 @@ def test_zero_integrator_columns():
     ],
 )
 def test_what_is_no_such_sum_is_refused(fraction, terms, message):
-    with pytest.raises(match=message):
-        factored(fraction, terms)
     with pytest.raises(DataError, match=message):
-        factored_jacobian(fraction, terms)
+        factored(fraction, terms)
