@@ -15,6 +15,7 @@ from ctid_cli.inference.covariance import white_noise_covariance
 from ctid_cli.inference.fit import IterationRecord
 from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertainty import Covariance, estimate_uncertainty
+from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.controller import DiscreteController
 
 #: An unstable loop is simulated over a record unless it would grow beyond this factor.
@@ -53,8 +54,6 @@ class SubmodelEstimate(NamedTuple):
 
     #: Parameters of the model, in the order of the problem's terms, shape (p,).
     theta: Array
-    #: Spectral radius of the sampled loop [-]; NaN in open loop.
-    loop_radius: float
     #: Covariance, status and all else that a `Fit` says of them, by its names.
     values: dict[str, Any]
 
@@ -69,7 +68,7 @@ def estimate_submodels(
     """
     p, y = problem.size, problem.data.y_used
     whole = np.concatenate((theta, np.zeros(problem.filter.free)))
-    radius = _loop_radius(problem, whole)
+    radius = radius_in_loop(problem, problem.model(theta)) if problem.filter.loop.closed else 0.0
     if radius > 1.0 and problem.data.y.size * np.log(radius) > np.log(LARGEST_GROWTH):
         raise DataError(
             "the start makes an unstable loop with the controller: its poles reach the magnitude "
@@ -90,7 +89,7 @@ def estimate_submodels(
         result = _better(result, run("refine_guarded", problem, result.theta, steps._replace(rule=GUARDED)))
     values: dict[str, Any] = {"iterations": history.steps, "history": history}
     if result is None:
-        return SubmodelEstimate(theta, radius, {**values, **diverged(p, y.size)})
+        return SubmodelEstimate(theta, {**values, **diverged(p, y.size)})
     equations, status = result.equations, result.status
     matrix = np.full((p, p), np.nan)
     if status is not Status.DIVERGED:
@@ -98,7 +97,7 @@ def estimate_submodels(
         if status is Status.CONVERGED and np.isnan(matrix).any():
             status = Status.SINGULAR
     values |= {"covariance": matrix, "status": status, **quality(equations, float(np.sum((y - y.mean()) ** 2)), y.size)}
-    return SubmodelEstimate(result.theta[:p], _loop_radius(problem, result.theta), values)
+    return SubmodelEstimate(result.theta[:p], values)
 
 
 def _better(one: Iterated | None, other: Iterated | None) -> Iterated | None:
@@ -121,13 +120,9 @@ def _covariance(problem: AdditiveProblem, theta: Array, equations: Equations, ki
     return estimate_uncertainty([psi], [error], kind, draws, regular=problem.data.interval > 0.0).widened()
 
 
-def _loop_radius(problem: AdditiveProblem, theta: Array) -> float:
-    """Spectral radius of the loop of the model with the controller; NaN in open loop."""
+def radius_in_loop(problem: AdditiveProblem, model: AdditiveModel) -> float:
+    """Spectral radius of the sampled loop of a model with the controller [-]; NaN in open loop."""
     loop, interval = problem.filter.loop, problem.data.interval
     if not loop.closed or interval == 0.0:
-        return float("nan")
-    try:
-        model = problem.model(theta)
-    except DataError:
         return float("nan")
     return loop_radius(model, DiscreteController(loop.numerator, loop.denominator), interval)

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.estimation.additive_estimate import SubmodelEstimate, estimate_submodels
+from ctid_cli.estimation.additive_estimate import SubmodelEstimate, estimate_submodels, radius_in_loop
 from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_record, named
 from ctid_cli.estimation.iteration import RULES, StepRule, Steps
@@ -231,6 +231,6 @@ def _fit(problem: AdditiveProblem, estimate: SubmodelEstimate, start: AdditiveMo
         additive=ordered,
         start=start,
         start_method=method,
-        loop_radius=estimate.loop_radius,
+        loop_radius=radius_in_loop(problem, model),
         **{**estimate.values, "covariance": estimate.values["covariance"][np.ix_(order, order)]},
     )

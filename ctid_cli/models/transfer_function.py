@@ -120,8 +120,8 @@ def polynomials(numerator: ArrayLike, denominator: ArrayLike, owner: str, variab
 
 def monic(b: Array, a: Array) -> tuple[Array, Array]:
     """A fraction over the leading coefficient of its denominator, without leading zeros of the numerator."""
-    b = np.trim_zeros(b, "f")
-    return (b if b.size else np.zeros(1)) / a[0], a / a[0]
+    b = b[np.argmax(b != 0) :] if b.any() else b[:1]
+    return b / a[0], a / a[0]
 
 
 def checked_delay(delay: float) -> float:
