@@ -1,6 +1,7 @@
 """Measured records laid out for estimation: means, state before the record, and what is refused."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
@@ -11,6 +12,7 @@ from ctid_cli.arrays import BoolArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import check_greatest_delay, check_record, named
 from ctid_cli.estimation.optimum.best_model import SearchOptions, problem_of
+from ctid_cli.estimation.optimum.pilot import liveliest_parts
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.output_error import Layout
 from ctid_cli.filtering.filter_data import FilterData, filter_data
@@ -106,6 +108,19 @@ class MeasuredRecords:
         """The records and what is eliminated with them."""
         return problem_of(self.data, self.structure.zeros, self.options)
 
+    def part(self) -> "MeasuredRecords | None":
+        """The liveliest parts of long records, each from a state of its own; None where they tell too little."""
+        treatment = self.treatment
+        parts = liveliest_parts(self.data, treatment.delay_bounds[1])
+        if parts is None or treatment.initial_state == "periodic":
+            return None
+        offset: Offset = "none" if treatment.offset == "remove" else treatment.offset
+        cut = [_cut(record, part) for record, part in zip(self.records, parts, strict=True)]
+        with suppress(DataError):
+            own = treatment._replace(initial_state="estimate", offset=offset, bridge=False)
+            return MeasuredRecords(cut, self.structure, own)
+        return None
+
     @cached_property
     def centred(self) -> FilterData:
         """The first record without its means, for starts that know no offset and no initial state."""
@@ -126,6 +141,12 @@ def _bridged(record: Record) -> Record:
     y = record.y.copy()
     y[wild] = np.interp(record.t[wild], record.t[kept], record.y[kept])
     return replace(record, y=y)
+
+
+def _cut(record: Record, part: slice) -> Record:
+    """Some samples of a record whose input is known at them."""
+    t, signal = record.t[part], record.input
+    return Record(t, record.y[part], HeldSignal(t, signal.values[part], signal.hold), name=record.name)
 
 
 def _without_means(record: Record) -> tuple[Record, float, float]:

@@ -88,18 +88,25 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) 
         own = theta[first : first + layout.own]
         state = own[:n] if layout.initial_state else None
         chain = twice(F, g, output, direct, None if state is None else state @ powers)
-        rows = rows_of(chain, point.delay, data, period, True)
-        filtered, u, through = rows[:, :n] @ powers.T, rows[:, 2 * n], rows[:, n : 2 * n]
-        eps = rows[:, -1] - rows[:, :n] @ output - direct * u
-        psi = np.zeros((eps.size, layout.size))
-        psi[:, n : n + m + 1] = np.column_stack((u - filtered @ a[1:], filtered))[:, n - m :]
+        # Columns of the rows that are wanted, each a combination of the states, the input and what else stands there.
+        wanted = np.zeros((chain.gain.size + chain.free_start.size + 3, layout.size + 1))
+        states, driven, now = wanted[:n], wanted[n : 2 * n], wanted[2 * n]
+        alone, driven_alone = wanted[2 * n + 1 : 3 * n + 1], wanted[3 * n + 1 : 4 * n + 1]
+        driven[:, :n] = -powers.T
+        filtered = powers.T
+        coefficients = np.column_stack((-filtered @ a[1:], filtered))[:, n - m :]
+        states[:, n : n + m + 1] = coefficients
+        if m == n:
+            now[n] = 1.0
         if structure.delay:
-            psi[:, n + m + 1] = -(rows[:, :n] @ (output @ F) + u * (output @ g))
+            states[:, n + m + 1], now[n + m + 1] = -(output @ F), -(output @ g)
         if layout.initial_state:
-            through = through + rows[:, 3 * n + 1 : 4 * n + 1]
-            psi[:, first : first + n] = rows[:, 2 * n + 1 : 3 * n + 1] @ powers.T
+            driven_alone[:, :n] = -powers.T
+            alone[:, first : first + n] = powers.T
         if layout.offset:
-            psi[:, first + layout.own - 1] = 1.0
-        psi[:, :n] = -through @ powers.T
-        result.append((psi, eps - psi[:, first : first + layout.own] @ own))
+            wanted[-2, first + layout.own - 1] = 1.0
+        states[:, -1], now[-1], wanted[-1, -1] = -output, -direct, 1.0
+        wanted[:, -1] -= wanted[:, first : first + layout.own] @ own
+        rows = rows_of(chain, point.delay, data, period, wanted)
+        result.append((rows[:, :-1], rows[:, -1].copy()))
     return result

@@ -49,6 +49,8 @@ class Profile:
     costs: Array
     #: Frequency below which the output has 95 % of its power [rad/s]; the spacing is at most a quarter of its period.
     bandwidth: float
+    #: Samples that were searched: of long records a part.
+    samples: int
     #: Cut-off frequency [rad/s] of the low-pass filter behind which the grid was searched, and to whose output the
     #: costs belong; the spacing is then a quarter of its period. None where every sample was searched.
     cutoff: float | None = None
@@ -101,13 +103,18 @@ class RecordsCost:
         return best
 
 
-def search_delay(measured: MeasuredRecords, svf_cutoff: float | None) -> Iterator[Found]:
-    """Look for the delay; what comes later is for where refining what came before led nowhere."""
+def search_delay(records: MeasuredRecords, svf_cutoff: float | None, nested: bool) -> Iterator[Found]:
+    """Look for the delay; what comes later is for where refining what came before led nowhere.
+
+    Where smaller models lead to the optimum, the profile of a part of long records will do.
+    """
+    part = records.part() if nested else None
+    measured = part or records
     bandwidth = svf_cutoff or measured.bandwidth
     cost = RecordsCost(measured, bandwidth, (1.0,) if measured.structure.delay else CUTOFFS)
     treatment = measured.treatment
-    # What filters see must be the answer to the input alone.
-    at_rest = treatment.initial_state == "rest" and treatment.offset != "estimate"
+    # What filters see must be the answer to the input alone, or to one that is known from the start of the window on.
+    at_rest = (treatment.initial_state == "rest" or part is not None) and treatment.offset != "estimate"
     if at_rest and len(measured.records) == 1 and measured.structure.delay:
         yield _search_levels(cost)
     yield _search_samples(cost)
@@ -130,15 +137,15 @@ def _search_levels(cost: RecordsCost) -> Found:
         [Lowpass(cutoff, LEVEL_ORDER) for cutoff in cutoffs.tolist()],
         cost.coefficients,
         bounds[1],
-        start=0.0,
+        start=0.0 if measured.plain else bounds[1],
         svf_cutoffs=cutoffs,
         steps=LEVEL_EFFORT,
     )
     levels = [(costs.behind(k), 0.5 * np.pi / cutoff) for k, cutoff in enumerate(cutoffs.tolist())]
     delays, found, minima = search_grid(levels, bounds)
-    profile = Profile(delays, found, bandwidth, float(cutoffs[0]))
+    profile = Profile(delays, found, bandwidth, record.n_samples, float(cutoffs[0]))
     interval = measured.data[0].interval
-    if interval > 0.0:
+    if interval > 0.0 and measured.plain:
         # On a regular clock the cost has a kink at every interval, and local minima between them that a model too small
         # for its system makes deep: every sample is asked about an eighth of a period around what the filters found.
         reach = max(interval, 0.25 * np.pi / bandwidth)
@@ -170,7 +177,7 @@ def _search_samples(cost: RecordsCost) -> Found:
     spacing = float(delays[1] - delays[0])
     interval = min(float(np.median(np.diff(record.t))) for record in measured.records)
     parts = int(np.clip(np.ceil(4.0 * spacing / interval), 4, FINEST))
-    profile = Profile(delays, found.squared_errors / count, cost.bandwidth)
+    profile = Profile(delays, found.squared_errors / count, cost.bandwidth, count)
     return _local_grid(cost, chosen, spacing, parts, MINIMA) or chosen, profile
 
 

@@ -245,7 +245,7 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
         return Refinement(measured)
 
     def _estimate(self, refinement: Refinement, start: Start | None) -> MeasuredFit:
-        for minima, profile in search_delay(refinement.measured, self.svf_cutoff):
+        for minima, profile in search_delay(refinement.measured, self.svf_cutoff, self.nested):
             if minima:
                 a = [np.concatenate(([1.0], minimum.theta[: self.poles])) for minimum in minima]
                 starts = [(each, minimum.delay) for each, minimum in zip(a, minima, strict=True)]

@@ -96,15 +96,17 @@ def _draw_profile(axes: Any, result: Identification, units: Units) -> None:
     if profile is None:
         axes.plot([delay], [result.fit.cost], "o", color=DARK, label=f"known delay {delay:.4g} {units.time}")
     else:
-        behind = "" if profile.cutoff is None else f" below {profile.cutoff:.3g} rad/{units.time}"
+        whole = profile.samples >= result.fit.count
+        behind = "" if whole else f" of the liveliest {profile.samples} samples"
+        behind += "" if profile.cutoff is None else f" below {profile.cutoff:.3g} rad/{units.time}"
         axes.plot(
             profile.delays, profile.costs, ".-", color=DARK, linewidth=0.8, markersize=4, label=f"profile{behind}"
         )
         label = f"minimum at {delay:.4g} {units.time}"
-        if profile.cutoff is None:
+        if profile.cutoff is None and whole:
             axes.plot([delay], [result.fit.cost], "v", color="black", markersize=7, label=label)
         else:
-            # The cost of the estimate is that of all frequencies.
+            # The cost of the estimate is that of all frequencies and samples.
             axes.axvline(delay, color="black", linewidth=0.8, label=label)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.35 * (high - low))

@@ -101,7 +101,7 @@ def identification_object(
         "condition_number": fit.condition_number,
         "iterations": fit.iterations,
         "residual_tests": [picked(test, TEST_KEYS) for test in result.tests],
-        "profile": profile and picked(profile, ("delays", "costs", "cutoff")),
+        "profile": profile and picked(profile, ("delays", "costs", "cutoff", "samples")),
         "validation": judged and _validation_object(judged, validation),
         "records": [_record_object(item, use) for item, use in zip(measurements, fit.used, strict=True)],
         "units": asdict(units),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
+from ctid_cli.estimation.optimum import pilot
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.output_error import Layout, sensitivities
 from ctid_cli.estimators.delay_profile import DelayProfile
@@ -313,3 +314,17 @@ def test_a_range_beyond_the_record_and_no_record():
 def test_case_1_without_noise_is_exact():
     fit = DelayProfile(2, 0, (0, 15)).fit(make_record(CASE_1, n=1500))
     assert_same_model(fit.model, CASE_1, 1e-7)
+
+
+@pytest.mark.parametrize("offset", ["remove", "estimate"])
+def test_the_profile_of_a_part_of_a_long_record_has_the_minimum_of_the_whole(monkeypatch, offset):
+    record = make_record(CASE_1, seed=4, snr_db=15.0, n=3000)
+    options = DelayProfile(2, 0, (0.0, 15.0), offset=offset, nested=True)
+    whole = options.fit(record)
+    monkeypatch.setattr(pilot, "LONG", 2000)
+    monkeypatch.setattr(pilot, "PART", 800)
+    part = options.fit(record)
+    assert part.profile.samples < 0.6 * record.n_samples <= whole.profile.samples
+    spacing = part.profile.delays[1]
+    assert abs(part.profile.delays[np.argmin(part.profile.costs)] - CASE_1.delay) < spacing
+    assert part.cost == pytest.approx(whole.cost, rel=1e-9)

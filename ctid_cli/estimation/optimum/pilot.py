@@ -1,5 +1,7 @@
 """A part of long records on which searches find out where to start on the whole."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ctid_cli.estimation.optimum.projection import Problem
@@ -14,23 +16,35 @@ def part_of(problem: Problem, latest: float) -> Problem | None:
 
     The input of a part is known for delays up to ``latest`` [s].
     """
-    records = problem.records
-    short = sum(data.t.size for data in records) <= LONG
-    if short or any(problem.periods) or not all(data.common_clock for data in records):
+    parts = liveliest_parts(problem.records, latest)
+    if parts is None or any(problem.periods):
         return None
-    size = PART // len(records)
-    parts = tuple(_liveliest(data, size, latest) for data in records)
-    return problem._replace(records=parts, free_response=True, periods=(0.0,) * len(parts))
+    records = tuple(_cut(data, part, latest) for data, part in zip(problem.records, parts, strict=True))
+    return problem._replace(records=records, free_response=True, periods=(0.0,) * len(records))
 
 
-def _liveliest(data: FilterData, size: int, latest: float) -> FilterData:
-    """So many samples around which the input moves and the output varies most, less those whose input is unknown."""
+def liveliest_parts(records: Sequence[FilterData], latest: float) -> list[slice] | None:
+    """Samples of each record around which the input moves and the output varies most; None where none is long."""
+    if sum(data.t.size for data in records) <= LONG or not all(data.common_clock for data in records):
+        return None
+    # What comes before the latest delay tells nothing.
+    sizes = [PART // len(records) + int(latest * data.t.size / (data.t[-1] - data.t[0])) for data in records]
+    return [_liveliest(data, size) for data, size in zip(records, sizes, strict=True)]
+
+
+def _liveliest(data: FilterData, size: int) -> slice:
     if data.t.size <= size:
-        return data
+        return slice(None)
     moves, spread = np.abs(np.diff(data.u, append=data.u[-1])), np.abs(data.y - data.y.mean())
     life = np.cumsum(moves / max(moves.mean(), 1e-300) + spread / max(spread.mean(), 1e-300))
     begins = np.arange(0, data.t.size - size + 1, size // 4)
     begin = int(begins[np.argmax(life[begins + size - 1] - life[begins])])
-    part = slice(begin, begin + size)
+    return slice(begin, begin + size)
+
+
+def _cut(data: FilterData, part: slice, latest: float) -> FilterData:
+    """A part, whose samples do not count while the input is unknown."""
+    if part == slice(None):
+        return data
     t, y, u = (values[part].copy() for values in (data.t, data.y, data.u))
     return data._replace(t=t, y=y, use=data.use[part] & (t >= t[0] + latest), tu=t, u=u)

@@ -19,7 +19,7 @@ from numba import njit
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.optimum.chain import chain_dynamics, driven_chain, logarithmic_slopes
-from ctid_cli.estimation.optimum.triangle import ChainState, Delay, rows_of
+from ctid_cli.estimation.optimum.triangle import MOMENTS, ChainState, Delay, rows_of
 from ctid_cli.filtering.filter_data import FilterData
 
 #: Singular values of the scaled columns below this fraction of the largest count as zero.
@@ -130,7 +130,7 @@ def project(problem: Problem, speed: Array, damping: Array, delay: Delay) -> Pro
     F, g = chain_dynamics(speed, damping)
     chain = ChainState(F, g, F, g if problem.free_response else np.zeros(0))
     each = zip(problem.records, problem.periods, strict=True)
-    rows = np.stack([rows_of(chain, delay, data, period, False) for data, period in each])
+    rows = np.stack([rows_of(chain, delay, data, period, MOMENTS) for data, period in each])
     found: Projected = _eliminated(rows, g.size, problem.zeros, problem.free_response, problem.offset)
     return found
 
@@ -182,7 +182,7 @@ def slopes(
     frees = projected.free if problem.free_response else [None] * len(problem.records)
     chains = [twice(F, g, projected.output, projected.direct, free) for free in frees]
     each = zip(chains, problem.records, problem.periods, strict=True)
-    rows = np.stack([rows_of(chain, delay, data, period, False) for chain, data, period in each])
+    rows = np.stack([rows_of(chain, delay, data, period, MOMENTS) for chain, data, period in each])
     free = problem.zeros, problem.free_response, problem.offset, delay_free
     found: Slopes = _kaufman(rows, F, g, projected, logarithmic_slopes(speed, damping, F), free)
     return found

@@ -15,9 +15,14 @@ from ctid_cli.filtering.chain_pass import _longest_step as longest_step
 from ctid_cli.filtering.chain_pass import _step as irregular_step
 from ctid_cli.filtering.chain_pass import _Transitions as Transitions
 from ctid_cli.filtering.chain_pass import _transitions as transitions
-from ctid_cli.filtering.exponential import exponential_minus_identity, held_readout, held_step, place
+from ctid_cli.filtering.exponential import HeldStep, exponential_minus_identity, held_readout, held_step, place
 from ctid_cli.filtering.filter_data import FilterData, clock_slack, split_delay
 from ctid_cli.filtering.row_sink import BLOCK
+
+#: A free response is over when its states are this fraction of their greatest.
+NOTHING = 1e-30
+#: No combinations of columns are wanted but the second moments of all.
+MOMENTS = np.zeros((0, 0))
 
 
 class Delay(NamedTuple):
@@ -25,6 +30,16 @@ class Delay(NamedTuple):
 
     seconds: float
     cell: int
+
+
+class Way(NamedTuple):
+    """What leads a chain from break to break: one step on a regular clock, else transitions over any."""
+
+    step: HeldStep
+    table: Transitions
+    #: State, held input and its slope; and the same twice for a step in parts, shapes (n + 2,) and (2, n + 2).
+    full: Array
+    work: Array
 
 
 class ChainState(NamedTuple):
@@ -66,41 +81,44 @@ def _table(dynamics: Array, gain: Array, data: FilterData, delay: float, period:
 
 
 @njit(cache=True, nogil=True)
-def _states_at_breaks(dynamics: Array, gain: Array, data: FilterData, period: float, table: Transitions) -> Array:
-    """States at every break of the input: from rest, or those of the input repeated for ever, shape (M, n)."""
-    n, breaks = gain.size, data.tu.size
-    u, tu = data.u, data.tu
-    regular = data.interval > 0.0
-    states = np.zeros((breaks + 1, n))
-    step = held_step(dynamics, gain, data.interval)
-    full, work = np.zeros(n + 2), np.zeros((2, n + 2))
-    # Twice for a periodic input: once from rest to the end of the period, where x_N is left over, and once more from
-    # x0 = x_N + Phi^N x0. With X = Phi^N - I, which the exponential gives without cancellation, X x0 = -x_N.
-    for turn in range(2 if period > 0.0 else 1):
-        if turn == 1:
-            missing = exponential_minus_identity(dynamics * period)
-            states[0] = np.linalg.solve(missing, -states[breaks])
-        for j in range(breaks if period > 0.0 else breaks - 1):
-            last = j == breaks - 1
-            change = (u[0] if last else u[j + 1]) - u[j] if data.input_foh else 0.0
-            if regular:
-                for i in range(n):
-                    states[j + 1, i] = step.from_value[i] * u[j] + step.from_change[i] * change
-                _advance(step.transition, states[j], states[j + 1])
-            else:
-                length = (tu[0] + period if last else tu[j + 1]) - tu[j]
-                for i in range(n):
-                    full[i] = states[j, i]
-                full[n], full[n + 1] = u[j], change / length
-                irregular_step(table, length, full, work)
-                for i in range(n):
-                    states[j + 1, i] = full[i]
-    return states
+def _follow(j: int, z: Array, following: Array, way: Way, data: FilterData, period: float) -> None:
+    """The state at the break after break j, from that at break j."""
+    u, tu, n = data.u, data.tu, z.size
+    last = j == tu.size - 1
+    change = (u[0] if last else u[j + 1]) - u[j] if data.input_foh else 0.0
+    if data.interval > 0.0:
+        for i in range(n):
+            following[i] = way.step.from_value[i] * u[j] + way.step.from_change[i] * change
+        _advance(way.step.transition, z, following)
+    else:
+        length = (tu[0] + period if last else tu[j + 1]) - tu[j]
+        for i in range(n):
+            way.full[i] = z[i]
+        way.full[n], way.full[n + 1] = u[j], change / length
+        irregular_step(way.table, length, way.full, way.work)
+        for i in range(n):
+            following[i] = way.full[i]
+
+
+@njit(cache=True, nogil=True)
+def _first_state(dynamics: Array, way: Way, data: FilterData, period: float) -> Array:
+    """State at the first break: rest, or that of the input repeated for ever.
+
+    From rest to the end of a period x_N is left over: x0 = x_N + Phi^N x0. With X = Phi^N - I, which the exponential
+    gives without cancellation, X x0 = -x_N.
+    """
+    z, following = np.zeros(dynamics.shape[0]), np.zeros(dynamics.shape[0])
+    if period == 0.0:
+        return z
+    for j in range(data.tu.size):
+        _follow(j, z, following, way, data, period)
+        z, following = following, z
+    return np.asarray(np.linalg.solve(exponential_minus_identity(dynamics * period), -z))
 
 
 @njit(cache=True, nogil=True)
 def _free_states(chain: ChainState, data: FilterData) -> Array:
-    """States at the used samples of a chain left alone from the first of them on, shape (count, n)."""
+    """States at the used samples of a chain left alone from the first of them on, until nothing is left of it."""
     n = chain.free_start.size
     states = np.zeros((np.count_nonzero(data.use) if n else 0, n))
     if n == 0:
@@ -110,7 +128,7 @@ def _free_states(chain: ChainState, data: FilterData) -> Array:
     table = _table(chain.free_dynamics, np.zeros(n), data, 0.0, 0.0)
     # The two states behind the n are an input and its slope, which stay zero: z(t) = exp(F (t - t_s)) z(t_s).
     now, following, work = np.zeros(n + 2), np.zeros(n + 2), np.zeros((2, n + 2))
-    row = 0
+    row, greatest = 0, 0.0
     for k in range(data.t.size):
         # Before the first used sample nothing moves; after it unused samples are steps of the way too.
         if row > 0 and regular:
@@ -123,10 +141,15 @@ def _free_states(chain: ChainState, data: FilterData) -> Array:
             if row == 0:
                 for i in range(n):
                     now[i] = chain.free_start[i]
+            left = 0.0
             for i in range(n):
                 states[row, i] = now[i]
+                left = max(left, abs(now[i]))
             row += 1
-    return states
+            greatest = max(greatest, left)
+            if left <= NOTHING * greatest:
+                break
+    return states[:row]
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
@@ -170,24 +193,26 @@ def _readout(chain: ChainState, delay: Delay, interval: float) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _read(rows: Array, readout: Array, result: Array) -> None:
+def _read(rows: Array, free: int, readout: Array, result: Array) -> None:
     """Write rows of a block, or of the triangle, with the read-out in the place of what it is read from."""
-    n = readout.shape[1] - 1
-    result[:, : n + 1] = np.ascontiguousarray(rows[:, : n + 2]) @ readout
-    result[:, n + 1 :] = rows[:, n + 2 :]
+    n, behind = readout.shape[1] - 1, free + readout.shape[0]
+    result[:, : n + 1] = np.ascontiguousarray(rows[:, free:behind]) @ readout
+    result[:, n + 1 : n + 1 + free] = rows[:, :free]
+    result[:, n + 1 + free :] = rows[:, behind:]
 
 
 @njit(cache=True, nogil=True)
-def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, whole: bool) -> Array:
-    """Rows ``[z, u, free response, 1, y]`` that have the second moments of those of all used samples, or these.
+def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wanted: Array) -> Array:
+    """Rows ``[z, u, free response, 1, y]`` that have the second moments of those of all used samples.
 
-    On a regular clock z is left at the break before the instant that is read: the way from there is one map for all
-    rows. On any other it is read at ``t - tau`` itself.
+    Or, where combinations of these columns are wanted, in the columns of a matrix, those of every used sample. On a
+    regular clock z is left at the break before the instant that is read: the way from there is one map for all rows.
+    On any other it is read at ``t - tau`` itself.
     """
     n, free = chain.gain.size, chain.free_start.size
-    q = n + free + 4
-    triangle, block = np.zeros((q, q)), np.zeros((q, BLOCK))
-    every = np.zeros((np.count_nonzero(data.use) if whole else q, q - 1))
+    q, whole = n + free + 4, wanted.size > 0
+    triangle, block, read = np.zeros((q, q)), np.zeros((q, BLOCK)), np.zeros((BLOCK, q - 1))
+    every = np.zeros((np.count_nonzero(data.use) if whole else 0, wanted.shape[1]))
     readout = _readout(chain, delay, data.interval)
     tu, u, breaks = data.tu, data.u, data.tu.size
     alone = _free_states(chain, data)
@@ -198,9 +223,11 @@ def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wh
     else:
         slack = clock_slack(data)
     table = _table(chain.dynamics, chain.gain, data, delay.seconds, period)
-    # The states at the breaks do not depend on the delay: it only chooses where they are read.
-    states = _states_at_breaks(chain.dynamics, chain.gain, data, period, table)
     now, work = np.zeros(n + 2), np.zeros((2, n + 2))
+    way = Way(held_step(chain.dynamics, chain.gain, data.interval), table, now, work)
+    # The states at the breaks do not depend on the delay: it only chooses where they are read.
+    first = _first_state(chain.dynamics, way, data, period)
+    z, following, at = first.copy(), np.zeros(n), 0
     filled, row, j = 0, 0, -1
     for k in range(data.t.size):
         if not data.use[k]:
@@ -221,6 +248,13 @@ def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wh
             while j + 1 < breaks and tu[j + 1] <= instant + slack:
                 j += 1
             rest = max(0.0, instant - tu[j]) if j >= 0 else 0.0
+        # The state at that break; after the step back out of the period before, from the first one again.
+        if j < at:
+            z[:], at = first, 0
+        while at < j:
+            _follow(at, z, following, way, data, period)
+            z, following = following, z
+            at += 1
         # The input that is held there, and its change up to the next break, after the last one that of the first.
         value, change, length = 0.0, 0.0, 1.0
         if j >= 0:
@@ -230,28 +264,32 @@ def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wh
             elif data.input_foh and period > 0.0:
                 change, length = u[0] - value, tu[0] + period - tu[j]
         for i in range(n):
-            now[i] = states[j, i] if j >= 0 else 0.0
+            now[i] = z[i] if j >= 0 else 0.0
         now[n], now[n + 1] = value, change / length
         # On from the break to the instant itself, after which no change is left to be read.
         if not regular:
             irregular_step(table, rest, now, work)
             change = 0.0
-        for i in range(n + 1):
-            block[i, filled] = now[i]
-        block[n + 1, filled] = change
+        # The free response goes first: once nothing is left of it, no reflection touches its columns any more.
         for i in range(free):
-            block[n + 2 + i, filled] = alone[row, i]
+            block[i, filled] = alone[row, i] if row < alone.shape[0] else 0.0
+        for i in range(n + 1):
+            block[free + i, filled] = now[i]
+        block[q - 3, filled] = change
         block[q - 2, filled], block[q - 1, filled] = 1.0, data.y[k]
         row += 1
         filled += 1
         if filled == BLOCK or row == every.shape[0] * whole:
             if whole:
-                _read(np.ascontiguousarray(block[:, :filled].T), readout, every[row - filled : row])
+                _read(np.ascontiguousarray(block[:, :filled].T), free, readout, read[:filled])
+                every[row - filled : row] = read[:filled] @ wanted
             else:
                 # R <- qr[R; block]: memory is that of one block, however long the record.
                 absorb(triangle, block, filled)
             filled = 0
-    if not whole:
-        absorb(triangle, block, filled)
-        _read(triangle, readout, every)
-    return every
+    if whole:
+        return every
+    absorb(triangle, block, filled)
+    rows = np.zeros((q, q - 1))
+    _read(triangle, free, readout, rows)
+    return rows

@@ -7,7 +7,7 @@ from scipy.linalg import block_diag
 from ctid_cli.estimation.optimum.box import Box, point_of
 from ctid_cli.estimation.optimum.chain import chain_dynamics, logarithmic_slopes, numerators
 from ctid_cli.estimation.optimum.projection import Problem, project, slopes
-from ctid_cli.estimation.optimum.triangle import Delay
+from ctid_cli.estimation.optimum.triangle import MOMENTS, ChainState, Delay, rows_of
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.signals.record import Record
 from tests.estimation.optimum.dense import columns_of, left_over, squared_error
@@ -149,3 +149,15 @@ def test_states_and_slopes_have_the_transfer_functions_that_they_claim():
         middle = s * s + 1.32 * s + 4.84
         expected = [4 / (s + 4), (1.32 * s + 9.68) / middle, 1.32 * s / middle, 0.4 / (s + 0.4)]
         np.testing.assert_allclose(slopes_of @ states, expected)
+
+
+@pytest.mark.parametrize("regular", [True, False])
+def test_a_free_response_that_is_over_leaves_the_moments_of_all_rows(regular):
+    rng = np.random.default_rng(3)
+    data = filter_data(record_of(MODEL, rng, samples=400, regular=regular))
+    F, g = chain_dynamics(np.array([40.0 / np.ptp(data.t) * 10]), np.array([-1.0]))
+    chain = ChainState(F, g, F, g)
+    every = rows_of(chain, Delay(0.3, -1), data, 0.0, np.eye(5))
+    assert np.abs(every[-1, 2]) < 1e-100 < np.abs(every[0, 2])
+    triangle = rows_of(chain, Delay(0.3, -1), data, 0.0, MOMENTS)
+    assert triangle.T @ triangle == pytest.approx(every.T @ every, rel=1e-10, abs=1e-12)
