@@ -22,7 +22,7 @@ from bench_srivc_iteration import CASES, noisy_record
 
 from ctid_cli.filtering.bank import modal_map, second_moments
 from ctid_cli.filtering.filter_data import filter_data, split_delay
-from ctid_cli.filtering.mode_blocks import all_weights
+from ctid_cli.filtering.step_weights import all_weights
 
 REPEATS = 200
 

@@ -3,7 +3,6 @@
 Recursions run along contiguous memory with their state in registers.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,71 +10,6 @@ from numba import njit
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray, IntArray
 from ctid_cli.filtering.row_sink import BLOCK
-
-#: Below this |pole * step| the functions of a held step are summed as series, 1/(k + 2)! for k = 0 … 10; above it the
-#: closed forms lose less than 1/SMALL_STEP^3 of the rounding error.
-SMALL_STEP = 0.15
-INVERSE_FACTORIALS = tuple(1.0 / math.factorial(k + 2) for k in range(11))
-
-
-class StepWeights(NamedTuple):
-    """What ``z = 1/(s - p) v`` and ``w = 1/(s - p)^2 v`` become over a step with v linear.
-
-    ``z+ = decay z + z_start v + z_change (change of v)``, and
-    ``w+ = decay w + mixed z + w_start v + w_change (change of v)``.
-    """
-
-    decay: complex
-    mixed: complex
-    z_start: complex
-    z_change: complex
-    w_start: complex
-    w_change: complex
-
-
-@njit(cache=True, nogil=True)
-def _step_functions(x: complex) -> tuple[complex, complex, complex]:
-    """``exp(x)``, ``f(x) = (exp(x) - 1 - x)/x^2`` and ``f'(x)``.
-
-    The other functions of a held step follow: ``(exp(x) - 1)/x = 1 + x f``, with the derivative ``f + x f'``.
-    """
-    if x.real * x.real + x.imag * x.imag < SMALL_STEP * SMALL_STEP:
-        # No cancellation, however slow the pole is against the step; and faster than an exponential.
-        value, slope = complex(INVERSE_FACTORIALS[-1], 0.0), 0.0j
-        for k in range(len(INVERSE_FACTORIALS) - 2, -1, -1):
-            slope = slope * x + value
-            value = value * x + INVERSE_FACTORIALS[k]
-        return 1.0 + x * (1.0 + x * value), value, slope
-    over = 1.0 / x
-    decay = np.exp(x)
-    value = ((decay - 1.0) * over - 1.0) * over
-    return decay, value, ((decay - 1.0) * over - 2.0 * value) * over
-
-
-@njit(cache=True, nogil=True)
-def step_weights(pole: complex, step: float) -> StepWeights:
-    """Weights of one mode over a step."""
-    x = pole * step
-    decay, value, slope = _step_functions(x)
-    square = step * step
-    return StepWeights(
-        decay,
-        step * decay,
-        step * (1.0 + x * value),
-        step * value,
-        square * (value + x * slope),
-        square * slope,
-    )
-
-
-@njit(cache=True, nogil=True)
-def all_weights(poles: ComplexArray, step: float) -> ComplexArray:
-    """Weights of all modes over a step, shape (modes, 6)."""
-    weights = np.zeros((poles.size, 6), np.complex128)
-    for i in range(poles.size):
-        for k, weight in enumerate(step_weights(poles[i], step)):
-            weights[i, k] = weight
-    return weights
 
 
 @njit(cache=True, nogil=True)
@@ -94,7 +28,7 @@ class Clock(NamedTuple):
     #: The delay is ``(shift - fraction) interval``.
     shift: int
     fraction: float
-    #: In the order of :class:`StepWeights`, shape (modes, 6).
+    #: In the order of :class:`~ctid_cli.filtering.step_weights.StepWeights`, shape (modes, 6).
     whole: ComplexArray
     part: ComplexArray
 

@@ -14,9 +14,10 @@ from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.filtering.filter_data import FilterData, split_delay
-from ctid_cli.filtering.mode_blocks import Clock, Source, all_weights, first_rows, keep_used, output_block
+from ctid_cli.filtering.mode_blocks import Clock, Source, first_rows, keep_used, output_block
 from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT
 from ctid_cli.filtering.row_sink import BLOCK, RowSink, emit, finish, row_sink
+from ctid_cli.filtering.step_weights import all_weights
 from ctid_cli.filtering.submodel_blocks import LoopData, input_block, loop_input
 from ctid_cli.filtering.submodel_map import PooledModes, pooled_modes
 
