@@ -6,12 +6,10 @@ cost minimised over the coefficients has the gradient ``g = eps_tau' eps`` and t
 of, filtered or not, samples or spectra, is the business of the *cost*.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numba import njit
-from numba.extending import overload
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.iteration import (
@@ -22,7 +20,6 @@ from ctid_cli.estimation.iteration import (
     Equations,
     Steps,
     admissible,
-    is_tuple_of,
     run,
     solve_scaled,
     with_best,
@@ -87,21 +84,9 @@ class Descent(NamedTuple):
 
 
 def minimise(cost: Any, delay: float, starts: Array, own: bool) -> Minimum:
-    """Least cost at a delay; compiled code is told by `minimised_by` what to call."""
+    """Least cost at a delay; compiled code is told by `calls` what to call."""
     found: Minimum = cost.minimise(delay, starts, own)
     return found
-
-
-def minimised_by(cost_type: type, kernel: Callable[..., Any]) -> None:
-    """Let compiled code minimise one type of cost."""
-
-    def least(cost: Any, delay: Any, starts: Any, own: Any) -> Any:
-        return kernel(cost, delay, starts, own)
-
-    # Inlined: what is compiled on its own takes all that it calls through the optimiser again.
-    @overload(minimise, inline="always")
-    def _minimise(cost: Any, delay: Any, starts: Any, own: Any) -> Any:
-        return least if is_tuple_of(cost_type, cost) else None
 
 
 @njit(cache=True, nogil=True)

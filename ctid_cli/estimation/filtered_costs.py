@@ -7,8 +7,8 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
-from ctid_cli.estimation.delay_search import Minimum, best_of, minimised_by
-from ctid_cli.estimation.iteration import Steps
+from ctid_cli.estimation.delay_search import Minimum, best_of, minimise
+from ctid_cli.estimation.iteration import Steps, calls
 from ctid_cli.estimation.spectral_problem import SpectralProblem, spectral_least_squares_start
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.spectra import HeldSpectrum, lowpass_weight, record_spectra, window_spectrum
@@ -123,7 +123,7 @@ def _minimise(cost: FilteredCost, delay: float, starts: Array, own: bool) -> Min
     return _least(costs, k, inputs, delay, starts, own)
 
 
-minimised_by(FilteredCost, _minimise)
+calls(minimise, FilteredCost, _minimise)
 
 
 @njit(cache=True, nogil=True)

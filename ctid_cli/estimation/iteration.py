@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
-from numba import njit, types
-from numba.extending import overload
+from numba import njit
+from numba.core.typing.templates import AbstractTemplate, infer_global
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.stability import with_stable_denominator
@@ -131,31 +131,36 @@ def admissible(problem: Any, theta: Array) -> Array:
     return inside
 
 
-def is_tuple_of(python_type: type, numba_type: Any) -> bool:
-    """Whether what numba compiles for is a NamedTuple of one class."""
-    return isinstance(numba_type, types.BaseNamedTuple) and getattr(numba_type, "instance_class", None) is python_type
+def calls(function: Callable[..., Any], problem_type: type, kernel: Any) -> None:
+    """Let compiled code that calls a function with one type of problem first call a kernel.
 
-
-def compiled_as(problem_type: type, kernel: Callable[..., Any]) -> None:
-    """Let compiled code iterate on one type of problem, whose denominator stands at the head of theta.
-
-    numba dispatches on the type of a NamedTuple and caches that; a kernel passed as an argument would not be cached.
+    An overload would be a function around the kernel, and everything below the kernel would be optimised once more for
+    it; a kernel passed as an argument would not be cached.
     """
 
-    # The annotations belong to the signature that numba compares.
-    def moments(problem: Any, theta: Any) -> Any:
-        return kernel(problem, theta)
+    @infer_global(function)  # type: ignore[no-untyped-call]
+    class _Call(AbstractTemplate):
+        key = function
 
-    def stable(problem: Any, theta: Any) -> Any:
-        return with_stable_denominator(theta, problem.poles)
+        def generic(self, args: Any, kws: Any) -> Any:
+            if getattr(args[0], "instance_class", None) is not problem_type:
+                return None
+            template, _, args, kws = kernel.get_call_template(args, kws)
+            return template(self.context).apply(args, kws)
 
-    @overload(equations)
-    def _equations(problem: Any, theta: Any) -> Any:
-        return moments if is_tuple_of(problem_type, problem) else None
+        def get_impl_key(self, sig: Any) -> Any:
+            return kernel.get_overload(sig.args)
 
-    @overload(admissible)
-    def _admissible(problem: Any, theta: Any) -> Any:
-        return stable if is_tuple_of(problem_type, problem) else None
+
+@njit(cache=True, nogil=True)
+def _stable(problem: Any, theta: Array) -> Array:
+    return with_stable_denominator(theta, problem.poles)
+
+
+def compiled_as(problem_type: type, kernel: Any) -> None:
+    """Let compiled code iterate on one type of problem, whose denominator stands at the head of theta."""
+    calls(equations, problem_type, kernel)
+    calls(admissible, problem_type, _stable)
 
 
 @njit(cache=True, nogil=True)
