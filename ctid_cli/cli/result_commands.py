@@ -46,7 +46,17 @@ def table(
         list[str] | None,
         typer.Argument(metavar="[NAME]...", help="Table (1, useful-redundancy/3) or experiment (quickstart)."),
     ] = None,
-    style: Annotated[Literal["text", "md", "csv", "json"], typer.Option("--format", help="Form of output.")] = "text",
+    style: Annotated[
+        Literal["text", "md", "latex", "csv", "json"], typer.Option("--format", help="Form of output.")
+    ] = "text",
+    measure: Annotated[
+        str | None,
+        typer.Option("--measure", metavar="NAMES", help="Measures of an experiment, such as bias,rmse,coverage."),
+    ] = None,
+    compare: Annotated[
+        str | None,
+        typer.Option("--compare", metavar="A,B", help="Differences of two estimators on the same data sets."),
+    ] = None,
     check: Annotated[
         bool,
         typer.Option("--check", help="Compare with the committed tables and the paper; exit code 7 if they differ."),
@@ -57,19 +67,26 @@ def table(
     ] = None,
     out: Out = Path("results"),
 ) -> None:
-    """Print tables of convergence percentages.
+    """Print tables of convergence percentages, or of other measures.
 
     With their 95 % intervals and numbers of data sets, and the published values where there are any.
+
+    Measures: percent, bias, deviation, mse, rmse, median_bias, robust_deviation, standard_error, error_ratio, coverage,
+    efficiency, failures, cpu, cpu_90. An experiment without a success rule shows bias and rmse, or what `measures` of
+    its specification names.
 
     Without a name: all tables of the useful-redundancy study. Cells that were not run say so; where the folder results
     holds nothing of a table, as in a fresh clone, the committed results are printed.
     """
     from ctid_cli.reporting.comparison import check_tables, mismatch_sentence, write_comparison
     from ctid_cli.reporting.layout import write_reports
-    from ctid_cli.reporting.tables import build_tables
+    from ctid_cli.reporting.paired_table import compare_estimators
+    from ctid_cli.reporting.tables import build_tables, experiments
 
     if reference is not None and not check:
         raise UsageError("--reference goes with --check")
+    if sum((check, measure is not None, compare is not None)) > 1:
+        raise UsageError("--check, --measure and --compare are three questions; ask one at a time")
     if not out.is_dir():
         typer.echo(f"ctid: there is no folder {out}, so nothing was run yet (--out names the results folder)", err=True)
     if check:
@@ -78,7 +95,11 @@ def table(
         if comparison.mismatches:
             raise MismatchError(mismatch_sentence(comparison))
         return
-    tables = build_tables(names or [], out, style, committed=out == Path("results"))
+    if compare is not None:
+        tables = [compare_estimators(results, compare, out) for results in experiments(names or [], out, "--compare")]
+    else:
+        measures = measure.split(",") if measure is not None else ()
+        tables = build_tables(names or [], out, style, committed=out == Path("results"), measures=measures)
     typer.echo(write_reports(tables, style))
     # Text and Markdown hold their notes themselves.
     for note in (note for report in tables for note in report.notes if style in ("csv", "json")):

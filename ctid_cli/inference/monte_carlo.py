@@ -16,7 +16,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.errors import UsageError
 from ctid_cli.inference.quantile import normal_quantile, student_quantile
+from ctid_cli.text import did_you_mean
 
 #: Standard errors on either side of an estimate that make a 95 % interval.
 QUANTILE = normal_quantile()
@@ -206,6 +208,14 @@ class Measure:
     #: What it is computed from: errors of parameters, or what an estimate has one of.
     source: Literal["errors", "converged", "status", "cpu_seconds"]
     compute: Callable[..., Measured]
+
+
+def requested(name: str) -> Measure:
+    """A measure by its name."""
+    if name not in MEASURES:
+        hint = did_you_mean(name, MEASURES) or "."
+        raise UsageError(f"there is no measure {name!r}{hint} Known: {', '.join(MEASURES)}")
+    return MEASURES[name]
 
 
 #: All measures by name.

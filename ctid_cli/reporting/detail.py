@@ -85,7 +85,7 @@ def _fitted(found: FoundEstimate) -> list[list[str]]:
         ("cost", f"{number(row['cost'])} (mean squared output error, output unit^2)"),
         ("iterations", number(row["iterations"])),
         ("condition number", number(row["condition_number"], 3)),
-        ("time", seconds(row["seconds"])),
+        ("time", _times(row)),
     ]
     measures = [f"{name:16} {text}" for name, text in facts]
     return [table, measures] if table else [measures]
@@ -99,7 +99,12 @@ def _measured(row: Mapping[str, Any]) -> list[list[str]]:
         for name in measure_names([measures])
     ]
     table = [[Table(["measure", "value", "unit"], body, "lrl").draw()]] if body else []
-    return [*table, [f"time             {seconds(row['seconds'])}"]]
+    return [*table, [f"time             {_times(row)}"]]
+
+
+def _times(row: Mapping[str, Any]) -> str:
+    cpu = row.get("cpu_seconds")
+    return seconds(row["seconds"]) + (f" ({seconds(cpu)} of the processor)" if cpu is not None else "")
 
 
 def _redo_command(found: FoundEstimate, out: Path) -> str:

@@ -1,9 +1,10 @@
-"""How answers look: aligned text or Markdown, and how numbers are written in it."""
+"""How answers look: aligned text, Markdown or LaTeX, and how numbers are written in it."""
 
 import csv
 import io
 import json
 import math
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,8 +21,12 @@ class Table:
     align: str
 
     def draw(self, style: str = "text") -> str:
-        """Columns padded with blanks and a rule under the header, or Markdown (``md``)."""
+        """Columns padded with blanks and a rule under the header, or Markdown (``md``), or ``latex`` with booktabs."""
         lines = [self.header, *self.rows]
+        if style == "latex":
+            header, *body = (" & ".join(map(latex, cells)) + r" \\" for cells in lines)
+            rules = [f"\\begin{{tabular}}{{{self.align}}}", r"\toprule", header, r"\midrule"]
+            return "\n".join([*rules, *body, r"\bottomrule", r"\end{tabular}"])
         if style == "md":
             drawn = ["| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |" for cells in lines]
             rule = "|" + "|".join(":--" if side == "l" else "--:" for side in self.align) + "|"
@@ -46,13 +51,36 @@ class Report:
     notes: Sequence[str] = field(default=())
 
     def draw(self, style: str = "text") -> str:
-        """The report for people, as text or as Markdown (``md``)."""
+        """The report for people, as text, as Markdown (``md``), or its tables in LaTeX with the rest as comments."""
         notes = [f"Note: {note}" for note in self.notes]
+        if style == "latex":
+            items = [*(item for block in self.blocks for item in block), *notes]
+            return "\n\n".join(
+                item.draw("latex") if isinstance(item, Table) else textwrap.indent(item.removeprefix("### "), "% ")
+                for item in items
+            )
         if style == "md":
             items = [item for block in self.blocks for item in block]
             return "\n\n".join([*(item.draw("md") if isinstance(item, Table) else item for item in items), *notes])
         blocks = ["\n".join(map(_drawn, block)) for block in self.blocks if block]
         return "\n\n".join([*blocks, "\n".join(notes)] if notes else blocks)
+
+
+#: What LaTeX would read as something else.
+_LATEX = str.maketrans(
+    {
+        **{sign: f"\\{sign}" for sign in "&%$#_{}"},
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "±": r"$\pm$",
+    }
+)
+
+
+def latex(text: str) -> str:
+    """A text for LaTeX."""
+    return text.translate(_LATEX)
 
 
 def _drawn(item: str | Table) -> str:
@@ -62,7 +90,7 @@ def _drawn(item: str | Table) -> str:
 
 
 def write_reports(reports: Sequence[Report], style: str) -> str:
-    """Reports as ``text``, ``md``, ``csv`` or ``json``."""
+    """Reports as ``text``, ``md``, ``latex``, ``csv`` or ``json``."""
     records = [record for report in reports for record in report.records]
     if style == "json":
         return json.dumps(records, indent=1, allow_nan=False)

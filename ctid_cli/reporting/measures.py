@@ -19,7 +19,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
-from ctid_cli.inference.monte_carlo import MEASURES, Measure, Measured
+from ctid_cli.inference.monte_carlo import MEASURES, Measure, Measured, requested
 from ctid_cli.inference.status import Status
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.parameter_errors import ParameterEstimates, estimates_by_group
@@ -27,7 +27,6 @@ from ctid_cli.reporting.percentages import Row, labelled_groups
 from ctid_cli.reporting.results import Results
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.manifest import true_values
-from ctid_cli.text import did_you_mean
 
 #: Statuses of estimates with which nothing is wrong.
 SUCCESSES = {Status.CONVERGED.name, Status.LEAST_SQUARES.name, "VALID"}
@@ -67,16 +66,14 @@ def measure_rows(results: Results, names: Sequence[str]) -> list[Row]:
 
 
 def default_measures(results: Results) -> Sequence[str]:
-    """What the specification asks for, or else bias and root mean square error."""
-    asked: Sequence[str] = results.settings.get("measures") or DEFAULT
-    return asked
+    """What the specification asks for; bias and root mean square error where it has no success rule; else nothing."""
+    asked: Sequence[str] = results.settings.get("measures") or ()
+    measurable = not results.settings.get("success") and any(map(true_values, results.manifest["data_cells"]))
+    return asked or (DEFAULT if measurable else ())
 
 
 def _known(name: str, results: Results) -> Measure:
-    if name not in MEASURES:
-        hint = did_you_mean(name, MEASURES) or "."
-        raise UsageError(f"there is no measure {name!r}{hint} Known: {', '.join(MEASURES)}")
-    measure = MEASURES[name]
+    measure = requested(name)
     if measure.source == "errors" and not any(map(true_values, results.manifest["data_cells"])):
         others = ", ".join(key for key, item in MEASURES.items() if item.source != "errors")
         reason = "needs true values, and only a simulated system has them"

@@ -5,7 +5,8 @@ Keys of a row
 - ``table``, ``experiment``, ``sampling``; one key per swept field; ``initial_delay``: where the search started [s],
   ``"random"``, or None for an estimator that needs no start; ``method``: name of the estimator.
 - ``n``, ``failed``, ``converged``; ``percent`` with its 95 % Wilson interval ``low`` and ``high`` [%];
-  ``published_percent`` [%]; ``median_seconds``: median time of one estimate [s].
+  ``published_percent`` [%]; ``median_seconds`` and
+  ``median_cpu_seconds``: median wall and processor time of one estimate [s].
 - Of frequencies of a signal: ``median_settling_time`` and ``median_settling_after_step`` of the slowest tone [s], None
   where half of the data sets or more never settled; ``median_rms_1 …`` [rad/s]; ``false_alarms`` of all data sets.
 """
@@ -34,7 +35,7 @@ ALWAYS = {"snr_db": "noise.snr_db"}
 #: What stands in a cell that was not run.
 NOTHING = {
     **dict.fromkeys(("n", "failed", "converged"), 0),
-    **dict.fromkeys(("percent", "low", "high", "published_percent", "median_seconds")),
+    **dict.fromkeys(("percent", "low", "high", "published_percent", "median_seconds", "median_cpu_seconds")),
 }
 
 
@@ -42,6 +43,12 @@ def measures_of(rows: Iterable[Mapping[str, Any]]) -> list[str]:
     """Keys of the measured frequencies."""
     names = dict.fromkeys(key for row in rows for key in row if key not in NOTHING)
     return [name for name in names if name == "false_alarms" or name.startswith(("median_settling", "median_rms"))]
+
+
+def time_of(row: Mapping[str, Any]) -> float | None:
+    """The time of one estimate that tables show: that of the processor, or of the clock where only that is stored."""
+    known = (row.get("median_cpu_seconds"), row["median_seconds"])
+    return next((float(time) for time in known if time is not None and not math.isnan(time)), None)
 
 
 def settings_of(rows: Iterable[Mapping[str, Any]]) -> list[str]:
@@ -158,7 +165,7 @@ def pooled_rows(study: Study, table: StudyTable, rows: Sequence[Row], options: S
                 "converged": converged,
                 "percent": 100 * converged / n if n else None,
                 "published_percent": None if np.isnan(published) else float(published),
-                "seconds": run["median_seconds"].dropna().tolist(),
+                "seconds": [time for _, row in run.iterrows() if (time := time_of(dict(row))) is not None],
             }
         )
     return pooled

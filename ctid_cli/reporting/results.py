@@ -83,8 +83,9 @@ class Results:
         """Counts and percentages in groups, as plain Python."""
         import pandas as pd
 
-        frame = pd.DataFrame(self.rows, columns=[*by, "status", "converged", "seconds"])
-        counted = summarise(frame.astype({"converged": "boolean", "seconds": "float64"}), by).astype(object)
+        frame = pd.DataFrame(self.rows, columns=[*by, "status", "converged", "seconds", "cpu_seconds"])
+        types = {"converged": "boolean", "seconds": "float64", "cpu_seconds": "float64"}
+        counted = summarise(frame.astype(types), by).astype(object)
         found: list[Any] = counted.where(counted.notna(), None).to_dict("records")
         return found
 

@@ -7,7 +7,7 @@ from typing import Any
 from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.reporting.estimate import parameters
 from ctid_cli.reporting.layout import Table, delay_label, number, percent, seconds, with_error
-from ctid_cli.reporting.percentages import Row, measures_of, pooled_rows, settings_of
+from ctid_cli.reporting.percentages import Row, measures_of, pooled_rows, settings_of, time_of
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.study import Study, StudyTable
 from ctid_cli.text import listed
@@ -16,7 +16,7 @@ Blocks = list[list[str | Table]]
 
 NOT_RUN = "not run"
 RULE = "Estimates that failed count as not converged. 95 %: Wilson interval of the percentage."
-TIME = "Time: median of one estimate"
+TIME = "Time: median of one estimate, of the processor where that is stored"
 
 #: Estimators side by side, and estimates of a measured record, before a table continues below.
 GROUPS_PER_BLOCK = 2
@@ -52,7 +52,7 @@ def interval_text(row: Row) -> str:
 
 def time_text(row: Row) -> str:
     """The time of a cell."""
-    return seconds(row["median_seconds"]) if row["n"] else ""
+    return seconds(time_of(row)) if row["n"] else ""
 
 
 def study_blocks(
@@ -126,7 +126,7 @@ def _flat(header: list[str], groups: list[list[Row]], delays: list[Any], labels:
             cells = ["", "", ""] if row is None else [percent_text(row), interval_text(row), _published(row)]
             one = " ".join(cells[:2]).rstrip() + (f" (pub {cells[2]})" if cells[2] else "")
             texts += cells if single else [one or "-"]
-        body.append([*texts, _span([row["median_seconds"] for row in group if row["n"]])])
+        body.append([*texts, _span([time_of(row) for row in group if row["n"]])])
     columns = ["percent", "95 %", "published"] if single else list(map(delay_label, delays))
     return Table([*header, "n", *columns, "time"], body, "l" * len(header) + "r" * (len(columns) + 2))
 
@@ -293,7 +293,7 @@ def _record_table(block: Sequence[Row], bounds: Mapping[str, Any], fits: Mapping
     for name in dict.fromkeys(name for one in found for name in one):
         body.append([name, units[name], *(_with_error(one.get(name)) for one in found)])
     body += [[title, "%", *(number(row.get(key), 4) for row in block)] for title, key in fits.items()]
-    body.append(["time", "", *(seconds(row.get("seconds")) for row in block)])
+    body.append(["time", "", *(seconds(row.get("cpu_seconds") or row.get("seconds")) for row in block)])
     header = ["", "unit", *(f"{row['estimator']}, start {_start(row['start'])}" for row in block)]
     return Table(header, body, "ll" + "r" * len(block))
 

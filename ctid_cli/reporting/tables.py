@@ -7,8 +7,18 @@ from typing import Any
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.committed import committed_tables, made_by, read_tables
 from ctid_cli.reporting.layout import Report
+from ctid_cli.reporting.measure_tables import measure_report
+from ctid_cli.reporting.measures import default_measures
 from ctid_cli.reporting.percentages import Row, experiment_rows, settings_of, study_rows
-from ctid_cli.reporting.results import Results, differences, experiments_in, find_results, out_option, shown_path
+from ctid_cli.reporting.results import (
+    Results,
+    differences,
+    experiments_in,
+    find_results,
+    out_option,
+    read_results,
+    shown_path,
+)
 from ctid_cli.reporting.study import Study, data_folder, load_study
 from ctid_cli.reporting.table_blocks import frequency_blocks, percentage_blocks, record_blocks, study_blocks
 from ctid_cli.specification.load import load_spec
@@ -23,8 +33,13 @@ RECORD_KEYS = (
 )
 
 
-def build_tables(names: Sequence[str], out: Path, style: str = "text", *, committed: bool = False) -> list[Report]:
+def build_tables(
+    names: Sequence[str], out: Path, style: str = "text", *, committed: bool = False, measures: Sequence[str] = ()
+) -> list[Report]:
     """The tables that were asked for; committed ones stand in for those of which nothing was run, if they may."""
+    if measures:
+        found = experiments(names, out, "--measure")
+        return [measure_report(results, measures, notes_of(results, out)) for results in found]
     study = load_study()
     reports = []
     for name in names or [study.name]:
@@ -42,8 +57,15 @@ def build_tables(names: Sequence[str], out: Path, style: str = "text", *, commit
                 hint = did_you_mean(name, known) or "."
                 wrong = f"{name!r} is neither a table nor an experiment with results in {out}{hint}"
                 raise UsageError(f"{wrong} Known: {', '.join(known)}")
-            reports.append(experiment_report(results, _notes(results, out)))
+            reports.append(experiment_report(results, notes_of(results, out)))
     return reports
+
+
+def experiments(names: Sequence[str], out: Path, option: str) -> list[Results]:
+    """Results of the experiments that an option is about."""
+    if not names:
+        raise UsageError(f"{option} needs the name of an experiment: ctid table NAME {option} …")
+    return [read_results(out, name) for name in names]
 
 
 def _study_report(study: Study, number: int, out: Path, style: str, committed: bool) -> Report:
@@ -84,7 +106,7 @@ def _results_of(study: Study, name: str, out: Path) -> tuple[Results | None, set
         return None, set(), [f"{name} has no stored results yet: {error}"]
     if results is None:
         return None, set(), [f"{name} was not run." + (f" To fill its rows: {command}" if specification else "")]
-    estimators, remarks = set(results.settings["estimators"]), _notes(results, out)
+    estimators, remarks = set(results.settings["estimators"]), notes_of(results, out)
     if specification is not None:
         estimators |= specification["estimators"].keys()
         remarks = [*_departures(results, specification, set(study.fields.values()), command), *remarks]
@@ -107,6 +129,8 @@ def experiment_report(results: Results, notes: Sequence[str] = ()) -> Report:
     rows = experiment_rows(results)
     if results.settings.get("data") is not None:
         return Report(record_blocks(results), _record_rows(results, rows), notes)
+    if names := default_measures(results):
+        return measure_report(results, names, notes)
     blocks = frequency_blocks if is_of_signal(results.manifest) else percentage_blocks
     return Report(blocks(results, rows), rows, notes)
 
@@ -122,7 +146,8 @@ def _record_rows(results: Results, rows: Sequence[Row]) -> list[Row]:
     return found
 
 
-def _notes(results: Results, out: Path) -> list[str]:
+def notes_of(results: Results, out: Path) -> list[str]:
+    """What to know of the results themselves."""
     notes = []
     if results.failed:
         command = f"ctid status {results.experiment}{out_option(out)}"

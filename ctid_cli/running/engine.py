@@ -182,7 +182,7 @@ class _Run:
             self.done += unfinished[data_set] == 0
             self.computed += len(item.outcomes)
             rows = tuple(
-                assemble(slot, self.manifest, outcome.result, outcome.seconds)
+                assemble(slot, self.manifest, outcome.result, outcome.seconds, outcome.cpu_seconds)
                 for outcome in item.outcomes
                 for slot in self.slots[outcome.key]
             )

@@ -5,6 +5,7 @@ Nothing here raises. Whatever goes wrong with an estimate becomes its result, wi
 
 from __future__ import annotations
 
+import os
 import re
 import time
 import traceback
@@ -12,6 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from ctid_cli.arrays import Array
 from ctid_cli.canonical import plain
 from ctid_cli.storage.columns import failed, no_result
 from ctid_cli.storage.manifest import Key, Outcome
@@ -45,25 +49,33 @@ def run_job(job: Job) -> list[Outcome]:
         return [Outcome(key, result, None) for key, _, _ in job.wanted]
     outcomes = []
     prepared: Any = None
-    preparing = 0.0
+    preparing = np.zeros(2)
     current: EstimatorCell | None = None
     for key, cell, start in job.wanted:
         try:
             if cell is not current:
                 current, prepared = None, None
-                begun = time.perf_counter()
+                begun = _clocks()
                 prepared = cell.estimator.prepare(data.record)
-                preparing = time.perf_counter() - begun
+                preparing = _clocks() - begun
                 current = cell
-            begun = time.perf_counter()
+            begun = _clocks()
             drawn = start.draw(job.seed, job.replicate, data.true_model)
             fit = prepared.fit(drawn)
-            seconds: float | None = preparing + time.perf_counter() - begun
+            seconds, cpu_seconds = (preparing + _clocks() - begun).tolist()
             result = no_result() | plain(data.result_of(fit, drawn, job.terms))
         except BaseException as error:
-            result, seconds = failure(error), None
-        outcomes.append(Outcome(key, result, seconds))
+            result, seconds, cpu_seconds = failure(error), None, None
+        outcomes.append(Outcome(key, result, seconds, cpu_seconds))
     return outcomes
+
+
+def _clocks() -> Array:
+    """Wall time and processor time, that of finished child processes too [s]."""
+    times = os.times()
+    # The clock of the process itself ticks faster than that of `os.times`.
+    processor = time.process_time() + times.children_user + times.children_system
+    return np.array([time.perf_counter(), processor])
 
 
 def failure(error: BaseException) -> dict[str, Any]:

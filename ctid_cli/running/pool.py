@@ -78,7 +78,7 @@ class Queue:
 
     def learn(self, outcomes: Sequence[Outcome]) -> None:
         """Note how long estimates took."""
-        for key, _, seconds in outcomes:
+        for key, _, seconds, _ in outcomes:
             self._seconds[key.data_hash, key.estimator_hash] = seconds or 0.0
 
     def _expected(self, job: Job) -> float:

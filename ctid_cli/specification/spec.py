@@ -13,6 +13,8 @@ from pydantic import Field, PrivateAttr
 from pydantic_core import ErrorDetails
 
 from ctid_cli.canonical import canonical_json
+from ctid_cli.errors import UsageError
+from ctid_cli.inference.monte_carlo import requested
 from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.simulation.dataset import MeasuredSource, located
 from ctid_cli.specification.fields import LATER, MAX_WHOLE, Positive, Text, matching
@@ -115,6 +117,8 @@ class Spec(Section):
         Number of data sets and their seed; needed where anything is random
     success : mapping, optional
         When an estimate counts as converged
+    measures : list of str, optional
+        What tables show, such as [bias, rmse, coverage]; by default percentages, or bias and rmse without success
     tracks : mapping, optional
         What is stored of the frequencies of a signal over time; nothing by default
     """
@@ -132,6 +136,7 @@ class Spec(Section):
     starts: StartsSection | None = None
     monte_carlo: MonteCarloSection | None = None
     success: SuccessSection | None = None
+    measures: Annotated[list[Text] | None, LATER] = None
     tracks: Annotated[TracksSection | None, LATER] = None
 
     _warnings: tuple[str, ...] = PrivateAttr(default=())
@@ -163,7 +168,12 @@ class Spec(Section):
         return error
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say which estimators are the same."""
+        """Say which measures there are not, and which estimators are the same."""
+        for k, name in enumerate(self.measures or ()):
+            try:
+                requested(name)
+            except UsageError as error:
+                yield ("measures", k), str(error)
         seen: dict[str, str] = {}
         for name, section in self.estimators.items():
             others = [seen.setdefault(canonical_json(variant.values), name) for variant in variants(section)]

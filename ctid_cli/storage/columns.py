@@ -90,6 +90,7 @@ COLUMNS = (
     Column("condition_number", "float64", "of the scaled normal equations", "-", of="systems"),
     Column("measures", "by name", "what was measured of the frequencies", of="signals", names=measure_names),
     Column("seconds", "float64", "time of this estimate, as if it had been alone", "s", source="clock"),
+    Column("cpu_seconds", "float64", "of the processor, called programs included", "s", source="clock"),
     Column("converged", "boolean", "whether it meets the success rule; null without one", source="truth"),
     Column("true_delay", "float64", "delay of the simulated system", "s", of="systems", source="truth"),
 )
@@ -99,13 +100,18 @@ COUNTS = {
     "n": "int64",
     "failed": "int64",
     "converged": "Int64",
-    **dict.fromkeys(("percent", "low", "high", "median_seconds"), "float64"),
+    **dict.fromkeys(("percent", "low", "high", "median_seconds", "median_cpu_seconds"), "float64"),
 }
+
+
+#: What a row of measures has besides.
+OF_MEASURES = ("parameter", "measure", "unit", "value", "error", "without_value")
 
 
 def reserved_names() -> frozenset[str]:
     """Names of the columns of estimates and tables; a swept field of such a name is written with its section."""
-    return frozenset((*(c.name for c in COLUMNS), *COUNTS, "table", "sampling", "method", "published_percent"))
+    of_tables = ("table", "sampling", "method", "published_percent", *OF_MEASURES)
+    return frozenset((*(c.name for c in COLUMNS), *COUNTS, *of_tables))
 
 
 def failed(message: str, status: str) -> dict[str, Any]:

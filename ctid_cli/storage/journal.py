@@ -6,6 +6,7 @@ and one line for each run with everything that does not belong among the results
 """
 
 import hashlib
+import itertools
 import json
 import shutil
 import sqlite3
@@ -23,7 +24,7 @@ from ctid_cli.storage.manifest import Key, Manifest, Outcome, refuse_newer
 
 FILE_NAME = "journal.sqlite"
 #: Raised by one whenever an older ctid could misread the file.
-FORMAT = 2
+FORMAT = 3
 #: Marks an SQLite file as a journal of ctid ("ctid" in ASCII).
 APPLICATION = 0x63746964
 
@@ -34,13 +35,17 @@ _SCHEMA = (
     """CREATE TABLE estimates (
         data_hash TEXT, replicate INTEGER, estimator_hash TEXT, start TEXT,
         result TEXT NOT NULL, checksum TEXT NOT NULL, seconds REAL, session INTEGER NOT NULL, origin INTEGER,
+        cpu_seconds REAL,
         PRIMARY KEY (data_hash, replicate, estimator_hash, start)) WITHOUT ROWID""",
 )
-#: From format 1, in which a run had one origin, whatever its estimators.
-_UPGRADE = (
-    "ALTER TABLE estimates ADD COLUMN origin INTEGER",
-    "UPDATE estimates SET origin = (SELECT origin FROM sessions WHERE number = session)",
-    "ALTER TABLE sessions DROP COLUMN origin",
+#: From each format to the next: in the first a run had one origin, whatever its estimators, the second has no CPU time.
+_UPGRADES = (
+    (
+        "ALTER TABLE estimates ADD COLUMN origin INTEGER",
+        "UPDATE estimates SET origin = (SELECT origin FROM sessions WHERE number = session)",
+        "ALTER TABLE sessions DROP COLUMN origin",
+    ),
+    ("ALTER TABLE estimates ADD COLUMN cpu_seconds REAL",),
 )
 _SEALED = "sealed"
 #: Columns of the identity of an estimate.
@@ -54,8 +59,9 @@ class Entry:
     """A stored estimate."""
 
     result: dict[str, Any]
-    #: Time it took [s].
+    #: Time it took, and processor time [s].
     seconds: float | None
+    cpu_seconds: float | None
     session: int
     origin: Origin
 
@@ -118,12 +124,16 @@ class Journal:
         """Every stored estimate, each compared with its checksum."""
         found, origins = {}, self._known_origins()
         with self._guard("read"):
-            rows = self._connection.execute(f"SELECT result, checksum, seconds, session, origin, {_KEY} {_WITH_RUNS}")
-            for result, checksum, seconds, session, origin, *parts in rows:
+            # A file that is only read keeps its format.
+            columns = {name for _, name, *_ in self._connection.execute("PRAGMA table_info(estimates)")}
+            cpu = "cpu_seconds" if "cpu_seconds" in columns else "NULL"
+            chosen = f"result, checksum, seconds, {cpu}, session, origin, {_KEY}"
+            rows = self._connection.execute(f"SELECT {chosen} {_WITH_RUNS}")
+            for result, checksum, seconds, cpu_seconds, session, origin, *parts in rows:
                 key = Key(*parts)
                 if _checksum(key, result) != checksum:
                     raise StorageError(f"{self.path} is damaged: estimate {key.id} has changed since it was written")
-                found[key] = Entry(json.loads(result), seconds, session, origins[origin])
+                found[key] = Entry(json.loads(result), seconds, cpu_seconds, session, origins[origin])
         return found
 
     def check(self) -> None:
@@ -157,12 +167,12 @@ class Journal:
     def add(self, outcomes: Iterable[Outcome], session: int) -> None:
         """Store estimates; when this returns, they are safe."""
         rows = []
-        for key, result, seconds in outcomes:
+        for key, result, seconds, cpu_seconds in outcomes:
             text = canonical_json(result)
             origin = self._origins[key.estimator_hash]
-            rows.append((*key, text, _checksum(key, text), seconds, session, origin))
+            rows.append((*key, text, _checksum(key, text), seconds, session, origin, cpu_seconds))
         with self._transaction() as connection:
-            connection.executemany("INSERT INTO estimates VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
+            connection.executemany("INSERT INTO estimates VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
             connection.execute("DELETE FROM meta WHERE name = ?", (_SEALED,))
 
     def mark_sealed(self, checksum: str) -> None:
@@ -223,7 +233,8 @@ def open_journal(path: Path) -> Journal:
             new = not connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone()
             if new or _format(connection, path) < FORMAT:
                 connection.execute("BEGIN IMMEDIATE")
-                for statement in _SCHEMA if new else _UPGRADE:
+                upgrades = () if new else _UPGRADES[_format(connection, path) - 1 :]
+                for statement in _SCHEMA if new else itertools.chain(*upgrades):
                     connection.execute(statement)
                 connection.execute(f"PRAGMA application_id={APPLICATION}")
                 connection.execute(f"PRAGMA user_version={FORMAT}")

@@ -40,6 +40,8 @@ class Outcome(NamedTuple):
     result: dict[str, Any]
     #: Time for preparing the record and fitting [s]; None where nothing was measured.
     seconds: float | None
+    #: The same of the processor [s].
+    cpu_seconds: float | None = None
 
 
 class Slot(NamedTuple):
@@ -73,7 +75,9 @@ def slots(manifest: Manifest) -> Iterator[Slot]:
                     yield Slot(Key(cell["hash"], replicate, estimator["hash"], start), cell, estimator)
 
 
-def assemble(slot: Slot, manifest: Manifest, result: Mapping[str, Any], seconds: float | None) -> dict[str, Any]:
+def assemble(
+    slot: Slot, manifest: Manifest, result: Mapping[str, Any], seconds: float | None, cpu_seconds: float | None
+) -> dict[str, Any]:
     """An estimate row."""
     values = {
         **result,
@@ -86,6 +90,7 @@ def assemble(slot: Slot, manifest: Manifest, result: Mapping[str, Any], seconds:
         "start": slot.key.start,
         "initial_delay": manifest["starts"].get(slot.key.start),
         "seconds": seconds,
+        "cpu_seconds": cpu_seconds,
     }
     return {column.name: values.get(column.name) for column in row_columns(manifest)} | slot.swept
 

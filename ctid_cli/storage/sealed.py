@@ -45,7 +45,7 @@ def seal_image(
 ) -> tuple[bytes, str, int]:
     """The sealed file as bytes, its checksum, and the number of estimates in it."""
     stored = [slot for slot in slots(manifest) if slot.key in results]
-    rows = [assemble(slot, manifest, results[slot.key], None) for slot in stored]
+    rows = [assemble(slot, manifest, results[slot.key], None, None) for slot in stored]
     with h5py.File("runs.h5", "w", driver="core", backing_store=False) as file:
         _write_plan(file, manifest, sorted(origins))
         group = file.create_group("estimates")

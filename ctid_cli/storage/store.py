@@ -6,7 +6,7 @@ import csv
 import io
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import groupby
 from pathlib import Path
@@ -34,6 +34,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+#: Columns of the table of times.
+CLOCKS = ("seconds", "cpu_seconds")
+
+
 @dataclass(frozen=True)
 class Stored:
     """The stored estimates of one plan."""
@@ -41,8 +45,9 @@ class Stored:
     manifest: Manifest
     origins: tuple[Origin, ...]
     results: Mapping[Key, dict[str, Any]]
-    #: Time that each took [s], by key.
+    #: Time that each took [s], by key, and processor time.
     seconds: Mapping[Key, float | None]
+    cpu_seconds: Mapping[Key, float | None] = field(default_factory=dict)
 
     @property
     def mixed(self) -> bool:
@@ -55,7 +60,8 @@ class Stored:
 
     def row(self, slot: Slot) -> dict[str, Any]:
         """The estimate row of one place, with ``true_delay`` and ``converged``."""
-        row = assemble(slot, self.manifest, self.results[slot.key], self.seconds.get(slot.key))
+        times = (self.seconds.get(slot.key), self.cpu_seconds.get(slot.key))
+        row = assemble(slot, self.manifest, self.results[slot.key], *times)
         true = self._truths[slot.key.data_hash]
         converged = is_converged(row, self.manifest["success"], true)
         return row | {"converged": converged, "true_delay": true.get("delay")}
@@ -131,8 +137,9 @@ def seal(folder: Path, log: journal.Journal) -> tuple[int, str]:
     image, checksum, count = seal_image(manifest, stored.origins, stored.results)
     times = io.StringIO()
     table = csv.writer(times, lineterminator="\n")
-    table.writerow(("id", "seconds", "session"))
-    table.writerows((key.id, entries[key].seconds, entries[key].session) for key in stored.results)
+    table.writerow(("id", "seconds", "cpu_seconds", "session"))
+    for key in stored.results:
+        table.writerow((key.id, entries[key].seconds, entries[key].cpu_seconds, entries[key].session))
     target, safe = folder / SEALED, f"all {len(entries)} estimates are safe in {log.path}"
     try:
         place.write_safely(folder / TIMINGS, times.getvalue().encode())
@@ -181,6 +188,7 @@ def _planned(manifest: Manifest, entries: Mapping[Key, journal.Entry]) -> Stored
         gathered((key.estimator_hash, entry.origin) for key, entry in planned.items()),
         {key: entry.result for key, entry in planned.items()},
         {key: entry.seconds for key, entry in planned.items()},
+        {key: entry.cpu_seconds for key, entry in planned.items()},
     )
 
 
@@ -207,14 +215,16 @@ def _read_sealed(folder: Path) -> Stored:
             raise StorageError(f"{error}; {advice}") from error
         raise
     times = _read_times(folder / TIMINGS)
-    return Stored(runs.manifest, runs.origins, runs.results, {key: times.get(key.id) for key in runs.results})
+    columns_of_times = ({key: times.get((key.id, name)) for key in runs.results} for name in CLOCKS)
+    return Stored(runs.manifest, runs.origins, runs.results, *columns_of_times)
 
 
-def _read_times(path: Path) -> dict[str, float]:
+def _read_times(path: Path) -> dict[tuple[str, str], float]:
     # Times are extra: results without them, copied from elsewhere, are complete.
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            return {row["id"]: float(row["seconds"]) for row in csv.DictReader(file) if row.get("seconds")}
+            rows = list(csv.DictReader(file))
+            return {(row["id"], name): float(row[name]) for row in rows for name in CLOCKS if row.get(name)}
     except (OSError, ValueError, KeyError):
         return {}
 

@@ -61,7 +61,7 @@ def summarise(estimates: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     for number, group in estimates.groupby(numbers):
         n, row = len(group), keys.iloc[int((numbers == number).argmax())].to_dict()
         row |= {"n": n, "failed": int(group["status"].isin(columns.FAILURES).sum())}
-        row["median_seconds"] = float(group["seconds"].median())
+        row |= {f"median_{clock}": float(group[clock].median()) for clock in ("seconds", "cpu_seconds")}
         if group["converged"].notna().all():
             k = int(group["converged"].sum())
             low, high = wilson_interval(k, n)

@@ -101,5 +101,6 @@ def test_what_cannot_be_measured_is_refused_in_a_sentence(results, make_results,
 
 
 def test_the_specification_sets_the_default(results, make_results):
-    assert default_measures(results) == ("bias", "rmse")
+    assert default_measures(results) == ()
+    assert default_measures(make_results({}, success=None)) == ("bias", "rmse")
     assert default_measures(make_results({}, measures=["coverage"])) == ["coverage"]

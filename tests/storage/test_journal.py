@@ -165,9 +165,9 @@ def test_another_programs_database_is_refused(tmp_path: Path) -> None:
 def test_a_newer_format_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "journal.sqlite"
     log = filled(path)
-    log._connection.execute("PRAGMA user_version=3")
+    log._connection.execute("PRAGMA user_version=4")
     log.close()
-    with pytest.raises(RefusedError, match="format 3; this ctid reads formats up to 2"), read_journal(path):
+    with pytest.raises(RefusedError, match="format 4; this ctid reads formats up to 3"), read_journal(path):
         pass
 
 

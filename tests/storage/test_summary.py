@@ -74,6 +74,7 @@ def frame() -> pd.DataFrame:
             "status": ["CONVERGED", "CONVERGED", "FAILED", "CONVERGED", "CRASHED"],
             "converged": pd.Series([True, True, False, False, False], dtype="boolean"),
             "seconds": [1.0, 2.0, np.nan, 4.0, 6.0],
+            "cpu_seconds": [0.5, 1.0, np.nan, 2.0, 3.0],
             "numerator": pd.Series([[2.0], [1.0, 3.0], None, [4.0], [None]], dtype="object"),
             "denominator": pd.Series([[1.0, 5.0], [1.0, 6.0, 7.0], None, [1.0, 8.0], [1.0, 9.0]], dtype="object"),
             "standard_errors": pd.Series(
@@ -91,6 +92,7 @@ def test_summarise_keeps_the_order_and_counts_failures() -> None:
     assert table["converged"].tolist() == [1, 1, 0]
     assert table["percent"].tolist() == [100.0, 50.0, 0.0]
     assert table["median_seconds"].tolist() == [1.0, 2.0, 5.0]
+    assert table["median_cpu_seconds"].tolist() == [0.5, 1.0, 2.5]
     low, high = wilson_interval(1, 2)
     assert table.loc[1, ["low", "high"]].tolist() == [100 * low, 100 * high]
 
@@ -108,7 +110,7 @@ def test_summarise_without_groups_and_without_a_rule() -> None:
 def test_export_has_a_column_for_every_coefficient() -> None:
     flat = export_rows(frame())
     assert flat.columns.tolist() == [
-        *("estimator", "initial_delay", "status", "converged", "seconds"),
+        *("estimator", "initial_delay", "status", "converged", "seconds", "cpu_seconds"),
         *("b0", "b1", "a1", "a2", "se_b0", "se_a1", "se_delay"),
     ]
     lists = flat[["b0", "b1", "a1", "a2"]].to_numpy()
@@ -128,7 +130,7 @@ def test_export_has_a_column_for_every_parameter_of_submodels() -> None:
     )
     flat = export_rows(estimates)
     assert flat.columns.tolist() == [
-        *("estimator", "initial_delay", "status", "converged", "seconds"),
+        *("estimator", "initial_delay", "status", "converged", "seconds", "cpu_seconds"),
         *("b0", "b1", "a1", "a2", "g1_a1", "g1_a2", "g1_a10", "g1_b0", "se_a1", "se_g1_a10", "se_g1_b0"),
     ]
     nan = np.nan

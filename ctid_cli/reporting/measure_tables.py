@@ -1,0 +1,66 @@
+"""Measures of an experiment as tables: what is measured of the same parameters side by side."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from ctid_cli.inference.monte_carlo import requested
+from ctid_cli.reporting.layout import Report, Table, delay_label, number, with_error
+from ctid_cli.reporting.measures import measure_rows
+from ctid_cli.reporting.percentages import Row, settings_of
+from ctid_cli.reporting.results import Results
+from ctid_cli.reporting.table_blocks import NOT_RUN, setting_text, setting_title
+
+
+def measure_report(results: Results, names: Sequence[str], notes: Sequence[str] = ()) -> Report:
+    """Measures by name, those of parameters in one table, those of estimates in another, failures in a third."""
+    rows = measure_rows(results, names)
+    tables: dict[str, list[str]] = {}
+    for name in dict.fromkeys(names):
+        source = requested(name).source
+        tables.setdefault(source if source in ("errors", "status") else "estimates", []).append(name)
+    blocks = [[_table(results, [row for row in rows if row["measure"] in own], own)] for own in tables.values()]
+    meanings = "; ".join(f"{name}: {requested(name).meaning}" for name in dict.fromkeys(names))
+    foot = f"{meanings}. ± is one Monte Carlo standard error, [ ] a 95 % interval; --format csv and json have both."
+    if any(row["without_value"] for row in rows):
+        foot += " no value: estimates that could not be counted, failed ones among them."
+    return Report([[f"### {results.experiment}"], *blocks, [foot]], rows, notes)
+
+
+def _table(results: Results, rows: Sequence[Row], names: Sequence[str]) -> Table:
+    """Swept fields, starts, estimators and parameters down, measures across."""
+    fields = [key for key in settings_of(rows) if any(row[key] is not None for row in rows)]
+    with_start = any(row["initial_delay"] is not None for row in rows)
+    parameters = any(row["parameter"] is not None for row in rows)
+    lacking = any(row["without_value"] for row in rows)
+    lines: dict[tuple[Any, ...], dict[str, Row]] = {}
+    for row in rows:
+        place = (*(row[key] for key in fields), row["initial_delay"], row["method"], row["parameter"])
+        lines.setdefault(place, {})[row["measure"]] = row
+    body = []
+    for (*settings, start, method, parameter), found in lines.items():
+        some = next(iter(found.values()))
+        cells = [*map(setting_text, fields, settings), *([delay_label(start)] if with_start else []), method]
+        cells += [number(parameter)] if parameters else []
+        cells += [_cell(found.get(name)) for name in names]
+        cells += [str(some["n"]), str(some["failed"])] if some["n"] else [NOT_RUN, ""]
+        body.append(cells + ([str(some["without_value"])] if lacking else []))
+    header = [*map(setting_title, fields), *(["initial delay"] if with_start else []), "method"]
+    header += ["status" if "failures" in names else "parameter"] if parameters else []
+    left = len(header)
+    header += [_title(name) for name in names]
+    header += ["n", "failed", *(["no value"] if lacking else [])]
+    return Table(header, body, "l" * left + "r" * (len(header) - left))
+
+
+def _title(name: str) -> str:
+    """A measure with its unit; one in the unit of its parameter has none."""
+    unit = requested(name).unit
+    return f"{name} [{unit}]" if unit in ("%", "s") else name
+
+
+def _cell(row: Row | None) -> str:
+    if row is None or row["value"] is None:
+        return "-"
+    if row["unit"] == "%" and row["low"] is not None and row["high"] is not None:
+        return f"{row['value']:.1f} [{row['low']:.1f}, {row['high']:.1f}]"
+    return number(row["value"], 4) if row["error"] is None else with_error(row["value"], row["error"])

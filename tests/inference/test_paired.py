@@ -1,0 +1,94 @@
+"""Differences on the same data sets: published examples, defining equations, and how often they hold the truth."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.optimize import minimize_scalar
+
+from ctid_cli.inference.paired import bootstrap_difference, mcnemar, percent_difference, tango_interval
+
+
+def root_of_mean(squares):
+    return np.sqrt(squares.mean(axis=-1))
+
+
+def test_mcnemar_of_published_tables():
+    # Fagerland, Lydersen and Laake 2013, airway hyper-responsiveness before and after stem cell transplantation.
+    assert mcnemar(1, 7) == pytest.approx(0.039, abs=5e-4)
+    assert mcnemar(7, 1) == mcnemar(1, 7)
+    assert mcnemar(0, 0) == mcnemar(4, 4) == 1.0
+    # A. Agresti, Categorical Data Analysis, Table 10.1: approval of the prime minister, z = 4.17.
+    assert mcnemar(86, 150) == pytest.approx(2 * stats.norm.sf(4.17), rel=0.15)
+
+
+@pytest.mark.parametrize(("b", "c"), [(0, 3), (2, 9), (5, 6), (0, 1)])
+def test_mid_p_halves_what_was_observed(b, c):
+    exact = stats.binomtest(min(b, c), b + c).pvalue
+    observed = stats.binom.pmf(min(b, c), b + c, 0.5)
+    assert mcnemar(b, c) == pytest.approx(min(1.0, exact - observed))
+
+
+def score(d, b, c, n):
+    """Tango's statistic, the likelihood of the discordant pairs maximised by brute force."""
+    low, high = max(0.0, -d), (1 - d) / 2
+
+    def cost(q):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            terms = [(b, q + d), (c, q), (n - b - c, 1 - 2 * q - d)]
+            return -sum(k * np.log(p) for k, p in terms if k)
+
+    q = minimize_scalar(cost, bounds=(low, high), method="bounded", options={"xatol": 1e-12}).x
+    return (b - c - n * d) / np.sqrt(n * (2 * q + d * (1 - d)))
+
+
+@pytest.mark.parametrize(("b", "c", "n"), [(1, 7, 21), (86, 150, 1600), (16, 3, 40), (5, 5, 20), (12, 2, 14)])
+def test_tango_solves_its_defining_equation(b, c, n):
+    low, high = tango_interval(b, c, n)
+    assert score(low, b, c, n) == pytest.approx(1.96, abs=2e-3)
+    assert score(high, b, c, n) == pytest.approx(-1.96, abs=2e-3)
+
+
+def test_tango_of_published_tables():
+    # Fagerland, Lydersen and Laake, Statistics in Medicine 33 (2014) 2850-2875: -0.52 to -0.026.
+    assert tango_interval(1, 7, 21) == pytest.approx((-0.517, -0.026), abs=1e-3)
+    # Without any difference the interval is as wide as Wilson's is for none of n (Tango 1998, section 3).
+    low, high = tango_interval(0, 0, 30)
+    assert (low, high) == pytest.approx((-(1.96**2) / (30 + 1.96**2), 1.96**2 / (30 + 1.96**2)), rel=1e-3)
+    assert tango_interval(30, 0, 30)[1] == 1.0
+
+
+def test_a_difference_is_that_of_the_percentages():
+    found = percent_difference(16, 3, 40)
+    assert found.value == 32.5
+    assert found.low < 32.5 < found.high
+    assert found.p_value == mcnemar(16, 3)
+
+
+def test_the_bootstrap_is_that_of_scipy():
+    rng = np.random.default_rng(1)
+    common = rng.standard_normal(60)
+    one, other = ((0.8 * common + 0.6 * rng.standard_normal(60)) * size for size in (1.3, 1.0))
+    found = bootstrap_difference(root_of_mean, one**2, other**2)
+
+    def statistic(a, b, axis=-1):
+        return np.sqrt((a**2).mean(axis)) - np.sqrt((b**2).mean(axis))
+
+    theirs = stats.bootstrap((one, other), statistic, paired=True, n_resamples=20_000, rng=np.random.default_rng(2))
+    interval = theirs.confidence_interval
+    width = interval.high - interval.low
+    assert found.value == pytest.approx(statistic(one, other))
+    assert (found.low, found.high) == pytest.approx((interval.low, interval.high), abs=0.04 * width)
+    # The p-value is that of the interval that ends at zero.
+    assert (found.p_value < 0.05) == (found.low > 0 or found.high < 0)
+    assert bootstrap_difference(root_of_mean, one**2, other**2) == found
+    assert bootstrap_difference(root_of_mean, one**2, one**2)[:3] == (0.0, 0.0, 0.0)
+    assert bootstrap_difference(root_of_mean, one**2, one**2).p_value == 1.0
+
+
+def test_the_p_value_of_no_difference_is_uniform():
+    rng = np.random.default_rng(3)
+    found = []
+    for _ in range(60):
+        one, other = rng.standard_normal((2, 80))
+        found.append(bootstrap_difference(root_of_mean, one**2, other**2).p_value)
+    assert stats.kstest(found, "uniform").pvalue > 0.01
