@@ -19,6 +19,8 @@ from ctid_cli.filtering.exponential import HeldStep, exponential_minus_identity,
 from ctid_cli.filtering.filter_data import FilterData, clock_slack, split_delay
 from ctid_cli.filtering.row_sink import BLOCK
 
+#: Breaks of which the states are kept at a time.
+STRETCH = 512
 #: A free response is over when its states are this fraction of their greatest.
 NOTHING = 1e-30
 #: No combinations of columns are wanted but the second moments of all.
@@ -37,9 +39,6 @@ class Way(NamedTuple):
 
     step: HeldStep
     table: Transitions
-    #: State, held input and its slope; and the same twice for a step in parts, shapes (n + 2,) and (2, n + 2).
-    full: Array
-    work: Array
 
 
 class ChainState(NamedTuple):
@@ -81,23 +80,28 @@ def _table(dynamics: Array, gain: Array, data: FilterData, delay: float, period:
 
 
 @njit(cache=True, nogil=True)
-def _follow(j: int, z: Array, following: Array, way: Way, data: FilterData, period: float) -> None:
-    """The state at the break after break j, from that at break j."""
-    u, tu, n = data.u, data.tu, z.size
-    last = j == tu.size - 1
-    change = (u[0] if last else u[j + 1]) - u[j] if data.input_foh else 0.0
-    if data.interval > 0.0:
-        for i in range(n):
-            following[i] = way.step.from_value[i] * u[j] + way.step.from_change[i] * change
-        _advance(way.step.transition, z, following)
-    else:
-        length = (tu[0] + period if last else tu[j + 1]) - tu[j]
-        for i in range(n):
-            way.full[i] = z[i]
-        way.full[n], way.full[n + 1] = u[j], change / length
-        irregular_step(way.table, length, way.full, way.work)
-        for i in range(n):
-            following[i] = way.full[i]
+def _follow(states: Array, begin: int, end: int, way: Way, data: FilterData, period: float) -> None:
+    """The states at the breaks up to ``end``, in rows, from that at break ``begin`` in the first one."""
+    n = states.shape[1]
+    u, tu, foh, regular = data.u, data.tu, data.input_foh, data.interval > 0.0
+    transition, from_value, from_change = way.step
+    table, full, work = way.table, np.zeros(n + 2), np.zeros((2, n + 2))
+    for j in range(begin, end):
+        z, following = states[j - begin], states[j - begin + 1]
+        last = j == tu.size - 1
+        change = (u[0] if last else u[j + 1]) - u[j] if foh else 0.0
+        if regular:
+            for i in range(n):
+                following[i] = from_value[i] * u[j] + from_change[i] * change
+            _advance(transition, z, following)
+        else:
+            length = (tu[0] + period if last else tu[j + 1]) - tu[j]
+            for i in range(n):
+                full[i] = z[i]
+            full[n], full[n + 1] = u[j], change / length
+            irregular_step(table, length, full, work)
+            for i in range(n):
+                following[i] = full[i]
 
 
 @njit(cache=True, nogil=True)
@@ -107,13 +111,15 @@ def _first_state(dynamics: Array, way: Way, data: FilterData, period: float) -> 
     From rest to the end of a period x_N is left over: x0 = x_N + Phi^N x0. With X = Phi^N - I, which the exponential
     gives without cancellation, X x0 = -x_N.
     """
-    z, following = np.zeros(dynamics.shape[0]), np.zeros(dynamics.shape[0])
+    breaks, states = data.tu.size, np.zeros((STRETCH + 1, dynamics.shape[0]))
+    first: Array = states[0]
     if period == 0.0:
-        return z
-    for j in range(data.tu.size):
-        _follow(j, z, following, way, data, period)
-        z, following = following, z
-    return np.asarray(np.linalg.solve(exponential_minus_identity(dynamics * period), -z))
+        return first
+    for begin in range(0, breaks, STRETCH):
+        end = min(begin + STRETCH, breaks)
+        _follow(states, begin, end, way, data, period)
+        first[:] = states[end - begin]
+    return np.asarray(np.linalg.solve(exponential_minus_identity(dynamics * period), -first))
 
 
 @njit(cache=True, nogil=True)
@@ -224,10 +230,11 @@ def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wa
         slack = clock_slack(data)
     table = _table(chain.dynamics, chain.gain, data, delay.seconds, period)
     now, work = np.zeros(n + 2), np.zeros((2, n + 2))
-    way = Way(held_step(chain.dynamics, chain.gain, data.interval), table, now, work)
+    way = Way(held_step(chain.dynamics, chain.gain, data.interval), table)
     # The states at the breaks do not depend on the delay: it only chooses where they are read.
     first = _first_state(chain.dynamics, way, data, period)
-    z, following, at = first.copy(), np.zeros(n), 0
+    states, begin, end = np.zeros((STRETCH + 1, n)), 0, 0
+    states[0] = first
     filled, row, j = 0, 0, -1
     for k in range(data.t.size):
         if not data.use[k]:
@@ -248,13 +255,14 @@ def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wa
             while j + 1 < breaks and tu[j + 1] <= instant + slack:
                 j += 1
             rest = max(0.0, instant - tu[j]) if j >= 0 else 0.0
-        # The state at that break; after the step back out of the period before, from the first one again.
-        if j < at:
-            z[:], at = first, 0
-        while at < j:
-            _follow(at, z, following, way, data, period)
-            z, following = following, z
-            at += 1
+        # The state at that break, from a stretch of them; after the step back from the first one again.
+        if j < begin:
+            states[0] = first
+            begin = end = 0
+        while end < j:
+            states[0] = states[end - begin]
+            begin, end = end, min(end + STRETCH, breaks - 1)
+            _follow(states, begin, end, way, data, period)
         # The input that is held there, and its change up to the next break, after the last one that of the first.
         value, change, length = 0.0, 0.0, 1.0
         if j >= 0:
@@ -264,7 +272,7 @@ def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wa
             elif data.input_foh and period > 0.0:
                 change, length = u[0] - value, tu[0] + period - tu[j]
         for i in range(n):
-            now[i] = z[i] if j >= 0 else 0.0
+            now[i] = states[j - begin, i] if j >= 0 else 0.0
         now[n], now[n + 1] = value, change / length
         # On from the break to the instant itself, after which no change is left to be read.
         if not regular:
