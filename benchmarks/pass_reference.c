@@ -68,52 +68,73 @@ void regular(const double *u, const double *y, long samples, long shift, int par
     moments(block, filled, gram);
 }
 
-static void weights(cx pole, double h, cx *p) {
-    static const double over[] = {1. / 2, 1. / 6, 1. / 24, 1. / 120, 1. / 720, 1. / 5040, 1. / 40320, 1. / 362880,
-                                  1. / 3628800, 1. / 39916800, 1. / 479001600};
-    cx x = pole * h, f, slope;
-    if (creal(x) * creal(x) + cimag(x) * cimag(x) < .0225) {
-        f = over[10], slope = 0;
-        for (int k = 9; k >= 0; k--) slope = slope * x + f, f = f * x + over[k];
-        p[0] = 1 + x * (1 + x * f);
-    } else {
-        cx r = 1 / x;
-        p[0] = cexp(x);
-        f = ((p[0] - 1) * r - 1) * r;
-        slope = ((p[0] - 1) * r - 2 * f) * r;
+/* Decay of a mode over each gap of a block, and what an input linear over it adds to the mode and to its square: series
+   for |pole gap| <= 1, which the compiler takes several at a time. */
+static void steps(cx pole, int count, double in[3][BLOCK], double out[6][BLOCK]) {
+    static const double over[] = {1. / 24, 1. / 120, 1. / 720, 1. / 5040, 1. / 40320, 1. / 362880, 1. / 3628800,
+                                  1. / 39916800, 1. / 479001600, 1. / 6227020800., 1. / 87178291200.,
+                                  1. / 1307674368000., 1. / 20922789888000., 1. / 355687428096000.,
+                                  1. / 6402373705728000.};
+    double p = creal(pole), q = cimag(pole);
+    for (int k = 0; k < count; k++) {
+        double h = in[0][k], v = in[1][k], c = in[2][k], re = p * h, im = q * h;
+        double twice = 2 * re, square = re * re + im * im, last = over[14], before = 0, next;
+#pragma GCC unroll 16
+        for (int m = 13; m > 0; m--) next = over[m] + twice * last - square * before, before = last, last = next;
+        cx x = re + im * I, tail = over[0] - square * before + x * last;
+        cx f = .5 + x * (1. / 6 + x * tail), slope = 1. / 6 + x * (1. / 6 + (x - 2) * tail);
+        cx g = 1 + x * f, decay = 1 + x * g, z = h * (g * v + f * c), w = h * h * ((f + x * slope) * v + slope * c);
+        out[0][k] = creal(decay), out[1][k] = cimag(decay), out[2][k] = creal(z), out[3][k] = cimag(z);
+        out[4][k] = creal(w), out[5][k] = cimag(w);
     }
-    p[1] = h * p[0], p[2] = h * (1 + x * f), p[3] = h * f, p[4] = h * h * (f + x * slope), p[5] = h * h * slope;
 }
 
-/* Any clock, common to input and output. */
+/* Any clock, common to input and output, whose steps are shorter than every mode's memory. */
 void irregular(const double *t, const double *u, const double *y, long samples, double delay, const cx *pole,
                const cx *residue, double *gram) {
-    cx z[MODES] = {0}, w[MODES] = {0}, e[MODES] = {0}, zr[MODES], wr[MODES], p[6];
-    static double block[Q][BLOCK];
-    int filled = 0;
-    long j = -1;
+    cx z[MODES] = {0}, w[MODES] = {0}, e[MODES] = {0};
+    static double block[Q][BLOCK], breaks[3][BLOCK], late[3][BLOCK], output[3][BLOCK];
+    static double b[MODES][6][BLOCK], r[MODES][6][BLOCK], o[MODES][6][BLOCK];
+    int passed[BLOCK], count, reached;
     memset(gram, 0, sizeof(double) * Q * Q);
-    for (long k = 0; k < samples; k++) {
-        double instant = t[k] - delay;
-        for (; j + 1 < samples && t[j + 1] <= instant; j++)
-            for (int i = 0; i < MODES && j >= 0; i++) {
-                weights(pole[i], t[j + 1] - t[j], p);
-                w[i] = p[0] * w[i] + p[1] * z[i] + p[4] * u[j];
-                z[i] = p[0] * z[i] + p[2] * u[j];
+    for (long start = 0, j = -1; start < samples; start += count, j += reached) {
+        for (count = reached = 0; count < BLOCK && start + count < samples; count++) {
+            long k = start + count, i;
+            while ((i = j + reached) + 1 < samples && t[i + 1] <= t[k] - delay) {
+                if (reached == BLOCK) {
+                    reached = passed[count - 1];
+                    goto full;
+                }
+                breaks[0][reached] = i < 0 ? 0 : t[i + 1] - t[i], breaks[1][reached] = i < 0 ? 0 : u[i];
+                reached++;
             }
+            passed[count] = reached;
+            late[0][count] = i < 0 ? 0 : t[k] - delay - t[i], late[1][count] = i < 0 ? 0 : u[i];
+            output[0][count] = k ? t[k] - t[k - 1] : 0, output[1][count] = k ? y[k - 1] : 0;
+            output[2][count] = k ? y[k] - y[k - 1] : 0;
+        }
+    full:
         for (int i = 0; i < MODES; i++) {
-            zr[i] = wr[i] = 0;
-            if (j < 0) continue;
-            weights(pole[i], instant - t[j], p);
-            zr[i] = p[0] * z[i] + p[2] * u[j];
-            wr[i] = p[0] * w[i] + p[1] * z[i] + p[4] * u[j];
+            steps(pole[i], reached, breaks, b[i]);
+            steps(pole[i], count, late, r[i]);
+            steps(pole[i], count, output, o[i]);
         }
-        read_out(block, filled, zr, wr, e, residue, j >= 0 ? u[j] : 0, y[k]);
-        if (++filled == BLOCK) moments(block, BLOCK, gram), filled = 0;
-        for (int i = 0; i < MODES && k + 1 < samples; i++) {
-            weights(pole[i], t[k + 1] - t[k], p);
-            e[i] = p[0] * e[i] + p[2] * y[k] + p[3] * (y[k + 1] - y[k]);
+        for (int k = 0, at = 0; k < count; k++) {
+            cx zr[MODES], wr[MODES];
+            for (int i = 0; i < MODES; i++) {
+                for (int m = at; m < passed[k]; m++) {
+                    cx d = b[i][0][m] + b[i][1][m] * I;
+                    w[i] = d * (w[i] + breaks[0][m] * z[i]) + b[i][4][m] + b[i][5][m] * I;
+                    z[i] = d * z[i] + b[i][2][m] + b[i][3][m] * I;
+                }
+                cx d = r[i][0][k] + r[i][1][k] * I;
+                zr[i] = d * z[i] + r[i][2][k] + r[i][3][k] * I;
+                wr[i] = d * (w[i] + late[0][k] * z[i]) + r[i][4][k] + r[i][5][k] * I;
+                e[i] = (o[i][0][k] + o[i][1][k] * I) * e[i] + o[i][2][k] + o[i][3][k] * I;
+            }
+            at = passed[k];
+            read_out(block, k, zr, wr, e, residue, late[1][k], y[start + k]);
         }
+        moments(block, count, gram);
     }
-    moments(block, filled, gram);
 }
