@@ -8,7 +8,8 @@ __version__: str
 from .signals.held import HeldSignal as HeldSignal
 from .signals.record import Loop as Loop, Record as Record
 from .signals.csv_file import read_record as read_record
-from .signals.excitation import Gaussian as Gaussian, Multisine as Multisine, Prbs as Prbs, Step as Step
+from .signals.excitation import Gaussian as Gaussian, Prbs as Prbs, Step as Step
+from .signals.multisine import Multisine as Multisine
 from .signals.sampling import RegularSampling as RegularSampling, UniformIntervals as UniformIntervals
 from .signals.noise import ArmaNoise as ArmaNoise, WhiteNoise as WhiteNoise
 

@@ -13,9 +13,13 @@ import pytest
 import ctid_cli
 from ctid_cli.frequency.tracking import BatchEstimator
 from ctid_cli.kinds import KINDS, classes
+from ctid_cli.models.pid import ContinuousPid
+from ctid_cli.models.relay import Relay
 from ctid_cli.models.transfer_function import ContinuousModel
+from ctid_cli.signals.drifts import ContinuousNoise
 from ctid_cli.signals.excitation import Excitation
 from ctid_cli.signals.noise import Noise
+from ctid_cli.signals.recorder import Recorder
 from ctid_cli.signals.sampling import Sampling
 from ctid_cli.signals.sinusoids import Piece, SumOfSinusoids, Tone
 from ctid_cli.simulation.dataset import MeasuredSource
@@ -46,8 +50,10 @@ def public_callables():
         for kind, member in classes(section).items():
             if member.__name__ not in ctid_cli.__all__:
                 yield from members_of(kind, member)
-    for contract in (BatchEstimator, ContinuousModel, Excitation, Noise, Sampling):
+    for contract in (BatchEstimator, ContinuousModel, ContinuousNoise, Excitation, Noise, Sampling):
         yield from members_of(contract.__name__, contract)
+    for member in (ContinuousPid, Recorder, Relay):  # options of sections without a kind
+        yield from members_of(member.__name__, member)
     for member in (MeasuredSource, Piece, SumOfSinusoids, Tone, *written_sections()):  # sections without a kind
         yield member.__name__, member
 

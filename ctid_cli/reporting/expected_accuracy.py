@@ -16,11 +16,14 @@ from ctid_cli.inference.asymptotic import limiting_accuracy, output_variance, re
 from ctid_cli.inference.finite_record import finite_record_covariance, sensitivities
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import factored, unfactored
+from ctid_cli.models.relay import Relay
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.running.cells import Plan
 from ctid_cli.signals.excitation import Gaussian
 from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.noise import Noise
 from ctid_cli.signals.sampling import RegularSampling
+from ctid_cli.signals.send_on_delta import SendOnDelta
 from ctid_cli.simulation.dataset import SimulatedSource
 
 #: From so many samples on the limit for long records is taken.
@@ -58,6 +61,12 @@ def expected_accuracy(
     """Accuracy of an estimator on the data sets of a source."""
     if source.noise is None:
         raise DataError("the data have no noise, so nothing but rounding limits the accuracy")
+    if not isinstance(source.noise, Noise):
+        raise DataError("theory is given here for noise with a covariance from sample to sample: white, ARMA, outliers")
+    if isinstance(source.sampling, SendOnDelta):
+        raise DataError("the instants of the samples depend on the noise, and theory is given here for others only")
+    if source.loop is not None and isinstance(source.loop.controller, Relay):
+        raise DataError("the relay feeds noise back into the input, and theory is given here for linear controllers")
     estimated = _estimated(source.system, estimator)
     loop, sampling = source.loop, source.sampling
     if loop is not None and estimated.instruments == "open_loop" and isinstance(sampling, RegularSampling):

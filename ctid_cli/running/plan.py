@@ -10,6 +10,7 @@ from ctid_cli.canonical import content_hash
 from ctid_cli.errors import UsageError
 from ctid_cli.kinds import KINDS
 from ctid_cli.running.cells import DataCell, EstimatorCell, Plan, starts_of
+from ctid_cli.signals.recorder import Recorder
 from ctid_cli.simulation.dataset import SimulatedSource, Source, located
 from ctid_cli.simulation.frequency_measures import Measuring
 from ctid_cli.simulation.frequency_runs import FrequencyEstimation, SignalSource
@@ -22,7 +23,7 @@ from ctid_cli.storage.columns import reserved_names
 #: Data sets that one experiment may ask for; beyond this its plan alone would fill the memory.
 MAX_DATA_SETS = 1_000_000
 #: Sections that data are simulated from.
-_SIMULATED = ("system", "excitation", "loop", "sampling", "noise", "signal", "disturbance")
+_SIMULATED = ("system", "excitation", "loop", "sampling", "noise", "recorder", "signal", "disturbance")
 
 
 def build_plan(spec: Spec, runs: int | None = None) -> Plan:
@@ -75,9 +76,11 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
             content |= {"noise": content.get("noise"), "seed": seed}
             if loop is not None:
                 loop = dataclasses.replace(loop, reference=located(loop.reference, folder))
+                loop = loop.at(options["sampling"].interval)
             excitation, noise = located(options.get("excitation"), folder), options.get("noise")
             # Any seed will do where nothing is random.
-            source = SimulatedSource(options["system"], excitation, options["sampling"], noise, seed or 0, loop)
+            drawn = (options["sampling"], noise, seed or 0, loop, options.get("recorder", Recorder()))
+            source = SimulatedSource(options["system"], excitation, *drawn)
         swept = {names[name, *path]: value for name, v in chosen.items() for path, value in v.swept.items()}
         cells.append(DataCell(content, content_hash(content), swept, source))
     return tuple(cells)

@@ -24,6 +24,13 @@ def require_not_negative(name: str, value: float, unit: str) -> None:
         raise OptionError(name, f"{name} must be zero or a positive number [{unit}], not {value!r}.")
 
 
+def require_share(name: str, value: float, *, whole: bool = True) -> None:
+    """Refuse anything but a number above 0, and up to 1 or below it."""
+    if not _is_number(value) or not 0 < value <= 1 or (value == 1 and not whole):
+        most = "at most" if whole else "below"
+        raise OptionError(name, f"{name} must be a number above 0 and {most} 1 [-], not {value!r}.")
+
+
 def require_finite(name: str, value: float, unit: str, label: str = "") -> None:
     """Refuse anything but a finite number."""
     if not _is_number(value):

@@ -1,6 +1,5 @@
 """Inputs: each is a frozen dataclass of options that generates a held signal."""
 
-import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, get_args
@@ -11,8 +10,9 @@ from numpy.typing import NDArray
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.signals import checks
+from ctid_cli.signals.clock import check_clock, clock_instants
 from ctid_cli.signals.csv_file import read_held_signal
-from ctid_cli.signals.held import COINCIDENCE, HeldSignal, Hold
+from ctid_cli.signals.held import HeldSignal, Hold
 
 #: Lags of a maximal-length feedback register by its number of stages: ``c[k]`` is the parity of the
 #: ``c[k - lag]``. The polynomial 1 + sum of x^lag is primitive over GF(2), hence the period is 2^stages - 1.
@@ -133,76 +133,50 @@ class Prbs(Excitation):
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """The sequence on its clock, the first edge at the first instant; the register's first state is drawn."""
-        clock = _clock(sample_times, self.clock_period)
+        clock = clock_instants(sample_times, self.clock_period)
         bits = maximal_length_sequence(self.stages, clock.size, int(rng.integers(1, 2**self.stages)))
         return HeldSignal(clock, np.where(bits == 1, self.amplitude, -self.amplitude))
 
 
 @dataclass(frozen=True)
-class Multisine(Excitation):
-    """Sum of sinusoids with equal amplitudes and random phases, held between clock instants.
+class Gbn(Excitation):
+    """Generalised binary noise: two values, with a chance of changing at every tick of a clock.
 
     Parameters
     ----------
-    lowest_frequency : float
-        Frequency of the first tone [rad/s].
-    highest_frequency : float
-        Frequency of the last tone [rad/s], below pi over the (mean) clock period.
-    tones : int
-        Number of tones, spaced linearly over the band; a single one lies at its lower end.
+    clock_period : float
+        Shortest time for which a value is held [s]; independent of the sampling.
+    switching_probability : float, default 0.5
+        Probability of a change at each tick [-], above 0 and at most 1. At 0.5 the values are independent.
     amplitude : float, default 1.0
-        Root mean square over whole periods of the tones [input unit].
-    clock_period : float, optional
-        Time for which each value is held [s]; None for a new value at every sampling instant.
+        The signal is plus or minus this [input unit].
 
     Notes
     -----
-    Each tone has the amplitude ``amplitude * sqrt(2 / tones)``, whatever the length of the record: a longer
-    record begins with the shorter one.
+    Both first values are equally likely. A value is held for ``clock_period / switching_probability`` on average,
+    and the autocorrelation k ticks apart is ``amplitude^2 (1 - 2 switching_probability)^k``: rare changes put the
+    power at low frequencies. With H. J. A. F. Tulleken, *Generalized binary noise test-signal concept for improved
+    identification-experiment design*, Automatica 26(1), 1990, https://doi.org/10.1016/0005-1098(90)90156-C, the
+    mean holding time is chosen near the time constants that matter.
     """
 
-    kind: ClassVar[str] = "multisine"
+    kind: ClassVar[str] = "gbn"
 
-    lowest_frequency: float
-    highest_frequency: float
-    tones: int
+    clock_period: float
+    switching_probability: float = 0.5
     amplitude: float = 1.0
-    clock_period: float | None = None
 
     def __post_init__(self) -> None:
-        checks.require_positive("lowest_frequency", self.lowest_frequency, "rad/s")
-        checks.require_positive("highest_frequency", self.highest_frequency, "rad/s")
-        checks.require_integer("tones", self.tones, 1)
+        checks.require_positive("clock_period", self.clock_period, "s")
+        checks.require_share("switching_probability", self.switching_probability)
         checks.require_positive("amplitude", self.amplitude, "input unit")
-        _check_clock(self.clock_period)
-        band = f"{self.lowest_frequency:g} and {self.highest_frequency:g} rad/s"
-        if self.lowest_frequency > self.highest_frequency:
-            raise OptionError(
-                "lowest_frequency", f"lowest_frequency must not exceed highest_frequency; they are {band}."
-            )
-        if self.tones > 1 and self.lowest_frequency == self.highest_frequency:
-            raise OptionError("tones", f"{self.tones} tones need a band, but its ends are {band}.")
-
-    @property
-    def frequencies(self) -> Array:
-        """Frequencies of the tones [rad/s], shape (tones,)."""
-        return np.linspace(self.lowest_frequency, self.highest_frequency, self.tones)
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """The sum on its clock, which must carry the highest tone; the phases are drawn."""
-        clock = _clock(sample_times, self.clock_period)
-        mean_period = (clock[-1] - clock[0]) / (clock.size - 1) if clock.size > 1 else math.inf
-        limit = math.pi / mean_period
-        if self.frequencies[-1] >= limit:
-            most = f"{limit:g} rad/s = pi / {mean_period:g} s, the most its clock can carry; lower one or the other"
-            raise DataError(f"the multisine's highest tone, {self.frequencies[-1]:g} rad/s, is not below {most}")
-        phases = rng.uniform(0.0, 2 * math.pi, self.tones)
-        elapsed = clock - clock[0]
-        total = np.zeros(clock.size)
-        # One tone at a time: a table of all tones at all instants would not fit in memory for long records.
-        for frequency, phase in zip(self.frequencies, phases, strict=True):
-            total += np.cos(frequency * elapsed + phase)
-        return HeldSignal(clock, self.amplitude * math.sqrt(2 / self.tones) * total)
+        """The values on their clock, the first edge at the first instant; the first value and all changes are drawn."""
+        clock = clock_instants(sample_times, self.clock_period)
+        drawn = rng.random(clock.size)
+        changes = np.concatenate(([drawn[0] < 0.5], drawn[1:] < self.switching_probability))
+        return HeldSignal(clock, np.where(np.cumsum(changes) % 2 == 1, self.amplitude, -self.amplitude))
 
 
 @dataclass(frozen=True)
@@ -224,11 +198,11 @@ class Gaussian(Excitation):
 
     def __post_init__(self) -> None:
         checks.require_positive("standard_deviation", self.standard_deviation, "input unit")
-        _check_clock(self.clock_period)
+        check_clock(self.clock_period)
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """Independent values on the clock."""
-        clock = _clock(sample_times, self.clock_period)
+        clock = clock_instants(sample_times, self.clock_period)
         return HeldSignal(clock, self.standard_deviation * rng.standard_normal(clock.size))
 
 
@@ -320,18 +294,3 @@ class InputFile(Excitation):
             times = np.concatenate(([start], times[inside]))
             values = np.concatenate((whole.at([start]), values[inside]))
         return HeldSignal(times, values, self.hold)
-
-
-def _clock(sample_times: Array, period: float | None) -> Array:
-    """Instants at which the signal takes a new value, from the first sample to the last."""
-    if period is None:
-        return sample_times
-    duration = float(sample_times[-1] - sample_times[0])
-    # An edge that coincides with the last sample counts, on whichever side rounding puts it.
-    ticks = math.floor(duration / period + COINCIDENCE) + 1
-    return np.asarray(sample_times[0] + period * np.arange(ticks))
-
-
-def _check_clock(period: float | None) -> None:
-    if period is not None:
-        checks.require_positive("clock_period", period, "s")

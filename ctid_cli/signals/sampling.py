@@ -34,6 +34,11 @@ class Sampling(ABC):
     samples: int
     input_record: InputRecord
 
+    @property
+    def mean_interval(self) -> float:
+        """Expected interval between samples [s]."""
+        return float(getattr(self, "interval"))  # noqa: B009 - most schemes have one
+
     @abstractmethod
     def times(self, rng: np.random.Generator) -> Array:
         """Sampling instants.
@@ -101,13 +106,14 @@ class UniformIntervals(Sampling):
         Longest interval [s].
     samples : int
         Number of samples, at least 2.
-    input_record : {"sampled", "exact"}, default "sampled"
+    input_record : {"sampled", "exact"}, default "exact"
         What the estimator is told of the input: its samples at the output's instants, or its true edges.
 
     Notes
     -----
     Holding the samples of an input whose edges fall between them makes it late by half an interval on
-    average, which biases the delay; ``exact`` removes that bias.
+    average, which biases the delay: that is what ``sampled`` is for. :class:`IrregularSampling` is the same scheme by
+    its mean.
     """
 
     kind: ClassVar[str] = "uniform_intervals"
@@ -115,7 +121,7 @@ class UniformIntervals(Sampling):
     low: float
     high: float
     samples: int = field(metadata={"geometric": True})
-    input_record: InputRecord = "sampled"
+    input_record: InputRecord = "exact"
 
     def __post_init__(self) -> None:
         require_positive("low", self.low, "s")
@@ -125,6 +131,16 @@ class UniformIntervals(Sampling):
         require_integer("samples", self.samples, 2)
         require_choice("input_record", self.input_record, get_args(InputRecord))
 
+    @property
+    def mean_interval(self) -> float:
+        """Expected interval between samples [s]."""
+        return 0.5 * float(self.low + self.high)
+
     def times(self, rng: np.random.Generator) -> Array:
         """Instants at intervals that are drawn."""
-        return np.concatenate(([0.0], np.cumsum(rng.uniform(self.low, self.high, self.samples - 1))))
+        return from_zero(rng.uniform(self.low, self.high, self.samples - 1))
+
+
+def from_zero(intervals: Array) -> Array:
+    """Instants at given intervals [s], the first 0."""
+    return np.concatenate(([0.0], np.cumsum(intervals)))

@@ -4,10 +4,10 @@ from typing import Literal
 
 import numpy as np
 
-Role = Literal["input", "sampling", "noise", "start", "parameters"]
+Role = Literal["input", "sampling", "noise", "start", "parameters", "recorder"]
 
 #: First component of every spawn key. Results are repeatable only while these numbers stay what they are.
-ROLES: dict[Role, int] = {"input": 0, "sampling": 1, "noise": 2, "start": 3, "parameters": 4}
+ROLES: dict[Role, int] = {"input": 0, "sampling": 1, "noise": 2, "start": 3, "parameters": 4, "recorder": 5}
 
 
 def stream(seed: int, role: Role, replicate: int) -> np.random.Generator:

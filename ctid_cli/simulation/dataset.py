@@ -6,22 +6,26 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.models.additive import AdditiveModel, Term
-from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.pid import ContinuousPid
+from ctid_cli.models.relay import Relay
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.csv_file import Offset, read_held_signal, read_record
+from ctid_cli.signals.drifts import ContinuousNoise, noise_at
 from ctid_cli.signals.excitation import Excitation, InputFile
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.noise import Noise
 from ctid_cli.signals.record import Enters, Loop, Record, regular_interval
+from ctid_cli.signals.recorder import Recorder
 from ctid_cli.signals.sampling import Sampling
+from ctid_cli.signals.send_on_delta import SendOnDelta
 from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.additive_parameters import additive_parameters
 
@@ -30,9 +34,16 @@ from ctid_cli.simulation.additive_parameters import additive_parameters
 class LoopOptions:
     """What closes a loop around a system."""
 
-    controller: DiscreteController
+    #: A `DiscreteController`, or by its gains a `ContinuousPid`, or a `Relay`.
+    controller: Any
     reference: Excitation | None = None
     enters: Enters = "controller"
+
+    def at(self, interval: float) -> Self:
+        """The loop with the controller that acts at a sampling interval."""
+        if not isinstance(self.controller, ContinuousPid):
+            return self
+        return dataclasses.replace(self, controller=self.controller.discrete(interval))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,43 +94,59 @@ class SimulatedSource:
     system: TransferFunction | AdditiveModel
     excitation: Excitation | None
     sampling: Sampling
-    noise: Noise | None
+    noise: Noise | ContinuousNoise | None
     seed: int
     loop: LoopOptions | None = None
+    recorder: Recorder = field(default_factory=Recorder)
 
     def dataset(self, replicate: int) -> DataSet:
         """One realisation."""
         generator = self.excitation if self.loop is None else self.loop.reference
         if isinstance(generator, InputFile) and generator.sha256 is not None:
             require_content(generator.file, generator.sha256)
-        assert generator is not None
         times = self.sampling.times(stream(self.seed, "sampling", replicate))
-        applied = generator.generate(times, stream(self.seed, "input", replicate))
+        applied = HeldSignal(times[:1], np.zeros(1))  # a relay needs no reference
+        if generator is not None:
+            applied = generator.generate(times, stream(self.seed, "input", replicate))
         if self.loop is not None:
             return DataSet(self._record_in(self.loop, times, applied.at(times), replicate), true_model=self.system)
         output = _simulated(self.system, applied, times)
+        y = self.recorder.rounded(output + self._drawn(times, output, replicate))
+        if isinstance(self.sampling, SendOnDelta):
+            sent = self.sampling.sent(y)
+            times, output, y = times[sent], output[sent], y[sent]
         known = applied
         if self.sampling.input_record == "sampled":
             known = HeldSignal(times, applied.at(times), applied.hold)
-        record = Record(times, output + self._drawn(output, replicate), known, noise_free=output)
-        return DataSet(record, true_model=self.system)
+        return DataSet(Record(times, self._with_losses(y, replicate), known, noise_free=output), self.system)
 
     def _record_in(self, loop: LoopOptions, times: Array, reference: Array, replicate: int) -> Record:
         from ctid_cli.filtering.loop import simulate_loop
+        from ctid_cli.filtering.relay import simulate_relay
 
         interval = regular_interval(times)
         if interval is None:
             raise DataError("a closed loop needs a regular clock, since its controller acts at every sample")
         # The noise comes before the output, because the output answers to it.
-        noise = self._drawn(np.zeros(times.size), replicate)
-        u, x = simulate_loop(self.system, loop.controller, reference, noise, interval, loop.enters)
-        closed = Loop(reference, loop.controller, loop.enters)
-        return Record(times, x + noise, HeldSignal(times, u), noise_free=x, loop=closed)
+        noise = self._drawn(times, np.zeros(times.size), replicate)
+        controller = loop.at(interval).controller
+        signals = (reference, noise, interval, loop.enters)
+        if isinstance(controller, Relay):
+            u, x = simulate_relay(self.system, controller, *signals)
+            closed = None  # estimators know the loops of linear controllers only
+        else:
+            u, x = simulate_loop(self.system, controller, *signals)
+            closed = Loop(reference, controller, loop.enters)
+        y = self._with_losses(self.recorder.rounded(x + noise), replicate)
+        return Record(times, y, HeldSignal(times, u), noise_free=x, loop=closed)
 
-    def _drawn(self, output: Array, replicate: int) -> Array:
+    def _drawn(self, times: Array, output: Array, replicate: int) -> Array:
         if self.noise is None:
             return np.zeros(output.size)
-        return self.noise.generate(output, stream(self.seed, "noise", replicate))
+        return noise_at(self.noise, times, output, stream(self.seed, "noise", replicate))
+
+    def _with_losses(self, y: Array, replicate: int) -> Array:
+        return self.recorder.with_losses(y, stream(self.seed, "recorder", replicate))
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +216,9 @@ class MeasuredSource:
             r = read_held_signal(self.file, time=self.time, input=self.reference).values[:count]
             if self.loop is not None:
                 mean = r.mean() if self.offset == "remove" else 0.0
-                loop = Loop(r - mean, self.loop.controller, self.loop.enters)
+                # A record of a loop is refused where its clock is not regular.
+                controller = self.loop.at(regular_interval(t[:count]) or 1.0).controller
+                loop = Loop(r - mean, controller, self.loop.enters)
         if self.offset == "remove":
             # The remaining samples must not have a say in what the model is made of.
             u = u - u[:count].mean()

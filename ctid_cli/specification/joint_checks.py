@@ -13,6 +13,8 @@ from ctid_cli.errors import DataError
 from ctid_cli.kinds import KINDS
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored
+from ctid_cli.models.relay import Relay
+from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.dataset import LoopOptions, located
 from ctid_cli.specification.messages import Complaint
@@ -61,13 +63,15 @@ def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool
         yield from too_long or signal_complaints(spec)
         return
     records = extents(spec, samplings) if files_are_good else []
-    open_loop = spec.loop is None and not broken & {"loop", "data", "excitation"}
+    open_loop = (spec.loop is None or has_relay(spec)) and not broken & {"loop", "data", "excitation"}
     yield from _estimator_complaints(spec, records, open_loop=open_loop)
     if spec.starts is not None:
         yield from _start_complaints(spec, spec.starts, broken)
     yield from _success_complaints(spec)
     if spec.loop is not None and spec.data is None:
         yield from _loop_complaints(spec, spec.loop)
+    elif has_relay(spec):
+        yield ("loop",), "a relay is for simulated data; leave the loop out, the record of its input says enough"
     if files_are_good:
         yield from too_long or _simulation_complaints(spec, records)
 
@@ -83,15 +87,8 @@ def extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
         interval = record.duration / max(record.n_samples - 1, 1)
         return [Variant({}, {}, Extent(interval, record.n_samples, (record.t - record.t[0])[record.valid]))]
     # Random intervals stand for themselves at their mean.
-    plans = [
-        (case, Extent(mean_interval(case.options), case.options.samples, None, case.options)) for case in samplings
-    ]
+    plans = [(case, Extent(case.options.mean_interval, case.options.samples, None, case.options)) for case in samplings]
     return [Variant({}, case.swept, extent) for case, extent in plans]
-
-
-def mean_interval(sampling: Any) -> float:
-    """Time from one sample to the next [s], on average."""
-    return float(sampling.interval) if hasattr(sampling, "interval") else 0.5 * float(sampling.low + sampling.high)
 
 
 def _too_long(at: KeyPath, sampling: Any) -> Iterator[Complaint]:
@@ -223,11 +220,16 @@ def _success_complaints(spec: Spec) -> Iterator[Complaint]:
 # Simulation
 
 
+def has_relay(spec: Spec) -> bool:
+    """Whether a relay closes the loop: estimators know nothing of it, and take the record for one in open loop."""
+    return spec.loop is not None and hasattr(spec.loop.controller, "relay")
+
+
 def _loop_complaints(spec: Spec, section: Section) -> Iterator[Complaint]:
     """What noise, sampling and system have against a loop."""
     yield from over({(): variants(spec.noise)}, _of_ratio)
     samplings = variants(spec.sampling)
-    if any(not hasattr(variant.options, "interval") for variant in samplings):
+    if any(not isinstance(variant.options, RegularSampling) for variant in samplings):
         yield ("sampling", "kind"), "must be regular in a loop: the controller is discrete and acts at every sample"
         return
     # How many samples there are makes no difference.
@@ -241,7 +243,7 @@ def _loop_complaints(spec: Spec, section: Section) -> Iterator[Complaint]:
 
 def _of_ratio(noise: Any) -> Iterator[Complaint]:
     if noise.snr_db is not None:
-        other = ", or its innovation_variance" if noise.coloured else ""
+        other = ", or its innovation_variance" if hasattr(noise, "innovation_variance") else ""
         yield ("noise", "snr_db"), f"in a loop the noise feeds back into the output; give the noise's variance{other}"
 
 
@@ -250,9 +252,11 @@ def _of_stability(system: Any, loop: LoopOptions, sampling: Any) -> Iterator[Com
     from ctid_cli.filtering.loop import loop_radius
 
     path, interval, radius = ("loop", "controller"), sampling.interval, 0.0
+    if isinstance(loop.controller, Relay):
+        return  # it bounds the input, and oscillates on purpose
     try:
         with np.errstate(all="ignore"):
-            radius = loop_radius(system, loop.controller, interval)
+            radius = loop_radius(system, loop.at(interval).controller, interval)
     except DataError as error:
         yield path, str(error)
     except np.linalg.LinAlgError:

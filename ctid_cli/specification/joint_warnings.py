@@ -10,7 +10,7 @@ import numpy as np
 from ctid_cli.models.additive import Term
 from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.dataset import located
-from ctid_cli.specification.joint_checks import MAX_TRIALS, Extent, extents, mean_interval
+from ctid_cli.specification.joint_checks import MAX_TRIALS, Extent, extents, has_relay
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import Variant, over, variants
 from ctid_cli.specification.signal_checks import signal_warnings
@@ -30,7 +30,7 @@ def joint_warnings(spec: Spec) -> list[Complaint]:
     warnings = [] if spec.system is None else _simulation_warnings(spec)
     if spec.data is not None and spec.monte_carlo is not None and spec.monte_carlo.runs > 1:
         warnings.append((("monte_carlo", "runs"), "a measured record is one data set; it is run once"))
-    if spec.loop is not None:
+    if spec.loop is not None and not has_relay(spec):
         for name, section in spec.estimators.items():
             warnings += over({(): variants(section)}, partial(_of_open_loop, ("estimators", name)))
     if spec.starts is not None:
@@ -76,7 +76,7 @@ def _simulation_warnings(spec: Spec) -> list[Complaint]:
 
 
 def _of_slow_sampling(fastest: float, sampling: Any) -> Iterator[Complaint]:
-    interval = mean_interval(sampling)
+    interval = sampling.mean_interval
     if interval * fastest > math.pi:
         slow = f"sampling every {interval:g} s is slower than twice the fastest pole ({fastest:.4g} rad/s)"
         key: KeyPath = ("sampling", "interval") if hasattr(sampling, "interval") else ("sampling",)
@@ -105,7 +105,7 @@ def _of_sampled_input(spec: Spec, excitation: Any, sampling: Any) -> Iterator[Co
         return
     edges = applied.t[1:][np.diff(applied.values) != 0.0]
     edges = edges[edges < times[-1]]
-    interval = mean_interval(sampling)
+    interval = sampling.mean_interval
     late = times[np.searchsorted(times, edges - ON_TIME * interval)] - edges
     if late.size and late.mean() > ON_TIME * interval:
         seen = f"the estimator sees the input at its samples only, each change {late.mean():.2g} s late on average"

@@ -16,6 +16,7 @@ from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.monte_carlo import requested
 from ctid_cli.kinds import KINDS, resolve
+from ctid_cli.signals.recorder import Recorder
 from ctid_cli.simulation.dataset import MeasuredSource, located
 from ctid_cli.specification.fields import LATER, MAX_WHOLE, Positive, Text, matching
 from ctid_cli.specification.loop_section import LoopSection
@@ -33,11 +34,12 @@ _EXPERIMENT = matching(
 _NAME = matching("[A-Za-z0-9_-]{1,60}", "a name has letters, digits, '-' and '_', at most 60 of them")
 _SIMULATED = ("system", "excitation", "sampling")
 #: Sections that belong to the identification of systems.
-_OF_SYSTEMS = ("system", "excitation", "loop", "noise", "data", "starts")
+_OF_SYSTEMS = ("system", "excitation", "loop", "noise", "recorder", "data", "starts")
 
 
 #: A measured record in place of a simulated one.
 MeasuredSection = Annotated[Any, Options(MeasuredSource, without="loop", sweeping=False)]
+RecorderSection = Annotated[Section, Options(Recorder)]
 
 
 class MonteCarloSection(Section):
@@ -107,6 +109,8 @@ class Spec(Section):
         When the output is sampled
     noise : mapping, optional
         What is added to the output; none by default
+    recorder : mapping, optional
+        What becomes of the output when it is recorded: its resolution, and losses; nothing by default
     data : mapping, optional
         A measured record, in place of system, excitation, sampling and noise
     estimators : mapping of mappings
@@ -131,6 +135,7 @@ class Spec(Section):
     disturbance: Annotated[DisturbanceOrNone | None, LATER] = None
     sampling: AnySamplingSection | None = None
     noise: NoiseSection | None = None
+    recorder: Annotated[RecorderSection | None, LATER] = None
     data: MeasuredSection | None = None
     estimators: Annotated[dict[Annotated[str, _NAME], EstimatorSection], Field(min_length=1)]
     starts: StartsSection | None = None
@@ -219,7 +224,7 @@ class Spec(Section):
 
 
 def _of_a_record(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complaint]:
-    for name in (*_SIMULATED, "noise"):
+    for name in (*_SIMULATED, "noise", "recorder"):
         if name in present:
             yield (name,), "belongs to simulated data, and 'data' names a measured record; keep one of the two"
     if _reference(raw, "loop") is not None:
@@ -234,7 +239,7 @@ def _of_a_record(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complain
 def _of_a_simulation(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complaint]:
     if {"loop", "excitation"} <= present:
         yield ("excitation",), "the loop makes the input; keep one of the two (a reference stands in loop.reference)"
-    elif isinstance(raw.get("loop"), Mapping) and raw["loop"].get("reference") is None:
+    elif isinstance(raw.get("loop"), Mapping) and raw["loop"].get("reference") is None and not _has_relay(raw["loop"]):
         yield ("loop", "reference"), "is missing; for example {kind: gaussian, standard_deviation: 1.0}"
     missing = [name for name in _SIMULATED if name not in present | ({"excitation"} if "loop" in present else set())]
     if len(missing) == len(_SIMULATED):
@@ -242,6 +247,11 @@ def _of_a_simulation(raw: Mapping[str, Any], present: set[str]) -> Iterator[Comp
         return
     for name in missing:
         yield (name,), "is missing; data are simulated with system, excitation (or loop) and sampling"
+
+
+def _has_relay(loop: Mapping[str, Any]) -> bool:
+    controller = loop.get("controller")
+    return isinstance(controller, Mapping) and "relay" in controller
 
 
 def _reference(raw: Mapping[str, Any], section: str) -> Any:
@@ -262,4 +272,5 @@ def _random_section(raw: Mapping[str, Any], present: set[str]) -> str:
         kind = part.get("kind") if isinstance(part, Mapping) else None
         if kind not in kinds or not getattr(resolve(name.split()[0], kind), "deterministic", False):
             return name
-    return ""
+    recorder = raw.get("recorder")
+    return "recorder" if isinstance(recorder, Mapping) and recorder.get("missing") else ""

@@ -19,7 +19,7 @@ SPEC = """\
 experiment: toy
 system: {numerator: [2], denominator: [0.25, 0.7, 1], delay: 1.0}
 excitation: {kind: prbs, stages: 6, clock_period: 0.5}
-sampling: {kind: uniform_intervals, low: 0.05, high: 0.15, samples: 200}
+sampling: {kind: uniform_intervals, low: 0.05, high: 0.15, samples: 200, input_record: sampled}
 noise: {kind: white, snr_db: [5, 15]}
 estimators:
   search: {kind: td_srivc, poles: 2, zeros: 0, delay_bounds: [0, 9]}

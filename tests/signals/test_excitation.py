@@ -10,11 +10,11 @@ from ctid_cli.signals.excitation import (
     TAPS,
     Gaussian,
     InputFile,
-    Multisine,
     Prbs,
     Step,
     maximal_length_sequence,
 )
+from ctid_cli.signals.multisine import Multisine
 from ctid_cli.signals.sampling import RegularSampling, UniformIntervals
 from ctid_cli.signals.streams import stream
 

@@ -117,7 +117,7 @@ def test_impossible_sizes_are_refused(sizes, message):
 
 def test_streams_are_those_of_the_spawn_keys():
     # Stored results are repeatable only as long as these numbers stay what they are.
-    assert ROLES == {"input": 0, "sampling": 1, "noise": 2, "start": 3, "parameters": 4}
+    assert ROLES == {"input": 0, "sampling": 1, "noise": 2, "start": 3, "parameters": 4, "recorder": 5}
     sequence = np.random.SeedSequence(20170331, spawn_key=(2, 5))
     expected = np.random.default_rng(sequence).standard_normal(3)
     assert np.array_equal(stream(20170331, "noise", 5).standard_normal(3), expected)
@@ -125,4 +125,4 @@ def test_streams_are_those_of_the_spawn_keys():
 
 def test_streams_differ_by_seed_role_and_replicate():
     draws = {float(stream(s, role, k).random()) for s in (0, 1) for role in ROLES for k in range(5)}
-    assert len(draws) == 2 * 5 * 5
+    assert len(draws) == 2 * len(ROLES) * 5

@@ -83,9 +83,9 @@ BROKEN = {
     ),
     "missing key": ("interval: 0.05, ", "", 7, 1, "sampling.interval", "is missing; add it: Sampling interval [s]."),
     "missing nested key": ("cutoff: 0.2, ", "", 15, 5, "estimators.one.lowpass.cutoff", "[rad/s]"),
-    "missing kind": ("  kind: prbs\n", "", 3, 1, "excitation.kind", "prbs, multisine, gaussian, step"),
+    "missing kind": ("  kind: prbs\n", "", 3, 1, "excitation.kind", "prbs, gbn, multisine, chirp, gaussian, step"),
     "unknown kind": ("kind: prbs", "kind: prsb", 4, 9, "excitation.kind", "did you mean 'prbs'?"),
-    "kind is a list": ("kind: white", "kind: [white]", 8, 15, "noise.kind", "must be one of white, arma, not a list"),
+    "kind is a list": ("kind: white", "kind: [white]", 8, 15, "noise.kind", "one_over_f, outliers, not a list"),
     "unknown estimator": (
         "kind: td_srivc", "kind: tdsrivc", 11, 11, "estimators.one.kind",
         "additive_srivc, not the text 'tdsrivc'; did you mean 'td_srivc'?",

@@ -1,0 +1,111 @@
+"""Samples that a sensor sends when its output has moved."""
+
+import math
+from dataclasses import dataclass, field
+from typing import ClassVar, get_args
+
+import numpy as np
+from numba import njit
+
+from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.errors import DataError, OptionError
+from ctid_cli.signals.checks import require_choice, require_integer, require_positive
+from ctid_cli.signals.sampling import InputRecord, Sampling
+
+
+@dataclass(frozen=True)
+class SendOnDelta(Sampling):
+    """Samples when the measured output has moved by a threshold since the last one, from 0 s.
+
+    Parameters
+    ----------
+    interval : float
+        Interval at which the sensor looks at the output [s].
+    samples : int
+        Number of looks, at least 2: the most samples that there can be.
+    delta : float
+        Change of the measured output, noise included, that makes a sample [output unit].
+    longest_interval : float, optional
+        Time without a sample after which there is one whatever the output [s]; None for no limit.
+    input_record : {"sampled", "exact"}, default "exact"
+        What the estimator is told of the input: its samples at the output's instants, or its true edges.
+
+    Notes
+    -----
+    The output is simulated, and the noise drawn, at every look. How many samples a record has depends on the output.
+    The instants depend on the noise: with a delta of about its size, mostly large errors are sent, and estimates that
+    take instants for given are biased.
+    """
+
+    kind: ClassVar[str] = "send_on_delta"
+
+    interval: float
+    samples: int = field(metadata={"geometric": True})
+    delta: float
+    longest_interval: float | None = None
+    input_record: InputRecord = "exact"
+
+    def __post_init__(self) -> None:
+        require_positive("interval", self.interval, "s")
+        require_integer("samples", self.samples, 2)
+        require_positive("delta", self.delta, "output unit")
+        require_choice("input_record", self.input_record, get_args(InputRecord))
+        if self.longest_interval is not None:
+            require_positive("longest_interval", self.longest_interval, "s")
+            if self.longest_interval < self.interval:
+                shorter = f"is shorter than the interval of the looks, {self.interval:g} s"
+                raise OptionError("longest_interval", f"longest_interval {shorter}; raise it.")
+
+    def times(self, rng: np.random.Generator) -> Array:
+        """Instants of the looks; nothing is drawn.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+            Not used.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Instants [s], the first 0.
+        """
+        return self.interval * np.arange(self.samples, dtype=float)
+
+    def sent(self, output: Array) -> IndexArray:
+        """Which looks make a sample.
+
+        Parameters
+        ----------
+        output : ndarray, shape (N,)
+            Measured output at the looks [output unit].
+
+        Returns
+        -------
+        ndarray of int, shape (M,)
+            Numbers of the looks, the first 0.
+
+        Raises
+        ------
+        DataError
+            If there is no second sample.
+        """
+        longest = output.size
+        if self.longest_interval is not None:
+            longest = math.floor(self.longest_interval / self.interval * (1 + 1e-9))
+        found = _sent(output, self.delta, longest)
+        if found.size < 2:
+            moved = f"the output moves by {np.ptp(output):g} in all"
+            raise DataError(f"no sample is sent but the first: {moved}, and delta is {self.delta:g}; lower delta")
+        return found
+
+
+@njit(cache=True, nogil=True)
+def _sent(output: Array, delta: float, longest: int) -> IndexArray:
+    """Compiled body of :meth:`SendOnDelta.sent`; ``longest`` is in looks."""
+    found = np.empty(output.size, dtype=np.int64)
+    # What was sent first is the value at the beginning.
+    found[0], count, last = 0, 1, 0
+    for k in range(1, output.size):
+        if abs(output[k] - output[last]) >= delta or k - last >= longest:
+            found[count], count, last = k, count + 1, k
+    return found[:count].copy()
