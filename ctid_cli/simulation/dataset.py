@@ -122,7 +122,7 @@ class SimulatedSource:
 
     def _record_in(self, loop: LoopOptions, times: Array, reference: Array, replicate: int) -> Record:
         from ctid_cli.filtering.loop import simulate_loop
-        from ctid_cli.filtering.relay import simulate_relay
+        from ctid_cli.filtering.relay_loop import simulate_relay
 
         interval = regular_interval(times)
         if interval is None:

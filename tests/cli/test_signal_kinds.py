@@ -14,7 +14,7 @@ from ctid_cli.specification.load import load_spec
 USUAL = {
     "excitation": {"kind": "prbs", "stages": 7, "clock_period": 0.4},
     "sampling": {"kind": "regular", "interval": 0.1, "samples": 400},
-    "noise": {"kind": "white", "snr_db": 20},
+    "noise": {"kind": "white", "snr_db": 30},
 }
 OPTIONS = {
     ("excitation", "gbn"): {"clock_period": 0.2, "switching_probability": 0.3},
@@ -32,10 +32,10 @@ OPTIONS = {
     ("sampling", "missing_samples"): {"interval": 0.1, "samples": 400, "missing": 0.2, "mean_burst": 4},
     ("sampling", "poisson"): {"interval": 0.1, "samples": 400},
     ("sampling", "send_on_delta"): {"interval": 0.1, "samples": 400, "delta": 0.2, "longest_interval": 1.0},
-    ("noise", "arma"): {"numerator": [1], "denominator": [1, -0.5], "snr_db": 20},
+    ("noise", "arma"): {"numerator": [1], "denominator": [1, -0.5], "snr_db": 30},
     ("noise", "random_walk"): {"intensity": 1e-4},
-    ("noise", "one_over_f"): {"lowest_frequency": 0.05, "highest_frequency": 30, "snr_db": 20},
-    ("noise", "outliers"): {"share": 0.05, "size": 10, "snr_db": 20},
+    ("noise", "one_over_f"): {"lowest_frequency": 0.05, "highest_frequency": 30, "snr_db": 30},
+    ("noise", "outliers"): {"share": 0.05, "size": 10, "snr_db": 30},
 }  # fmt: skip
 
 
@@ -89,7 +89,7 @@ def results(tmp_path_factory):
 def test_every_kind_runs_from_its_specification_to_its_estimates(ctid, results, name):
     (estimate,) = json.loads(ctid("export", name, "--format", "json", "--out", results).stdout)
     assert estimate["status"] == "CONVERGED"
-    # 20 dB and a few hundred samples: a fifth is far more than the noise can do.
+    # 30 dB and a few hundred samples: a fifth is far more than the noise can do.
     np.testing.assert_allclose([*estimate["numerator"], estimate["denominator"][1]], [2.0, 2.0], rtol=0.2)
 
 
