@@ -1,11 +1,18 @@
 """What the documentation's Python examples print is what the pages show."""
 
+import dataclasses
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from ctid_cli.kinds import KINDS, classes
+from ctid_cli.models.pid import ContinuousPid
+from ctid_cli.models.relay import Relay
+from ctid_cli.signals.recorder import Recorder
+from ctid_cli.specification.option_docs import option_docs
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLE = re.compile(r"^```python\n(.*?)^```$.*?^```text\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -26,3 +33,27 @@ def test_examples_print_what_is_shown(page):
             [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT, timeout=300
         )
         assert done.stdout == shown
+
+
+#: What the tables of docs/signals.md are made from.
+SIGNALS = [
+    (kind, target)
+    for section in ("excitation", "sampling", "noise")
+    for kind, target in {name: classes(section)[name] for name in KINDS[section]}.items()
+] + [("recorder", Recorder), ("continuous_pid", ContinuousPid), ("relay", Relay)]
+
+
+def options_of(target):
+    for option in dataclasses.fields(target):
+        if option.name not in ("sha256", "input_record"):
+            unit = re.search(r" \[[^\]]+\]", option_docs(target)[option.name])
+            default = "" if option.default in (dataclasses.MISSING, None) else f" = {option.default}"
+            yield f"`{option.name}`{unit[0] if unit else ''}{default}"
+
+
+@pytest.mark.parametrize(("kind", "target"), SIGNALS, ids=[kind for kind, _ in SIGNALS])
+def test_the_tables_of_signals_are_made_from_the_classes(kind, target):
+    """Where this fails, the row that it asks for is in the message."""
+    summary = target.__doc__.strip().splitlines()[0].replace("``", "`")
+    row = f"| `{kind}` | {summary} | {', '.join(options_of(target))} |"
+    assert row in (ROOT / "docs" / "signals.md").read_text(encoding="utf-8").splitlines()

@@ -14,7 +14,7 @@ from ctid_cli.signals.checks import (
     require_positive,
     require_share,
 )
-from ctid_cli.signals.loss import check_loss, ticks_between
+from ctid_cli.signals.missing import check_loss, ticks_between
 from ctid_cli.signals.sampling import InputRecord, Sampling, UniformIntervals, from_zero
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
 from ctid_cli.signals.checks import require_not_negative
-from ctid_cli.signals.loss import check_loss, ticks_between
+from ctid_cli.signals.missing import check_loss, ticks_between
 
 
 @dataclass(frozen=True)
