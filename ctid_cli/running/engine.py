@@ -13,7 +13,7 @@ import time
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -150,19 +150,19 @@ class _Run:
         self.on_event(self.ready)
 
     def compute(self, stopping: StopRequest) -> None:
-        from ctid_cli.running.pool import Died, Finished, run_jobs
+        from ctid_cli.running.pool import Died, Finished, kill_workers, run_jobs
 
         unfinished = {(job.cell.hash, job.replicate): len(job.wanted) for job in self.jobs}
         batch: list[Finished] = []
         since = time.monotonic()
         told = False
-        with closing(run_jobs(self.jobs, self.workers, stopping)) as items:
-            for item in items:
+        try:
+            for item in run_jobs(self.jobs, self.workers, stopping):
                 if stopping() and not told:
                     told = True
                     self.on_event(events.Stopping(stopping.reason or ""))
                 if isinstance(item, Died):
-                    self.on_event(events.WorkerDied(1, item.reason))
+                    self.on_event(events.WorkerDied(item.jobs, item.reason))
                 elif isinstance(item, Finished):
                     batch.append(item)
                 late = time.monotonic() - since >= COMMIT_SECONDS
@@ -173,6 +173,9 @@ class _Run:
                     since = time.monotonic()
             if batch:
                 self._commit(batch, unfinished)
+        except BaseException:
+            kill_workers()
+            raise
 
     def _commit(self, batch: list[Any], unfinished: dict[tuple[str, int], int]) -> None:
         self.log.add([outcome for item in batch for outcome in item.outcomes], self.session)

@@ -45,7 +45,7 @@ class DataSetDone:
 
 @dataclass(frozen=True)
 class WorkerDied:
-    """A worker process died; the estimates of its data set are repeated one by one to find out which of them did it."""
+    """A worker process died; the estimates in work are repeated one by one to find out which of them did it."""
 
     data_sets: int
     reason: str

@@ -1,26 +1,26 @@
 """A pool of worker processes that survives the death of any of them.
 
-Only separate processes can be lost without losing the run, so that one is used for one job at a time as well. On Linux
-they are forked from this process, which has imported and compiled everything that they need.
+joblib's loky backend does the work. It is used for one job at a time as well, because only separate processes can be
+lost without losing the run, and only they can be given one BLAS thread: with more, results have other last bits.
 
-The estimates of a job whose worker died are repeated one by one when nothing else is running; those whose worker dies
-again are ``CRASHED``.
+When a worker dies, the backend drops every unfinished job and does not say which one did it. So their estimates are
+repeated one by one, and those whose worker dies again are ``CRASHED``.
 """
 
-import multiprocessing
+import logging
 import os
-import signal
-import sys
+import queue
+import re
+import threading
 import time
 import warnings
-from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import groupby
-from multiprocessing.connection import Connection, wait
+from typing import Any
 
 from ctid_cli.running.job import Job, run_job
+from ctid_cli.running.job_order import JobQueue
 from ctid_cli.running.worker import initialise
 from ctid_cli.storage.columns import failed
 from ctid_cli.storage.manifest import Outcome
@@ -30,15 +30,12 @@ TICK = 0.05
 #: How long running jobs may go on after a request to stop [s].
 DRAIN = 1.0
 
-#: Nothing that is open or locked here is used in a forked process, and its threads are not needed there.
-_CONTEXT = multiprocessing.get_context("fork") if sys.platform == "linux" else multiprocessing.get_context("spawn")
-
 
 @dataclass(frozen=True)
 class Died:
-    """A worker process died at a job."""
+    """A worker process died."""
 
-    job: Job
+    jobs: int
     reason: str
 
 
@@ -50,148 +47,117 @@ class Finished:
     outcomes: list[Outcome]
 
 
-class Queue:
-    """Jobs in the order of the plan, but the longest of a replicate first, so that at the end no worker waits long.
-
-    Replicates stay in order: a run that is stopped has as many data sets of one cell as of another. What an estimate
-    takes is known from those of the same cell and estimator; unknown ones come first. The last replicate is split into
-    estimators, which are spread more evenly than whole data sets.
-    """
-
-    def __init__(self, jobs: Sequence[Job]) -> None:
-        self._rounds = deque(list(group) for _, group in groupby(jobs, key=lambda job: job.replicate))
-        self._seconds: dict[tuple[str, str], float] = {}
-        self._split_last()
-
-    def __bool__(self) -> bool:
-        return bool(self._rounds)
-
-    def pop(self) -> Job:
-        """The next job."""
-        first = self._rounds[0]
-        job = max(first, key=self._expected)
-        first.remove(job)
-        if not first:
-            self._rounds.popleft()
-            self._split_last()
-        return job
-
-    def learn(self, outcomes: Sequence[Outcome]) -> None:
-        """Note how long estimates took."""
-        for key, _, seconds, _ in outcomes:
-            self._seconds[key.data_hash, key.estimator_hash] = seconds or 0.0
-
-    def _expected(self, job: Job) -> float:
-        return sum(self._seconds.get((key.data_hash, key.estimator_hash), float("inf")) for key, _, _ in job.wanted)
-
-    def _split_last(self) -> None:
-        if len(self._rounds) == 1:
-            self._rounds[0] = [
-                replace(job, wanted=tuple(wanted))
-                for job in self._rounds[0]
-                for _, wanted in groupby(job.wanted, key=lambda one: one[0].estimator_hash)
-            ]
+def run_jobs(jobs: Sequence[Job], workers: int, stopping: Callable[[], bool]) -> Iterator[Finished | Died | None]:
+    """Run jobs in worker processes."""
+    waiting = JobQueue(jobs)
+    while waiting and not stopping():
+        lost, reason = yield from _round(waiting, workers, stopping)
+        if lost and not stopping():
+            yield Died(len(lost), reason)
+            for job in lost:
+                yield from _alone(job, stopping)
 
 
-class _Worker:
-    """A process that runs the jobs it is sent, one at a time."""
-
-    def __init__(self) -> None:
-        self.job: Job | None = None
-        self.pipe, theirs = _CONTEXT.Pipe()
-        self._process = _CONTEXT.Process(target=_serve, args=(theirs, os.getpid()), daemon=True)
-        with warnings.catch_warnings():
-            # Newer versions of Python warn of forking beside threads: here those of BLAS and of the progress bar.
-            warnings.simplefilter("ignore", DeprecationWarning)
-            self._process.start()
-        theirs.close()
-
-    def begin(self, job: Job) -> None:
-        """Send the process a job."""
-        self.job = job
-        # Where it has died while it waited, the end of its pipe is read later, as that of any other.
-        with suppress(OSError):
-            self.pipe.send(job)
-
-    def result(self) -> Finished | Died:
-        """What became of the job."""
-        job, self.job = self.job, None
-        assert job is not None
-        try:
-            return Finished(job, self.pipe.recv())
-        except (EOFError, OSError):
-            return Died(job, self.end())
-
-    def end(self) -> str:
-        """End the process at once, finished or not; how it ended."""
-        self._process.kill()
-        self._process.join()
-        self.pipe.close()
-        code = self._process.exitcode or 0
-        return signal.Signals(-code).name if code < 0 else f"EXIT({code})"
+def _alone(job: Job, stopping: Callable[[], bool]) -> Iterator[Finished | Died | None]:
+    for one in job.wanted:
+        part = replace(job, wanted=(one,))
+        lost, reason = yield from _round(JobQueue([part]), 1, stopping)
+        if lost and not stopping():
+            message = f"the worker process died each time this was computed, the last time alone ({reason})"
+            yield Finished(part, [Outcome(key, failed(message, "CRASHED"), None) for key, _, _ in part.wanted])
 
 
-def _serve(pipe: Connection, parent: int) -> None:
-    initialise(parent)
-    with suppress(EOFError, OSError):
-        while True:
-            pipe.send(run_job(pipe.recv()))
+def _round(
+    waiting: JobQueue, workers: int, stopping: Callable[[], bool]
+) -> Generator[Finished | None, None, tuple[list[Job], str]]:
+    """Run jobs until all are finished or a worker dies; return the jobs that were lost, and why."""
+    import joblib
 
+    logging.getLogger("concurrent.futures").addFilter(_no_failed_callback)
+    running: dict[int, Job] = {}
 
-def run_jobs(
-    jobs: Sequence[Job], workers: int, stopping: Callable[[], bool]
-) -> Generator[Finished | Died | None, None, None]:
-    """Run jobs in worker processes, which end with the iterator."""
-    lost: list[Job] = []
-    for item in _run(Queue(jobs), workers, stopping):
-        if isinstance(item, Died):
-            lost.append(item.job)
-        yield item
-    for job in lost:
-        for one in job.wanted:
-            for item in _run(Queue([replace(job, wanted=(one,))]), 1, stopping):
-                yield _crashed(item) if isinstance(item, Died) else item
+    def calls() -> Iterator[Any]:
+        # joblib asks for the next job from a thread of its own whenever one is finished.
+        while waiting and not stopping():
+            job = waiting.pop()
+            running[id(job)] = job
+            yield joblib.delayed(_numbered)(id(job), job)
 
-
-def _crashed(death: Died) -> Finished:
-    message = f"the worker process died each time this was computed, the last time alone ({death.reason})"
-    outcomes = [Outcome(key, failed(message, "CRASHED"), None) for key, _, _ in death.job.wanted]
-    return Finished(death.job, outcomes)
-
-
-def _run(queue: Queue, workers: int, stopping: Callable[[], bool]) -> Generator[Finished | Died | None, None, None]:
-    """Run jobs until all are finished or a worker died at them, or little longer than until a stop is asked for."""
-    pool: list[_Worker] = []
-    items: list[Finished | Died] = []
-    deadline: float | None = None
+    # joblib would run a single job at a time in this very process; two workers, one of them idle, keep it out.
+    with joblib.parallel_config(
+        backend="loky", n_jobs=max(workers, 2), inner_max_num_threads=1, initializer=initialise, initargs=(os.getpid(),)
+    ):
+        parallel = joblib.Parallel(
+            return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs" if workers > 1 else 1
+        )
     try:
-        while True:
-            if stopping():
-                deadline = deadline or time.monotonic() + DRAIN
-            else:
-                # Before the caller stores what has been finished: workers need not wait for that.
-                idle = [worker for worker in pool if worker.job is None]
-                while queue and (idle or len(pool) < workers):
-                    if not idle:
-                        idle.append(_Worker())
-                        pool += idle
-                    idle.pop().begin(queue.pop())
-            yield from items
-            if not items:
-                yield None
-            busy = [worker for worker in pool if worker.job is not None]
-            if not busy or (deadline is not None and time.monotonic() > deadline):
-                return
-            ready = wait([worker.pipe for worker in busy], TICK)
-            items = []
-            for worker in busy:
-                if worker.pipe in ready:
-                    item = worker.result()
-                    items.append(item)
-                    if isinstance(item, Died):
-                        pool.remove(worker)
-                    else:
-                        queue.learn(item.outcomes)
-    finally:
-        for worker in pool:
-            worker.end()
+        results = parallel(calls())
+    except Exception as error:
+        # The pool can break while the first jobs are handed to it.
+        return list(running.values()), _reason(error)
+    inbox: queue.SimpleQueue[tuple[int, list[Outcome]] | BaseException | None] = queue.SimpleQueue()
+    # The pool itself was started above, by the calling thread: workers die with the thread that started them.
+    threading.Thread(target=_collect, args=(results, inbox), name="ctid-collect", daemon=True).start()
+    deadline: float | None = None
+    reason = ""
+    while True:
+        if deadline is None and stopping():
+            deadline = time.monotonic() + DRAIN
+        try:
+            item = inbox.get(timeout=TICK)
+        except queue.Empty:
+            if deadline is not None and time.monotonic() > deadline:
+                kill_workers()
+                break
+            yield None
+            continue
+        if item is None:
+            break
+        if isinstance(item, BaseException):
+            reason = _reason(item)
+            break
+        number, outcomes = item
+        waiting.learn(outcomes)
+        yield Finished(running.pop(number), outcomes)
+    return list(running.values()), reason
+
+
+def _no_failed_callback(record: logging.LogRecord) -> bool:
+    """Whether a log record is anything but a callback that met a pool being torn down.
+
+    joblib starts the next job from such a callback. When a run ends early the pool may be gone by then; the backend
+    logs a traceback, although nothing is wrong and the outcome of every job reaches us as a result.
+    """
+    return not str(record.msg).startswith("exception calling callback")
+
+
+def _numbered(number: int, job: Job) -> tuple[int, list[Outcome]]:
+    return number, run_job(job)
+
+
+def _collect(results: Iterator[Any], inbox: queue.SimpleQueue[Any]) -> None:
+    try:
+        for result in results:
+            inbox.put(result)
+    except BaseException as error:
+        inbox.put(error)
+    else:
+        inbox.put(None)
+
+
+def _reason(error: BaseException) -> str:
+    # loky names how its workers ended somewhere in a long explanation; how many did so is a matter of chance.
+    endings = sorted(set(re.findall(r"SIG[A-Z0-9]+|EXIT\(\d+\)", str(error))))
+    if endings:
+        return " ".join(endings)
+    first = str(error).strip().partition("\n")[0]
+    return f"{type(error).__name__}: {first}"
+
+
+def kill_workers() -> None:
+    """End the pool's processes at once, finished or not."""
+    from joblib.externals.loky import get_reusable_executor
+
+    with suppress(Exception), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        get_reusable_executor(reuse=True).shutdown(wait=True, kill_workers=True)

@@ -9,12 +9,7 @@ import threading
 import time
 import warnings
 
-import threadpoolctl
-
 _PR_SET_PDEATHSIG = 1
-#: One BLAS thread: with more, results have other last bits.
-_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "BLIS")}
-_ONE_THREAD["VECLIB_MAXIMUM_THREADS"] = "1"
 
 
 def initialise(parent: int) -> None:
@@ -28,9 +23,6 @@ def initialise(parent: int) -> None:
     # Estimators report through their status; warnings of several workers at once would only garble the terminal.
     warnings.simplefilter("ignore")
     faulthandler.disable()
-    # Libraries that are loaded already, and those that will be.
-    threadpoolctl.threadpool_limits(1)
-    os.environ.update(_ONE_THREAD)
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:

@@ -45,7 +45,7 @@ PATH = (
 #: Libraries whose version decides what is computed.
 NUMERICAL_LIBRARIES = ("numpy", "scipy", "numba")
 #: Libraries whose version is worth knowing.
-OTHER_LIBRARIES = ("pandas", "h5py", "pydantic", "pyyaml")
+OTHER_LIBRARIES = ("pandas", "h5py", "joblib", "pydantic", "pyyaml")
 
 _CORE_NAME_FUNCTIONS = (
     "scipy_openblas_get_corename64_",

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import logging
 import os
 import random
 import shutil
@@ -20,8 +21,8 @@ import pytest
 from ctid_cli.errors import DataError, RefusedError, StorageError
 from ctid_cli.running import engine, events
 from ctid_cli.running.engine import RunSummary, current_origins, preview, run_experiment
+from ctid_cli.running.job_order import JobQueue
 from ctid_cli.running.plan import build_plan
-from ctid_cli.running.pool import Queue
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import folder, journal
 from ctid_cli.storage.columns import no_result
@@ -115,7 +116,7 @@ def test_sealed_bytes_do_not_depend_on_jobs_or_order(tmp_path: Path) -> None:
 
 def test_the_longest_of_a_replicate_comes_first_and_the_last_replicate_is_split() -> None:
     plan = FakePlan(runs=3, levels=(1, 2, 3))
-    queue = Queue(engine._jobs(plan, set()))  # type: ignore[arg-type]
+    queue = JobQueue(engine._jobs(plan, set()))  # type: ignore[arg-type]
     taken: list[tuple[int, float, int]] = []
     while queue:
         job = queue.pop()
@@ -469,6 +470,14 @@ def test_mixing_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 # Storage
+
+
+def test_callbacks_of_a_pool_that_is_gone_print_no_traceback(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    run(FakePlan(runs=1), tmp_path)
+    logger = logging.getLogger("concurrent.futures")
+    logger.error("exception calling callback for <Future>")
+    logger.error("something else")
+    assert [record.getMessage() for record in caplog.records] == ["something else"]
 
 
 def test_a_full_disk_loses_nothing_that_was_reported(tmp_path: Path, undisturbed: bytes) -> None:

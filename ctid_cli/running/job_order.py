@@ -1,0 +1,52 @@
+"""In which order the data sets of a run are computed, so that no worker is left waiting at its end."""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import groupby
+
+from ctid_cli.running.job import Job
+from ctid_cli.storage.manifest import Outcome
+
+
+class JobQueue:
+    """Jobs in the order of the plan, but the longest of a replicate first.
+
+    Replicates stay in order: a run that is stopped has as many data sets of one cell as of another. What an estimate
+    takes is known from those of the same cell and estimator; unknown ones come first. The last replicate is split into
+    estimators, which are spread more evenly than whole data sets.
+    """
+
+    def __init__(self, jobs: Sequence[Job]) -> None:
+        self._rounds = deque(list(group) for _, group in groupby(jobs, key=lambda job: job.replicate))
+        self._seconds: dict[tuple[str, str], float] = {}
+        self._split_last()
+
+    def __bool__(self) -> bool:
+        return bool(self._rounds)
+
+    def pop(self) -> Job:
+        """The next job."""
+        first = self._rounds[0]
+        job = max(first, key=self._expected)
+        first.remove(job)
+        if not first:
+            self._rounds.popleft()
+            self._split_last()
+        return job
+
+    def learn(self, outcomes: Sequence[Outcome]) -> None:
+        """Note how long estimates took."""
+        for key, _, seconds, _ in outcomes:
+            self._seconds[key.data_hash, key.estimator_hash] = seconds or 0.0
+
+    def _expected(self, job: Job) -> float:
+        return sum(self._seconds.get((key.data_hash, key.estimator_hash), float("inf")) for key, _, _ in job.wanted)
+
+    def _split_last(self) -> None:
+        if len(self._rounds) == 1:
+            self._rounds[0] = [
+                replace(job, wanted=tuple(wanted))
+                for job in self._rounds[0]
+                for _, wanted in groupby(job.wanted, key=lambda one: one[0].estimator_hash)
+            ]
