@@ -40,7 +40,7 @@ reproduce-small: $(VENV)/.installed
 	$(BIN)/ctid study check --first --jobs $(JOBS)
 
 bench: $(VENV)/.test-installed
-	set -e; for benchmark in benchmarks/bench_*.py; do $(BIN)/python "$$benchmark"; done
+	set -e; for file in benchmarks/bench_*.py; do echo "== $$file"; PYTHONPATH=. $(BIN)/python "$$file"; done
 
 clean:
 	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -4,7 +4,7 @@ All start at the same delay and coefficients, fit the same samples, and report t
 by the same exact simulation.
 """
 
-import time
+from _timing import cpu, least
 
 import control
 import numpy as np
@@ -80,26 +80,18 @@ def exact_cost(record, theta):
 
 
 def main():
-    print(f"{'clock':10}{'method':34}{'ms':>10}{'ratio':>8}{'cost':>12}{'delay s':>10}{'simulations':>13}")
+    print(f"{'clock':10}{'method':34}{'CPU ms':>10}{'ratio':>8}{'cost':>12}{'delay s':>10}{'simulations':>13}")
     for regular in (True, False):
         record = make_record(regular)
         clock = "regular" if regular else "irregular"
         estimator = TdSrivc(poles=2, zeros=0, delay_bounds=BOUNDS)
-        estimator.fit(record, Start(START))  # compiles, or loads what was compiled
-        times = []
-        for _ in range(15):
-            begin = time.perf_counter()
-            fit = estimator.fit(record, Start(START))  # laying out the record included
-            times.append(time.perf_counter() - begin)
-        ours = float(np.median(times))
-        theta = np.array(list(fit.parameters.values()))
+        [ours] = least(15, lambda e=estimator, r=record: e.fit(r, Start(START)))  # laying out the record included
+        theta = np.array(list(estimator.fit(record, Start(START)).parameters.values()))
         print(f"{clock:10}{'td_srivc':34}{1e3 * ours:10.2f}{'1':>8}{exact_cost(record, theta):12.6f}{theta[3]:10.4f}")
         start = np.array([*Svf(2, 0, delay=START).fit(record).parameters.values(), START])
         for name, simulator in (("scipy.signal.lsim", with_lsim), ("python-control", with_control)):
             problem = LeastSquares(record, simulator)
-            begin = time.perf_counter()
-            found = problem.solve(start)
-            seconds = time.perf_counter() - begin
+            seconds, found = cpu(problem.solve, start)
             print(
                 f"{clock:10}{'least_squares, ' + name:34}{1e3 * seconds:10.2f}{seconds / ours:8.0f}"
                 f"{exact_cost(record, found):12.6f}{found[3]:10.4f}{problem.calls:13d}"

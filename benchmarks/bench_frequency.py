@@ -1,6 +1,6 @@
 """Samples per second of the frequency estimators: whole records, one sample at a time, and plain numpy beside them."""
 
-import time
+from _timing import cpu, least
 
 import numpy as np
 
@@ -44,16 +44,6 @@ def estimators(n):
     )
 
 
-def fastest(function, repeats=REPEATS):
-    """Shortest processor time of some calls [s], which neighbours on the same cores disturb least."""
-    times = []
-    for _ in range(repeats):
-        begin = time.thread_time()
-        function()
-        times.append(time.thread_time() - begin)
-    return min(times)
-
-
 def numpy_finite_time(y, n, h, d, gain):
     """The finite-time recursion for n tones, sample by sample with numpy, frequencies included."""
     table, lag, spacing = delay_table(n).astype(float), round(h / INTERVAL), round(d / INTERVAL)
@@ -77,37 +67,36 @@ def numpy_finite_time(y, n, h, d, gain):
 
 
 def main():
-    print(f"{'estimator':28}{'n':>3}{'samples/s':>12}{'target':>10}{'one by one':>13}{'error':>10}")
+    print(f"{'estimator':28}{'n':>3}{'samples/CPU s':>15}{'target':>10}{'one by one':>13}{'error':>10}")
     for n in (2, 5):
         y = signal(n)
         for name, options, fft in estimators(n):
-            options.start(INTERVAL).run(y[:5000], fft=fft)
-            seconds = fastest(lambda options=options, fft=fft, y=y: options.start(INTERVAL).run(y, fft=fft))
+            [seconds] = least(REPEATS, lambda options=options, fft=fft, y=y: options.start(INTERVAL).run(y, fft=fft))
             error = np.abs(options.start(INTERVAL).run(y, fft=fft).omega[-1] - OMEGA[n]).max()
             single = ""
             if not fft:
                 tracker = options.start(INTERVAL)
                 tracker.run(y[:10_000])
-                each = fastest(lambda tracker=tracker, y=y: [tracker.update(sample) for sample in y[:1000]], 3) / 1000
-                single = f"{1e6 * each:.1f} us"
+                [each] = least(3, lambda tracker=tracker, y=y: [tracker.update(sample) for sample in y[:1000]])
+                single = f"{1e3 * each:.1f} us"
             target = TARGETS.get(name, TARGETS["drem"] if name in ("drem_gradient", "drem_finite_time") else {}).get(n)
             wanted = f"{target:.0e}" if target else "-"
-            print(f"{name:28}{n:3d}{SAMPLES / seconds:12.3g}{wanted:>10}{single:>13}{error:10.1e}")
-        begin = time.thread_time()
+            print(f"{name:28}{n:3d}{SAMPLES / seconds:15.3g}{wanted:>10}{single:>13}{error:10.1e}")
         count = 20_000
         h, d = (0.7, 0.4) if n == 2 else (0.4, 0.3)
-        numpy_finite_time(y[:count], n, h, d, 1.0)
-        seconds = time.thread_time() - begin
+        seconds, _ = cpu(numpy_finite_time, y[:count], n, h, d, 1.0)
         compiled = DremFiniteTime(tones=n, h=h, d=d, epsilon=1.0)
-        ratio = seconds / fastest(lambda compiled=compiled, y=y[:count]: compiled.start(INTERVAL).run(y))
-        print(f"{'finite time, numpy':28}{n:3d}{count / seconds:12.3g}   drem_finite_time is {ratio:.0f} times as fast")
+        [ours] = least(REPEATS, lambda compiled=compiled, y=y[:count]: compiled.start(INTERVAL).run(y))
+        ratio = seconds / ours
+        print(f"{'finite time, numpy':28}{n:3d}{count / seconds:15.3g}   drem_finite_time is {ratio:.0f} times as fast")
     y = signal(2, 20_000) + 0.1 * np.random.default_rng(0).standard_normal(20_000)
     print(f"\n{'20 s, 20,000 samples, n = 2':34}{'ms':>8}")
     for name, options in (
         ("ESPRIT on averages of 0.05 s", Esprit(tones=2, averaging=0.05)),
         ("nonlinear least squares", NonlinearLeastSquares(tones=2, averaging=0.05)),
     ):
-        print(f"{name:34}{1e3 * fastest(lambda options=options: options.estimate(y, INTERVAL)):8.1f}")
+        [seconds] = least(REPEATS, lambda options=options: options.estimate(y, INTERVAL))
+        print(f"{name:34}{1e3 * seconds:8.1f}")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@ python benchmarks/bench_measured.py record.csv --delay 0:1 --samples 500 --centr
 """
 
 import argparse
-import time
+
+from _timing import cpu, least
 
 import numpy as np
 from scipy import linalg, optimize, signal
@@ -56,8 +57,8 @@ def with_lsim(a, b, delay, interval, u):
 SIMULATIONS = {"exact": exact_zoh, "scipy.signal.lsim": with_lsim}
 
 
-def multi_start(record, poles, bounds, starts, simulation, zeros=0):
-    """Coefficients and delay of the lowest cost over starts at equally spaced delays."""
+def multi_start(record, poles, bounds, delays, simulation, zeros=0):
+    """Coefficients and delay of the lowest cost over starts at some delays."""
     u, interval = record.input.values, record.interval
 
     def residuals(theta):
@@ -66,8 +67,7 @@ def multi_start(record, poles, bounds, starts, simulation, zeros=0):
     low = [0.0] * poles + [-np.inf] * (zeros + 1) + [bounds[0]]
     high = [np.inf] * (poles + zeros + 1) + [bounds[1]]
     best = None
-    inner = np.linspace(*bounds, starts + 2)[1:-1]  # a start on a bound would be moved off it anyway
-    for delay in inner:
+    for delay in delays:
         start = np.append(list(Svf(poles, zeros, delay=float(delay)).fit(record).parameters.values()), delay)
         start[:poles] = np.maximum(start[:poles], 1e-6)
         found = optimize.least_squares(
@@ -85,20 +85,14 @@ def exact_cost(record, poles, theta):
 
 def compare(name, record, poles, bounds, starts, names):
     estimator = DelayProfile(poles, 0, bounds)
-    estimator.fit(record)  # compiles, or loads what was compiled
-    times = []
-    for _ in range(REPEATS):
-        begin = time.perf_counter()
-        fit = estimator.fit(record)
-        times.append(time.perf_counter() - begin)
-    ours, theta = float(np.median(times)), np.array(list(fit.parameters.values()))
+    [ours] = least(REPEATS, lambda: estimator.fit(record))
+    theta = np.array(list(estimator.fit(record).parameters.values()))
     cost = exact_cost(record, poles, theta)
     print(f"{name:24}{poles:6}  {'delay_profile':28}{'':8}{ours:9.3f}{'1':>7}{cost:16.9g}{'':13}{theta[-1]:10.4f}")
     for simulation in names:
         for count in starts:
-            begin = time.perf_counter()
-            found = multi_start(record, poles, bounds, count, SIMULATIONS[simulation])
-            seconds = time.perf_counter() - begin
+            inner = np.linspace(*bounds, count + 2)[1:-1]  # a start on a bound would be moved off it anyway
+            seconds, found = cpu(multi_start, record, poles, bounds, inner, SIMULATIONS[simulation])
             other = exact_cost(record, poles, found)
             worse = cost / other - 1.0
             verdict = "" if worse <= EXCESS else "  ours is worse"
@@ -154,7 +148,7 @@ def main():
             ("case 1", simulated(case1, 0.05, 4000, Prbs(10, 0.05), 1), [2], (7.75, 8.25)),
         ]
     print(
-        f"{'record':24}{'poles':>6}  {'method':28}{'starts':>8}{'s':>9}{'ratio':>7}{'cost':>16}{'ours excess':>13}"
+        f"{'record':24}{'poles':>6}  {'method':28}{'starts':>8}{'CPU s':>9}{'ratio':>7}{'cost':>16}{'ours excess':>13}"
         f"{'delay s':>10}"
     )
     for name, record, poles, bounds in records:

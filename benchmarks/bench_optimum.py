@@ -9,9 +9,10 @@ above the peer by more than a millionth, and a summary at the end.
 """
 
 import argparse
-import time
 import warnings
 from collections import Counter
+
+from _timing import cpu
 
 import numpy as np
 from numba import njit
@@ -200,9 +201,7 @@ def random_poles(rng, n, box):
 def compared(number, rng, peer_starts):
     """One system: the status of ctid's estimate, its squared error over the peer's, and what to say of it."""
     record, truth, options = random_case(rng)
-    began = time.process_time()
-    fit = options.fit(record)
-    spent = time.process_time() - began
+    spent, fit = cpu(options.fit, record)
     ours, peer = fit.cost * fit.count, Peer(record, options, fit.box)
     here = peer.residual(fit.model.poles, fit.model.delay)
     starts = {"the truth": (truth.poles, truth.delay), "ctid's own": (fit.model.poles, fit.model.delay)}

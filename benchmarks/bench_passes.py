@@ -1,4 +1,4 @@
-"""One pass over a record, ns a sample, beside the same pass written in C and compiled on the spot.
+"""One pass over a record, ns of processor time a sample, beside the same pass written in C and compiled on the spot.
 
     python benchmarks/bench_passes.py
 
@@ -6,16 +6,13 @@ Ours also finds the poles, the partial fractions and the map to the standard row
 Where no C compiler is found only our times are printed.
 """
 
-import os
-
-os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-
 import ctypes
 import shutil
 import subprocess
 import tempfile
-import time
 from pathlib import Path
+
+from _timing import least
 
 import numpy as np
 from bench_srivc_iteration import CASES, noisy_record
@@ -54,17 +51,6 @@ def reference(library, data, poles, residues, delay):
     return lambda: library.irregular(address(data.t), *clock, *rest), gram
 
 
-def fastest(*calls):
-    """Least time of each call [s]; they take turns, so that a disturbance meets all of them."""
-    times = np.empty((REPEATS, len(calls)))
-    for row in times:
-        for k, call in enumerate(calls):
-            begun = time.perf_counter()
-            call()
-            row[k] = time.perf_counter() - begun
-    return times.min(axis=0)
-
-
 def main():
     compiler = shutil.which("cc")
     print(f"{'system':8}{'clock':11}{'delay':16}{'ours':>7}{'C':>7}{'ratio':>7}   ns a sample")
@@ -84,7 +70,7 @@ def main():
                         both = mapping @ np.triu(gram) @ mapping.T
                         theirs = both + both.T - mapping @ np.diag(np.diag(gram)) @ mapping.T
                         np.testing.assert_allclose(theirs, calls[0](), rtol=1e-6, atol=1e-9 * np.abs(theirs).max())
-                    times = 1e9 * fastest(*calls) / samples
+                    times = 1e9 * least(REPEATS, *calls) / samples
                     others = f"{times[1]:7.1f}{times[0] / times[1]:7.2f}" if library else ""
                     print(f"{name:8}{clock:11}{said:16}{times[0]:7.1f}{others}", flush=True)
 

@@ -1,6 +1,6 @@
-"""Time of one SRIVC iteration: second moments of all filtered signals in one pass, then a small solve."""
+"""Processor time of one SRIVC iteration: second moments of all filtered signals in one pass, then a small solve."""
 
-import time
+from _timing import cpu
 
 import numpy as np
 
@@ -37,9 +37,8 @@ def iteration_times(problem, theta, variant):
     """Seconds per iteration, one entry per repeat; the first, which may compile, is left out."""
     times = []
     for _ in range(REPEATS + 1):
-        begin = time.perf_counter()
-        result = iterate(problem, theta, Steps(ITERATIONS, 1e-300, RULES[variant]))
-        times.append((time.perf_counter() - begin) / ITERATIONS)
+        seconds, result = cpu(iterate, problem, theta, Steps(ITERATIONS, 1e-300, RULES[variant]))
+        times.append(seconds / ITERATIONS)
         assert result.iterations == ITERATIONS
     return np.array(times[1:])
 

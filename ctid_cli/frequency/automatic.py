@@ -8,7 +8,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.frequency.decimation import Decimation, low_pass, without_low
+from ctid_cli.frequency.decimation import PIECE, Decimation, low_pass, without_low
 from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES
 from ctid_cli.frequency.spectrum import Peaks, find_peaks
 from ctid_cli.frequency.windows import estimate_window
@@ -132,7 +132,7 @@ def choose_settings(
     gaps = bool((~np.isfinite(samples)).any())
     chosen = method or ("nonlinear_least_squares" if gaps else "esprit")
     band = _choose_band(samples.size * interval, interval, tones, peaks, chosen, bridge, gaps)
-    thinned = band.decimation.apply(samples - offset)
+    thinned = band.decimation.apply(samples, offset)
     thin = interval * band.decimation.factor
     if method is None and gaps and np.isfinite(thinned).all():
         chosen = "esprit"
@@ -167,10 +167,12 @@ def _preparation(peaks: Peaks, tones: int, offset: float, bridged: float) -> Ite
 
 
 def _refuse_unusable(samples: Array, tones: int) -> None:
-    present = samples[np.isfinite(samples)]
-    if present.size < SAMPLES_PER_TONE * tones:
-        raise DataError(f"{present.size} samples are too few for {tones} tones, which need {SAMPLES_PER_TONE * tones}")
-    low, high, largest = present.min(), present.max(), np.abs(present).max()
+    present = np.isfinite(samples)
+    count = np.count_nonzero(present)
+    if count < SAMPLES_PER_TONE * tones:
+        raise DataError(f"{count} samples are too few for {tones} tones, which need {SAMPLES_PER_TONE * tones}")
+    low, high = samples.min(where=present, initial=np.inf), samples.max(where=present, initial=-np.inf)
+    largest = max(abs(low), abs(high))
     if high - low <= CONSTANT * largest:
         raise DataError(f"the signal is constant ({low:.6g}): it has no tones")
     if not SMALLEST_SAMPLE <= largest <= LARGEST_SAMPLE:
@@ -188,9 +190,15 @@ def _doubts(peaks: Peaks, tones: int, interval: float) -> Iterator[str]:
 
 def _offset(samples: Array, weakest: float) -> float:
     """Constant part, if it matters; a Hann window keeps the tones out of the mean."""
-    present = np.isfinite(samples)
-    window = np.where(present, np.sin(np.pi * (np.arange(samples.size) + 0.5) / samples.size) ** 2, 0.0)
-    mean = float(window @ np.where(present, samples, 0.0) / window.sum())
+    total = weight = 0.0
+    for first in range(0, samples.size, PIECE):
+        part = samples[first : first + PIECE]
+        present = np.isfinite(part)
+        places = first + np.arange(part.size) + 0.5
+        window = np.where(present, np.sin(np.pi * places / samples.size) ** 2, 0.0)
+        total += float(window @ np.where(present, part, 0.0))
+        weight += float(window.sum())
+    mean = total / weight
     return mean if abs(mean) > HARMLESS_OFFSET * weakest else 0.0
 
 

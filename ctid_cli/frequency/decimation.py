@@ -7,6 +7,10 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.prefilter import fast_convolve
 
+#: A long record is filtered in pieces of so many samples, or of some filters if these are longer, and never copied.
+PIECE = 2**18
+LENGTHS = 4
+
 
 @dataclass(frozen=True, eq=False)
 class Decimation:
@@ -17,12 +21,17 @@ class Decimation:
     factor: int = 1
     longest_gap: int = 0
 
-    def apply(self, samples: Array) -> Array:
-        """Filter and thin a record."""
-        bridged = bridge_gaps(samples, self.longest_gap)
-        if self.weights.size == 1:
-            return bridged[:: self.factor]
-        return fast_convolve(bridged, self.weights)[:: self.factor]
+    def apply(self, samples: Array, offset: float = 0.0) -> Array:
+        """Filter and thin a record without a constant; nothing is left of one that is shorter than the filter."""
+        bridged, taps = bridge_gaps(samples, self.longest_gap), self.weights.size
+        if taps == 1:
+            return bridged[:: self.factor] - offset
+        length = self.factor * (max(PIECE, LENGTHS * taps) // self.factor)
+        parts = [
+            fast_convolve(bridged[first : first + length + taps - 1] - offset, self.weights)[:: self.factor]
+            for first in range(0, samples.size - taps + 1, length)
+        ]
+        return np.concatenate(parts or [np.empty(0)])
 
     def gain(self, omega: Array, interval: float) -> Array:
         """Factor by which the filter changes amplitudes."""

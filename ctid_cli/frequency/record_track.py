@@ -41,7 +41,7 @@ def track_record(
     on_progress: Callable[[int, int], None] | None = None,
 ) -> RecordTrack:
     """Follow the frequencies of a recorded signal."""
-    thinned = settings.decimation.apply(samples - settings.offset)
+    thinned = settings.decimation.apply(samples, settings.offset)
     thin = settings.interval
     wanted_step = samples.size * interval / USUAL_ROWS
     if every is not None:

@@ -80,7 +80,9 @@ def read_sampled_signal(
     notes += more
     name, unit = split_header(column)
     values = table.numbers(column)
-    values = np.where(np.isfinite(values), values, np.nan)
+    infinite = np.isinf(values)
+    if infinite.any():
+        values = np.where(infinite, np.nan, values)
     time_unit: str | None = "s"
     if interval is None and times is not None:
         time_unit = split_header(times)[1]
@@ -197,17 +199,17 @@ def _read_sound(path: str | os.PathLike[str]) -> tuple[Table, float, str]:
     channels = np.asarray(data).reshape(len(data), -1)
     if channels.size == 0 or rate <= 0:
         raise DataError(f"{file}: the file holds no samples")
-    # Whole numbers become fractions of full scale; those of eight bits are not signed.
-    kind = channels.dtype
-    scaled = channels.astype(np.float64)
-    if kind == np.uint8:
-        scaled = (scaled - 128.0) / 128.0
-    elif kind.kind == "i":
-        scaled /= float(np.iinfo(kind).max) + 1.0
     names = tuple(f"channel {k + 1}" for k in range(channels.shape[1]))
 
     def convert(name: str) -> Array:
-        return scaled[:, names.index(name)]
+        # Whole numbers become fractions of full scale; those of eight bits are not signed.
+        kind, scaled = channels.dtype, channels[:, names.index(name)].astype(np.float64)
+        if kind == np.uint8:
+            scaled -= 128.0
+            scaled /= 128.0
+        elif kind.kind == "i":
+            scaled /= float(np.iinfo(kind).max) + 1.0
+        return scaled
 
     note = f"Sound of {rate} Hz; amplitudes are fractions of full scale."
     if len(names) > 1:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ctid_cli.frequency import decimation
 from ctid_cli.frequency.decimation import Decimation, bridge_gaps, low_pass, without_low
 
 INTERVAL = 0.01
@@ -45,6 +46,14 @@ def test_short_gaps_are_bridged_and_long_ones_stay():
     assert np.isnan(y[100])
     wide = Decimation(np.ones(3) / 3.0, 1, 2).apply(y)
     assert np.flatnonzero(np.isnan(wide)).tolist() == [0, 198, 199, 200, 201, 202]
+
+
+def test_pieces_join_to_the_whole(monkeypatch):
+    monkeypatch.setattr(decimation, "PIECE", 64)
+    step = Decimation(low_pass(40.0, 80.0, 60.0, INTERVAL), 7)
+    y = np.random.default_rng(0).standard_normal(20 * step.weights.size) + 3.0
+    assert step.apply(y, 3.0) == pytest.approx(np.convolve(y - 3.0, step.weights, "valid")[::7], abs=1e-12)
+    assert step.apply(y[: step.weights.size - 1]).size == 0
 
 
 def test_without_a_filter_only_samples_are_kept():

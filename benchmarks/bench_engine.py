@@ -1,4 +1,6 @@
-"""What the engine costs on top of the estimates: ``python -m benchmarks.engine_overhead [DATA_SETS [JOBS...]]``.
+"""What the engine costs on top of the estimates, in wall time, since what is measured is waiting.
+
+    PYTHONPATH=. python benchmarks/bench_engine.py [DATA_SETS [JOBS...]]
 
 Every data set takes 50 ms. The ideal is their sum divided by the number of jobs. The measured time is that of the whole
 command: looking at the folder, starting workers, journal with full synchronisation, sealing and reading back. The start
@@ -16,6 +18,8 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+
+import _timing  # noqa: F401
 
 from ctid_cli.running.engine import run_experiment, usable_processors
 from ctid_cli.running.pool import kill_workers
