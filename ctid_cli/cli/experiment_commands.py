@@ -140,8 +140,18 @@ def validate(configs: Configs, overrides: Overrides = None) -> None:
 
 
 @guarded
-def schema() -> None:
-    """Print the JSON Schema of experiment files."""
-    from ctid_cli.specification.load import json_schema
+def schema(
+    section: Annotated[str | None, typer.Argument(metavar="[SECTION]", help="A section or kind, with --text.")] = None,
+    as_text: Annotated[bool, typer.Option("--text", help="Write a reference to read, not JSON.")] = False,
+) -> None:
+    """Print the JSON Schema of experiment files, or a reference of their keys.
 
-    typer.echo(json.dumps(json_schema(), indent=2))
+    With --text: type, unit, default, allowed values and meaning of every key, or of those of one section or kind, for
+    example `ctid schema --text sampling` or `ctid schema --text td_srivc`.
+    """
+    from ctid_cli.specification.load import json_schema
+    from ctid_cli.specification.reference import reference_text
+
+    if section is not None and not as_text:
+        raise UsageError(f"a part of the schema is there as text only; write: ctid schema --text {section}")
+    typer.echo(reference_text(section) if as_text else json.dumps(json_schema(), indent=2))

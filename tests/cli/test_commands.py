@@ -159,3 +159,8 @@ def test_a_stopped_run_can_be_resumed(ctid, tiny, tmp_path, number, code):
     assert time.monotonic() - begun < 30
     assert f'"stopped_by": "{number.name}"' in output.splitlines()[-1]
     assert "unfinished" in ctid("status", "--out", tmp_path / "results").stdout
+
+
+def test_the_schema_as_text(ctid):
+    assert ctid("schema", "--text", "noise").stdout.startswith("noise: mapping; optional\n")
+    assert "write: ctid schema --text noise" in ctid("schema", "noise", code=2).stderr
