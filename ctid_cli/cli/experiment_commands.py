@@ -141,7 +141,7 @@ def validate(configs: Configs, overrides: Overrides = None) -> None:
 
 @guarded
 def schema(
-    section: Annotated[str | None, typer.Argument(metavar="[SECTION]", help="A section or kind, with --text.")] = None,
+    section: Annotated[str | None, typer.Argument(metavar="SECTION", help="A section or kind, with --text.")] = None,
     as_text: Annotated[bool, typer.Option("--text", help="Write a reference to read, not JSON.")] = False,
 ) -> None:
     """Print the JSON Schema of experiment files, or a reference of their keys.

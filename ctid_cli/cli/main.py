@@ -9,6 +9,7 @@ from ctid_cli.cli._common import Command
 from ctid_cli.cli.check_commands import CheckCommand, check
 from ctid_cli.cli.experiment_commands import run, schema, validate
 from ctid_cli.cli.fit_command import fit
+from ctid_cli.cli.init_command import init
 from ctid_cli.cli.result_commands import export, figure, show, status, table
 from ctid_cli.cli.study_command import study
 from ctid_cli.cli.track_command import track
@@ -38,15 +39,15 @@ def _root(
 ) -> None:
     """Identify continuous-time models with a time delay, and tabulate how often it succeeds.
 
-    `ctid check` and `ctid fit` take a measured record. A YAML file describes one experiment: `ctid validate` checks
-    it, `ctid run` computes it (again to resume), `ctid table` prints the percentages. Exit codes: 0 done, 1 internal
-    error, 2 bad input, 3 refused, 4 too many failures, 5 stopped early, 6 storage error, 7 difference found,
-    130 Ctrl-C, 143 terminated.
+    `ctid check` and `ctid fit` take a measured record. A YAML file describes one experiment: `ctid init` writes some to
+    begin with, `ctid validate` checks it, `ctid run` computes it (again to resume), `ctid table` prints the
+    percentages. Exit codes: 0 done, 1 internal error, 2 bad input, 3 refused, 4 too many failures, 5 stopped early,
+    6 storage error, 7 difference found, 130 Ctrl-C, 143 terminated.
     """
 
 
 app.command(cls=CheckCommand)(check)
-for _command in (fit, track, run, status, table, figure, show, export, validate, schema):
+for _command in (fit, track, init, run, status, table, figure, show, export, validate, schema):
     app.command(cls=Command)(_command)
 app.add_typer(study, name="study")
 

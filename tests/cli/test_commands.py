@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-COMMANDS = ["run", "status", "table", "show", "export", "validate", "schema"]
+COMMANDS = ["init", "run", "status", "table", "show", "export", "validate", "schema"]
 
 
 def test_help_names_every_command(ctid):
@@ -22,7 +22,7 @@ def test_help_names_every_command(ctid):
 def test_every_command_explains_itself_and_its_options(ctid, command):
     text = ctid(command, "--help").stdout
     assert text.startswith(f"Usage: root {command}") or f" {command} " in text.splitlines()[0]
-    if command not in ("validate", "schema"):
+    if command not in ("init", "validate", "schema"):
         assert "--out DIR" in text
     for line in text.splitlines():
         option = re.match(r"^  (-\w, )?--[\w-]+(  +(\S.*))?$", line)
