@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.models.additive import Term
+from ctid_cli.signals.send_on_delta import SendOnDelta
 from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.dataset import located
 from ctid_cli.specification.joint_checks import MAX_TRIALS, Extent, extents, has_relay
@@ -107,8 +108,12 @@ def _of_sampled_input(spec: Spec, excitation: Any, sampling: Any) -> Iterator[Co
     edges = edges[edges < times[-1]]
     interval = sampling.mean_interval
     late = times[np.searchsorted(times, edges - ON_TIME * interval)] - edges
-    if late.size and late.mean() > ON_TIME * interval:
-        seen = f"the estimator sees the input at its samples only, each change {late.mean():.2g} s late on average"
+    # Where the output says when it is sampled, the sensor's looks are only the earliest instants.
+    if late.size and (late.mean() > ON_TIME * interval or isinstance(sampling, SendOnDelta)):
+        wait = (
+            "not before the next one" if isinstance(sampling, SendOnDelta) else f"{late.mean():.2g} s late on average"
+        )
+        seen = f"the estimator sees the input at its samples only, each change {wait}"
         biased = "which biases delay and parameters; write input_record: exact, unless that is the point"
         yield ("sampling", "input_record"), f"{seen}, {biased}"
 

@@ -114,3 +114,10 @@ def test_edges_between_the_samples_of_a_regular_clock(warnings):
     assert float(re.search(r"each change (\S+) s late", said)[1]) == pytest.approx(0.02, abs=0.0011)
     assert warnings("excitation.clock_period=0.24", "sampling.input_record=exact") == []
     assert warnings("excitation={kind: gaussian}") == []
+
+
+def test_samples_that_the_output_asks_for_never_come_with_the_edges(warnings):
+    sent = "sampling={kind: send_on_delta, interval: 0.05, samples: 400, delta: 0.1, input_record: %s}"
+    (said,) = warnings(sent % "sampled")
+    assert "each change not before the next one" in said
+    assert warnings(sent % "exact") == []
