@@ -152,6 +152,8 @@ def _why_no_limit(source: SimulatedSource, estimated: _Estimated) -> str:
         return "the clock is irregular"
     if not isinstance(signal, Gaussian) or signal.clock_period not in (None, sampling.interval):
         return f"the {name} is not white Gaussian noise held from sample to sample"
+    if source.recorder.missing:
+        return "outputs are missing"
     if sampling.samples < LONG:
         return f"there are fewer than {LONG} samples"
     if not estimated.model.is_stable and (source.loop is None or isinstance(estimated.model, TransferFunction)):
@@ -199,8 +201,9 @@ def _of_records(source: Any, estimated: _Estimated, why: str) -> ExpectedAccurac
     if not np.isfinite(covariance).all():
         raise DataError("the data would not determine the parameters, even without noise")
     parameters = ParameterAccuracy.of(estimated.model, covariance, estimated.zeros, estimated.delay_from is not None)
-    # Instruments other than the input itself are not the best there are.
-    start = f"{'the Cramér-Rao bound ' if estimated.instruments == 'open_loop' else ''}sigma^2 (psi' psi)^-1"
+    # Instruments other than the input itself are not the best there are, nor is least squares where there are outliers.
+    best = estimated.instruments == "open_loop" and source.noise.gaussian
+    start = f"{'the Cramér-Rao bound ' if best else ''}sigma^2 (psi' psi)^-1"
     if source.noise.coloured:
         start = "(psi' psi)^-1 psi' R psi (psi' psi)^-1, R the covariance matrix of the noise"
     where = "in the first data set" if sets == 1 else f"averaged over the first {sets} data sets"
@@ -218,6 +221,8 @@ def _record_covariance(source: Any, estimated: _Estimated, replicate: int) -> Ar
         signal = HeldSignal(record.t, loop.u)
     sought = estimated.delay_from is not None
     psi = sensitivities(estimated.model, signal, record.t, estimated.zeros, estimate_delay=sought)
+    # Nothing is learnt from outputs that are missing; the others keep their distances.
+    psi = psi * record.valid[:, None]
     if estimated.delay_from is not None:
         psi = psi[record.t >= record.input.t[0] + estimated.delay_from]
     lags = np.arange(psi.shape[0] if source.noise.coloured else 1)

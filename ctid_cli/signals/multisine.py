@@ -76,6 +76,8 @@ class Multisine(Excitation):
     """
 
     kind: ClassVar[str] = "multisine"
+    #: Values of an option with which no random number is drawn.
+    deterministic_with: ClassVar[dict[str, tuple[str, ...]]] = {"phases": ("schroeder", "low_crest")}
 
     lowest_frequency: float | None = None
     highest_frequency: float | None = None

@@ -53,6 +53,8 @@ class Noise:
     kind: ClassVar[str]
     #: Whether samples at different instants are correlated.
     coloured: ClassVar[bool]
+    #: Whether least squares is the best there is.
+    gaussian: ClassVar[bool] = True
 
     snr_db: float | None
     variance: float | None
@@ -266,6 +268,7 @@ class OutlierNoise(Noise):
 
     kind: ClassVar[str] = "outliers"
     coloured: ClassVar[bool] = False
+    gaussian: ClassVar[bool] = False
 
     share: float
     size: float

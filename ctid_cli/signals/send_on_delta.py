@@ -38,6 +38,8 @@ class SendOnDelta(Sampling):
     """
 
     kind: ClassVar[str] = "send_on_delta"
+    #: No random number is drawn.
+    deterministic: ClassVar[bool] = True
 
     interval: float
     samples: int = field(metadata={"geometric": True})

@@ -260,6 +260,12 @@ def _reference(raw: Mapping[str, Any], section: str) -> Any:
     return content.get("reference") if isinstance(content, Mapping) else None
 
 
+def _draws_nothing(chosen: type, options: Mapping[str, Any]) -> bool:
+    """Whether a class draws no random number with the options that are given."""
+    without = getattr(chosen, "deterministic_with", {})
+    return getattr(chosen, "deterministic", False) or any(options.get(name) in without[name] for name in without)
+
+
 def _random_section(raw: Mapping[str, Any], present: set[str]) -> str:
     """A section of simulated data that draws random numbers; empty if none does."""
     if "data" in present:
@@ -270,7 +276,7 @@ def _random_section(raw: Mapping[str, Any], present: set[str]) -> str:
             continue
         kinds = KINDS[name.split()[0]]
         kind = part.get("kind") if isinstance(part, Mapping) else None
-        if kind not in kinds or not getattr(resolve(name.split()[0], kind), "deterministic", False):
+        if kind not in kinds or not _draws_nothing(resolve(name.split()[0], kind), part):
             return name
     recorder = raw.get("recorder")
     return "recorder" if isinstance(recorder, Mapping) and recorder.get("missing") else ""

@@ -7,7 +7,9 @@ import pytest
 from typer.testing import CliRunner
 
 from ctid_cli.kinds import KINDS
+from ctid_cli.models.pid import ContinuousPid
 from ctid_cli.running.plan import build_plan
+from ctid_cli.simulation.dataset import LoopOptions, MeasuredSource
 from ctid_cli.specification.load import load_spec
 
 #: A value for every section, and options for every kind that has some without a default.
@@ -156,6 +158,42 @@ def test_only_a_linear_controller_has_closed_loop_instruments_and_theory(ctid, t
     file.write_text(json.dumps(specification("one", **sections, estimators=closed)))
     said = ctid("validate", file, code=2).stderr
     assert "closed-loop instruments need the reference and the controller" in " ".join(said.split())
+
+
+def test_what_draws_nothing_needs_no_seed(ctid, tmp_path):
+    file = tmp_path / "spec.yaml"
+    designed = options("excitation", "multisine")
+    sections = {"excitation": designed, "noise": None, "monte_carlo": None}
+    file.write_text(json.dumps(specification("one", **sections)))
+    ctid("validate", file)
+    file.write_text(json.dumps(specification("one", **sections | {"excitation": designed | {"phases": "random"}})))
+    assert "monte_carlo: is missing, and the excitation is random" in ctid("validate", file, code=2).stderr
+    file.write_text(json.dumps(specification("one", **sections | {"recorder": {"missing": 0.1}})))
+    assert "the recorder is random" in ctid("validate", file, code=2).stderr
+
+
+@pytest.mark.parametrize("noise", [{"kind": "white", "variance": 0.01}, options("noise", "arma")])
+def test_missing_outputs_cost_accuracy(ctid, tmp_path, noise):
+    file = tmp_path / "spec.yaml"
+    errors = []
+    for recorder in (None, {"missing": 0.5}):
+        sampling = {"kind": "regular", "interval": 0.1, "samples": 4000}
+        file.write_text(json.dumps(specification("one", noise=noise, sampling=sampling, recorder=recorder)))
+        (found,) = json.loads(ctid("check", "accuracy", file, "--json").stdout)["estimates"]
+        errors.append([row["standard_error"] for row in found["parameters"]])
+    ratios = np.divide(*errors[::-1])
+    # Half of the samples of white noise are worth half; of coloured noise the half is worth more.
+    assert (ratios > 1.1).all()
+    if noise["kind"] == "white":
+        np.testing.assert_allclose(ratios, 2**0.5, rtol=0.05)
+
+
+def test_a_measured_loop_takes_gains_in_seconds(tmp_path):
+    file = tmp_path / "record.csv"
+    file.write_text("t,r,u,y\n" + "".join(f"{0.1 * k},{k % 3},{k % 5},{k % 7}\n" for k in range(30)))
+    loop = LoopOptions(ContinuousPid(kp=1.0, ti=2.0))
+    record = MeasuredSource(str(file), reference="r", loop=loop).dataset(0).record
+    np.testing.assert_allclose(record.loop.controller.numerator, [1.05, -1.0])
 
 
 @pytest.mark.parametrize("sections", [

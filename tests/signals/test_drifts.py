@@ -9,6 +9,7 @@ from ctid_cli.signals import drifts
 from ctid_cli.signals.drifts import OneOverFNoise, RandomWalk, noise_at
 from ctid_cli.signals.irregular import PoissonSampling
 from ctid_cli.signals.noise import OutlierNoise, WhiteNoise
+from ctid_cli.signals.sinusoids import disturb
 from ctid_cli.signals.streams import stream
 
 TIMES = PoissonSampling(0.1, 20_000).times(stream(2, "sampling", 0))
@@ -80,6 +81,12 @@ def test_long_records_are_drawn_in_blocks_and_begin_with_the_shorter_ones(monkey
     monkeypatch.setattr(drifts, "BLOCK", 64)
     np.testing.assert_array_equal(noise.generate_at(TIMES[:500], np.ones(500), rng()), whole)
     np.testing.assert_array_equal(noise.generate_at(TIMES[:200], np.ones(200), rng()), whole[:200])
+
+
+def test_a_signal_is_disturbed_at_its_instants():
+    noise = OneOverFNoise(0.1, 100.0, variance=2.0)
+    disturbed = disturb(OUTPUT, TIMES, noise, rng())
+    np.testing.assert_array_equal(disturbed, OUTPUT + noise.generate_at(TIMES, OUTPUT, rng()))
 
 
 def test_noise_of_samples_needs_no_times():
