@@ -69,6 +69,8 @@ class ContinuousPid:
                 (require_positive if name == "ti" else require_not_negative)(name, getattr(self, name), "s")
                 if getattr(self, other) is not None:
                     raise OptionError(name, f"{name} gives the same as {other}; keep one of the two.")
+        for name, gain in (("ti", self.integral_gain), ("td", self.derivative_gain)):
+            require_finite(name, gain, units["ki" if name == "ti" else "kd"], label=f"the gain that kp and {name} make")
         require_not_negative("filter_time", self.filter_time, "s")
         require_choice("discretisation", self.discretisation, get_args(Discretisation))
         if self.discretisation == "tustin" and self.derivative_gain and self.filter_time == 0.0:
@@ -85,6 +87,11 @@ class ContinuousPid:
     def derivative_gain(self) -> float:
         """Gain of the derivative of the error [input unit s/output unit]."""
         return self.kd or 0.0 if self.td is None else self.kp * self.td
+
+    @property
+    def does_nothing(self) -> bool:
+        """Whether all gains are zero."""
+        return not (self.kp or self.integral_gain or self.derivative_gain)
 
     def discrete(self, interval: float) -> DiscreteController:
         """The controller that acts at every sample.

@@ -15,6 +15,8 @@ from ctid_cli.signals.noise import require_one_level, variance_at
 
 #: First-order processes in a decade of frequencies: with two, their sum has a ripple of 0.1 %.
 PER_DECADE = 2
+#: Widest band.
+MAX_DECADES = 12
 #: Samples that are drawn at once, so that long records need little memory.
 BLOCK = 65_536
 
@@ -150,6 +152,8 @@ class OneOverFNoise(ContinuousNoise):
         if self.lowest_frequency >= self.highest_frequency:
             ends = f"{self.lowest_frequency:g} and {self.highest_frequency:g} rad/s"
             raise OptionError("lowest_frequency", f"lowest_frequency must be below highest_frequency; they are {ends}.")
+        if self.highest_frequency > 10**MAX_DECADES * self.lowest_frequency:
+            raise OptionError("highest_frequency", f"highest_frequency is over {MAX_DECADES} decades up; lower it.")
         require_positive("exponent", self.exponent, "-")
         if self.exponent >= 2:
             raise OptionError("exponent", f"exponent must be below 2 [-], not {self.exponent!r}; 2 is a random_walk.")

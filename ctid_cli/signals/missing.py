@@ -6,6 +6,9 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
 from ctid_cli.signals.checks import require_finite
 
+#: Longest bursts on average [samples].
+LONGEST_MEAN = 1e6
+
 
 def check_loss(missing: float, mean_burst: float | None) -> None:
     """Refuse bursts that are no bursts, or too short for the share of losses."""
@@ -13,8 +16,9 @@ def check_loss(missing: float, mean_burst: float | None) -> None:
         return
     require_finite("mean_burst", mean_burst, "samples")
     least = max(1.0, missing / (1 - missing))
-    if mean_burst < least:
-        why = f"must be at least {least:g} [samples] where a share of {missing:g} is missing, not {mean_burst:g}"
+    if not least <= mean_burst <= LONGEST_MEAN:
+        ends = f"from {least:g} to {LONGEST_MEAN:g} [samples]"
+        why = f"must be {ends} where a share of {missing:g} is missing, not {mean_burst:g}"
         raise OptionError("mean_burst", f"mean_burst {why}.")
 
 

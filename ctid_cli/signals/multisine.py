@@ -19,8 +19,8 @@ Spacing = Literal["linear", "logarithmic", "odd"]
 Phases = Literal["random", "schroeder", "low_crest"]
 #: Of options that the identity of older results does not hold.
 _LATER = {"added_later": True}
-#: Harmonics that a band may be filled with.
-MAX_TONES = 10_000
+#: Number of the highest harmonic: with phases that are searched for, of a band that is filled, and otherwise.
+MAX_SEARCHED, MAX_FILLED, MAX_HARMONIC = 4_000, 10_000, 1_000_000
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,24 @@ class Multisine(Excitation):
         for name, value in (("spacing", "odd"), ("phases", "low_crest")):
             if getattr(self, name) == value and self.period is None:
                 raise OptionError("period", f"{name} {value} needs the period [s] of which the tones are harmonics.")
+        if self.period is not None:
+            self._check_harmonics(self.period)
+        if self.frequencies is not None and self.frequencies_used.size < len(self.frequencies):
+            harmonic = "" if self.period is None else ", or fall on the same harmonic of the period"
+            raise OptionError("frequencies", f"two of the frequencies are the same{harmonic}; leave one out.")
         if self.frequencies_used.size == 0:
             harmonic = f"{'odd ' * (self.spacing == 'odd')}harmonic of {2 * math.pi / (self.period or 1.0):g} rad/s"
             raise OptionError("period", f"there is no {harmonic} in the band; give a longer period, or a wider band.")
+
+    def _check_harmonics(self, period: float) -> None:
+        highest = self.band[1] if self.frequencies is None else max(self.frequencies)
+        what, most = "the tones are", MAX_HARMONIC
+        if self.phases == "low_crest":
+            what, most = "low_crest phases are searched for", MAX_SEARCHED
+        elif self.tones is None and self.frequencies is None:
+            what, most = "a band without tones is filled", MAX_FILLED
+        if highest * period / (2 * math.pi) > most:
+            raise OptionError("period", f"{what} up to harmonic {most} of the period; give a shorter one.")
 
     def _check_frequencies(self, frequencies: tuple[float, ...]) -> None:
         object.__setattr__(self, "frequencies", tuple(frequencies))
@@ -116,9 +131,6 @@ class Multisine(Excitation):
         for name in ("lowest_frequency", "highest_frequency", "tones"):
             if getattr(self, name) is not None:
                 raise OptionError(name, f"{name} is of a band, and frequencies are given; keep one of the two.")
-        if self.frequencies_used.size < len(frequencies):
-            harmonic = "" if self.period is None else ", or fall on the same harmonic of the period"
-            raise OptionError("frequencies", f"two of the frequencies are the same{harmonic}; leave one out.")
 
     def _check_band(self) -> None:
         for name in ("lowest_frequency", "highest_frequency"):
@@ -132,8 +144,6 @@ class Multisine(Excitation):
             raise OptionError("tones", "tones is missing: the number of tones; with a period it may be left out.")
         elif self.spacing == "logarithmic":
             raise OptionError("tones", "tones is missing: the number of tones that are spaced logarithmically.")
-        elif high * self.period / (2 * math.pi) > MAX_TONES:
-            raise OptionError("tones", f"tones is missing; the band has more than {MAX_TONES} harmonics of the period.")
         ends = f"{low:g} and {high:g} rad/s"
         if low > high:
             raise OptionError(
@@ -162,8 +172,8 @@ class Multisine(Excitation):
         inside = np.arange(first, math.floor(self.band[1] / base * (1 + COINCIDENCE)) + 1, step)
         if self.tones is None or inside.size == 0:
             return tuple(inside.tolist())
-        nearest = first + step * np.rint((self._spaced(self.tones) / base - first) / step)
-        return tuple(np.unique(np.clip(nearest, inside[0], inside[-1])).astype(int).tolist())
+        nearest = np.rint((self._spaced(self.tones) / base - first) / step).astype(int)
+        return tuple(np.unique(inside[np.clip(nearest, 0, inside.size - 1)]).tolist())
 
     @cached_property
     def frequencies_used(self) -> Array:

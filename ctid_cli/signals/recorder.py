@@ -8,6 +8,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
 from ctid_cli.signals.checks import require_not_negative
 from ctid_cli.signals.missing import check_loss, ticks_between
+from ctid_cli.signals.sampling import from_zero
 
 
 @dataclass(frozen=True)
@@ -88,9 +89,8 @@ class Recorder:
         """
         if self.missing == 0.0:
             return output
-        there = np.cumsum(ticks_between(rng, output.size - 1, self.missing, self.mean_burst)).astype(int)
+        ticks = from_zero(ticks_between(rng, output.size - 1, self.missing, self.mean_burst))
+        there = ticks[ticks < output.size].astype(int)
         marked = np.full(output.size, np.nan)
-        marked[0] = output[0]
-        there = there[there < output.size]
         marked[there] = output[there]
         return marked

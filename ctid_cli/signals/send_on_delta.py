@@ -10,6 +10,7 @@ from numba import njit
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.signals.checks import require_choice, require_integer, require_positive
+from ctid_cli.signals.held import COINCIDENCE
 from ctid_cli.signals.sampling import InputRecord, Sampling
 
 
@@ -91,10 +92,8 @@ class SendOnDelta(Sampling):
         DataError
             If there is no second sample.
         """
-        longest = output.size
-        if self.longest_interval is not None:
-            longest = math.floor(self.longest_interval / self.interval * (1 + 1e-9))
-        found = _sent(output, self.delta, longest)
+        longest = math.inf if self.longest_interval is None else self.longest_interval / self.interval
+        found = _sent(output, self.delta, int(min(longest * (1 + COINCIDENCE), output.size)))
         if found.size < 2:
             moved = f"the output moves by {np.ptp(output):g} in all"
             raise DataError(f"no sample is sent but the first: {moved}, and delta is {self.delta:g}; lower delta")

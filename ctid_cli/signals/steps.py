@@ -105,8 +105,10 @@ class Doublets(Excitation):
         end = float(sample_times[-1])
         if self.time >= end:
             raise DataError(f"the doublet at {self.time:g} s comes too late for a record that ends at {end:g} s")
-        starts = self.time + (2 * self.width + self.pause) * np.arange(self.count)
-        levels = np.tile([self.amplitude, -self.amplitude, 0.0], self.count)
+        every = 2 * self.width + self.pause
+        count = int(min(self.count, (end - self.time) / every + 1))
+        starts = self.time + every * np.arange(count)
+        levels = np.tile([self.amplitude, -self.amplitude, 0.0], count)
         times = (starts[:, None] + self.width * np.arange(3)).ravel()
         if self.pause == 0.0:
             # The zero between two pairs has no length; that behind the last one stays.

@@ -126,6 +126,11 @@ class LoopSection(Section):
 
     def complaints(self) -> Iterator[Complaint]:
         """Say that the controller does nothing."""
-        controllers = (variant.options.at(1.0).controller for variant in variants(self))
-        if not all(isinstance(one, Relay) or one.numerator.any() for one in controllers):
+        if any(_does_nothing(variant.options.controller) for variant in variants(self)):
             yield ("controller",), "the controller is zero, so there is no loop; give it a gain, or give excitation"
+
+
+def _does_nothing(controller: DiscreteController | ContinuousPid | Relay) -> bool:
+    if isinstance(controller, ContinuousPid):
+        return controller.does_nothing
+    return isinstance(controller, DiscreteController) and not controller.numerator.any()

@@ -36,7 +36,7 @@ def test_losses_are_marked_and_nothing_else_changes(burst):
     [
         ({"resolution": -1.0}, r"resolution must be zero or a positive number \[output unit\]"),
         ({"missing": 1.0}, "missing must be a share below 1"),
-        ({"missing": 0.5, "mean_burst": 0.5}, r"mean_burst must be at least 1 \[samples\]"),
+        ({"missing": 0.5, "mean_burst": 0.5}, r"mean_burst must be from 1 to 1e\+06 \[samples\]"),
     ],
 )
 def test_impossible_options_are_refused(options, message):
