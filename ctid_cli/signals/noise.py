@@ -20,6 +20,9 @@ LEVEL_UNITS = {
     "intensity": "output unit^2/s",
 }
 
+#: Largest signal-to-noise ratio of either sign; far beyond it no number holds the ratio of the variances.
+MAX_SNR_DB = 1000
+
 
 def require_one_level(noise: Any) -> None:
     """Refuse anything but exactly one level, a signal-to-noise ratio or a number that is not negative."""
@@ -31,6 +34,8 @@ def require_one_level(noise: Any) -> None:
         raise ValueError(f"noise needs exactly one of {', '.join(choices)}; {found} given.")
     check = require_finite if given == ["snr_db"] else require_not_negative
     check(given[0], levels[given[0]], LEVEL_UNITS[given[0]])
+    if given == ["snr_db"] and abs(noise.snr_db) > MAX_SNR_DB:
+        raise OptionError("snr_db", f"snr_db must be within plus or minus {MAX_SNR_DB} dB, not {noise.snr_db!r}.")
 
 
 def variance_at(snr_db: float, noise_free: Array | None) -> float:

@@ -276,7 +276,7 @@ def _random_section(raw: Mapping[str, Any], present: set[str]) -> str:
             continue
         kinds = KINDS[name.split()[0]]
         kind = part.get("kind") if isinstance(part, Mapping) else None
-        if kind not in kinds or not _draws_nothing(resolve(name.split()[0], kind), part):
+        if not isinstance(kind, str) or kind not in kinds or not _draws_nothing(resolve(name.split()[0], kind), part):
             return name
     recorder = raw.get("recorder")
     return "recorder" if isinstance(recorder, Mapping) and recorder.get("missing") else ""

@@ -170,6 +170,8 @@ def test_what_draws_nothing_needs_no_seed(ctid, tmp_path):
     assert "monte_carlo: is missing, and the excitation is random" in ctid("validate", file, code=2).stderr
     file.write_text(json.dumps(specification("one", **sections | {"recorder": {"missing": 0.1}})))
     assert "the recorder is random" in ctid("validate", file, code=2).stderr
+    file.write_text(json.dumps(specification("one", **sections | {"noise": {"kind": ["white"]}})))
+    assert "noise.kind: must be one of white" in ctid("validate", file, code=2).stderr
 
 
 @pytest.mark.parametrize("noise", [{"kind": "white", "variance": 0.01}, options("noise", "arma")])
