@@ -72,8 +72,9 @@ def table(
     With their 95 % intervals and numbers of data sets, and the published values where there are any.
 
     Measures: percent, bias, deviation, mse, rmse, median_bias, robust_deviation, standard_error, error_ratio, coverage,
-    efficiency, failures, cpu, cpu_90. An experiment without a success rule shows bias and rmse, or what `measures` of
-    its specification names.
+    efficiency, failures, cpu, cpu_90, h2, hinf, fresh_fit; rmse:delay of one parameter, rmse:poles, response:1.5 at a
+    frequency [rad/s]. An experiment without a success rule shows bias and rmse, or what `measures` of its specification
+    names.
 
     Without a name: all tables of the useful-redundancy study. Cells that were not run say so; where the folder results
     holds nothing of a table, as in a fresh clone, the committed results are printed.

@@ -205,17 +205,28 @@ class Measure:
     meaning: str
     #: ``""`` stands for that of the parameter, ``^2`` for its square.
     unit: str
-    #: What it is computed from: errors of parameters, or what an estimate has one of.
-    source: Literal["errors", "converged", "status", "cpu_seconds"]
+    #: What it is computed from: errors of parameters, a distance between models, or what an estimate has one of.
+    source: Literal["errors", "distance", "converged", "status", "cpu_seconds", "fresh_fit_percent"]
     compute: Callable[..., Measured]
 
 
 def requested(name: str) -> Measure:
-    """A measure by its name."""
-    if name not in MEASURES:
-        hint = did_you_mean(name, MEASURES) or "."
-        raise UsageError(f"there is no measure {name!r}{hint} Known: {', '.join(MEASURES)}")
-    return MEASURES[name]
+    """A measure by its name: ``rmse``, ``rmse:delay`` of one parameter, ``rmse:poles``, or ``response:1.5`` [rad/s]."""
+    base, colon, argument = name.partition(":")
+    if base not in MEASURES:
+        hint = did_you_mean(base, MEASURES) or "."
+        raise UsageError(f"there is no measure {base!r}{hint} Known: {', '.join(MEASURES)}")
+    measure = MEASURES[base]
+    if base == "response":
+        try:
+            known = 0.0 < float(argument) < math.inf
+        except ValueError:
+            known = False
+        if not known:
+            raise UsageError(f"{name!r} needs a frequency [rad/s] above zero, such as response:1.5")
+    elif colon and (measure.source != "errors" or not argument):
+        raise UsageError(f"{name!r} is about the estimate as a whole; ask for {base}")
+    return measure
 
 
 #: All measures by name.
@@ -231,6 +242,12 @@ MEASURES: Mapping[str, Measure] = {
     "error_ratio": Measure("the model's standard error over the empirical deviation", "-", "errors", error_ratio),
     "coverage": Measure("95 % intervals that hold the true value", "%", "errors", coverage),
     "efficiency": Measure("least possible variance over the mean square error", "%", "errors", efficiency),
+    "h2": Measure("median relative error in the H2 norm: of the impulse response", "%", "distance", quantile),
+    "hinf": Measure("median largest error of the frequency response over its largest gain", "%", "distance", quantile),
+    "response": Measure("median relative error of the frequency response there", "%", "distance", quantile),
+    "fresh_fit": Measure(
+        "median fit on the output of a fresh data set, without noise", "%", "fresh_fit_percent", quantile
+    ),
     "failures": Measure("estimates with each status but success", "%", "status", share),
     "cpu": Measure("median CPU time of one estimate", "s", "cpu_seconds", quantile),
     "cpu_90": Measure("CPU time that 90 % of the estimates stay below", "s", "cpu_seconds", lambda s: quantile(s, 0.9)),

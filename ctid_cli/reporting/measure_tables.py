@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from ctid_cli.inference.monte_carlo import requested
+from ctid_cli.inference.monte_carlo import MEASURES, requested
 from ctid_cli.reporting.layout import Report, Table, delay_label, number, with_error
 from ctid_cli.reporting.measures import measure_rows
 from ctid_cli.reporting.percentages import Row, settings_of
@@ -17,9 +17,11 @@ def measure_report(results: Results, names: Sequence[str], notes: Sequence[str] 
     tables: dict[str, list[str]] = {}
     for name in dict.fromkeys(names):
         source = requested(name).source
-        tables.setdefault(source if source in ("errors", "status") else "estimates", []).append(name)
+        kind = source if source in ("errors", "status") else "estimates"
+        tables.setdefault("poles" if name.endswith(":poles") else kind, []).append(name)
     blocks = [[_table(results, [row for row in rows if row["measure"] in own], own)] for own in tables.values()]
-    meanings = "; ".join(f"{name}: {requested(name).meaning}" for name in dict.fromkeys(names))
+    bases = dict.fromkeys(name.partition(":")[0] for name in names)
+    meanings = "; ".join(f"{name}: {MEASURES[name].meaning}" for name in bases)
     foot = f"{meanings}. ± is one Monte Carlo standard error, [ ] a 95 % interval; --format csv and json have both."
     if any(row["without_value"] for row in rows):
         foot += " no value: estimates that could not be counted, failed ones among them."

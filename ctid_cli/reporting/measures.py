@@ -11,8 +11,9 @@ Keys of a row
   those that failed.
 """
 
+import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,11 +23,13 @@ from ctid_cli.errors import UsageError
 from ctid_cli.inference.monte_carlo import MEASURES, Measure, Measured, requested
 from ctid_cli.inference.status import Status
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.parameter_errors import ParameterEstimates, estimates_by_group
+from ctid_cli.reporting.model_measures import distance_of, distances, pole_estimates, system_of
+from ctid_cli.reporting.parameter_errors import ParameterEstimates, estimates_by_group, least_variances
 from ctid_cli.reporting.percentages import Row, labelled_groups
 from ctid_cli.reporting.results import Results
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.manifest import true_values
+from ctid_cli.text import did_you_mean, listed
 
 #: Statuses of estimates with which nothing is wrong.
 SUCCESSES = {Status.CONVERGED.name, Status.LEAST_SQUARES.name, "VALID"}
@@ -39,20 +42,32 @@ Found = tuple[str | None, Measured, str, int]
 
 def measure_rows(results: Results, names: Sequence[str]) -> list[Row]:
     """Measures by name, of every combination of swept fields, estimator and start that was planned."""
-    wanted = {name: _known(name, results) for name in names}
+    for name in names:
+        _require_measurable(name, results)
     groups = results.groups()
-    of_errors = any(measure.source == "errors" for measure in wanted.values())
+    of_errors = any(requested(name).source == "errors" for name in names)
     estimates = {one.group: one for one in estimates_by_group(results)} if of_errors else {}
     statuses = sorted({row["status"] for row in results.rows} - SUCCESSES) or ["FAILED"]
+    bounds = least_variances(results) if any(name.startswith("efficiency") for name in names) else {}
+    cells = {cell["hash"]: cell for cell in results.manifest["data_cells"]}
     rows = []
     for group, labels in labelled_groups(results):
         members = groups.get(group, [])
         counts = {"n": len(members), "failed": sum(row["status"] in FAILURES for row in members)}
-        for name, measure in wanted.items():
+        for name in dict.fromkeys(names):
+            measure, argument = requested(name), name.partition(":")[2]
+            found: Iterable[Found]
             if not members:
-                found: Iterator[Found] = iter([(None, Measured(), measure.unit, 0)])
+                found = [(None, Measured(), measure.unit, 0)]
+            elif measure.source == "distance":
+                system = system_of(cells[group.cell], name)
+                far = distances(system, members, distance_of(name.partition(":")[0], argument))
+                found = [(None, measure.compute(far), measure.unit, int(np.isinf(far).sum()))]
             elif measure.source == "errors":
-                found = _of_errors(measure, estimates[group])
+                own = estimates[group]
+                if argument == "poles":
+                    own = pole_estimates(own, system_of(cells[group.cell], name), members)
+                found = _of_errors(measure, own, argument, bounds.get(group, {}))
             else:
                 found = _of_estimates(measure, members, statuses)
             rows += [
@@ -72,28 +87,45 @@ def default_measures(results: Results) -> Sequence[str]:
     return asked or (DEFAULT if measurable else ())
 
 
-def _known(name: str, results: Results) -> Measure:
-    measure = requested(name)
-    if measure.source == "errors" and not any(map(true_values, results.manifest["data_cells"])):
-        others = ", ".join(key for key, item in MEASURES.items() if item.source != "errors")
+def _require_measurable(name: str, results: Results) -> None:
+    """Refuse a measure of what these results do not have."""
+    measure, settings = requested(name), results.settings
+    true = [name for cell in results.manifest["data_cells"] for name in true_values(cell)]
+    argument = name.partition(":")[2]
+    if measure.source == "errors" and not true:
+        others = ", ".join(
+            key for key, item in MEASURES.items() if item.source in ("converged", "status", "cpu_seconds")
+        )
         reason = "needs true values, and only a simulated system has them"
         raise UsageError(f"{results.experiment}: {name} {reason}; use {others}")
-    if measure.source == "converged" and not results.settings.get("success"):
+    if measure.source == "errors" and argument and argument not in (*true, "poles"):
+        hint = did_you_mean(argument, true) or "."
+        known = f"There are {listed(true)}, and poles for those of the model"
+        raise UsageError(f"{results.experiment}: {name} is about no parameter of the system{hint} {known}")
+    if measure.source == "converged" and not settings.get("success"):
         reason = "needs a rule by which an estimate counts as converged, and the specification has no success section"
         raise UsageError(f"{results.experiment}: {name} {reason}; use {', '.join(DEFAULT)}")
-    return measure
+    if name == "fresh_fit" and name not in (settings.get("measures") or ()):
+        advice = "add 'measures: [fresh_fit]' to the specification, and run it again"
+        raise UsageError(f"{results.experiment}: {name} is computed while the experiment runs; {advice}")
 
 
-def _of_errors(measure: Measure, estimates: ParameterEstimates) -> Iterator[Found]:
-    """A measure of every parameter."""
+def _of_errors(
+    measure: Measure, estimates: ParameterEstimates, argument: str, bounds: Mapping[str, float]
+) -> Iterator[Found]:
+    """A measure of every parameter, or of one."""
     for k, name in enumerate(estimates.names):
-        sample, own = estimates.sample(k), parameter_unit(name, estimates.names)
-        unit = {"": own, "^2": f"({own})^2"}.get(measure.unit, measure.unit)
-        yield name, measure.compute(sample), unit, estimates.runs - sample.errors.size
+        if argument in ("", "poles", name):
+            sample = estimates.sample(k, bounds.get(name, math.nan))
+            own = parameter_unit(name, estimates.names)
+            unit = {"": own, "^2": f"({own})^2"}.get(measure.unit, measure.unit)
+            yield name, measure.compute(sample), unit, estimates.runs - sample.errors.size
 
 
 def parameter_unit(name: str, names: Sequence[str]) -> str:
     """Unit of one of the parameters of a system; ``-`` of those that are not known here."""
+    if name.startswith("pole_"):
+        return "rad/s"
     if re.fullmatch(r"[ab]\d+|delay", name):
         poles, coefficients = (sum(other[0] == letter and other != "delay" for other in names) for letter in "ab")
         return Units().of(name, poles, coefficients - 1)
@@ -109,4 +141,7 @@ def _of_estimates(measure: Measure, rows: Sequence[Mapping[str, Any]], statuses:
         return
     known = [row[measure.source] for row in rows if row.get(measure.source) is not None]
     values: Array = np.array(known, dtype=bool if measure.source == "converged" else float)
+    if measure.source == "fresh_fit_percent":
+        # Where there is no model, it fits infinitely badly.
+        values = np.append(values, np.full(len(rows) - len(known), -np.inf))
     yield None, measure.compute(values), measure.unit, len(rows) - len(known)

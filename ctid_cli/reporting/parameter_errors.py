@@ -18,6 +18,7 @@ Attributes of ``ParameterErrors``
 """
 
 import operator
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -27,12 +28,13 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.errors import UsageError
+from ctid_cli.errors import DataError, UsageError
 from ctid_cli.inference import monte_carlo
 from ctid_cli.inference.monte_carlo import Sample
-from ctid_cli.reporting.expected_accuracy import long_record_variances
+from ctid_cli.reporting.expected_accuracy import expected_accuracy, long_record_variances
 from ctid_cli.reporting.results import Group, Results, lookup
 from ctid_cli.running.plan import build_plan
+from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.manifest import found_values, true_values
@@ -107,15 +109,48 @@ def parameter_estimates(results: Results) -> list[ParameterEstimates]:
         raise UsageError(f"{results.experiment}: {wanted}")
     groups = estimates_by_group(results)
     variances = long_record_variances(build_plan(spec_from_canonical(results.settings))) if groups else {}
-    # By place, not by hash: a later version may write the same specification with more defaults.
-    cells = {cell["hash"]: k for k, cell in enumerate(manifest["data_cells"])}
-    options = results.swept("estimators")
-    parts = [(part["name"], tuple(part["swept"].get(name) for name in options)) for part in manifest["estimators"]]
     found = []
     for one in groups:
-        theory = variances.get((cells[one.group.cell], parts.index((one.group.estimator, one.group.options))))
+        theory = variances.get(_place(results, one.group))
         found.append(replace(one, theory=None if theory is None else np.array([theory[name] for name in one.names])))
     return found
+
+
+def least_variances(results: Results) -> dict[Group, dict[str, float]]:
+    """Variances that theory gives the estimates of each group at their number of samples, where there is a theory."""
+    plan = build_plan(spec_from_canonical(results.settings))
+    found = {}
+    for group in results.groups():
+        k, j = _place(results, group)
+        source = plan.data_cells[k].source
+        if not isinstance(source, SimulatedSource):
+            continue
+        try:
+            expected = expected_accuracy(source, plan.estimators[j].estimator, plan.terms).parameters
+        except DataError:
+            continue
+        variances = dict(zip(expected.names, expected.covariance.diagonal().tolist(), strict=True))
+        found[group] = _under_true_names(variances, true_values(results.manifest["data_cells"][k]))
+    return found
+
+
+def _under_true_names(variances: dict[str, float], true: Mapping[str, float]) -> dict[str, float]:
+    """The same where the estimated numerator is longer than the true one: coefficients go together by their power."""
+    shift = sum(re.fullmatch(r"b\d+", name) is not None for name in variances)
+    shift -= sum(re.fullmatch(r"b\d+", name) is not None for name in true)
+    moved = {name: f"b{int(name[1:]) + shift}" if re.fullmatch(r"b\d+", name) else name for name in true}
+    return {name: variances[source] for name, source in moved.items() if source in variances}
+
+
+def _place(results: Results, group: Group) -> tuple[int, int]:
+    """Places of the data cell and of the estimator in the plan.
+
+    Not by hash: a later version may write the same specification with more defaults.
+    """
+    manifest, options = results.manifest, results.swept("estimators")
+    cells = [cell["hash"] for cell in manifest["data_cells"]]
+    parts = [(part["name"], tuple(part["swept"].get(name) for name in options)) for part in manifest["estimators"]]
+    return cells.index(group.cell), parts.index((group.estimator, group.options))
 
 
 def estimates_by_group(results: Results) -> list[ParameterEstimates]:

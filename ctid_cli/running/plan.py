@@ -80,7 +80,10 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
             excitation, noise = located(options.get("excitation"), folder), options.get("noise")
             # Any seed will do where nothing is random.
             drawn = (options["sampling"], noise, seed or 0, loop, options.get("recorder", Recorder()))
-            source = SimulatedSource(options["system"], excitation, *drawn)
+            fresh = "fresh_fit" in (spec.measures or ())
+            # What is measured of an estimate is stored with it, so that it belongs to its identity.
+            content |= {"fresh_fit": True} if fresh else {}
+            source = SimulatedSource(options["system"], excitation, *drawn, fresh)
         swept = {names[name, *path]: value for name, v in chosen.items() for path, value in v.swept.items()}
         cells.append(DataCell(content, content_hash(content), swept, source))
     return tuple(cells)

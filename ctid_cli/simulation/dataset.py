@@ -3,8 +3,9 @@
 import dataclasses
 import hashlib
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -28,6 +29,9 @@ from ctid_cli.signals.sampling import Sampling
 from ctid_cli.signals.send_on_delta import SendOnDelta
 from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.additive_parameters import additive_parameters
+
+#: Data sets to try models on are numbered from here: no experiment has so many.
+FRESH = 2**31
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,8 @@ class DataSet:
     record: Record
     true_model: TransferFunction | AdditiveModel | None = None
     validation: Record | None = None
+    #: Makes the record of a fresh data set, if one is asked for.
+    fresh: Callable[[], Record] | None = None
 
     def result_of(self, fit: Any, start: Any, terms: Sequence[Term] | None) -> dict[str, Any]:
         """What is stored of a fit to the record."""
@@ -71,11 +77,24 @@ class DataSet:
             "cost": fit.cost,
             "fit_percent": fit.fit_percent,
             "validation_fit_percent": self._validation_fit_percent(fit.model),
+            "fresh_fit_percent": self._fresh_fit_percent(fit.model),
             "iterations": int(fit.iterations),
             "search_delay": None if search is None else search.point,
             "switches": None if search is None else len(search.switches),
             "condition_number": fit.condition_number,
         }
+
+    @cached_property
+    def _fresh_record(self) -> Record | None:
+        return None if self.fresh is None else self.fresh()
+
+    def _fresh_fit_percent(self, model: Any) -> float | None:
+        from ctid_cli.inference.diagnostics import fit_percent
+
+        record = self._fresh_record
+        if record is None or record.noise_free is None:
+            return None
+        return float(fit_percent(record.noise_free, _simulated(model, record.input, record.t)))
 
     def _validation_fit_percent(self, model: Any) -> float | None:
         from ctid_cli.inference.diagnostics import fit_percent
@@ -98,9 +117,15 @@ class SimulatedSource:
     seed: int
     loop: LoopOptions | None = None
     recorder: Recorder = field(default_factory=Recorder)
+    #: Whether models are tried on a data set besides the one that they are estimated from.
+    fresh: bool = False
 
     def dataset(self, replicate: int) -> DataSet:
         """One realisation."""
+        data = self._realised(replicate)
+        return replace(data, fresh=lambda: self._realised(FRESH + replicate).record) if self.fresh else data
+
+    def _realised(self, replicate: int) -> DataSet:
         generator = self.excitation if self.loop is None else self.loop.reference
         if isinstance(generator, InputFile) and generator.sha256 is not None:
             require_content(generator.file, generator.sha256)

@@ -82,6 +82,7 @@ COLUMNS = (
     Column("cost", "float64", "mean squared output error", "output unit^2", of="systems"),
     Column("fit_percent", "float64", "fit on the record that was estimated from", "%", of="systems"),
     Column("validation_fit_percent", "float64", "fit on the rest of a measured record", "%", of="systems"),
+    Column("fresh_fit_percent", "float64", "fit on a fresh data set without its noise", "%", of="systems"),
     Column("iterations", "Int64", "in all stages", of="systems"),
     Column(
         "search_delay", "float64", "where `useful_redundancy` ended its search, before refinement", "s", of="systems"

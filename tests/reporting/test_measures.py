@@ -5,7 +5,9 @@ import pytest
 
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.measures import default_measures, measure_rows
+from ctid_cli.reporting.parameter_errors import estimates_by_group, least_variances
 from ctid_cli.reporting.percentages import experiment_rows
+from tests.reporting.ideal_results import TWO_MODES, ideal_results, plan_of
 
 DELAYS = (8.1, 7.9, 8.4)
 
@@ -78,6 +80,49 @@ def test_a_delay_that_was_given_is_no_estimate(make_results, estimate):
     assert [row["parameter"] for row in rows_of(make_results({(5.0, "0.0"): given}), "bias")] == ["a1", "a2", "b0"]
 
 
+def test_one_parameter_or_the_poles_are_asked_for_by_name(make_results, estimate):
+    # In truth they are -1.4 -+ 1.428j.
+    found = [estimate(8.1, denominator=(1.0, 2.0 * x, x**2 + y**2)) for x, y in ((1.5, 1.4), (1.3, 1.5))]
+    results = make_results({(5.0, "0.0"): [*found, estimate(8.0, denominator=(1.0, 2.0))]})
+    assert [row["parameter"] for row in rows_of(results, "rmse:delay")] == ["delay"]
+    poles = {row["parameter"]: row for row in rows_of(results, "bias:poles")}
+    assert {name: row["value"] for name, row in poles.items()} == pytest.approx(
+        {"pole_1_real": 0.0, "pole_1_imag": 1.45 - np.sqrt(4 - 1.4**2)}
+    )
+    assert {(row["unit"], row["n"], row["without_value"]) for row in poles.values()} == {("rad/s", 3, 1)}
+
+
+def test_real_poles_are_matched_whatever_their_order(make_results, estimate):
+    system = {"numerator": [6.0], "denominator": [1.0, 5.0, 6.0], "delay": 8.0}
+    results = make_results({(5.0, "0.0"): [estimate(8.0, denominator=(1.0, 5.3, 6.72))] * 2})
+    for cell in results.manifest["data_cells"]:
+        cell["content"]["system"] = system
+    values = {row["parameter"]: row["value"] for row in rows_of(results, "bias:poles")}
+    assert values == pytest.approx({"pole_1": -0.2, "pole_2": -0.1})
+
+
+def test_distances_count_what_has_no_model_as_infinitely_far(make_results, estimate):
+    near, far, none = estimate(8.0, numerator=(8.8,)), estimate(8.0, numerator=(16.0,)), estimate(None, status="FAILED")
+    for name in ("h2", "hinf", "response:2"):
+        (row,) = rows_of(make_results({(5.0, "0.0"): [near, far, none]}), name)
+        assert (row["value"], row["without_value"], row["unit"]) == (pytest.approx(100.0), 1, "%")
+        (row,) = rows_of(make_results({(5.0, "0.0"): [near, none, none]}), name)
+        assert row["value"] is None
+
+
+def test_efficiency_is_the_bound_over_the_mean_square(tmp_path):
+    plan = plan_of(TWO_MODES, tmp_path)
+    results = ideal_results(plan, tmp_path)
+    rows = [row for row in measure_rows(results, ["efficiency"]) if row["method"] == "additive"]
+    assert len(rows) == 2 * 6
+    for row, group in zip(rows, np.repeat(estimates_by_group(results)[:2], 6), strict=True):
+        bound = least_variances(results)[group.group][row["parameter"]]
+        k = group.names.index(row["parameter"])
+        assert row["value"] == pytest.approx(100 * bound / np.mean((group.values[:, k] - group.truth[k]) ** 2))
+        # The estimates were drawn with the variance of long records.
+        assert 40 < row["value"] < 250
+
+
 def test_failures_are_counted_by_kind(make_results, estimate):
     found = [estimate(8.0), estimate(None, status="FAILED"), estimate(8.1, status="MAX_ITERATIONS"), estimate(8.0)]
     results = make_results({(5.0, "0.0"): found, (15.0, "0.0"): found[:1]})
@@ -91,6 +136,15 @@ def test_failures_are_counted_by_kind(make_results, estimate):
 def test_what_cannot_be_measured_is_refused_in_a_sentence(results, make_results, estimate):
     with pytest.raises(UsageError, match=r"no measure 'rsme'; did you mean 'rmse'\? Known: percent, bias"):
         measure_rows(results, ["bias", "rsme"])
+    for name, sentence in {
+        "rmse:dely": "no parameter of the system; did you mean 'delay'",
+        "cpu:delay": "about the estimate as a whole; ask for cpu",
+        "response": "needs a frequency",
+        "response:-1": "needs a frequency",
+        "fresh_fit": r"add 'measures: \[fresh_fit\]' to the specification",
+    }.items():
+        with pytest.raises(UsageError, match=sentence):
+            measure_rows(results, [name])
     without = make_results({(5.0, "0.0"): [estimate(8.0)]}, success=None)
     with pytest.raises(UsageError, match=r"percent needs a rule .* no success section; use bias, rmse"):
         measure_rows(without, ["percent"])

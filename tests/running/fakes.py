@@ -63,6 +63,8 @@ class FakeData:
 
     result_of = DataSet.result_of
     _validation_fit_percent = DataSet._validation_fit_percent
+    _fresh_fit_percent = DataSet._fresh_fit_percent
+    _fresh_record: ClassVar[None] = None
 
 
 @dataclass(frozen=True)
