@@ -18,7 +18,8 @@ from ctid_cli.specification.signal_checks import signal_warnings
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.yaml_source import KeyPath
 
-#: A record shows the slowest pole if it lasts so many of its time constants beyond the delay.
+#: A record shows the slowest pole if it lasts so many of its time constants beyond the delay: below that its standard
+#: error grows much faster than that of a longer record falls with the number of samples.
 TIME_CONSTANTS = 3.0
 #: Input edges this close to a sample, as a fraction of the sampling interval, are seen when they happen.
 ON_TIME = 1e-6
@@ -90,8 +91,11 @@ def _of_short_record(key: str, system: Any, extent: Extent) -> Iterator[Complain
     slowest = float(1.0 / frequencies[frequencies > 0.0].min(initial=math.inf))
     needed = float(system.delay + TIME_CONSTANTS * slowest)
     if extent.duration < needed:
-        short = f"a record of {extent.duration:.4g} s ends before the slowest pole, with {slowest:.4g} s after a delay"
-        short += f" of {system.delay:g} s, shows in the output"
+        delayed = f", {system.delay:g} s of it delay," if system.delay else ""
+        short = (
+            f"a record of {extent.duration:.4g} s{delayed} shows little of the slowest pole, whose time constant is "
+        )
+        short += f"{slowest:.4g} s"
         enough = f"{needed:.3g}" if key == "duration" else math.ceil(needed / extent.interval) + 1
         yield ("sampling", key), f"{short}; write {key}: {enough} or more"
 

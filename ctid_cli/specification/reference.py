@@ -116,7 +116,7 @@ def _list_form(node: Node, defs: Node) -> Node | None:
     """The list of such values that may stand in the place of one."""
     forms = _alternatives(node, defs)
     single = [form for form in forms if form.get("type") != "array"]
-    lists = [form for form in forms if form.get("type") == "array" and _alternatives(form["items"], defs)[0] in single]
+    lists = [form for form in forms if form.get("type") == "array" and _alternatives(form.get("items", {}), defs)[0] in single]
     return lists[0] if lists else None
 
 
