@@ -115,9 +115,9 @@ def _mappings(node: Node, defs: Node) -> list[Node]:
 def _list_form(node: Node, defs: Node) -> Node | None:
     """The list of such values that may stand in the place of one."""
     forms = _alternatives(node, defs)
-    single = [form for form in forms if form.get("type") != "array"]
-    lists = [form for form in forms if form.get("type") == "array" and _alternatives(form.get("items", {}), defs)[0] in single]
-    return lists[0] if lists else None
+    lists = [form for form in forms if form.get("type") == "array"]
+    same = [form for form in lists if _alternatives(form.get("items", {}), defs)[0] in forms]
+    return same[0] if same else None
 
 
 def _type(node: Node, defs: Node) -> str:
