@@ -34,8 +34,9 @@ class SendOnDelta(Sampling):
     Notes
     -----
     The output is simulated, and the noise drawn, at every look. How many samples a record has depends on the output.
-    The instants depend on the noise: with a delta of about its size, mostly large errors are sent, and estimates that
-    take instants for given are biased.
+    The instants depend on the noise: errors that carry the output over the threshold are sent more often than others,
+    and estimates that take the instants for given are biased. In 150 data sets of a first-order system at 20 dB ``b0``
+    is 3.6 % too large with a delta of 1.4 standard deviations of the noise, and 5.9 % with 4.
     """
 
     kind: ClassVar[str] = "send_on_delta"
