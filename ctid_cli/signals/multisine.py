@@ -65,8 +65,8 @@ class Multisine(Excitation):
     https://doi.org/10.1109/TIT.1970.1054411): for N equally spaced tones ``phase_k = -pi k (k - 1) / N``, and in
     general ``phase_k - phase_(k-1) = -(w_k - w_(k-1)) T (k - 1) / N``, T being 2 pi over the smallest distance of two
     tones. The peak over the root mean square, the crest factor, is about 1.7 for many equally spaced tones, 1.4
-    with ``low_crest`` and 2.6 to 3.5 with random phases; sparse tones, as in logarithmic spacing, have more. ``low_crest``
-    descends from Schroeder's phases (:mod:`ctid_cli.signals.crest`) and may find others on another processor.
+    with ``low_crest`` and 2.6 to 3.5 with random phases; sparse tones, as in logarithmic spacing, have more. The
+    descent to ``low_crest`` begins at Schroeder's phases, and may end at others on another processor.
 
     Examples
     --------
