@@ -26,6 +26,10 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the file, e.g. noise.snr_db=15; repeatable."),
 ]
+AllowCode = Annotated[
+    bool,
+    typer.Option("--allow-code", envvar="CTID_ALLOW_CODE", help="Run the code that the file names as kind; trust it."),
+]
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Worker processes; all processors by default.")]
 Runs = Annotated[int | None, typer.Option("--runs", min=1, help="Data sets per setting, not the file's own number.")]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Move older results aside and start anew.")]

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from ctid_cli.cli._common import (
+    AllowCode,
     Command,
     Config,
     From,
@@ -86,7 +87,9 @@ def check_filters(
 
 @further.command("accuracy", cls=Command)
 @guarded
-def check_accuracy(config: Config, overrides: Overrides = None, as_json: Json = False) -> None:
+def check_accuracy(
+    config: Config, overrides: Overrides = None, allow_code: AllowCode = False, as_json: Json = False
+) -> None:
     """Say how accurate the estimates of an experiment can be, before any data are taken.
 
     For every estimator and the swept numbers of samples: the standard error of each parameter by theory, with the
@@ -95,7 +98,7 @@ def check_accuracy(config: Config, overrides: Overrides = None, as_json: Json = 
     """
     from ctid_cli.reporting.accuracy_report import accuracy_object, accuracy_text
 
-    ((_, plan),) = load_plans([config], overrides or [])
+    ((_, plan),) = load_plans([config], overrides or [], allow_code=allow_code)
     content = accuracy_object(plan)
     answer(as_json, lambda: content, lambda: accuracy_text(content))
 

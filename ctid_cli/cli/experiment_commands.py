@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ctid_cli.cli._common import Configs, Fresh, Jobs, Out, Overrides, Runs, guarded
+from ctid_cli.cli._common import AllowCode, Configs, Fresh, Jobs, Out, Overrides, Runs, guarded
 from ctid_cli.cli._progress import Reporter, json_lines
 from ctid_cli.errors import Problem, SpecError, TooManyFailuresError, UsageError
 from ctid_cli.reporting.layout import count, seconds
@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from ctid_cli.running.events import Event, PlanReady
 
 
-def load_plans(configs: Sequence[Path], overrides: Sequence[str], runs: int | None = None) -> list[tuple[Path, Plan]]:
+def load_plans(
+    configs: Sequence[Path], overrides: Sequence[str], runs: int | None = None, *, allow_code: bool = False
+) -> list[tuple[Path, Plan]]:
     """Read and check experiment files; warnings go to stderr."""
     from ctid_cli.running.plan import build_plan
     from ctid_cli.specification.load import load_spec
@@ -31,7 +33,7 @@ def load_plans(configs: Sequence[Path], overrides: Sequence[str], runs: int | No
     plans: list[tuple[Path, Plan]] = []
     for config in configs:
         try:
-            plans.append((config, build_plan(load_spec(config, overrides), runs)))
+            plans.append((config, build_plan(load_spec(config, overrides, allow_code=allow_code), runs)))
         except SpecError as error:
             problems += error.problems
     if problems:
@@ -61,6 +63,7 @@ def run(
     jobs: Jobs = None,
     runs: Runs = None,
     overrides: Overrides = None,
+    allow_code: AllowCode = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and stop.")] = False,
     out: Out = Path("results"),
     fresh: Fresh = False,
@@ -74,7 +77,7 @@ def run(
     """
     from ctid_cli.running.engine import preview, run_experiment
 
-    plans = [plan for _, plan in load_plans(configs, overrides or [], runs)]
+    plans = [plan for _, plan in load_plans(configs, overrides or [], runs, allow_code=allow_code)]
     if dry_run:
         for ready in [preview(plan, out / plan.experiment, fresh=fresh, allow_mixed=allow_mixed) for plan in plans]:
             typer.echo(json_lines(ready)[0] if as_json else _intention(ready))
@@ -130,12 +133,15 @@ def _conclusion(summary: RunSummary, out: Path) -> str:
 
 
 @guarded
-def validate(configs: Configs, overrides: Overrides = None) -> None:
+def validate(configs: Configs, overrides: Overrides = None, allow_code: AllowCode = False) -> None:
     """Check experiment files without running them.
 
     Prints every mistake with its place in the file, or how much work the experiment asks for.
     """
-    for config, plan in load_plans(configs, overrides or []):
+    from ctid_cli.running.own_check import check_components
+
+    for config, plan in load_plans(configs, overrides or [], allow_code=allow_code):
+        check_components(plan)
         typer.echo(f"{config}: ok, {plan.experiment}: {_workload(plan)}")
 
 

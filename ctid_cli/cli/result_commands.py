@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from ctid_cli.cli._common import Json, Out, answer, guarded, write_files
+from ctid_cli.cli._common import AllowCode, Json, Out, answer, guarded, write_files
 from ctid_cli.errors import MismatchError, UsageError
 
 
@@ -113,6 +113,7 @@ def show(
     out: Out = Path("results"),
     as_json: Json = False,
     history: Annotated[bool, typer.Option("--history", help="Estimate again, and print every iteration.")] = False,
+    allow_code: AllowCode = False,
 ) -> None:
     """Print one estimate in full.
 
@@ -123,7 +124,7 @@ def show(
     from ctid_cli.storage.store import find_estimate
 
     found = find_estimate(out, id)
-    again = repeat(found) if history else None
+    again = repeat(found, allow_code=allow_code) if history else None
     answer(as_json, lambda: detail_object(found, again, out), lambda: detail_text(found, again, out))
 
 

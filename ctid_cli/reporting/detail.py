@@ -111,10 +111,11 @@ def _redo_command(found: FoundEstimate, out: Path) -> str:
     return f"ctid show {found.row['id']} --history{out_option(out)}"
 
 
-def repeat(found: FoundEstimate) -> Repeated:
+def repeat(found: FoundEstimate, *, allow_code: bool = False) -> Repeated:
     """Make the data set of an estimate and the estimate once more."""
     row = found.row
-    plan = build_plan(spec_from_canonical(found.stored.manifest["spec"], spec_folder(found.folder)))
+    folder = spec_folder(found.folder)
+    plan = build_plan(spec_from_canonical(found.stored.manifest["spec"], folder, allow_code=allow_code))
     for task in plan.tasks():
         cell = plan.data_cells[task.cell]
         if (cell.hash, task.replicate) != (row["cell"], row["replicate"]):
@@ -128,8 +129,8 @@ def repeat(found: FoundEstimate) -> Repeated:
                     sides = (row.get("measures") or {}, data.result_of(fit, None, None)["measures"])
                     then, now = ({k: v for k, v in side.items() if k.startswith("omega")} for side in sides)
                     return Repeated([], _difference(then, now))
-                model = {name: plain(getattr(fit.model, name)) for name in ("numerator", "denominator", "delay")}
-                then, now = _coefficients(row), _coefficients(model)
+                model = data.result_of(fit, drawn, None)
+                then, now = _coefficients(row), _coefficients(plain(model))
                 difference = _difference(then, now) if then.keys() <= now.keys() else float("inf")
                 return Repeated([plain(asdict(entry)) for entry in fit.history], difference)
     raise MismatchError(f"the stored specification of {row['experiment']} does not describe estimate {row['id']}")
@@ -137,7 +138,7 @@ def repeat(found: FoundEstimate) -> Repeated:
 
 def _coefficients(model: Mapping[str, Any]) -> dict[str, float | None]:
     if not model["numerator"] or not model["denominator"]:
-        return {}
+        return dict(model.get("parameters") or {})
     sides = {"b": model["numerator"], "a": model["denominator"], "delay": [model["delay"]]}
     return {f"{name}{len(values) - k}": value for name, values in sides.items() for k, value in enumerate(values)}
 

@@ -25,6 +25,7 @@ from ctid_cli.signals.noise import Noise
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.send_on_delta import SendOnDelta
 from ctid_cli.simulation.dataset import SimulatedSource
+from ctid_cli.simulation.own_components import OwnEstimation, OwnNoise, OwnSystem
 
 #: From so many samples on the limit for long records is taken.
 LONG = 5000
@@ -59,6 +60,9 @@ def expected_accuracy(
     source: SimulatedSource, estimator: Any, terms: tuple[Term, ...] | None = None
 ) -> ExpectedAccuracy:
     """Accuracy of an estimator on the data sets of a source."""
+    system = source.system
+    if isinstance(system, OwnSystem) or isinstance(estimator, OwnEstimation) or isinstance(source.noise, OwnNoise):
+        raise DataError("there is no theory here of systems, noises and estimators of one's own")
     if source.noise is None:
         raise DataError("the data have no noise, so nothing but rounding limits the accuracy")
     if not isinstance(source.noise, Noise):
@@ -67,13 +71,13 @@ def expected_accuracy(
         raise DataError("the instants of the samples depend on the noise, and theory is given here for others only")
     if source.loop is not None and isinstance(source.loop.controller, Relay):
         raise DataError("the relay feeds noise back into the input, and theory is given here for linear controllers")
-    estimated = _estimated(source.system, estimator)
+    estimated = _estimated(system, estimator)
     loop, sampling = source.loop, source.sampling
     if loop is not None and estimated.instruments == "open_loop" and isinstance(sampling, RegularSampling):
-        require_uncorrelated_input(source.system, sampling.interval, loop.controller, source.noise.filter)
+        require_uncorrelated_input(system, sampling.interval, loop.controller, source.noise.filter)
     why_not = _why_no_limit(source, estimated)
     accuracy = _of_records(source, estimated, why_not) if why_not else _of_long_records(source, estimated)
-    if terms is None or not source.system.is_stable:
+    if terms is None or not system.is_stable:
         return accuracy
     parameters = accuracy.parameters.factored(terms)
     # Of a coefficient that is zero in truth the partial fractions leave rounding.

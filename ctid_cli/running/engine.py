@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from ctid_cli.errors import DataError, StorageError
 from ctid_cli.running import events
 from ctid_cli.running.job import Job
+from ctid_cli.running.own_check import check_components
 from ctid_cli.running.stopping import StopRequest
 from ctid_cli.storage import folder as place
 from ctid_cli.storage import journal
@@ -88,7 +89,8 @@ def run_experiment(
         if todo:
             on_event(events.KernelsCompiling())
             on_event(events.KernelsCompiled(warm() if warm else _compile_kernels(plan)))
-            _check_first_records(todo)
+            if not check_components(plan):
+                _check_first_records(todo)
         moved = place.move_aside(folder) if fresh else None
         with _writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -295,10 +297,12 @@ def _check_first_records(jobs: list[Job]) -> None:
 def _compile_kernels(plan: Plan) -> float:
     from ctid_cli.estimation.compilation import compile_kernels
     from ctid_cli.simulation.frequency_runs import FrequencyEstimation, SignalSource
+    from ctid_cli.simulation.own_components import OwnEstimation
 
     source = plan.data_cells[0].source
     if not isinstance(source, SignalSource):
-        return compile_kernels(cell.estimator for cell in plan.estimators)
+        ours = (cell.estimator for cell in plan.estimators if not isinstance(cell.estimator, OwnEstimation))
+        return compile_kernels(ours)
     begun = time.perf_counter()
     for cell in plan.estimators:
         if isinstance(cell.estimator, FrequencyEstimation):

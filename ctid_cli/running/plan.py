@@ -14,6 +14,7 @@ from ctid_cli.signals.recorder import Recorder
 from ctid_cli.simulation.dataset import SimulatedSource, Source, located
 from ctid_cli.simulation.frequency_measures import Measuring
 from ctid_cli.simulation.frequency_runs import FrequencyEstimation, SignalSource
+from ctid_cli.simulation.own_components import OwnSystem
 from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, replaced, variants
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.start_points import NO_START, start_points
@@ -74,6 +75,10 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
             source = dataclasses.replace(located(spec.data.options(), folder), loop=loop)
         else:
             content |= {"noise": content.get("noise"), "seed": seed}
+            if isinstance(options["system"], OwnSystem):
+                truth, own = content["system"]["truth"], content["system"]
+                # The name of an option stands for its value.
+                own["truth"] = {name: own[value] if isinstance(value, str) else value for name, value in truth.items()}
             if loop is not None:
                 loop = dataclasses.replace(loop, reference=located(loop.reference, folder))
                 loop = loop.at(options["sampling"].interval)

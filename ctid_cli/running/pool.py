@@ -19,6 +19,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
+from ctid_cli import own_code
 from ctid_cli.running.job import Job, run_job
 from ctid_cli.running.job_order import JobQueue
 from ctid_cli.running.worker import initialise
@@ -81,12 +82,9 @@ def _round(
         while waiting and not stopping():
             job = waiting.pop()
             running[id(job)] = job
-            yield joblib.delayed(_numbered)(id(job), job)
+            yield joblib.delayed(_numbered)(own_code.served(), id(job), job)
 
-    # joblib would run a single job at a time in this very process; two workers, one of them idle, keep it out.
-    with joblib.parallel_config(
-        backend="loky", n_jobs=max(workers, 2), inner_max_num_threads=1, initializer=initialise, initargs=(os.getpid(),)
-    ):
+    with _workers(workers):
         parallel = joblib.Parallel(
             return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs" if workers > 1 else 1
         )
@@ -122,6 +120,34 @@ def _round(
     return list(running.values()), reason
 
 
+def in_worker(call: Callable[..., Any], *given: Any) -> Any:
+    """What a call answers in a worker process; None if the process died of it."""
+    import joblib
+
+    with _workers(2):
+        parallel = joblib.Parallel(return_as="list")
+    try:
+        return parallel([joblib.delayed(_called)(own_code.served(), call, given)])[0]
+    except KeyboardInterrupt:
+        kill_workers()
+        raise
+    except Exception:
+        return None
+
+
+def _workers(count: int) -> Any:
+    import joblib
+
+    # joblib would run a single job at a time in this very process; two workers, one of them idle, keep it out.
+    return joblib.parallel_config(
+        backend="loky", n_jobs=max(count, 2), inner_max_num_threads=1, initializer=initialise, initargs=(os.getpid(),)
+    )
+
+
+def _called(own: own_code.Served, call: Callable[..., Any], given: tuple[Any, ...]) -> Any:
+    return call(*given)
+
+
 def _no_failed_callback(record: logging.LogRecord) -> bool:
     """Whether a log record is anything but a callback that met a pool being torn down.
 
@@ -131,7 +157,7 @@ def _no_failed_callback(record: logging.LogRecord) -> bool:
     return not str(record.msg).startswith("exception calling callback")
 
 
-def _numbered(number: int, job: Job) -> tuple[int, list[Outcome]]:
+def _numbered(own: own_code.Served, number: int, job: Job) -> tuple[int, list[Outcome]]:
     return number, run_job(job)
 
 

@@ -20,6 +20,8 @@ def initialise(parent: int) -> None:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    # What an estimator of one's own prints must not stand between the lines of an answer.
+    sys.stdout = sys.stderr
     # Estimators report through their status; warnings of several workers at once would only garble the terminal.
     warnings.simplefilter("ignore")
     faulthandler.disable()

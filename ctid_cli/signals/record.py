@@ -168,6 +168,11 @@ class Record:
         return cls(times, np.asarray(y, dtype=float), HeldSignal(times, np.asarray(u, dtype=float), hold), name=name)
 
     @property
+    def inputs(self) -> tuple[HeldSignal, ...]:
+        """The inputs; today there is one."""
+        return (self.input,)
+
+    @property
     def n_samples(self) -> int:
         """Number of output samples, masked ones included."""
         return int(self.t.size)

@@ -19,7 +19,7 @@ def additive_parameters(fit: Any, terms: Sequence[Term] | None) -> tuple[dict[st
     additive = getattr(fit, "additive", None)
     if additive is not None:
         return additive.parameters, {}
-    if terms is None:
+    if terms is None or fit.model is None:
         return None, {}
     try:
         with np.errstate(all="ignore"):  # what overflows is refused

@@ -29,6 +29,7 @@ from ctid_cli.signals.sampling import Sampling
 from ctid_cli.signals.send_on_delta import SendOnDelta
 from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.additive_parameters import additive_parameters
+from ctid_cli.simulation.own_components import OwnSystem
 
 #: Data sets to try models on are numbered from here: no experiment has so many.
 FRESH = 2**31
@@ -63,22 +64,24 @@ class DataSet:
     def result_of(self, fit: Any, start: Any, terms: Sequence[Term] | None) -> dict[str, Any]:
         """What is stored of a fit to the record."""
         parameters, errors = additive_parameters(fit, terms)
+        # Of estimators of one's own, which may give parameters of any name, and no model.
+        named, model = getattr(fit, "named", {}), fit.model
         # Of useful redundancy alone.
         search = getattr(fit, "search", None)
         return {
             "status": fit.status.name,
-            "message": str(fit.status.value),
+            "message": getattr(fit, "message", "") or str(fit.status.value),
             "start_delay": None if start is None else start.delay,
-            "delay": fit.model.delay,
-            "numerator": fit.model.numerator,
-            "denominator": fit.model.denominator,
-            "parameters": parameters,
+            "delay": named.get("delay") if model is None else model.delay,
+            "numerator": None if model is None else model.numerator,
+            "denominator": None if model is None else model.denominator,
+            "parameters": {**named, **(parameters or {})} or None,
             "standard_errors": fit.standard_errors | errors,
             "cost": fit.cost,
             "fit_percent": fit.fit_percent,
-            "validation_fit_percent": self._validation_fit_percent(fit.model),
-            "fresh_fit_percent": self._fresh_fit_percent(fit.model),
-            "iterations": int(fit.iterations),
+            "validation_fit_percent": self._validation_fit_percent(model),
+            "fresh_fit_percent": self._fresh_fit_percent(model),
+            "iterations": None if fit.iterations is None else int(fit.iterations),
             "search_delay": None if search is None else search.point,
             "switches": None if search is None else len(search.switches),
             "condition_number": fit.condition_number,
@@ -92,7 +95,7 @@ class DataSet:
         from ctid_cli.inference.diagnostics import fit_percent
 
         record = self._fresh_record
-        if record is None or record.noise_free is None:
+        if record is None or record.noise_free is None or model is None:
             return None
         return float(fit_percent(record.noise_free, _simulated(model, record.input, record.t)))
 
@@ -100,7 +103,7 @@ class DataSet:
         from ctid_cli.inference.diagnostics import fit_percent
 
         record = self.validation
-        if record is None:
+        if record is None or model is None:
             return None
         simulated = _simulated(model, record.input, record.t)
         return float(fit_percent(record.y[record.valid], simulated[record.valid]))
@@ -110,7 +113,7 @@ class DataSet:
 class SimulatedSource:
     """Data sets from a simulated system."""
 
-    system: TransferFunction | AdditiveModel
+    system: TransferFunction | AdditiveModel | OwnSystem
     excitation: Excitation | None
     sampling: Sampling
     noise: Noise | ContinuousNoise | None
@@ -134,6 +137,7 @@ class SimulatedSource:
         if generator is not None:
             applied = generator.generate(times, stream(self.seed, "input", replicate))
         if self.loop is not None:
+            assert not isinstance(self.system, OwnSystem)
             return DataSet(self._record_in(self.loop, times, applied.at(times), replicate), true_model=self.system)
         output = _simulated(self.system, applied, times)
         y = self.recorder.rounded(output + self._drawn(times, output, replicate))
@@ -143,12 +147,14 @@ class SimulatedSource:
         known = applied
         if self.sampling.input_record == "sampled":
             known = HeldSignal(times, applied.at(times), applied.hold)
-        return DataSet(Record(times, self._with_losses(y, replicate), known, noise_free=output), self.system)
+        record = Record(times, self._with_losses(y, replicate), known, noise_free=output)
+        return DataSet(record, true_model=None if isinstance(self.system, OwnSystem) else self.system)
 
     def _record_in(self, loop: LoopOptions, times: Array, reference: Array, replicate: int) -> Record:
         from ctid_cli.filtering.loop import simulate_loop
         from ctid_cli.filtering.relay_loop import simulate_relay
 
+        assert not isinstance(self.system, OwnSystem)
         interval = regular_interval(times)
         if interval is None:
             raise DataError("a closed loop needs a regular clock, since its controller acts at every sample")
@@ -260,11 +266,13 @@ class MeasuredSource:
 Source = SimulatedSource | MeasuredSource
 
 
-def _simulated(system: TransferFunction | AdditiveModel, applied: HeldSignal, times: Array) -> Array:
+def _simulated(system: TransferFunction | AdditiveModel | OwnSystem, applied: HeldSignal, times: Array) -> Array:
     """Output of a model."""
     from ctid_cli.filtering.sampled import simulate_additive
     from ctid_cli.filtering.simulate import simulate
 
+    if isinstance(system, OwnSystem):
+        return system.simulate(applied, times)
     if isinstance(system, AdditiveModel):
         return simulate_additive(system, applied, times)
     return simulate(system, applied, times)

@@ -1,7 +1,7 @@
 """What is wrong with a specification although every section is right by itself."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
@@ -58,7 +58,8 @@ def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool
     yield from world_complaints(spec, broken)
     samplings = variants(spec.sampling)
     key = "duration" if hasattr(spec.sampling, "duration") else "samples"
-    too_long = over({(): samplings}, partial(_too_long, ("sampling", key)))
+    of_ours = [] if getattr(spec.sampling, "own", False) else samplings
+    too_long = over({(): of_ours}, partial(_too_long, ("sampling", key)))
     if spec.signal is not None:
         yield from too_long or signal_complaints(spec)
         return
@@ -86,6 +87,9 @@ def extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
         record = spec.measured.dataset(0).record
         interval = record.duration / max(record.n_samples - 1, 1)
         return [Variant({}, {}, Extent(interval, record.n_samples, (record.t - record.t[0])[record.valid]))]
+    # What is one's own is asked in a worker process only, before the run.
+    if getattr(spec.sampling, "own", False):
+        return []
     # Random intervals stand for themselves at their mean.
     plans = [(case, Extent(case.options.mean_interval, case.options.samples, None, case.options)) for case in samplings]
     return [Variant({}, case.swept, extent) for case, extent in plans]
@@ -119,7 +123,7 @@ def _of_record(at: KeyPath, options: Any, extent: Extent) -> Iterator[Complaint]
 def _estimator_complaints(spec: Spec, records: Sequence[Variant], *, open_loop: bool) -> Iterator[Complaint]:
     """What each estimator of a system has against the record, the loop and the initial delays."""
     for name, section in spec.estimators.items():
-        if section.kind in KINDS["frequency_estimator"]:
+        if section.kind in KINDS["frequency_estimator"] or section.own:
             continue
         at, cases = ("estimators", name), variants(section)
         yield from over({(): cases, ("sampling",): records}, partial(_of_record, at))
@@ -161,6 +165,8 @@ def _start_complaints(spec: Spec, starts: StartsSection, broken: frozenset[str])
             continue  # all of them have the structure of the system
         elif spec.data is not None:
             yield path, "the parameters of a measured record are not known; give values: {additive: [submodels]}"
+        elif spec.system is not None and spec.system.own:
+            yield path, "a system of one's own has no known structure; give values: {additive: [submodels]}"
         elif spec.system is not None:
             try:
                 model = additive_form(variants(spec.system)[0].options)
@@ -173,7 +179,8 @@ def _start_complaints(spec: Spec, starts: StartsSection, broken: frozenset[str])
 def _structure_complaints(spec: Spec, path: KeyPath, model: AdditiveModel) -> Iterator[Complaint]:
     """Say which estimators cannot start from a model."""
     for name, section in spec.estimators.items():
-        yield from over({(): variants(section)}, partial(_of_structure, name, model, path))
+        if not section.own:
+            yield from over({(): variants(section)}, partial(_of_structure, name, model, path))
 
 
 def _of_structure(name: str, model: AdditiveModel, path: KeyPath, options: Any) -> Iterator[Complaint]:
@@ -206,6 +213,8 @@ def _success_complaints(spec: Spec) -> Iterator[Complaint]:
             yield path, f"the {unknown} of a measured record are not known; {other}"
         elif spec.system is None:
             continue
+        elif spec.system.own:
+            yield from _truth_complaints(path, spec.system.truth, name)
         elif name == "delay_relative_error":
             if 0.0 in np.atleast_1d(spec.system.delay):
                 yield path, f"a relative error needs a true delay above zero; {other}"
@@ -214,6 +223,15 @@ def _success_complaints(spec: Spec) -> Iterator[Complaint]:
         elif 0.0 in model.theta:
             zero = model.names[model.theta.tolist().index(0.0)]
             yield path, f"a relative error needs true parameters other than zero, and {zero} is zero; leave it out"
+
+
+def _truth_complaints(path: KeyPath, truth: Mapping[str, Any], rule: str) -> Iterator[Complaint]:
+    """Say that a system of one's own does not say what is true of it."""
+    names = ["delay"] if rule == "delay_relative_error" else [name for name in truth if name != "delay"]
+    if not names or not truth.keys() >= set(names):
+        yield path, f"needs true values: system.truth: {{{names[0] if names else 'gain'}: 1.0}}"
+    elif zero := [name for name in names if truth[name] == 0.0]:
+        yield path, f"a relative error needs true values other than zero, and {zero[0]} is zero"
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -227,6 +245,9 @@ def has_relay(spec: Spec) -> bool:
 
 def _loop_complaints(spec: Spec, section: Section) -> Iterator[Complaint]:
     """What noise, sampling and system have against a loop."""
+    if spec.system is not None and spec.system.own:
+        yield ("system", "kind"), "a loop needs a transfer function in it; give excitation in place of loop"
+        return
     yield from over({(): variants(spec.noise)}, _of_ratio)
     samplings = variants(spec.sampling)
     if any(not isinstance(variant.options, RegularSampling) for variant in samplings):
@@ -272,6 +293,8 @@ def _simulation_complaints(spec: Spec, records: Sequence[Variant]) -> Iterator[C
     if spec.generator is None:
         return
     place, section = spec.generator
+    if section.own:
+        return
     seed = spec.monte_carlo.seed if spec.monte_carlo is not None else 0
 
     # Some faults show only where an excitation meets a sampling scheme: a step after the end, a tone that the clock
@@ -293,5 +316,5 @@ def _simulation_complaints(spec: Spec, records: Sequence[Variant]) -> Iterator[C
 
 
 def _of_delay(system: Any, extent: Extent) -> Iterator[Complaint]:
-    if system.delay >= extent.duration:
+    if getattr(system, "delay", 0.0) >= extent.duration:
         yield ("system", "delay"), f"{system.delay:g} s is not shorter than the record ({extent.duration:g} s)"

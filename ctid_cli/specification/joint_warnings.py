@@ -52,8 +52,9 @@ def _of_open_loop(at: KeyPath, options: Any) -> Iterator[Complaint]:
 def _simulation_warnings(spec: Spec) -> list[Complaint]:
     """What is unwise where the truth is known."""
     warnings: list[Complaint] = []
-    samplings = variants(spec.sampling)
-    if spec.excitation is not None:
+    # What is one's own is asked in a worker process only.
+    samplings = [] if getattr(spec.sampling, "own", False) else variants(spec.sampling)
+    if spec.excitation is not None and not getattr(spec.excitation, "own", False):
         told: dict[KeyPath, list[Variant]] = {("excitation",): variants(spec.excitation), ("sampling",): samplings}
         warnings += over(told, partial(_of_sampled_input, spec), MAX_TRIALS)
     # A system of one's own need not have poles.

@@ -1,21 +1,22 @@
 """From a YAML file to a checked specification; everything that is wrong with it is reported at once."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError, create_model
 
-from ctid_cli.errors import DataError, Problem, SpecError
+from ctid_cli.errors import DataError, Problem, RefusedError, SpecError
 from ctid_cli.signals.csv_file import read_held_signal
 from ctid_cli.simulation.dataset import file_sha256, joined, located
 from ctid_cli.specification.joint_checks import joint_complaints
 from ctid_cli.specification.joint_warnings import joint_warnings
 from ctid_cli.specification.messages import Complaint, Located, explained, shown
 from ctid_cli.specification.option_sections import EstimatorSection
+from ctid_cli.specification.own_sections import names_code, own_places, with_own_kinds
 from ctid_cli.specification.sections import replaced, variants
 from ctid_cli.specification.spec import Spec
-from ctid_cli.specification.yaml_source import OVERRIDE_FILE, apply_overrides, path_text, read_yaml
+from ctid_cli.specification.yaml_source import OVERRIDE_FILE, KeyPath, apply_overrides, path_text, read_yaml
 
 
 class _PartialSpec(Spec):
@@ -32,8 +33,8 @@ _Remainder = create_model(
 )
 
 
-def load_spec(path: Path, overrides: Sequence[str] = ()) -> Spec:
-    """Read and check a specification.
+def load_spec(path: Path, overrides: Sequence[str] = (), *, allow_code: bool = False) -> Spec:
+    """Read and check a specification; code that it names is run only if that is allowed.
 
     Sampling is called slow, which is a warning and no error, if its (mean) interval exceeds pi / max |p| over the
     poles p [rad/s] of the system: its rate is then below twice the frequency of the fastest pole.
@@ -44,8 +45,9 @@ def load_spec(path: Path, overrides: Sequence[str] = ()) -> Spec:
     if not isinstance(tree, dict):
         message = f"the file must hold a mapping that begins with 'experiment: name', not {shown(tree)}"
         raise SpecError([Problem(source.file, 1, 1, "", "the file is empty" if tree is None else message)])
-    spec, complaints = _validated(tree)
-    spec._folder = Path(path).parent
+    _require_allowed(tree, source.problem, allow_code)
+    spec, complaints = _validated(with_own_kinds(tree, Path(path).parent))
+    spec._folder, spec._source = Path(path).parent, source
     spec, about_files = _with_files(spec)
     broken = frozenset(str(where[0]) for where, _, _ in complaints if where)
     joint = joint_complaints(spec, broken, files_are_good=not about_files)
@@ -59,14 +61,26 @@ def load_spec(path: Path, overrides: Sequence[str] = ()) -> Spec:
     return spec
 
 
-def spec_from_canonical(canonical: Mapping[str, Any], folder: Path | None = None) -> Spec:
+def spec_from_canonical(canonical: Mapping[str, Any], folder: Path | None = None, *, allow_code: bool = False) -> Spec:
     """A specification from its canonical form."""
-    spec, complaints = _validated(dict(canonical))
+
+    def problem(path: KeyPath, message: str) -> Problem:
+        return Problem("(canonical specification)", 1, 1, path_text(path), message)
+
+    _require_allowed(canonical, problem, allow_code)
+    spec, complaints = _validated(with_own_kinds(canonical, folder or Path()))
     if complaints:
-        name = "(canonical specification)"
-        raise SpecError([Problem(name, 1, 1, path_text(path), message) for path, message, _ in complaints])
+        raise SpecError([problem(path, message) for path, message, _ in complaints])
     spec._folder = folder or Path()
     return spec
+
+
+def _require_allowed(tree: Mapping[str, Any], problem: Callable[[KeyPath, str], Problem], allow_code: bool) -> None:
+    """Refuse to run code that a specification names, as a specification may come from anywhere."""
+    ask = "names code, which would be run; if you trust it, repeat the command with --allow-code (or CTID_ALLOW_CODE=1)"
+    places = [(*path, "kind") for path, _, kind in own_places(tree) if names_code(kind)]
+    if places and not allow_code:
+        raise RefusedError("\n".join(str(problem(path, ask)) for path in places))
 
 
 def json_schema() -> dict[str, Any]:
@@ -99,7 +113,7 @@ def _with_files(spec: Spec) -> tuple[Spec, list[Complaint]]:
     place: tuple[str, ...]
     section: Any
     place, section = (("data",), spec.data) if spec.data is not None else spec.generator or ((), None)
-    if not hasattr(section, "sha256"):
+    if not hasattr(section, "sha256") or section.own:
         return spec, []
     file = joined(spec.folder, section.file)
     try:

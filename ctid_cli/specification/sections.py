@@ -57,6 +57,8 @@ class Section(BaseModel):
     target: ClassVar[type | None] = None
     #: Sentences for keys that belong to another form of the section.
     elsewhere: ClassVar[Mapping[str, str]] = {}
+    #: Whether the option dataclass is one that the user wrote.
+    own: ClassVar[bool] = False
 
     @pydantic.model_serializer(mode="wrap")
     def _as_before(self, handler: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -183,7 +185,9 @@ class Geometric(Section):
         return geometric_sizes(first, last, count)
 
 
-def section_for(target: type, kind: str = "", *, sweeping: bool = True, without: str = "") -> type[Section]:
+def section_for(
+    target: type, kind: str = "", *, sweeping: bool = True, without: str = "", base: type[Section] = Section
+) -> type[Section]:
     """Section of an option dataclass."""
     hints = get_type_hints(target)
     fields: dict[str, Any] = {}
@@ -199,23 +203,31 @@ def section_for(target: type, kind: str = "", *, sweeping: bool = True, without:
         if option.metadata.get("added_later"):
             form = Annotated[form, LATER]
         fields[option.name] = (form, _default(option))
-    summary = (target.__doc__ or target.__name__).strip().splitlines()[0]
-    section = pydantic.create_model(target.__name__, __base__=Section, __doc__=summary, **fields)
+    summary = ((target.__doc__ or "").strip() or target.__name__).splitlines()[0]
+    section = pydantic.create_model(target.__name__, __base__=base, __doc__=summary, **fields)
     section.target = target
     return section
 
 
 class Kinds(OneOf):
-    """Annotation of a section that is one of several, told apart by its ``kind``."""
+    """Annotation of a section that is one of several, told apart by its ``kind``, or one's own if that has a form."""
 
-    def __init__(self, *names: str) -> None:
+    def __init__(self, *names: str, own: Any = None) -> None:
         sections = {kind: section_for(target, kind) for name in names for kind, target in classes(name).items()}
 
         def choose(value: Any) -> str | None:
             kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
+            if own is not None and is_own(value):
+                return "own"
             return kind if isinstance(kind, str) and kind in sections else None
 
-        super().__init__(choose, sections, "no_kind", ", ".join(sections))
+        forms = sections if own is None else {**sections, "own": own}
+        super().__init__(choose, forms, "no_kind", ", ".join(sections))
+
+
+def is_own(value: Any) -> bool:
+    """Whether a section, or the mapping that it is made from, is about a component of one's own."""
+    return bool(getattr(value.get("kind") if isinstance(value, Mapping) else value, "own", False))
 
 
 class Options(OneOf):
@@ -255,24 +267,28 @@ def _form(hint: Any, name: str) -> tuple[Any, bool]:
         if word:
             return Annotated[Any, ByShape(usual, "a word is allowed too", text=other)], True
         return Annotated[Any, ByShape(usual, "a list is allowed too", list=other)], False
-    if origin is tuple:
-        return _list_form(arguments), False
-    raise TypeError(f"{name}: a field of type {hint} has no form in a specification")
+    if origin is tuple and arguments and (listed := _list_form(arguments)) is not None:
+        return listed, False
+    allowed = "float, int, bool, str, Literal, tuple[float, ...], dataclasses of these, and any of them or None"
+    raise TypeError(f"{name}: a field of type {hint} has no form in a specification; allowed: {allowed}")
 
 
 def _list_form(items: tuple[Any, ...]) -> Any:
-    """Annotation of an option that is a tuple of numbers or of option dataclasses."""
+    """Annotation of an option that is a tuple of numbers, words or option dataclasses; None for any other tuple."""
     if dataclasses.is_dataclass(items[0]):
         # A list of such lists would say too little about which of them belong together, so that nothing in it is swept.
         item = section_for(items[0], sweeping=False)  # type: ignore[arg-type]
         return Annotated[list[item], Field(min_length=1)]  # type: ignore[valid-type]
     length = None if Ellipsis in items else len(items)
-    return Annotated[list[Number], Field(min_length=length or 1, max_length=length)]
+    one: Any = {float: Number, int: Whole, str: Text}.get(items[0])
+    return None if one is None else Annotated[list[one], Field(min_length=length or 1, max_length=length)]
 
 
 def _default(option: dataclasses.Field[Any]) -> Any:
     """The default as a file would give it."""
     default: Any = option.default
+    if option.default_factory is not dataclasses.MISSING:
+        default = option.default_factory()
     if default is dataclasses.MISSING:
         return ...
     if dataclasses.is_dataclass(default) and not isinstance(default, type):

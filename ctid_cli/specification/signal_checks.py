@@ -34,7 +34,7 @@ def world_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
     if not on_signal:
         here, does = "a system; give signal, or one of", "estimates the frequencies of a signal"
     for name, section in spec.estimators.items():
-        if section.kind not in KINDS[wanted]:
+        if section.kind not in KINDS[wanted] and (on_signal or not section.own):
             message = f"{section.kind} {does}, and this experiment has {here} {', '.join(KINDS[wanted])}"
             yield ("estimators", name, "kind"), message
     for name in _OF_SYSTEMS if on_signal else _OF_SIGNALS:

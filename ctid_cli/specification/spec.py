@@ -13,7 +13,7 @@ from pydantic import Field, PrivateAttr
 from pydantic_core import ErrorDetails
 
 from ctid_cli.canonical import canonical_json
-from ctid_cli.errors import UsageError
+from ctid_cli.errors import Problem, UsageError
 from ctid_cli.inference.monte_carlo import requested
 from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.signals.recorder import Recorder
@@ -26,6 +26,7 @@ from ctid_cli.specification.sections import Options, Section, variants
 from ctid_cli.specification.signal_sections import AnySamplingSection, DisturbanceOrNone, SignalSection, TracksSection
 from ctid_cli.specification.start_sections import StartsSection
 from ctid_cli.specification.system_sections import AnySystemSection
+from ctid_cli.specification.yaml_source import KeyPath, YamlSource, path_text
 
 _EXPERIMENT = matching(
     r"(?!.*\.\.)(?=.{1,200}\Z)[A-Za-z0-9][A-Za-z0-9._-]*(?:/[A-Za-z0-9][A-Za-z0-9._-]*)*",
@@ -147,6 +148,7 @@ class Spec(Section):
     _warnings: tuple[str, ...] = PrivateAttr(default=())
     _text: str = PrivateAttr(default="")
     _folder: Path = PrivateAttr(default=Path())
+    _source: YamlSource | None = PrivateAttr(default=None)
 
     @classmethod
     def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
@@ -207,6 +209,12 @@ class Spec(Section):
     def warnings(self) -> tuple[str, ...]:
         """What is unwise but allowed, each with its place in the file."""
         return self._warnings
+
+    def problem(self, path: KeyPath, message: str) -> Problem:
+        """Something wrong at a key path, with its place in the file."""
+        if self._source is None:
+            return Problem("(stored specification)", 1, 1, path_text(path), message)
+        return self._source.problem(path, message)
 
     @property
     def text(self) -> str:
@@ -276,7 +284,8 @@ def _random_section(raw: Mapping[str, Any], present: set[str]) -> str:
             continue
         kinds = KINDS[name.split()[0]]
         kind = part.get("kind") if isinstance(part, Mapping) else None
-        if not isinstance(kind, str) or kind not in kinds or not _draws_nothing(resolve(name.split()[0], kind), part):
+        found = resolve(name.split()[0], kind) if isinstance(kind, str) and kind in kinds else kind
+        if not _draws_nothing(found, part):
             return name
     recorder = raw.get("recorder")
     return "recorder" if isinstance(recorder, Mapping) and recorder.get("missing") else ""

@@ -1,7 +1,7 @@
 """Sections for the system to simulate: one fraction, or a sum of submodels."""
 
 from collections.abc import Iterator
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -10,9 +10,10 @@ from ctid_cli.arrays import ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.specification.fields import Coefficients, NotNegative, Swept
+from ctid_cli.specification.fields import Coefficients, NotNegative, OneOf, Swept
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.sections import RefusedOptionsError, Section, WithKey
+from ctid_cli.specification.own_sections import OWN_FORM
+from ctid_cli.specification.sections import RefusedOptionsError, Section, WithKey, is_own
 
 #: Highest order that the simulation handles to its stated accuracy.
 MAX_ORDER = 12
@@ -132,8 +133,9 @@ class AdditiveSystemSection(AdditiveSection):
                 yield ("additive", k), f"the submodel is unstable and cannot be simulated: {_unstable(poles)}"
 
 
+_LinearSystem = Annotated[Any, WithKey("additive", AdditiveSystemSection, SystemSection)]
 AnySystemSection = Annotated[
-    SystemSection | AdditiveSystemSection, WithKey("additive", AdditiveSystemSection, SystemSection)
+    Any, OneOf(lambda value: "own" if is_own(value) else "linear", {"own": OWN_FORM, "linear": _LinearSystem})
 ]
 
 

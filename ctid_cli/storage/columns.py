@@ -41,7 +41,7 @@ class Column:
     meaning: str
     unit: str | None = None
     #: Which experiments have it; in rows, those of systems are empty for signals.
-    of: Literal["all", "systems", "additive", "signals"] = "all"
+    of: Literal["all", "systems", "signals"] = "all"
     #: Where its value comes from.
     source: Literal["plan", "result", "clock", "truth"] = "result"
     #: What the names of its parts begin with in a table with one number per cell.
@@ -75,8 +75,12 @@ COLUMNS = (
     Column("numerator", "coefficients", "descending powers", of="systems", prefix="b"),
     Column("denominator", "coefficients", "descending powers, monic", of="systems", prefix="a"),
     Column(
-        *("parameters", "by name", "of submodels: `g1_a1` multiplies s in the denominator of the slowest one"),
-        of="additive",
+        *(
+            "parameters",
+            "by name",
+            "of submodels (`g1_a1` multiplies s in the denominator of the slowest), or own ones",
+        ),
+        of="systems",
     ),
     Column("standard_errors", "by name", "of `b0` ..., `a1` ..., `delay` and `parameters`", of="systems", prefix="se_"),
     Column("cost", "float64", "mean squared output error", "output unit^2", of="systems"),

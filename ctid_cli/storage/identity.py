@@ -7,7 +7,8 @@ then the estimator. The *numeric platform* covers what makes the same code give 
 OpenBLAS and NumPy choose for the processor, the processor that Numba compiles for, and the Python version.
 
 Which modules those are follows from the import statements, wherever they stand, of the modules that define the classes
-in use. Only imports from `COMPUTING_FLOORS` are followed: what lies above them plans, reports and stores. The modules
+in use. Only imports from `COMPUTING_FLOORS` are followed: what lies above them plans, reports and stores; and those of
+components of one's own, as far as they are neither installed nor part of Python. The modules
 there that turn a specification into options, and options into data sets and estimates, are named in `PATH`.
 """
 
@@ -28,6 +29,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Self, TypeGuard
 
+from ctid_cli import own_code
 from ctid_cli.canonical import content_hash
 from ctid_cli.kinds import KINDS
 
@@ -117,19 +119,46 @@ def code_version(data: Iterable[str], estimator: Iterable[str], root: Path = ROO
 def modules_behind(names: Iterable[str], root: Path = ROOT) -> dict[str, str]:
     """Hash of the syntax tree of some modules and of every computing module that they import, directly or not."""
     found: dict[str, str] = {}
+    own: dict[str, str] = {}
     waiting = list(names)
     while waiting:
         name = waiting.pop()
-        if name not in found:
+        if name in found or name in own:
+            continue
+        source = own_code.source_of(name)
+        if source is None:
             found[name], imports = _tree(name, root)
-            waiting += imports
-    return found
+        else:
+            own[name], imports = _own_tree(source, name, root)
+        waiting += imports
+    # What a module of one's own contains matters, not what it is called.
+    return found | {f"own {digest}": digest for digest in own.values()}
 
 
 def modules_of(value: Any) -> set[str]:
     """The modules of the classes that options and their fields have."""
     parts = [getattr(value, part.name) for part in dataclasses.fields(value)]
     return {type(value).__module__}.union(*(modules_of(part) for part in parts if dataclasses.is_dataclass(part)))
+
+
+def _own_tree(source: own_code.Source, name: str, root: Path) -> tuple[str, list[str]]:
+    """The same as `_tree` of a module of one's own; one without a readable source counts by its bytes."""
+    try:
+        digest = hashlib.sha256(ast.dump(_Reduced().visit(ast.parse(source.content))).encode()).hexdigest()
+    except (SyntaxError, ValueError):
+        return hashlib.sha256(source.content).hexdigest(), []
+    imports = []
+    for other in sorted(own_code.imports_of(source, name)):
+        package, _, attribute = other.rpartition(".")
+        # Names that the package gives away are those of a module further down.
+        module = getattr(sys.modules[package], attribute, None) if package == "ctid_cli" else None
+        imports.append(getattr(module, "__module__", other))
+    computing = [other for other in imports if _is_computing(other) and _file_of(other, root).is_file()]
+    return digest, computing + [other for other in imports if own_code.source_of(other) is not None]
+
+
+def _is_computing(name: str) -> bool:
+    return name.startswith("ctid_cli.") and name.split(".")[1] in COMPUTING_FLOORS
 
 
 def _file_of(name: str, root: Path) -> Path:
@@ -155,9 +184,8 @@ def _tree(name: str, root: Path) -> tuple[str, list[str]]:
             temporary.write_text(json.dumps(known), encoding="utf-8")
             temporary.replace(_TREES)
     digest, imports = known[key]
-    computing = [name for name in imports if name.startswith("ctid_cli.") and name.split(".")[1] in COMPUTING_FLOORS]
     # What is imported may be a name in a module instead.
-    return digest, [name for name in computing if _file_of(name, root).is_file()]
+    return digest, [name for name in imports if _is_computing(name) and _file_of(name, root).is_file()]
 
 
 class _Reduced(ast.NodeTransformer):

@@ -97,15 +97,8 @@ def assemble(
 
 def row_columns(manifest: Manifest) -> list[columns.Column]:
     """The columns of a row as it is computed, before it is compared with the truth."""
-    here = {"all", "systems", "additive" if is_additive(manifest) else "", "signals" if is_of_signal(manifest) else ""}
+    here = {"all", "systems", "signals" if is_of_signal(manifest) else ""}
     return [column for column in columns.COLUMNS if column.of in here and column.source != "truth"]
-
-
-def is_additive(manifest: Manifest) -> bool:
-    """Whether estimates have parameters of submodels."""
-    # One system for all data cells.
-    system = manifest["data_cells"][0]["content"].get("system") or {}
-    return "additive" in system or any("terms" in part["content"] for part in manifest["estimators"])
 
 
 def is_of_signal(manifest: Manifest) -> bool:

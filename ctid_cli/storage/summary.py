@@ -87,5 +87,9 @@ def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:
         found = found or sorted({k for row in rows for k in row if k or name != "denominator"})
         for part in found:
             values = [row.get(part) for row in rows]
-            flat[f"{parts[name].prefix}{part}"] = pd.Series(values, dtype="float64", index=estimates.index)
+            key, column = f"{parts[name].prefix}{part}", pd.Series(values, dtype="float64", index=estimates.index)
+            # Parameters that make a model are its coefficients too; other names that are taken get a longer one.
+            if key in estimates.columns and key != "delay":
+                key = f"parameters.{key}"
+            flat[key] = flat[key].combine_first(column) if key in flat else column
     return pd.DataFrame(flat)

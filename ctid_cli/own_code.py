@@ -1,0 +1,262 @@
+"""Code of one's own: classes that a specification names by file or module, or that packages offer as entry points.
+
+Files are read once and served to imports as they were read, in this process and in its workers: a run ends with the
+code that it began with, whatever happens to the files meanwhile.
+"""
+
+import ast
+import builtins
+import hashlib
+import importlib
+import importlib.util
+import os
+import re
+import sys
+import sysconfig
+import traceback
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import redirect_stdout, suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib.abc import MetaPathFinder, SourceLoader
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+#: Part of a specification to the group of entry points that offers kinds for it.
+GROUPS = {name: f"ctid.{name}s" for name in ("estimator", "excitation", "noise", "sampling", "system")}
+_STANDARD = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib"))
+
+
+class OwnCodeError(ValueError):
+    """Code of one's own that cannot be used, and why."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A module's file as it was read."""
+
+    path: str
+    content: bytes
+
+    @property
+    def is_package(self) -> bool:
+        """Whether other modules are inside it."""
+        return Path(self.path).name == "__init__.py"
+
+
+def find_class(kind: str, folder: Path) -> Any:
+    """What ``./file.py:Class``, seen from a folder, or ``package.module:Class`` names."""
+    place, _, name = kind.rpartition(":")
+    if not place or not name.isidentifier():
+        raise OwnCodeError(f"{kind!r} names no code; write './file.py:Class' or 'package.module:Class'")
+    of_file = "/" in place or place.endswith(".py")
+    module = _serve_file(Path(os.path.abspath(folder / place)), place) if of_file else place
+    found = _tried(place, lambda: getattr(importlib.import_module(module), name, None))
+    if found is None:
+        raise OwnCodeError(f"{place} has no class {name}")
+    return found
+
+
+def find_entry_point(section: str, name: str) -> Any:
+    """What an installed package offers as a kind of a part of a specification; None where none does."""
+    from importlib.metadata import entry_points
+
+    for found in entry_points(group=GROUPS[section], name=name):
+        return _tried(f"the entry point {name} ({found.value})", found.load)
+    return None
+
+
+def _tried(place: str, load: Callable[[], Any]) -> Any:
+    try:
+        # What it prints must not stand between the lines of an answer.
+        with redirect_stdout(sys.stderr):
+            return load()
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        raise OwnCodeError(f"{place} cannot be imported: {reason(error)}") from None
+
+
+def reason(error: BaseException) -> str:
+    """An exception in a clause: what it says, and the last line of one's own code that it came through."""
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if is_own_file(frame.filename)]
+    where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}{': ' if text else ''}{text[:200]}{where}"
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Files, served to imports
+
+
+_SERVED: dict[str, Source] = {}
+
+
+class _Loader(SourceLoader):
+    """Loads a module from what was read of its file; it imports its neighbours as they were read with it.
+
+    These have names of their own in ``sys.modules``, so that any number of folders may have a ``helpers.py``.
+    """
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+
+    def get_filename(self, fullname: str) -> str:
+        return self.source.path
+
+    def get_data(self, path: str | bytes) -> bytes:
+        return self.source.content
+
+    def exec_module(self, module: ModuleType) -> None:
+        main = module.__name__.partition(".")[0]
+
+        def load(name: str, given: Any = None, local: Any = None, names: Any = (), level: int = 0) -> Any:
+            top, private = name.partition(".")[0], f"{main}.{name}"
+            if level or f"{main}.{top}" not in _SERVED:
+                return builtins.__import__(name, given, local, names, level)
+            for full in (private, *(f"{private}.{part}" for part in names or ())):
+                if full in _SERVED:
+                    importlib.import_module(full)
+            return sys.modules[private if names else f"{main}.{top}"]
+
+        # Where import statements of a module look for what they do.
+        module.__dict__["__builtins__"] = {**vars(builtins), "__import__": load}
+        super().exec_module(module)
+
+
+class _Finder(MetaPathFinder):
+    def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        source = _SERVED.get(fullname)
+        if source is None:
+            return None
+        return importlib.util.spec_from_file_location(
+            fullname, source.path, loader=_Loader(source), submodule_search_locations=[]
+        )
+
+
+@dataclass(frozen=True)
+class Served:
+    """What this process has served; reading it from a pickle serves it in another process too."""
+
+    sources: dict[str, Source]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _received, (self.sources,)
+
+
+def served() -> Served:
+    """What a worker must be told before it reads the rest of a job."""
+    return Served(dict(_SERVED))
+
+
+def _received(sources: dict[str, Source]) -> Served:
+    _serve(sources)
+    return Served(sources)
+
+
+def _serve(sources: dict[str, Source]) -> None:
+    if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _Finder())
+    for name, source in sources.items():
+        _SERVED.setdefault(name, source)
+
+
+def _serve_file(path: Path, place: str) -> str:
+    """Name of the module that a file is now served as; the modules beside it that it imports are inside that."""
+    try:
+        sources = _with_neighbours(path)
+    except FileNotFoundError:
+        raise OwnCodeError(f"there is no file {place}; names start at the folder of the specification") from None
+    except (OSError, ValueError) as error:
+        raise OwnCodeError(f"{place} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    digest = hashlib.sha256(repr([(name, source.content) for name, source in sorted(sources.items())]).encode())
+    # Named by content, so that a changed file is another module.
+    main = f"own_{re.sub(r'[^0-9A-Za-z_]', '_', path.stem)}_{digest.hexdigest()[:12]}"
+    _serve({f"{main}.{name}" if name else main: source for name, source in sources.items()})
+    return main
+
+
+def _with_neighbours(path: Path) -> dict[str, Source]:
+    """A file, under no name, and the modules in its folder that it imports, directly or not."""
+    found, waiting = {"": Source(str(path), path.read_bytes())}, [""]
+    while waiting:
+        name = waiting.pop()
+        for other in imports_of(found[name], name):
+            file = None if other in found or _is_installed(other) else _beside(path.parent, other)
+            if file is not None:
+                found[other] = Source(str(file), file.read_bytes())
+                waiting.append(other)
+    return found
+
+
+def _beside(folder: Path, name: str) -> Path | None:
+    base = folder.joinpath(*name.split("."))
+    return next((file for file in (base.with_suffix(".py"), base / "__init__.py") if file.is_file()), None)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# What a module is made of
+
+
+def is_own_file(file: str | None) -> bool:
+    """Whether a file is neither part of Python, nor of an installed package, nor of ctid."""
+    if not file or not os.path.isabs(file):
+        return False
+    parts = Path(file).parts
+    installed = "site-packages" in parts or "dist-packages" in parts or file.startswith(_STANDARD)
+    return not installed and not Path(file).is_relative_to(Path(__file__).parent)
+
+
+def source_of(name: str) -> Source | None:
+    """What a module of one's own is made from; None for any other name."""
+    if name in _SERVED:
+        return _SERVED[name]
+    # What has side effects when it is imported may do anything.
+    with suppress(BaseException):
+        spec = importlib.util.find_spec(name)
+        if spec is not None and is_own_file(spec.origin):
+            return Source(str(spec.origin), Path(str(spec.origin)).read_bytes())
+    return None
+
+
+def _is_installed(name: str) -> bool:
+    top = name.partition(".")[0]
+    with suppress(ImportError, ValueError):
+        spec = importlib.util.find_spec(top)
+        places: Iterable[str | None] = () if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
+        return spec is not None and not any(map(is_own_file, places))
+    return False
+
+
+def imports_of(source: Source, name: str) -> set[str]:
+    """Modules, and names that may be modules, that a module imports by a statement anywhere in it."""
+    found = _named(source.content, name if source.is_package else name.rpartition(".")[0])
+    neighbours = {other: f"{name.partition('.')[0]}.{other}" for other in found}
+    return {private if private in _SERVED else other for other, private in neighbours.items()} - {name}
+
+
+@cache
+def _named(content: bytes, package: str) -> set[str]:
+    try:
+        nodes = list(ast.walk(ast.parse(content)))
+    except (SyntaxError, ValueError):
+        return set()
+    return {parent for node in nodes for full in _imported(node, package) for parent in _parents(full)}
+
+
+def _imported(node: ast.AST, package: str) -> Iterator[str]:
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+    elif isinstance(node, ast.ImportFrom):
+        base = node.module or ""
+        if node.level:
+            above = package.split(".")[: len(package.split(".")) - node.level + 1]
+            base = ".".join(filter(None, [*above, base]))
+        yield from (f"{base}.{alias.name}".lstrip(".") for alias in node.names)
+
+
+def _parents(full: str) -> Iterator[str]:
+    parts = full.split(".")
+    return (".".join(parts[: k + 1]) for k in range(len(parts)))

@@ -1,0 +1,139 @@
+"""A first look at components of one's own, before anything is stored: one data set, twice, in a worker process."""
+
+import random
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from ctid_cli.canonical import canonical_json, plain
+from ctid_cli.errors import SpecError
+from ctid_cli.own_code import reason
+from ctid_cli.running.cells import Plan, Task
+from ctid_cli.running.job import Job
+from ctid_cli.running.pool import in_worker
+from ctid_cli.simulation.dataset import SimulatedSource
+from ctid_cli.simulation.own_components import (
+    ContractError,
+    OwnEstimation,
+    OwnExcitation,
+    OwnNoise,
+    OwnSampling,
+    OwnSystem,
+)
+
+STAND_INS = (OwnSampling, OwnExcitation, OwnSystem, OwnNoise)
+#: Key path, and what is wrong there.
+Complaint = tuple[tuple[str, ...], str]
+#: An estimate that takes longer is not repeated [s].
+SLOW = 30.0
+#: Errors of a program, which no other data set would mend.
+MISTAKES = (NameError, AttributeError, TypeError, ImportError)
+#: What depends on the state of the global generators is another thing each time that it is computed.
+GLOBAL = "depends on the global random state, so that no run could be repeated; draw from"
+
+
+def check_components(plan: Plan) -> bool:
+    """Refuse components that fail on the first data set, or come out otherwise the second time.
+
+    A component that ends the process is left to the run, which stores that for every estimate. Says whether data are
+    made by a component of one's own, so that no other process but a worker should make them.
+    """
+    task = Task(0, 0)
+    cell = plan.data_cells[task.cell]
+    wanted = [entry for entry in plan.keys(task) if isinstance(entry[1].estimator, OwnEstimation)]
+    makes_data = bool(_parts(cell.source))
+    if not wanted and not makes_data:
+        return False
+    seed = (plan.spec.canonical().get("monte_carlo") or {}).get("seed")
+    found: list[Complaint] = in_worker(look, Job(cell, task.replicate, seed, tuple(wanted), plan.terms)) or []
+    if found:
+        raise SpecError([plan.spec.problem(path, message) for path, message in found])
+    return makes_data
+
+
+def look(job: Job) -> list[Complaint]:
+    """What components of one's own do wrong on a data set."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return list(_of_data(job)) or list(_of_estimators(job))
+
+
+def _parts(source: Any) -> dict[str, Any]:
+    """Components of one's own that make a data set, by their place in the specification, in the order of their work."""
+    if not isinstance(source, SimulatedSource):
+        return {}
+    reference = None if source.loop is None else source.loop.reference
+    parts: dict[str, Any] = {"sampling": source.sampling, "excitation": source.excitation, "loop.reference": reference}
+    parts |= {"system": source.system, "noise": source.noise}
+    return {name: part.options for name, part in parts.items() if isinstance(part, STAND_INS)}
+
+
+def _set_global(seed: int) -> None:
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002 - the one that must not matter
+
+
+def _of_data(job: Job) -> Iterator[Complaint]:
+    own = _parts(job.cell.source)
+    records: list[Any] = []
+    try:
+        for seed in (0, 1) if own else ():
+            _set_global(seed)
+            records.append(job.cell.dataset(job.replicate).record)
+    except ContractError as error:
+        yield from (((*at.split("."), "kind"), str(error)) for at in own if own[at] is error.component)
+    except Exception:
+        # Not theirs alone: the run stores that for every estimate.
+        return
+    if len(records) == 2:
+        made: dict[str, Callable[[Any], Any]] = {
+            "sampling": lambda r: r.t,
+            "excitation": lambda r: r.input.values,
+            "loop.reference": lambda r: None if r.loop is None else r.loop.reference,
+            "system": lambda r: r.noise_free,
+            "noise": lambda r: r.y,
+        }
+        for name in own:
+            first, second = (np.asarray(made[name](record), dtype=float) for record in records)
+            if not np.array_equal(first, second, equal_nan=True):
+                yield (*name.split("."), "kind"), f"{GLOBAL} the rng that it is given"
+                return
+
+
+def _of_estimators(job: Job) -> Iterator[Complaint]:
+    try:
+        data = job.cell.dataset(job.replicate)
+    except Exception:
+        # The run stores that for every estimate.
+        return
+    seen: set[str] = set()
+    for key, cell, start in job.wanted:
+        if key.estimator_hash not in seen:
+            seen.add(key.estimator_hash)
+            drawn = start.draw(job.seed, job.replicate, data.true_model)
+            message = _of_estimator(cell.estimator, data, drawn, job.terms)
+            if message:
+                yield ("estimators", cell.name, "kind"), message
+
+
+def _of_estimator(estimator: Any, data: Any, start: Any, terms: Sequence[Any] | None) -> str:
+    results = []
+    for seed in (0, 1):
+        begun = time.perf_counter()
+        _set_global(seed)
+        try:
+            fit = estimator.prepare(data.record).fit(start)
+            results.append(canonical_json(plain(data.result_of(fit, start, terms))))
+        except ContractError as error:
+            return str(error)
+        except MISTAKES as error:
+            return f"fails on the first data set: {reason(error)}"
+        except BaseException:
+            # Of another kind of failure others may be free.
+            return ""
+        if time.perf_counter() - begun > SLOW:
+            return ""
+    return "" if results[0] == results[1] else f"{GLOBAL} numpy.random.default_rng(seed), with seed among its options"

@@ -1,0 +1,303 @@
+"""Components of one's own in a specification: what is wrong with them is said with its place, and never a traceback."""
+
+import random
+import re
+import sys
+
+import pytest
+
+from ctid_cli.errors import CtidError, RefusedError, SpecError
+from ctid_cli.own_code import find_class
+from ctid_cli.running.plan import build_plan
+from ctid_cli.specification import own_sections
+from ctid_cli.specification.load import load_spec, spec_from_canonical
+
+CODE = '''\
+from dataclasses import dataclass, field
+from typing import Literal
+from ctid_cli import HeldSignal
+from gains import GAIN
+
+@dataclass(frozen=True)
+class Part:
+    size: float = 1.0
+
+@dataclass(frozen=True)
+class Estimator:
+    """An estimator.
+
+    Parameters
+    ----------
+    order : int
+        Order [-].
+    cutoff : float
+        Cut-off [rad/s].
+    """
+    start_from = "delay"
+    order: int
+    cutoff: float = 1.0
+    mode: Literal["fast", "slow"] = "fast"
+    bounds: tuple[float, float] | None = None
+    names: tuple[str, ...] = ("b0",)
+    inner: Part = field(default_factory=Part)
+    def __post_init__(self):
+        if self.cutoff <= 0:
+            raise ValueError(f"cutoff must be positive, not {self.cutoff}")
+        1 / self.order
+    def fit(self, record, start):
+        return {"parameters": {"tau": 1.0}}
+
+@dataclass(frozen=True)
+class Noise:
+    deviation: float
+    def generate(self, output, rng):
+        return GAIN * self.deviation * rng.standard_normal(output.size)
+
+@dataclass(frozen=True)
+class Steps:
+    deterministic = True
+    def generate(self, times, rng):
+        return HeldSignal(times, times % 2)
+
+@dataclass(frozen=True)
+class Clock:
+    interval: float = 0.1
+    def times(self, rng):
+        return [self.interval * k for k in range(300)]
+
+@dataclass(frozen=True)
+class Tank:
+    area: float = 2.0
+    def simulate(self, input, times):
+        return times
+'''
+
+SPEC = """\
+experiment: own
+system:      {kind: "./parts.py:Tank", area: [1.0, 2.0], truth: {area: area, b0: 0.5}}
+excitation:  {kind: "./parts.py:Steps"}
+sampling:    {kind: "./parts.py:Clock", interval: 0.1}
+noise:       {kind: "./parts.py:Noise", deviation: [0.1, 0.2]}
+estimators:
+  mine:
+    kind: ./parts.py:Estimator
+    order: 2
+    cutoff: [1.0, 2.0]
+    mode: slow
+    bounds: [0, 1]
+    names: [a1, b0]
+    inner: {size: 2.0}
+  srivc:     {kind: srivc, poles: 1, zeros: 0}
+starts:      {initial_delay: [0.3, {uniform: [0.2, 0.5]}]}
+monte_carlo: {runs: 2, seed: 1}
+success:     {parameter_relative_error: 0.05}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "parts.py").write_text(CODE, encoding="utf-8")
+    (tmp_path / "gains.py").write_text("GAIN = 2.0\n", encoding="utf-8")
+    (tmp_path / "spec.yaml").write_text(SPEC, encoding="utf-8")
+    return tmp_path
+
+
+def edited(folder, file, old, new):
+    path = folder / file
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def load(folder):
+    return load_spec(folder / "spec.yaml", allow_code=True)
+
+
+def problem(folder):
+    with pytest.raises(SpecError) as caught:
+        load(folder)
+    (found,) = caught.value.problems
+    return found
+
+
+def test_options_are_swept_validated_and_canonical(folder):
+    spec = load(folder)
+    plan = build_plan(spec)
+    assert len(plan.data_cells) == 4
+    first = plan.estimators[0]
+    assert first.estimator.options.bounds == (0.0, 1.0)
+    assert first.estimator.options.inner.size == 2.0
+    assert [cell.swept for cell in plan.estimators] == [{"cutoff": 1.0}, {"cutoff": 2.0}, {}]
+    assert [start.label for _, cell, start in plan.keys(plan.tasks()[0]) if cell is first] == [
+        "0.3",
+        "uniform(0.2, 0.5)",
+    ]
+    # The name of an option stands for its value.
+    truths = [cell.content["system"]["truth"] for cell in plan.data_cells]
+    assert truths == [{"area": area, "b0": 0.5} for area in (1.0, 1.0, 2.0, 2.0)]
+    again = build_plan(spec_from_canonical(spec.canonical(), folder, allow_code=True))
+    assert [cell.hash for cell in again.data_cells] == [cell.hash for cell in plan.data_cells]
+    assert [cell.hash for cell in again.estimators] == [cell.hash for cell in plan.estimators]
+
+
+def test_nothing_is_imported_without_permission(folder):
+    edited(folder, "parts.py", "GAIN\n", 'GAIN\nraise SystemExit("imported")\n')
+    canonical = {"experiment": "x", "estimators": {"a": {"kind": "parts:X"}}}
+    with pytest.raises(RefusedError, match=r"spec.yaml:2:21: system.kind: names code(.|\n)*spec.yaml:8:11"):
+        load_spec(folder / "spec.yaml")
+    with pytest.raises(RefusedError, match="--allow-code"):
+        spec_from_canonical(canonical)
+
+
+def test_installed_packages_offer_kinds_without_permission(folder, monkeypatch):
+    target = find_class("./parts.py:Noise", folder)
+    offered = {("noise", "hum"): target}
+    monkeypatch.setattr(own_sections, "find_entry_point", lambda section, name: offered.get((section, name)))
+    text = re.sub(r"\{kind: \"\./parts.py:Tank.*", "{numerator: [2], denominator: [1, 2]}", SPEC.replace("area", "x"))
+    text = text.replace('{kind: "./parts.py:Steps"}', "{kind: step, time: 1.0}").replace(
+        '{kind: "./parts.py:Clock", interval', "{kind: regular, samples: 300, interval"
+    )
+    text = re.sub(r"  mine:(.|\n)*  srivc", "  srivc", text.replace('"./parts.py:Noise"', "hum"))
+    text = re.sub(r"starts.*\n|success.*", "", text)
+    (folder / "spec.yaml").write_text(text, encoding="utf-8")
+    plan = build_plan(load_spec(folder / "spec.yaml"))
+    assert plan.data_cells[0].source.noise.options == target(0.1)
+    assert plan.data_cells[0].content["noise"]["kind"] == "hum"
+
+
+WRONG = {
+    "no such file": ("spec.yaml", "./parts.py:Estimator", "./part.py:Estimator", "8:11", "there is no file ./part.py"),
+    "no such module": ("spec.yaml", "./parts.py:Estimator", "no_such.place:E", "8:11", "No module named 'no_such'"),
+    "no such class": ("spec.yaml", "./parts.py:Estimator", "./parts.py:Estimate", "8:11", "has no class Estimate"),
+    "no class": ("spec.yaml", "./parts.py:Estimator", "./parts.py:GAIN", "8:11", "is no class"),
+    "no name": ("spec.yaml", "./parts.py:Estimator", '"./parts.py:"', "8:11", "'./file.py:Class'"),
+    "other method": ("spec.yaml", "./parts.py:Estimator", "./parts.py:Noise", "8:11", "fit(self, record, start)"),
+    "another kind": ("spec.yaml", '"./parts.py:Tank"', "tank", "2:21", "'package.module:Class', not the text 'tank'"),
+    "no dataclass": ("parts.py", "@dataclass(frozen=True)\nclass Noise", "class Noise", "5:21", "@dataclass"),
+    "arguments": ("parts.py", "def fit(self, record, start)", "def fit(self, record)", "8:11", "cannot be called so"),
+    "syntax": ("parts.py", "class Steps:", "class Steps", "", "SyntaxError"),
+    "import": ("gains.py", "GAIN = 2.0", "GAIN = 1 / 0", "", "ZeroDivisionError: division by zero (gains.py:1)"),
+    "exit": ("gains.py", "GAIN = 2.0", "exit(3)", "", "SystemExit: 3"),
+    "type": ("parts.py", "    deviation: float", "    deviation: dict", "5:21", "Noise.deviation: a field of type"),
+    "annotation": ("parts.py", "    deviation: float", "    deviation: 'Float'", "5:21", "name 'Float' is not defined"),
+    "name of an option": ("parts.py", "area: float", "copy: float", "2:21", "cannot be called 'copy'"),
+    "unit": (
+        "spec.yaml",
+        "cutoff: [1.0, 2.0]",
+        "cutoff: fast",
+        "10:13",
+        "must be a number [rad/s], not the text 'fast'",
+    ),
+    "unknown option": ("spec.yaml", "    mode: slow", "    mood: slow", "11:5", "did you mean 'mode'?"),
+    "choice": ("spec.yaml", "mode: slow", "mode: slowly", "11:11", "must be one of 'fast', 'slow'"),
+    "length": ("spec.yaml", "bounds: [0, 1]", "bounds: [0]", "12:13", "a list of at least 2"),
+    "words": ("spec.yaml", "names: [a1, b0]", "names: [a1, 2]", "13:17", "must be a text, not 2"),
+    "inner option": ("spec.yaml", "size: 2.0", "site: 2.0", "14:13", "did you mean 'size'?"),
+    "refused": ("spec.yaml", "cutoff: [1.0, 2.0]", "cutoff: [1.0, -2.0]", "7:3", "cutoff must be positive, not -2.0"),
+    "broken check": ("spec.yaml", "order: 2", "order: 0", "8:11", "ZeroDivisionError: division by zero (parts.py:31)"),
+    "start": ("parts.py", 'start_from = "delay"', 'start_from = "gain"', "8:11", "None, 'delay' or 'parameters'"),
+    "truth": ("spec.yaml", "truth: {area: area", "truth: {area: aera", "2:72", "did you mean 'area'?"),
+    "no truth": (
+        "spec.yaml",
+        "parameter_relative_error",
+        "delay_relative_error",
+        "18:37",
+        "system.truth: {delay: 1.0}",
+    ),
+    "pickle": (
+        "parts.py",
+        "        1 / self.order",
+        "        object.__setattr__(self, 'lock', __import__('threading').Lock())",
+        "8:11",
+        "cannot be sent to worker processes",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_is_said_where_it_is(case, folder):
+    file, old, new, place, words = WRONG[case]
+    edited(folder, file, old, new)
+    with pytest.raises(SpecError) as caught:
+        load(folder)
+    # A file that cannot be imported is wrong at all places that name it.
+    assert len(caught.value.problems) == (1 if place else 5)
+    assert f"spec.yaml:{place}" in str(caught.value)
+    assert words in str(caught.value)
+
+
+def test_a_loop_and_starts_around_the_truth_need_a_transfer_function(folder):
+    edited(
+        folder, "spec.yaml", "{initial_delay: [0.3, {uniform: [0.2, 0.5]}]}", "{parameters: {relative_uniform: 0.1}}"
+    )
+    edited(
+        folder,
+        "spec.yaml",
+        'excitation:  {kind: "./parts.py:Steps"}',
+        'loop: {controller: {pid: {kp: 1.0}}, reference: {kind: "./parts.py:Steps"}}',
+    )
+    with pytest.raises(
+        SpecError, match=r"2:21: system.*a loop needs a transfer function(.|\n)*starts.*no known structure"
+    ):
+        load(folder)
+
+
+def test_every_folder_has_neighbours_of_its_own(folder, tmp_path_factory):
+    other = tmp_path_factory.mktemp("other")
+    (other / "gains.py").write_text("GAIN = 3.0\n", encoding="utf-8")
+    (other / "inner").mkdir()
+    (other / "inner" / "__init__.py").write_text("from .deep import DEEP\n", encoding="utf-8")
+    (other / "inner" / "deep.py").write_text("import gains\nDEEP = 2 * gains.GAIN\n", encoding="utf-8")
+    lines = [
+        "from inner import deep, DEEP",
+        "import inner.deep",
+        "class A:",
+        "    def f():",
+        "        from gains import GAIN",
+    ]
+    text = "\n".join([*lines, "        return GAIN, DEEP, deep.DEEP, inner.deep.DEEP", ""])
+    (other / "parts.py").write_text(text, encoding="utf-8")
+    first, second = find_class("./parts.py:Noise", folder), find_class("./parts.py:A", other)
+    assert (first.generate.__globals__["GAIN"], second.f()) == (2.0, (3.0, 6.0, 6.0, 6.0))
+    # The same file with another content is another module, also behind a module that did not change.
+    edited(folder, "gains.py", "2.0", "4.0")
+    after = find_class("./parts.py:Noise", folder)
+    assert [c.generate.__globals__["GAIN"] for c in (first, after)] == [2.0, 4.0]
+    assert "gains" not in sys.modules
+
+
+def test_500_mutations_end_in_a_sentence_or_in_a_plan(folder):
+    rng = random.Random(14)
+    words = [
+        *re.findall(r"[\w./:]+|[^\w\s]", SPEC),
+        "null",
+        "[]",
+        "{}",
+        "-1",
+        "1e400",
+        "'",
+        ".nan",
+        "parts:",
+        ":X",
+        "..:Y",
+    ]
+    good, refused = 0, []
+    for _ in range(500):
+        file, text = rng.choice([("spec.yaml", SPEC), ("spec.yaml", SPEC), ("parts.py", CODE)])
+        pieces = re.split(r"(\W)", text)
+        for _ in range(rng.randint(1, 2)):
+            k = rng.randrange(len(pieces))
+            pieces[k] = rng.choice(["", pieces[k] * 2, rng.choice(words), rng.choice(pieces)])
+        (folder / "spec.yaml").write_text(SPEC, encoding="utf-8")
+        (folder / "parts.py").write_text(CODE, encoding="utf-8")
+        (folder / file).write_text("".join(pieces), encoding="utf-8")
+        try:
+            build_plan(load(folder))
+            good += 1
+        except CtidError as error:
+            refused.append(error)
+    assert good > 50
+    assert len(refused) > 150
+    assert {error.exit_code for error in refused} <= {2, 3}
+    for error in refused:
+        assert all(re.search(r"spec.yaml:\d+:\d+: |: \d+ data ", line) for line in str(error).splitlines()), error
