@@ -9,6 +9,7 @@ from typing import Any
 from ctid_cli.canonical import plain
 from ctid_cli.errors import MismatchError
 from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.kinds import KINDS
 from ctid_cli.reporting.estimate import as_object, parameter_object, parameter_table, parameters
 from ctid_cli.reporting.layout import Table, delay_label, number, seconds
 from ctid_cli.reporting.results import out_option
@@ -69,7 +70,9 @@ def detail_text(found: FoundEstimate, again: Repeated | None, out: Path) -> str:
 
 
 def _parameters(found: FoundEstimate) -> list[UncertainValue]:
-    return parameters(found.row, found.slot.estimator["content"].get("delay_bounds"))
+    # An estimator of one's own may mean something else by the name.
+    ours = found.slot.estimator["kind"] in KINDS["estimator"]
+    return parameters(found.row, found.slot.estimator["content"].get("delay_bounds") if ours else None)
 
 
 def _fitted(found: FoundEstimate) -> list[list[str]]:

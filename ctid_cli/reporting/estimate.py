@@ -1,5 +1,6 @@
 """One estimate: its parameters with their uncertainty, and as a row of an export."""
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import nan
@@ -74,9 +75,10 @@ class Units:
 def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None = None) -> list[UncertainValue]:
     """Parameters of an estimate with their uncertainty."""
     numerator, denominator = estimate.get("numerator"), estimate.get("denominator")
+    errors, given, units = estimate.get("standard_errors") or {}, estimate.get("parameters") or {}, Units()
     if not numerator or not denominator:
-        return []
-    errors, submodels, units = estimate.get("standard_errors") or {}, estimate.get("parameters") or {}, Units()
+        return [_found(name, value, errors, "") for name, value in given.items()]
+    submodels = {name: value for name, value in given.items() if re.match(r"g\d+_", name)}
     values = {f"b{k}": value for k, value in enumerate(numerator)}
     values |= {f"a{k}": value for k, value in enumerate(denominator[1:], start=1)}
     if submodels and not values.keys() & errors.keys():
@@ -86,12 +88,15 @@ def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None
     integrators = next(k for k, value in enumerate(reversed(denominator)) if value != 0)
     named |= {name: units.of_submodel(name, integrators if name.startswith("g1_") else 0) for name in submodels}
     delay = estimate.get("delay")
-    values |= {**submodels, "delay": delay}
-    found = [
-        UncertainValue.symmetric(name, _or_nan(values[name]), _or_nan(errors.get(name)), unit)
-        for name, unit in {**named, "delay": units.time}.items()
-    ]
-    return [*found[:-1], replace(found[-1], status=_delay_status(delay, delay_bounds))]
+    # Of an estimator of one's own, in units that it alone knows.
+    free = {name: "" for name in given if name not in (*named, "delay")}
+    values |= {**given, "delay": delay}
+    found = [_found(name, values[name], errors, unit) for name, unit in {**named, **free, "delay": units.time}.items()]
+    return [*found[:-1], replace(found[-1], status="free" if "delay" in given else _delay_status(delay, delay_bounds))]
+
+
+def _found(name: str, value: float | None, errors: Mapping[str, float | None], unit: str) -> UncertainValue:
+    return UncertainValue.symmetric(name, _or_nan(value), _or_nan(errors.get(name)), unit)
 
 
 def _or_nan(value: float | None) -> float:

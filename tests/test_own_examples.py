@@ -1,0 +1,74 @@
+"""The examples of components of one's own run as documented, and permission is asked for where it is needed."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "docs" / "examples"
+
+
+def ctid(*arguments, code=0, env=None):
+    from ctid_cli.cli.main import app
+
+    done = CliRunner().invoke(app, [str(argument) for argument in arguments], env=env)
+    assert done.exit_code == code, f"exit code {done.exit_code}\n{done.output}\n{done.exception!r}"
+    return done
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("out")
+    files = [EXAMPLES / "own_study.yaml", EXAMPLES / "tank.yaml"]
+    assert ctid("run", *files, "--allow-code", "--quiet", "--jobs", "2", "--out", folder).stdout == ""
+    return folder
+
+
+def test_the_study(out):
+    rows = json.loads(ctid("export", "own-study", "--format", "json", "--out", out).stdout)
+    assert len(rows) == 12
+    by_name = {name: [row for row in rows if row["estimator"] == name] for name in ("mine", "external", "srivc")}
+    assert {row["status"] for row in by_name["external"]} == {"LEAST_SQUARES"}
+    for mine, ours in zip(by_name["mine"], by_name["srivc"], strict=True):
+        # Both minimise the output error, one of them from the time on that the greatest delay leaves.
+        assert mine["status"] == "CONVERGED"
+        assert mine["delay"] == pytest.approx(ours["delay"], abs=2 * ours["standard_errors"]["delay"])
+        assert mine["standard_errors"]["delay"] == pytest.approx(ours["standard_errors"]["delay"], rel=0.2)
+        assert mine["parameters"]["b0"] == mine["numerator"][0]
+    assert "mine: %" in ctid("table", "own-study", "--out", out).stdout
+
+
+def test_the_tank_is_nearly_linear(out):
+    rows = json.loads(ctid("export", "tank", "--format", "json", "--out", out).stdout)
+    found = np.array([[row["numerator"][0], row["denominator"][1]] for row in rows])
+    np.testing.assert_allclose(found, [[0.5, 0.25]] * 4, rtol=0.03)
+
+
+def test_one_estimate_is_computed_once_more_with_permission_only(out):
+    row = json.loads(ctid("export", "own-study", "--format", "json", "--out", out).stdout)[0]
+    assert "mine (./output_error.py:OutputError)" in ctid("show", row["id"], "--out", out).stdout
+    assert "--allow-code" in ctid("show", row["id"], "--history", "--out", out, code=3).stderr
+    again = ctid("show", row["id"], "--history", "--allow-code", "--out", out).stdout
+    assert "the same parameters to the last digit" in again
+
+
+@pytest.mark.parametrize("command", [("validate",), ("run", "--dry-run"), ("check", "accuracy")])
+def test_permission(command, tmp_path, monkeypatch):
+    file = EXAMPLES / "own_study.yaml"
+    place = () if command[0] != "run" else ("--out", tmp_path)
+    message = ctid(*command, file, *place, code=3).stderr
+    assert re.search(r"own_study.yaml:6:21: noise.kind: names code, which would be run; .*--allow-code", message)
+    answer = ctid(*command, file, *place, env={"CTID_ALLOW_CODE": "1"}).stdout
+    assert "no theory: there is no theory here" in answer if command[0] == "check" else "own-study: " in answer
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_documentation_names_what_there_is():
+    text = (EXAMPLES.parent / "own-components.md").read_text(encoding="utf-8")
+    names = set(re.findall(r"`(\w+\.(?:py|yaml))`", text))
+    assert {"output_error.py", "external_fit.py", "bursts.py", "tank.py"} <= names
+    for name in names:
+        assert (EXAMPLES / name).is_file(), name
