@@ -268,7 +268,7 @@ def _reference(raw: Mapping[str, Any], section: str) -> Any:
     return content.get("reference") if isinstance(content, Mapping) else None
 
 
-def _draws_nothing(chosen: type, options: Mapping[str, Any]) -> bool:
+def _draws_nothing(chosen: Any, options: Mapping[str, Any]) -> bool:
     """Whether a class draws no random number with the options that are given."""
     without = getattr(chosen, "deterministic_with", {})
     return getattr(chosen, "deterministic", False) or any(options.get(name) in without[name] for name in without)
