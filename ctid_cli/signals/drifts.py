@@ -126,8 +126,9 @@ class OneOverFNoise(ContinuousNoise):
 
     A first-order process is exact on any clock, ``x_k = a x_(k-1) + sigma sqrt(1 - a^2) e_k`` with
     ``a = exp(-w_i (t_k - t_(k-1)))``, and so is the sum, on irregular instants too; what lies above half the sampling
-    frequency is folded back, as of any process that is sampled without a filter. For the exponent 1 the density is
-    that of the formula within 0.1 % ripple and, a factor of ten inside the band, 7 %; at its ends it is half of it.
+    frequency is folded back, as of any process that is sampled without a filter. For the exponent 1 the density
+    follows ``1 / w`` within 0.1 % in the middle of a wide band and 3.5 % a factor of ten from its ends, where it is two
+    thirds of that.
 
     Examples
     --------
@@ -135,7 +136,7 @@ class OneOverFNoise(ContinuousNoise):
     >>> from ctid_cli.signals.drifts import OneOverFNoise
     >>> noise = OneOverFNoise(lowest_frequency=0.1, highest_frequency=100.0, variance=4.0)
     >>> noise.autocovariance_at([0.0, 1.0]).round(3)
-    array([4.   , 1.492])
+    array([4.   , 1.168])
     """
 
     kind: ClassVar[str] = "one_over_f"

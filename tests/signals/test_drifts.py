@@ -45,6 +45,15 @@ def test_the_density_over_the_band_falls_as_told(exponent):
     assert slope == pytest.approx(-exponent, abs=0.02)
 
 
+def test_the_density_is_one_over_f_up_to_the_ends_of_the_band():
+    corners, shares = OneOverFNoise(1e-4, 1e4, variance=1.0).processes()
+    w = np.concatenate(([1e-4, 1e-3], np.geomspace(0.1, 10.0, 100)))
+    relative = w * (2 * corners * shares / (corners**2 + w[:, None] ** 2)).sum(axis=1)
+    relative *= np.log(corners[1] / corners[0]) / (np.pi * shares[0])
+    assert relative[:2] == pytest.approx([0.68, 0.967], abs=0.005)
+    assert np.abs(relative[2:] - 1).max() < 1e-3
+
+
 def test_the_periodogram_falls_like_one_over_f():
     """Periodograms are exponential about the density of the sampled noise, so that the error of a slope is known."""
     count, step, sets = 8192, 0.01, 40
