@@ -155,3 +155,13 @@ def test_starts_are_told_the_true_system_and_fractions_the_submodels_to_find() -
     assert factored.result["standard_errors"]["g1_a1"] == pytest.approx(0.75 * np.hypot(0.1 / 3, 0.2 / 4))
     assert factored.result["standard_errors"].keys() == {"b0", "a1", "a2", *factored.result["parameters"]}
     assert json.loads(json.dumps(factored.result, allow_nan=False)) == factored.result
+
+
+def test_processor_time_does_not_pass_while_an_estimator_waits() -> None:
+    # Of a busy one it does, however many others share the processor.
+    (waits, *_), (works, *_) = run_job(job(Toy(seconds=0.2))), run_job(job(Toy(seconds=0.2, busy=True)))
+    assert waits.seconds is not None
+    assert waits.cpu_seconds is not None
+    assert works.cpu_seconds is not None
+    assert waits.cpu_seconds < 0.1 < 0.2 <= waits.seconds
+    assert works.cpu_seconds > waits.cpu_seconds

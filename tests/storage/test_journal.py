@@ -181,3 +181,21 @@ def test_no_journal_and_an_empty_one_are_the_same(tmp_path: Path) -> None:
     open_journal(path).close()
     with read_journal(path) as read:
         assert read is None
+
+
+def test_a_journal_without_processor_times_is_read_and_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "journal.sqlite"
+    log = filled(path, count=2)
+    log._connection.execute("ALTER TABLE estimates DROP COLUMN cpu_seconds")
+    log._connection.execute("PRAGMA user_version=2")
+    log.close()
+    before = path.read_bytes()
+    with read_journal(path) as read:
+        assert read is not None
+        assert [(entry.seconds, entry.cpu_seconds) for entry in read.entries().values()] == [(0.25, None)] * 2
+    assert path.read_bytes() == before
+    log = open_journal(path)
+    session = log.begin(MANIFEST, ORIGINS, "2026-11-21T06:00:00Z", {})
+    log.add([outcome(7)._replace(cpu_seconds=0.125)], session)
+    assert sorted(entry.cpu_seconds or 0.0 for entry in log.entries().values()) == [0.0, 0.0, 0.125]
+    log.close()
