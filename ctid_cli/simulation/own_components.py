@@ -293,6 +293,8 @@ def _model(named: Mapping[str, float], what: str) -> TransferFunction | None:
             message = f"{what} returned {', '.join(given[letter])}; the coefficients in descending powers are"
             raise ContractError(f"{message} {', '.join(expected)}")
         given[letter] = expected
+    if len(given["b"]) > len(given["a"]) + 1:
+        raise ContractError(f"{what} returned {len(given['b'])} coefficients b and {len(given['a'])} a: too many zeros")
     numerator, denominator = ([named[name] for name in given[letter]] for letter in "ba")
     if named.get("delay", 0.0) < 0:
         raise ContractError(f"{what} returned a delay of {named['delay']:g} s; a delay is zero or more")

@@ -85,6 +85,7 @@ REFUSED = {
     "complex": ({"parameters": {"k": 1j}}, "k is complex"),
     "name": ({"parameters": {"a b": 1.0}}, "'a b' cannot be a name"),
     "gap": ({"parameters": {"b0": 1.0, "a2": 1.0}}, "returned a2; the coefficients in descending powers are a1"),
+    "zeros": ({"parameters": {"b0": 1.0, "b1": 1.0, "b2": 1.0, "a1": 1.0}}, "too many zeros"),
     "delay": ({"parameters": {"b0": 1.0, "a1": 1.0, "delay": -1.0}}, "a delay of -1 s"),
     "errors": ({"parameters": {"k": 1.0}, "standard_errors": {"m": 1.0}}, "standard errors of m"),
 }
