@@ -32,6 +32,10 @@ class DataError(UsageError):
         self.field = field
 
 
+class BiasedError(DataError):
+    """An estimator that settles elsewhere than at the truth, however many the data; the text is the reason."""
+
+
 class OptionError(ValueError):
     """An option that has no allowed value."""
 

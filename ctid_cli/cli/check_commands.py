@@ -13,6 +13,7 @@ from ctid_cli.cli._common import (
     InputColumn,
     InputHold,
     Json,
+    Out,
     OutputColumn,
     Overrides,
     TimeColumn,
@@ -88,18 +89,24 @@ def check_filters(
 @further.command("accuracy", cls=Command)
 @guarded
 def check_accuracy(
-    config: Config, overrides: Overrides = None, allow_code: AllowCode = False, as_json: Json = False
+    config: Config,
+    overrides: Overrides = None,
+    out: Out = Path("results"),
+    allow_code: AllowCode = False,
+    as_json: Json = False,
 ) -> None:
     """Say how accurate the estimates of an experiment can be, before any data are taken.
 
     For every estimator and the swept numbers of samples: the standard error of each parameter by theory, with the
     formula that it comes from. White Gaussian excitation on a regular clock has a limit for long records; otherwise
-    the sensitivities of the experiment's first data set count.
+    the sensitivities of the experiment's first data set count. Where the experiment has results in OUT, the answer ends
+    with what is unexpected about them.
     """
     from ctid_cli.reporting.accuracy_report import accuracy_object, accuracy_text
+    from ctid_cli.reporting.results import find_results
 
     ((_, plan),) = load_plans([config], overrides or [], allow_code=allow_code)
-    content = accuracy_object(plan)
+    content = accuracy_object(plan, find_results(out, plan.experiment))
     answer(as_json, lambda: content, lambda: accuracy_text(content))
 
 

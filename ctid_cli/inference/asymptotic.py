@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
-from ctid_cli.errors import DataError
+from ctid_cli.errors import BiasedError, DataError
 from ctid_cli.filtering.loop import NO_GAIN
 from ctid_cli.filtering.sampled import sampled_model
 from ctid_cli.inference.accuracy import ParameterAccuracy
@@ -86,8 +86,7 @@ def require_uncorrelated_input(
     if not why and sampled_model(model, interval).state_space()[3].any() and controller.direct != 0.0:
         why = "model and controller both react at once"
     if why:
-        biased = "the input is correlated with the noise and instruments from it are biased"
-        raise DataError(f"{why}, so {biased}; ask for closed_loop instruments")
+        raise BiasedError(f"{why}, so that the input is correlated with the noise (closed_loop instruments are not)")
 
 
 def output_variance(model: AdditiveModel | TransferFunction, interval: float, input_deviation: float) -> float:

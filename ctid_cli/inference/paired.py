@@ -1,6 +1,6 @@
 """Two estimators on the same data sets: how far apart they are, and whether that may be chance."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -110,3 +110,16 @@ def _share(drawn: Array, limit: float) -> float:
     """How many resamples are below a limit, ties half, never none or all."""
     below = float(np.sum(drawn < limit) + 0.5 * np.sum(drawn == limit))
     return (below + 0.5) / (drawn.size + 1)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Holm's correction for several tests.
+
+    With ``p_(1) <= ... <= p_(m)``, the adjusted p-value of ``p_(i)`` is the largest ``(m + 1 - j) p_(j)``, j <= i,
+    and at most 1.
+    """
+    order = np.argsort(p_values, kind="stable")
+    adjusted = np.empty(len(order))
+    scaled = np.arange(len(order), 0, -1) * np.asarray(p_values, dtype=float)[order]
+    adjusted[order] = np.minimum(np.maximum.accumulate(scaled), 1.0) if len(order) else 0.0
+    return adjusted.tolist()

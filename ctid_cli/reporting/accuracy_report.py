@@ -4,10 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from ctid_cli.errors import DataError, UsageError
+from ctid_cli.errors import BiasedError, DataError, UsageError
 from ctid_cli.inference.quantile import normal_quantile
 from ctid_cli.reporting.expected_accuracy import expected_accuracy
 from ctid_cli.reporting.layout import Report, Table, count, number
+from ctid_cli.reporting.results import Results
+from ctid_cli.reporting.surprises import FEWEST, surprises
 from ctid_cli.reporting.table_blocks import setting_text, setting_title
 from ctid_cli.running.cells import DataCell, EstimatorCell, Plan
 from ctid_cli.simulation.dataset import SimulatedSource
@@ -24,15 +26,16 @@ SIZES = 4
 SETTINGS = 6
 
 
-def accuracy_object(plan: Plan) -> dict[str, Any]:
-    """Expected accuracy of every estimator of an experiment as JSON-able content."""
+def accuracy_object(plan: Plan, results: Results | None = None) -> dict[str, Any]:
+    """Expected accuracy of every estimator of an experiment as JSON-able content, and what its results say to it."""
     cells = [(cell, cell.source) for cell in plan.data_cells if isinstance(cell.source, SimulatedSource)]
     if not cells:
         text = f"{plan.experiment} is about a measured record, whose true system is not known; "
         raise UsageError(f"{text}its estimates carry their standard errors: ctid fit, or ctid run and ctid table")
     shown = _shown(cells)
     estimates = [_entry(cell, source, estimator, plan) for cell, source in shown for estimator in plan.estimators]
-    return {"experiment": plan.experiment, "left_out": len(cells) - len(shown), "estimates": estimates}
+    content = {"experiment": plan.experiment, "left_out": len(cells) - len(shown), "estimates": estimates}
+    return content | {"surprises": None if results is None else surprises(results)}
 
 
 def _own(cell: DataCell) -> dict[str, Any]:
@@ -63,7 +66,8 @@ def _entry(cell: DataCell, source: SimulatedSource, estimator: EstimatorCell, pl
     try:
         expected = expected_accuracy(source, estimator.estimator, plan.terms)
     except DataError as error:
-        return entry | {"scales": False, "reason": str(error), "parameters": []}
+        reason = f"the estimate is biased, as {error}" if isinstance(error, BiasedError) else str(error)
+        return entry | {"scales": False, "reason": reason, "parameters": []}
     found = expected.parameters
     rows = [
         {
@@ -104,6 +108,10 @@ def accuracy_text(content: dict[str, Any]) -> str:
     if content["left_out"]:
         more = count(content["left_out"], "further combination")
         blocks.append([f"Not shown: {more} of swept settings and numbers of samples; --set gives a key one value."])
+    found = content["surprises"]
+    if found is not None:
+        agree = f"The stored estimates are as expected, as far as {FEWEST} data sets or more tell."
+        blocks.append(["Unexpected in the stored estimates:", *(f"- {text}" for text in found)] if found else [agree])
     return Report([*blocks, [REMARK]]).draw()
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ctid_cli.errors import UsageError
+from ctid_cli.inference.paired import holm
 from ctid_cli.reporting.committed import committed_tables, made_by, plain_row, read_tables
 from ctid_cli.reporting.layout import Report, Table, count, csv_text, delay_label, number, percent
 from ctid_cli.reporting.percentages import Row, settings_of
@@ -186,21 +187,6 @@ def fisher(converged: int, n: int, reference_converged: int, reference_n: int) -
 
     reference = [reference_converged, reference_n - reference_converged]
     return float(fisher_exact([reference, [converged, n - converged]]).pvalue)
-
-
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Holm's correction for several tests.
-
-    With ``p_(1) <= ... <= p_(m)``, the adjusted p-value of ``p_(i)`` is the largest ``(m + 1 - j) p_(j)``, j <= i,
-    and at most 1.
-    """
-    import numpy as np
-
-    order = np.argsort(p_values, kind="stable")
-    adjusted = np.empty(len(order))
-    scaled = np.arange(len(order), 0, -1) * np.asarray(p_values, dtype=float)[order]
-    adjusted[order] = np.minimum(np.maximum.accumulate(scaled), 1.0) if len(order) else 0.0
-    return adjusted.tolist()
 
 
 def smallest_detectable(

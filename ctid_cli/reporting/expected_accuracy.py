@@ -9,12 +9,13 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.canonical import content_hash
-from ctid_cli.errors import DataError
+from ctid_cli.errors import BiasedError, DataError
 from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.inference.accuracy import ParameterAccuracy
 from ctid_cli.inference.asymptotic import limiting_accuracy, output_variance, require_uncorrelated_input
 from ctid_cli.inference.finite_record import finite_record_covariance, sensitivities
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import factored, unfactored
 from ctid_cli.models.relay import Relay
 from ctid_cli.models.transfer_function import TransferFunction
@@ -60,9 +61,7 @@ def expected_accuracy(
     source: SimulatedSource, estimator: Any, terms: tuple[Term, ...] | None = None
 ) -> ExpectedAccuracy:
     """Accuracy of an estimator on the data sets of a source."""
-    system = source.system
-    if isinstance(system, OwnSystem) or isinstance(estimator, OwnEstimation) or isinstance(source.noise, OwnNoise):
-        raise DataError("there is no theory here of systems, noises and estimators of one's own")
+    estimated = _unbiased(source, estimator)
     if source.noise is None:
         raise DataError("the data have no noise, so nothing but rounding limits the accuracy")
     if not isinstance(source.noise, Noise):
@@ -71,13 +70,9 @@ def expected_accuracy(
         raise DataError("the instants of the samples depend on the noise, and theory is given here for others only")
     if source.loop is not None and isinstance(source.loop.controller, Relay):
         raise DataError("the relay feeds noise back into the input, and theory is given here for linear controllers")
-    estimated = _estimated(system, estimator)
-    loop, sampling = source.loop, source.sampling
-    if loop is not None and estimated.instruments == "open_loop" and isinstance(sampling, RegularSampling):
-        require_uncorrelated_input(system, sampling.interval, loop.controller, source.noise.filter)
     why_not = _why_no_limit(source, estimated)
     accuracy = _of_records(source, estimated, why_not) if why_not else _of_long_records(source, estimated)
-    if terms is None or not system.is_stable:
+    if terms is None or not source.system.is_stable:
         return accuracy
     parameters = accuracy.parameters.factored(terms)
     # Of a coefficient that is zero in truth the partial fractions leave rounding.
@@ -85,16 +80,40 @@ def expected_accuracy(
     return replace(accuracy, parameters=replace(parameters, values=np.where(rounding, 0.0, parameters.values)))
 
 
+def why_biased(source: SimulatedSource, estimator: Any) -> str:
+    """Why an estimator does not settle at the truth; empty where theory knows no reason."""
+    try:
+        _unbiased(source, estimator)
+    except BiasedError as error:
+        return str(error)
+    except DataError:
+        return ""
+    return ""
+
+
+def _unbiased(source: SimulatedSource, estimator: Any) -> _Estimated:
+    """The system as the estimator has it, or why it is biased."""
+    system, loop, sampling, noise = source.system, source.loop, source.sampling, source.noise
+    if isinstance(system, OwnSystem) or isinstance(estimator, OwnEstimation) or isinstance(noise, OwnNoise):
+        raise DataError("there is no theory here of systems, noises and estimators of one's own")
+    estimated = _estimated(system, estimator)
+    if loop is None or estimated.instruments != "open_loop" or not isinstance(loop.controller, DiscreteController):
+        return estimated
+    if isinstance(sampling, RegularSampling) and isinstance(noise, Noise):
+        require_uncorrelated_input(system, sampling.interval, loop.controller, noise.filter)
+    return estimated
+
+
 def _estimated(system: AdditiveModel | TransferFunction, estimator: Any) -> _Estimated:
     """The system as the estimator has it, or why it cannot hold the system."""
     if estimator.kind == "svf":
-        raise DataError("svf is the least-squares start of other estimators; noise biases it, by an unknown amount")
+        raise BiasedError("svf is least squares, the start of other estimators")
     bounds = getattr(estimator, "delay_bounds", None)
     low, high = bounds or (estimator.delay, estimator.delay)
     reach = 0.0 if bounds else SAME_DELAY * system.delay
     if not low - reach <= system.delay <= high + reach:
         sought = f"sought from {low:g} to {high:g} s" if bounds else f"taken as {low:g} s"
-        raise DataError(f"the delay is {sought} and the true one is {system.delay:g} s: the estimate is biased")
+        raise BiasedError(f"the delay is {sought} and the true one is {system.delay:g} s")
     delay_from = high if low < high else None
     instruments = getattr(estimator, "instruments", "open_loop")
     if hasattr(estimator, "terms"):
@@ -105,7 +124,7 @@ def _estimated(system: AdditiveModel | TransferFunction, estimator: Any) -> _Est
     zeros = fraction.numerator.size - 1
     has = f"{estimator.poles} poles and {estimator.zeros} zeros, the system {fraction.order} and {zeros}"
     if estimator.poles < fraction.order or estimator.zeros < zeros:
-        raise DataError(f"the model has {has}: it cannot hold the system, and its estimate is biased")
+        raise BiasedError(f"the model has {has}: it cannot hold the system")
     if estimator.poles > fraction.order:
         raise DataError(f"the model has {has}: no data determine the poles in excess")
     return _Estimated(fraction, estimator.zeros, delay_from, instruments)

@@ -17,8 +17,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
-from ctid_cli.inference.paired import Difference, bootstrap_difference, percent_difference
-from ctid_cli.reporting.comparison import holm
+from ctid_cli.inference.paired import Difference, bootstrap_difference, holm, percent_difference
 from ctid_cli.reporting.layout import Report, Table, count, delay_label, number
 from ctid_cli.reporting.measures import parameter_unit
 from ctid_cli.reporting.parameter_errors import ParameterEstimates, estimates_by_group

@@ -28,11 +28,12 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.errors import DataError, UsageError
+from ctid_cli.errors import CtidError, DataError, UsageError
 from ctid_cli.inference import monte_carlo
 from ctid_cli.inference.monte_carlo import Sample
 from ctid_cli.reporting.expected_accuracy import expected_accuracy, long_record_variances
 from ctid_cli.reporting.results import Group, Results, lookup
+from ctid_cli.running.cells import Plan
 from ctid_cli.running.plan import build_plan
 from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.specification.load import spec_from_canonical
@@ -111,27 +112,34 @@ def parameter_estimates(results: Results) -> list[ParameterEstimates]:
     variances = long_record_variances(build_plan(spec_from_canonical(results.settings))) if groups else {}
     found = []
     for one in groups:
-        theory = variances.get(_place(results, one.group))
+        theory = variances.get(place_of(results, one.group))
         found.append(replace(one, theory=None if theory is None else np.array([theory[name] for name in one.names])))
     return found
 
 
 def least_variances(results: Results) -> dict[Group, dict[str, float]]:
     """Variances that theory gives the estimates of each group at their number of samples, where there is a theory."""
-    plan = build_plan(spec_from_canonical(results.settings))
-    found = {}
-    for group in results.groups():
-        k, j = _place(results, group)
-        source = plan.data_cells[k].source
-        if not isinstance(source, SimulatedSource):
-            continue
-        try:
-            expected = expected_accuracy(source, plan.estimators[j].estimator, plan.terms).parameters
-        except DataError:
-            continue
-        variances = dict(zip(expected.names, expected.covariance.diagonal().tolist(), strict=True))
-        found[group] = _under_true_names(variances, true_values(results.manifest["data_cells"][k]))
-    return found
+    try:
+        plan = build_plan(spec_from_canonical(results.settings))
+    except CtidError:  # it names code, which is not run to read results, or is of another version
+        return {}
+    places = {group: place_of(results, group) for group in results.groups()}
+    known = {place: _variances(plan, *place) for place in set(places.values())}
+    found = {group: variances for group, place in places.items() if (variances := known[place])}
+    truths = [true_values(cell) for cell in results.manifest["data_cells"]]
+    return {group: _under_true_names(variances, truths[places[group][0]]) for group, variances in found.items()}
+
+
+def _variances(plan: Plan, k: int, j: int) -> dict[str, float]:
+    """Variances of the parameters in one cell by theory; empty where there is none."""
+    source = plan.data_cells[k].source
+    if not isinstance(source, SimulatedSource):
+        return {}
+    try:
+        expected = expected_accuracy(source, plan.estimators[j].estimator, plan.terms).parameters
+    except DataError:
+        return {}
+    return dict(zip(expected.names, expected.covariance.diagonal().tolist(), strict=True))
 
 
 def _under_true_names(variances: dict[str, float], true: Mapping[str, float]) -> dict[str, float]:
@@ -142,7 +150,7 @@ def _under_true_names(variances: dict[str, float], true: Mapping[str, float]) ->
     return {name: variances[source] for name, source in moved.items() if source in variances}
 
 
-def _place(results: Results, group: Group) -> tuple[int, int]:
+def place_of(results: Results, group: Group) -> tuple[int, int]:
     """Places of the data cell and of the estimator in the plan.
 
     Not by hash: a later version may write the same specification with more defaults.

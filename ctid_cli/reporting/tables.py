@@ -20,6 +20,7 @@ from ctid_cli.reporting.results import (
     shown_path,
 )
 from ctid_cli.reporting.study import Study, data_folder, load_study
+from ctid_cli.reporting.surprises import surprises
 from ctid_cli.reporting.table_blocks import frequency_blocks, percentage_blocks, record_blocks, study_blocks
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.folder import InUseError
@@ -39,7 +40,7 @@ def build_tables(
     """The tables that were asked for; committed ones stand in for those of which nothing was run, if they may."""
     if measures:
         found = experiments(names, out, "--measure")
-        return [measure_report(results, measures, notes_of(results, out)) for results in found]
+        return [measure_report(results, measures, [*notes_of(results, out), *surprises(results)]) for results in found]
     study = load_study()
     reports = []
     for name in names or [study.name]:
@@ -57,7 +58,7 @@ def build_tables(
                 hint = did_you_mean(name, known) or "."
                 wrong = f"{name!r} is neither a table nor an experiment with results in {out}{hint}"
                 raise UsageError(f"{wrong} Known: {', '.join(known)}")
-            reports.append(experiment_report(results, notes_of(results, out)))
+            reports.append(experiment_report(results, [*notes_of(results, out), *surprises(results)]))
     return reports
 
 

@@ -174,7 +174,7 @@ def test_estimators_that_can_do_the_same_share_a_table(accuracy):
     text = accuracy(two, "--set", "noise.snr_db=[5, 10]", text=True)
     assert "known (srivc) and again (srivc): standard errors at SNR 5 dB\n" in text
     assert text.count("half width\n") == 2
-    assert "\nsvf: no theory: svf is the least-squares start of other estimators; noise biases it" in text
+    assert "\nsvf: no theory: the estimate is biased, as svf is least squares, the start of other estimators" in text
 
 
 def test_a_level_relative_to_the_output_is_that_of_long_records(accuracy):
@@ -326,7 +326,7 @@ def test_without_noise_and_with_coloured_noise_in_a_loop(accuracy):
     assert "no noise" in accuracy(silent)["estimates"][0]["reason"]
     coloured = CLOSED.replace("kind: white", "kind: arma, numerator: [1], denominator: [1, -0.9]")
     content = accuracy(coloured)
-    assert "instruments from it are biased" in entries(content, "direct")[0]["reason"]
+    assert "the input is correlated with the noise" in entries(content, "direct")[0]["reason"]
     assert entries(content, "clsrivc")[0]["parameters"]
     assert "M^-1 Sigma M^-1" in entries(content, "clsrivc")[1]["formula"]
 

@@ -5,13 +5,13 @@ from math import comb
 import pytest
 
 from ctid_cli.errors import UsageError
+from ctid_cli.inference.paired import holm
 from ctid_cli.reporting.committed import read_tables
 from ctid_cli.reporting.comparison import (
     LEVEL,
     check_tables,
     compare,
     fisher,
-    holm,
     mismatch_sentence,
     smallest_detectable,
     write_comparison,

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.inference.paired import bootstrap_difference, percent_difference
-from ctid_cli.reporting.comparison import holm
+from ctid_cli.inference.paired import bootstrap_difference, holm, percent_difference
 from ctid_cli.reporting.paired_table import _root_of_mean, compare_estimators, paired_rows
 
 FIRST = [8.01, 9.0, 7.97, 12.0, 8.02, 8.03, 7.5]
