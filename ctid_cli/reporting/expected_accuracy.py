@@ -72,7 +72,7 @@ def expected_accuracy(
         raise DataError("the relay feeds noise back into the input, and theory is given here for linear controllers")
     why_not = _why_no_limit(source, estimated)
     accuracy = _of_records(source, estimated, why_not) if why_not else _of_long_records(source, estimated)
-    if terms is None or not source.system.is_stable:
+    if terms is None or not estimated.model.is_stable:
         return accuracy
     parameters = accuracy.parameters.factored(terms)
     # Of a coefficient that is zero in truth the partial fractions leave rounding.
