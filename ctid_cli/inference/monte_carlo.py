@@ -46,6 +46,15 @@ class Sample(NamedTuple):
     bound: float = math.nan
 
 
+def complete(values: Array) -> BoolArray:
+    """Which values of parameters count: those of data sets with all parameters but the ones that none has.
+
+    All parameters so count the same data sets. NaN marks what is missing, shape (R, p).
+    """
+    known: BoolArray = np.isfinite(values)
+    return known & known[:, known.any(axis=0)].all(axis=1, keepdims=True)
+
+
 def wilson_interval(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
     """Wilson's score interval for a proportion.
 

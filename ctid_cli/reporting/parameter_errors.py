@@ -198,9 +198,7 @@ def _estimates(
     values, errors = (
         np.array([[side[name] for name in true] for side in sides], dtype=float) for sides in zip(*pairs, strict=True)
     )
-    # All parameters count the same data sets, but for those that the model does not have at all.
-    known = np.isfinite(values)
-    values[~known[:, known.any(axis=0)].all(axis=1)] = np.nan
+    values[~monte_carlo.complete(values)] = np.nan
     failed = sum(row["status"] in FAILURES for row in rows)
     options = dict(zip(results.swept("estimators"), group.options, strict=True))
     swept = {name: value for name, value in cell["swept"].items() if name != "samples"}

@@ -131,7 +131,7 @@ def differences(settings: Mapping[str, Any], reference: Mapping[str, Any], shown
     common = tuple(f"estimators.{name}." for name in set(settings["estimators"]) & set(reference["estimators"]))
     found = []
     for path in dict.fromkeys([*right, *left]):
-        if path in shown or path == "monte_carlo.runs":
+        if path in shown or (path.startswith("monte_carlo.") and path != "monte_carlo.seed"):
             continue
         if path.startswith("estimators.") and not path.startswith(common):
             continue

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.storage.manifest import Key, Manifest
@@ -57,7 +58,8 @@ class Plan:
     data_cells: tuple[DataCell, ...]
     estimators: tuple[EstimatorCell, ...]
     starts: tuple[StartPoint, ...]
-    runs: int
+    #: Number of data sets of each data cell.
+    replicates: tuple[int, ...]
     spec_hash: str
 
     @property
@@ -65,9 +67,23 @@ class Plan:
         """Name of the experiment."""
         return self.spec.experiment
 
+    @property
+    def runs(self) -> int:
+        """Number of data sets of the data cell that has most."""
+        return max(self.replicates)
+
     def tasks(self) -> list[Task]:
         """The data sets."""
-        return [Task(cell, replicate) for replicate in range(self.runs) for cell in range(len(self.data_cells))]
+        return [
+            Task(cell, replicate)
+            for replicate in range(self.runs)
+            for cell, own in enumerate(self.replicates)
+            if replicate < own
+        ]
+
+    def with_replicates(self, replicates: Sequence[int]) -> Plan:
+        """The plan with other numbers of data sets."""
+        return replace(self, replicates=tuple(replicates))
 
     def keys(self, task: Task) -> list[tuple[Key, EstimatorCell, StartPoint]]:
         """The estimates wanted of a data set."""
@@ -104,8 +120,8 @@ class Plan:
             "spec": canonical,
             "success": canonical.get("success"),
             "data_cells": [
-                {"hash": cell.hash, "replicates": self.runs, "swept": dict(cell.swept), "content": cell.content}
-                for cell in self.data_cells
+                {"hash": cell.hash, "replicates": own, "swept": dict(cell.swept), "content": cell.content}
+                for cell, own in zip(self.data_cells, self.replicates, strict=True)
             ],
             "estimators": [
                 {

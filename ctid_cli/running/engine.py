@@ -22,6 +22,7 @@ from ctid_cli.errors import DataError, StorageError
 from ctid_cli.running import events
 from ctid_cli.running.job import Job
 from ctid_cli.running.own_check import check_components
+from ctid_cli.running.precision import CellPrecision, as_needed, stored_precisions
 from ctid_cli.running.stopping import StopRequest
 from ctid_cli.storage import folder as place
 from ctid_cli.storage import journal
@@ -57,6 +58,8 @@ class RunSummary:
     #: Duration [s].
     seconds: float
     stopped_by: str | None
+    #: How well each data cell is known; empty where the number of data sets was given.
+    precision: tuple[CellPrecision, ...] = ()
 
     @property
     def missing(self) -> int:
@@ -84,8 +87,8 @@ def run_experiment(
     begun = time.monotonic()
     origins = current_origins(plan)
     with StopRequest(stop) as stopping, ExitStack() as stack:
-        peek = _look(plan, folder, origins, fresh=fresh, allow_mixed=allow_mixed)
-        todo = _jobs(plan, peek)
+        begun_with, peek = _look(plan, folder, origins, fresh=fresh, allow_mixed=allow_mixed)
+        todo = _jobs(begun_with, peek)
         if todo:
             on_event(events.KernelsCompiling())
             on_event(events.KernelsCompiled(warm() if warm else _compile_kernels(plan)))
@@ -102,10 +105,12 @@ def run_experiment(
         except StorageError as error:
             raise StorageError(f"{error}. {place.what_is_safe(folder)}") from error
         stack.callback(log.close)
-        run = _Run(plan, folder, log, origins, on_event, jobs or usable_processors())
+        run = _Run(as_needed(plan, log), folder, log, origins, on_event, jobs or usable_processors())
         stack.callback(run.cleanup)
         run.start()
         run.compute(stopping)
+        while run.needs_more() and not stopping():
+            run.compute(stopping)
         return run.finish(stopping.reason, moved, begun)
 
 
@@ -130,13 +135,22 @@ class _Run:
     ) -> None:
         self.plan, self.folder, self.log, self.origins = plan, folder, log, origins
         self.on_event, self.workers = on_event, workers
-        self.manifest = plan.manifest()
+        #: Estimates that were stored when the run began.
+        self.stored = log.keys()
+        self.computed = self.done = self.total = 0
+        self.precision: tuple[CellPrecision, ...] = ()
+        self.started = now()
+        self._lay_out()
+
+    def _lay_out(self) -> None:
+        """Where the estimates of the plan belong, and what there is to compute."""
+        self.manifest = self.plan.manifest()
         self.slots: dict[Key, list[Slot]] = defaultdict(list)
         for slot in slots(self.manifest):
             self.slots[slot.key].append(slot)
-        self.ready, self.jobs = _ready(plan, folder, log.keys())
-        self.computed = self.done = 0
-        self.started = now()
+        self.ready = _ready(self.plan, self.folder, self.stored)
+        self.jobs = _jobs(self.plan, self.log.keys())
+        self.total += len(self.jobs)
 
     def start(self) -> None:
         spec = self.plan.spec
@@ -150,6 +164,18 @@ class _Run:
         self.session = self.log.begin(self.manifest, self.origins, self.started, self.info)
         self._announce()
         self.on_event(self.ready)
+
+    def needs_more(self) -> bool:
+        """Whether the finished block leaves data cells that are not known well enough; plan their next one."""
+        self.precision = stored_precisions(self.manifest, self.log)
+        needed = tuple(cell.needed for cell in self.precision)
+        if needed in ((), self.plan.replicates):
+            return False
+        self.plan = self.plan.with_replicates(needed)
+        self._lay_out()
+        self.log.replan(self.manifest)
+        self.on_event(events.BlockDone(self.total, self.precision))
+        return True
 
     def compute(self, stopping: StopRequest) -> None:
         from ctid_cli.running.pool import Died, Finished, kill_workers, run_jobs
@@ -191,11 +217,11 @@ class _Run:
                 for outcome in item.outcomes
                 for slot in self.slots[outcome.key]
             )
-            self.on_event(events.DataSetDone(self.done, len(self.jobs), rows))
+            self.on_event(events.DataSetDone(self.done, self.total, rows))
         self._announce()
 
     def _announce(self) -> None:
-        place.announce(self.folder, self.plan.experiment, self.started, self.done, len(self.jobs))
+        place.announce(self.folder, self.plan.experiment, self.started, self.done, self.total)
 
     def finish(self, reason: str | None, moved: Path | None, begun: float) -> RunSummary:
         self.on_event(events.Sealed(self.folder / place.SEALED, *seal(self.folder, self.log)))
@@ -219,6 +245,7 @@ class _Run:
             moved_aside=moved,
             seconds=time.monotonic() - begun,
             stopped_by=reason if missing else None,
+            precision=self.precision,
         )
 
     def cleanup(self) -> None:
@@ -228,8 +255,8 @@ class _Run:
 
 def preview(plan: Plan, folder: Path, *, fresh: bool = False, allow_mixed: bool = False) -> events.PlanReady:
     """What a run would do, without doing or writing anything."""
-    stored = _look(plan, folder, current_origins(plan), fresh=fresh, allow_mixed=allow_mixed)
-    return _ready(plan, folder, stored)[0]
+    needed, stored = _look(plan, folder, current_origins(plan), fresh=fresh, allow_mixed=allow_mixed)
+    return _ready(needed, folder, stored)
 
 
 def current_origins(plan: Plan) -> dict[str, Origin]:
@@ -239,22 +266,24 @@ def current_origins(plan: Plan) -> dict[str, Origin]:
     return {cell.hash: origin_of(source, cell.estimator) for cell in plan.estimators}
 
 
-def _ready(plan: Plan, folder: Path, stored: set[Key]) -> tuple[events.PlanReady, list[Job]]:
-    """What there is to do, in numbers and as jobs."""
+def _ready(plan: Plan, folder: Path, stored: set[Key]) -> events.PlanReady:
+    """What there is to do, in numbers."""
     planned = {slot.key for slot in slots(plan.manifest())}
-    reused, jobs = len(planned & stored), _jobs(plan, stored)
-    counts = (len(jobs), len(planned) - reused, reused, len(stored - planned))
-    return events.PlanReady(plan.experiment, folder, *counts), jobs
+    reused = len(planned & stored)
+    counts = (len(_jobs(plan, stored)), len(planned) - reused, reused, len(stored - planned))
+    return events.PlanReady(plan.experiment, folder, *counts)
 
 
-def _look(plan: Plan, folder: Path, origins: Mapping[str, Origin], *, fresh: bool, allow_mixed: bool) -> set[Key]:
-    """Which estimates are stored in a folder that this plan may be run into."""
+def _look(
+    plan: Plan, folder: Path, origins: Mapping[str, Origin], *, fresh: bool, allow_mixed: bool
+) -> tuple[Plan, set[Key]]:
+    """The plan as far as it is decided, and which estimates are stored in a folder that it may be run into."""
     if fresh or not folder.exists():
-        return set()
+        return plan, set()
     with place.lock(folder, shared=True):
         place.check_free(folder, plan.manifest(), origins, allow_mixed=allow_mixed)
         with place.reading_journal(folder) as log:
-            return set() if log is None else log.keys()
+            return (plan, set()) if log is None else (as_needed(plan, log), log.keys())
 
 
 def _jobs(plan: Plan, stored: set[Key]) -> list[Job]:

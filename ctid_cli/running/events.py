@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ctid_cli.running.precision import CellPrecision
+
 #: One estimate as plain data, with the keys documented in `ctid_cli.storage.manifest`.
 Row = Mapping[str, Any]
 
@@ -19,6 +21,8 @@ class PlanReady:
     estimates: int
     reused: int
     left_aside: int
+    #: Most data sets of a data cell, where it gets as many as a precision needs.
+    at_most: int | None = None
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,15 @@ class DataSetDone:
     done: int
     total: int
     rows: tuple[Row, ...]
+
+
+@dataclass(frozen=True)
+class BlockDone:
+    """A block of data sets is stored, and some data cells need more of them."""
+
+    #: Data sets to compute so far, those of the next block among them.
+    total: int
+    precision: tuple[CellPrecision, ...]
 
 
 @dataclass(frozen=True)
@@ -67,7 +80,7 @@ class Sealed:
     checksum: str
 
 
-Event = PlanReady | KernelsCompiling | KernelsCompiled | DataSetDone | WorkerDied | Stopping | Sealed
+Event = PlanReady | KernelsCompiling | KernelsCompiled | DataSetDone | BlockDone | WorkerDied | Stopping | Sealed
 OnEvent = Callable[[Event], None]
 
 

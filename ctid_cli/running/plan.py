@@ -16,7 +16,7 @@ from ctid_cli.simulation.frequency_measures import Measuring
 from ctid_cli.simulation.frequency_runs import FrequencyEstimation, SignalSource
 from ctid_cli.simulation.own_components import OwnSystem
 from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, replaced, variants
-from ctid_cli.specification.spec import Spec
+from ctid_cli.specification.spec import MonteCarloSection, Spec
 from ctid_cli.specification.start_points import NO_START, start_points
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.storage.columns import reserved_names
@@ -31,10 +31,11 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
     """Plan an experiment."""
     if runs is not None and runs < 1:
         raise UsageError(f"the number of data sets must be 1 or more, not {runs}")
-    count = 1
-    if spec.data is None and spec.monte_carlo is not None:
-        count = spec.monte_carlo.runs if runs is None else runs
-        spec = replaced(spec, ("monte_carlo", "runs"), count)
+    count = first = 1
+    if spec.data is None and (section := spec.monte_carlo) is not None:
+        section = section if runs is None else MonteCarloSection(runs=runs, seed=section.seed)
+        spec = replaced(spec, ("monte_carlo",), section)
+        count, first = section.most, section.first
     # Of a measured record only those of its loop.
     parts = {name: found for name in _SIMULATED if (found := variants(getattr(spec, name)))}
     cells = math.prod(map(len, parts.values()))
@@ -48,7 +49,7 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
     if any(NO_START in starts_of(cell.estimator.start_from, starts) for cell in estimators):
         starts = (*starts, NO_START)
     spec_hash = content_hash(_without_circumstances(spec.canonical()))
-    return Plan(spec, _data_cells(spec, parts, names), estimators, starts, count, spec_hash)
+    return Plan(spec, _data_cells(spec, parts, names), estimators, starts, (first,) * cells, spec_hash)
 
 
 def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[KeyPath, str]) -> tuple[DataCell, ...]:

@@ -30,7 +30,7 @@ def joint_warnings(spec: Spec) -> list[Complaint]:
     if spec.signal is not None:
         return signal_warnings(spec)
     warnings = [] if spec.system is None else _simulation_warnings(spec)
-    if spec.data is not None and spec.monte_carlo is not None and spec.monte_carlo.runs > 1:
+    if spec.data is not None and spec.monte_carlo is not None and spec.monte_carlo.most > 1:
         warnings.append((("monte_carlo", "runs"), "a measured record is one data set; it is run once"))
     if spec.loop is not None and not has_relay(spec):
         for name, section in spec.estimators.items():

@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import Problem, UsageError
 from ctid_cli.inference.monte_carlo import requested
+from ctid_cli.inference.precision import AT_LEAST, block_ends
 from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.signals.recorder import Recorder
 from ctid_cli.simulation.dataset import MeasuredSource, located
@@ -43,19 +44,68 @@ MeasuredSection = Annotated[Any, Options(MeasuredSource, without="loop", sweepin
 RecorderSection = Annotated[Section, Options(Recorder)]
 
 
-class MonteCarloSection(Section):
-    """How many data sets, and which.
+class UntilSection(Section):
+    """How precise the measures of every data cell must be, in place of a number of data sets.
 
     Parameters
     ----------
-    runs : int
+    percent_half_width : float, optional
+        Largest half-width of the 95 % interval of every percentage [percentage points]
+    rmse_relative : float, optional
+        Largest half-width of the 95 % interval of every root mean square error, as a fraction of the error [-]
+    """
+
+    percent_half_width: Annotated[Positive | None, Field(lt=50.0)] = None
+    rmse_relative: Annotated[Positive | None, Field(lt=1.0)] = None
+
+    def complaints(self) -> Iterator[Complaint]:
+        """Say that nothing is asked for."""
+        if self.percent_half_width is None and self.rmse_relative is None:
+            yield (), "give percent_half_width, rmse_relative or both; for example {rmse_relative: 0.05}"
+
+
+class MonteCarloSection(Section):
+    """How many data sets, and which: a number of them, or until the measures are precise enough.
+
+    Parameters
+    ----------
+    runs : int, optional
         Data sets of every data cell
     seed : int
         Seed of all random numbers; with the same seed the same data sets come out
+    until : mapping, optional
+        Precision that decides how many data sets each data cell gets, in place of runs
+    at_most : int, optional
+        With until, most data sets of a data cell; 200 is the fewest
     """
 
-    runs: int = Field(ge=1, le=1_000_000)
+    runs: Annotated[int | None, Field(ge=1, le=1_000_000), LATER] = None
     seed: int = Field(ge=0, le=MAX_WHOLE)
+    until: Annotated[UntilSection | None, LATER] = None
+    at_most: Annotated[int | None, Field(ge=AT_LEAST, le=1_000_000), LATER] = None
+
+    @classmethod
+    def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
+        """Say that there is no number of data sets, or more than one rule for it."""
+        given = {name for name in ("runs", "until", "at_most") if raw.get(name) is not None}
+        if {"runs", "until"} <= given:
+            yield ("until",), "decides how many data sets there are; keep runs or until (with at_most)"
+        elif "until" in given and "at_most" not in given:
+            yield ("at_most",), "is missing; add the most data sets of a data cell, for example at_most: 5000"
+        elif "at_most" in given and "until" not in given:
+            yield ("at_most",), "goes with until; leave it out, or ask for a precision: until: {rmse_relative: 0.05}"
+        elif not given:
+            yield ("runs",), "is missing; add it: Data sets of every data cell, for example runs: 100"
+
+    @property
+    def most(self) -> int:
+        """Most data sets that a data cell can get."""
+        return self.runs or self.at_most or 1
+
+    @property
+    def first(self) -> int:
+        """Data sets of every data cell, or of its first block."""
+        return self.runs or next(block_ends(self.most))
 
 
 class SuccessSection(Section):
@@ -175,7 +225,8 @@ class Spec(Section):
         return error
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say which measures there are not, and which estimators are the same."""
+        """Say which measures there are not, which precision cannot be had, and which estimators are the same."""
+        yield from self._precision_complaints()
         for k, name in enumerate(self.measures or ()):
             try:
                 requested(name)
@@ -186,6 +237,19 @@ class Spec(Section):
             others = [seen.setdefault(canonical_json(variant.values), name) for variant in variants(section)]
             for other in [other for other in others if other != name][:1]:
                 yield ("estimators", name), f"the same settings as {other!r}; its estimates would be the same too"
+
+    def _precision_complaints(self) -> Iterator[Complaint]:
+        until = None if self.monte_carlo is None else self.monte_carlo.until
+        if until is None:
+            return
+        place = ("monte_carlo", "until")
+        if self.data is not None:
+            yield place, "a measured record is one data set; give runs: 1 in place of until and at_most"
+            return
+        if until.percent_half_width is not None and self.success is None:
+            yield (*place, "percent_half_width"), "is of the estimates that meet the success rule; add success"
+        if until.rmse_relative is not None and self.system is None:
+            yield (*place, "rmse_relative"), "needs the true values of a simulated system; use percent_half_width"
 
     @property
     def measured(self) -> MeasuredSource | None:

@@ -145,11 +145,7 @@ class Journal:
     def begin(self, manifest: Manifest, origins: Mapping[str, Origin], started: str, info: dict[str, Any]) -> int:
         """Note that a run begins, and where the estimates of each estimator will come from."""
         with self._transaction() as connection:
-            # Not sorted: the order of swept fields and starts is that of the specification.
-            text = json.dumps(manifest, allow_nan=False)
-            if self._meta("manifest") != text:
-                self._set_meta("manifest", text)
-                connection.execute("DELETE FROM meta WHERE name = ?", (_SEALED,))
+            self._replan(manifest)
             known = {origin: number for number, origin in self._known_origins().items()}
             for estimator, origin in origins.items():
                 if origin not in known:
@@ -163,6 +159,18 @@ class Journal:
                 "INSERT INTO sessions (started, info) VALUES (?, ?)", (started, canonical_json(info))
             )
             return int(cursor.lastrowid or 0)
+
+    def replan(self, manifest: Manifest) -> None:
+        """Note that the plan of the present run has changed."""
+        with self._transaction():
+            self._replan(manifest)
+
+    def _replan(self, manifest: Manifest) -> None:
+        # Not sorted: the order of swept fields and starts is that of the specification.
+        text = json.dumps(manifest, allow_nan=False)
+        if self._meta("manifest") != text:
+            self._set_meta("manifest", text)
+            self._connection.execute("DELETE FROM meta WHERE name = ?", (_SEALED,))
 
     def add(self, outcomes: Iterable[Outcome], session: int) -> None:
         """Store estimates; when this returns, they are safe."""

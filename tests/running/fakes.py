@@ -8,6 +8,8 @@ import json
 import os
 import signal
 import time
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
@@ -17,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ctid_cli.errors import DataError
-from ctid_cli.running.cells import Plan
+from ctid_cli.running.cells import Plan, Task
 from ctid_cli.simulation.dataset import DataSet
 from ctid_cli.storage.manifest import Key
 
@@ -174,12 +176,6 @@ STARTS = {
 
 
 @dataclass(frozen=True)
-class FakeTask:
-    cell: int
-    replicate: int
-
-
-@dataclass(frozen=True)
 class FakeSpec:
     content: dict[str, Any]
     text: str
@@ -193,7 +189,7 @@ class FakePlan:
     """Same surface as the real plan: cells of several noise levels, estimators, starts, runs."""
 
     terms = None
-    manifest = Plan.manifest
+    manifest, runs, tasks = Plan.manifest, Plan.runs, Plan.tasks
 
     def __init__(
         self,
@@ -204,10 +200,11 @@ class FakePlan:
         experiment: str = "toys",
         names: tuple[str, ...] | None = None,
         text: str = "# toys\n",
+        precision: dict[str, Any] | None = None,
     ) -> None:
         toys = estimators or (Toy(), Toy(order=3))
         names = names or tuple(f"toy{k}" for k in range(len(toys)))
-        self.experiment, self.runs = experiment, runs
+        self.experiment, self.replicates = experiment, (runs,) * len(levels)
         system = {"numerator": [2.0], "denominator": [1.0, 1.0], "delay": 8.0}
         self.data_cells = tuple(
             FakeCell({"system": system, "level": level, "seed": seed}, {"level": level}) for level in levels
@@ -220,16 +217,18 @@ class FakePlan:
         self.starts = tuple(STARTS.values())
         content = {
             "experiment": experiment,
-            "monte_carlo": {"runs": runs, "seed": seed},
+            "monte_carlo": {"seed": seed, **(precision or {"runs": runs})},
             "success": {"delay_relative_error": 0.01},
         }
         self.spec = FakeSpec(content, text)
         self.spec_hash = content_hash(content)
 
-    def tasks(self) -> list[FakeTask]:
-        return [FakeTask(cell, replicate) for replicate in range(self.runs) for cell in range(len(self.data_cells))]
+    def with_replicates(self, replicates: Sequence[int]) -> FakePlan:
+        other = copy(self)
+        other.replicates = tuple(replicates)
+        return other
 
-    def keys(self, task: FakeTask) -> list[tuple[Key, FakeEstimatorCell, FakeStartPoint]]:
+    def keys(self, task: Task) -> list[tuple[Key, FakeEstimatorCell, FakeStartPoint]]:
         data_hash = self.data_cells[task.cell].hash
         return [
             (Key(data_hash, task.replicate, cell.hash, label), cell, STARTS[label])

@@ -1,0 +1,217 @@
+"""Data sets until the measures are precise: the rule itself, and runs that follow it."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ctid_cli.inference import precision
+from ctid_cli.inference.monte_carlo import Sample, root_mean_square, wilson_interval
+from ctid_cli.inference.precision import AT_LEAST, GROWTH, Replications, Until, block_ends, decide
+from ctid_cli.running import events
+from ctid_cli.running.engine import RunSummary, preview, run_experiment
+from ctid_cli.running.precision import cell_precisions
+from ctid_cli.storage.store import read_stored
+from tests.running.fakes import FakePlan
+
+NOTHING = np.empty((5000, 0))
+
+
+def of_hits(hits: Any) -> Replications:
+    return Replications(np.asarray(hits, dtype=bool), NOTHING[: len(hits)])
+
+
+def of_errors(errors: Any) -> Replications:
+    return Replications(None, np.asarray(errors).reshape(len(errors), -1))
+
+
+def test_blocks_grow_to_the_most_that_is_allowed() -> None:
+    ends = list(block_ends(1000))
+    assert ends == [200, 250, 313, 392, 490, 613, 767, 959, 1000]
+    assert list(block_ends(AT_LEAST)) == [AT_LEAST]
+    # Another limit changes the last block only.
+    assert list(block_ends(2000))[: len(ends) - 1] == ends[:-1]
+
+
+def test_the_first_block_with_narrow_intervals_of_all_estimators_ends_it() -> None:
+    rng = np.random.default_rng(2)
+    hits, errors = rng.random(2000) < 0.9, rng.standard_normal(2000)
+    until, found = Until(percent_half_width=2.0, rmse_relative=0.06), [of_hits(hits), of_errors(errors)]
+
+    def widths(n: int) -> tuple[float, float]:
+        low, high = wilson_interval(int(hits[:n].sum()), n)
+        rmse = root_mean_square(Sample(errors[:n], errors[:n]))
+        assert rmse.value is not None
+        assert rmse.error is not None
+        return 50 * (high - low) / 2.0, 1.96 * rmse.error / rmse.value / 0.06
+
+    expected = next(n for n in block_ends(2000) if max(widths(n)) <= 1.0)
+    decision = decide(until, found, 2000)
+    assert (decision.state, decision.finished, decision.needed) == ("enough", expected, expected)
+    assert decision.widest is not None
+    assert decision.widest.excess == pytest.approx(max(widths(expected)), rel=1e-4)
+    # Neither of them alone needs more.
+    assert max(decide(until, [one], 2000).needed for one in found) == expected
+    # What comes later does not matter, and without the last data set of the block nothing is decided.
+    assert decide(until, [found[0].first(expected), found[1]], 2000) == decision
+    before = decide(until, [found[0].first(expected - 1), found[1]], 2000)
+    assert (before.state, before.needed) == ("open", expected)
+    assert before.finished < expected
+
+
+def test_what_cannot_be_measured_decides_nothing() -> None:
+    rng = np.random.default_rng(4)
+    errors = np.column_stack([rng.standard_normal(900), np.zeros(900), np.full(900, np.nan)])
+    asked = Until(rmse_relative=0.08)
+    # A parameter that is given has no error, and one that the model lacks has no value.
+    assert decide(asked, [of_errors(errors)], 900) == decide(asked, [of_errors(errors[:, :1])], 900)
+    # Of a single value nothing is known but the value.
+    once = np.where(np.arange(900) == 3, 1.0, np.nan)
+    lonely = decide(asked, [of_errors(once)], 900)
+    assert (lonely.state, lonely.needed) == ("at_most", 900)
+    assert lonely.widest is not None
+    assert lonely.widest.excess == math.inf
+    assert decide(asked, [of_errors(np.full(900, np.nan))], 900).needed == AT_LEAST
+
+
+REPETITIONS = 600
+
+
+def stopped(until: Until, draw: Any, at_most: int) -> list[Replications]:
+    """What a study that follows the rule ends with, over and over."""
+    found = []
+    for _ in range(REPETITIONS):
+        whole = draw(at_most)
+        found.append(whole.first(decide(until, [whole], at_most).needed))
+    return found
+
+
+@pytest.mark.parametrize("probability", [0.5, 0.9, 0.98])
+def test_intervals_of_percentages_keep_their_promise_under_the_rule(probability: float) -> None:
+    rng = np.random.default_rng(round(1000 * probability))
+    found = stopped(Until(percent_half_width=1.5), lambda n: of_hits(rng.random(n) < probability), 5000)
+    intervals = [wilson_interval(int(one.hits.sum()), one.hits.size) for one in found if one.hits is not None]
+    inside = sum(low <= probability <= high for low, high in intervals)
+    # As many as 93 % would give with 99 %: 558 - 2.33 sqrt(600 0.93 0.07).
+    assert inside >= 543
+    assert max(high - low for low, high in intervals) <= 0.03
+    assert len({one.hits.size for one in found if one.hits is not None}) > (1 if probability > 0.5 else 0)
+
+
+def test_intervals_of_errors_keep_their_promise_under_the_rule() -> None:
+    rng = np.random.default_rng(6)
+    found = stopped(Until(rmse_relative=0.08), lambda n: of_errors(rng.standard_normal(n)), 2000)
+    measured = [root_mean_square(Sample(one.errors[:, 0], one.errors[:, 0])) for one in found]
+    assert sum(one.low <= 1.0 <= one.high for one in measured if one.low is not None and one.high is not None) >= 543
+    assert np.mean([len(one.errors) for one in found]) < GROWTH * 1.1 * 0.5 * (1.96 / 0.08) ** 2
+
+
+UNTIL = {"until": {"percent_half_width": 13.0}, "at_most": 60}
+#: First block of the runs below, which need not be long to be interrupted.
+FEW = 20
+
+
+@pytest.fixture(scope="module")
+def small_blocks() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(precision, "AT_LEAST", FEW)
+        yield
+
+
+def plan(**options: Any) -> FakePlan:
+    return FakePlan(levels=(1, 15.5), **({"precision": UNTIL} | options))
+
+
+def run(asked: FakePlan, place: Path, jobs: int = 2, **options: Any) -> RunSummary:
+    return run_experiment(asked, place, jobs=jobs, warm=lambda: 0.0, **options)  # type: ignore[arg-type]
+
+
+def sealed(place: Path) -> bytes:
+    return (place / "runs.h5").read_bytes()
+
+
+def sizes(place: Path) -> list[int]:
+    return [cell["replicates"] for cell in read_stored(place).manifest["data_cells"]]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(small_blocks: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("undisturbed") / "toys"
+    summary = run(plan(), place, jobs=1)
+    assert summary.exit_code == summary.missing == 0
+    return place
+
+
+def test_every_cell_gets_the_data_sets_it_needs(undisturbed: Path) -> None:
+    stored = read_stored(undisturbed)
+    first, second = cell_precisions(stored.manifest, stored.results)
+    assert (first.state, second.state) == ("enough", "enough")
+    assert sizes(undisturbed) == [first.needed, second.needed]
+    assert first.needed > second.needed
+    assert len(stored.results) == 3 * (first.needed + second.needed)
+    # The interval that decided is that of the tables.
+    rows = [row for row in stored.rows() if row["cell"] == first.cell]
+    assert first.widest is not None
+    hits = [row["converged"] for row in rows if (row["estimator"], row["start"]) == ("toy0", first.widest.start)]
+    low, high = wilson_interval(sum(hits), len(hits))
+    assert first.widest.half_width == 50 * (high - low) <= 13.0
+
+
+def test_neither_workers_nor_interruptions_change_a_byte(tmp_path: Path, undisturbed: Path) -> None:
+    place, stop, seen = tmp_path / "toys", threading.Event(), 0
+
+    def after(count: int) -> Any:
+        def listen(event: events.Event) -> None:
+            nonlocal seen
+            seen += isinstance(event, events.DataSetDone)
+            if seen >= count:
+                stop.set()
+
+        return listen
+
+    interruptions = 0
+    for count in (1, 1, 20):
+        stop.clear()
+        seen = 0
+        summary = run(plan(), place, jobs=1 + interruptions % 2, stop=stop, on_event=after(count))
+        interruptions += summary.exit_code == 5
+    assert interruptions > 0
+    told: list[events.Event] = []
+    summary = run(plan(), place, on_event=told.append)
+    assert (summary.exit_code, summary.missing) == (0, 0)
+    assert sealed(place) == sealed(undisturbed)
+    # Once more there is nothing to do.
+    assert preview(plan(), place).estimates == 0  # type: ignore[arg-type]
+    assert run(plan(), place).computed == 0
+    assert sealed(place) == sealed(undisturbed)
+
+
+def test_estimates_of_other_plans_are_used_and_neither_more_nor_fewer(tmp_path: Path, undisturbed: Path) -> None:
+    run(plan(runs=30, precision=None), tmp_path)
+    summary = run(plan(), tmp_path)
+    assert sealed(tmp_path) == sealed(undisturbed)
+    most, fewer = sizes(undisturbed)
+    assert summary.reused == 3 * (30 + fewer)
+    assert summary.computed == 3 * (most - 30)
+    assert summary.planned == 3 * (most + fewer)
+
+
+def test_a_cell_that_is_not_precise_in_the_end_is_said(small_blocks: None, tmp_path: Path) -> None:
+    told: list[events.Event] = []
+    asked = plan(precision={"until": {"percent_half_width": 13.0, "rmse_relative": 0.04}, "at_most": 26})
+    summary = run(asked, tmp_path, on_event=told.append)
+    assert summary.exit_code == 0
+    assert [cell.state for cell in summary.precision] == ["at_most", "at_most"]
+    assert sizes(tmp_path) == [26, 26]
+    widest = [cell.widest for cell in summary.precision if cell.widest is not None]
+    assert {(one.estimator, one.measure, one.parameter) for one in widest} == {("toy0", "rmse", "delay")}
+    assert all(one.half_width is not None and one.half_width > 0.04 for one in widest)
+    blocks = [event for event in told if isinstance(event, events.BlockDone)]
+    assert [[cell.needed for cell in event.precision] for event in blocks] == [[25, 25], [26, 26]]
+    assert blocks[-1].total == 2 * 26
