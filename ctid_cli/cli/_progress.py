@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 import typer
 
 from ctid_cli.reporting.layout import count, seconds
+from ctid_cli.reporting.precision_words import block_sentence
 
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn, TaskID
@@ -135,7 +136,7 @@ class FitProgress(RecordProgress):
 class Reporter(_Progress):
     """Shows the events of one run on stderr."""
 
-    failed = 0
+    failed = done = 0
 
     def __call__(self, event: Event) -> None:
         """Show one event."""
@@ -151,6 +152,9 @@ class Reporter(_Progress):
                     self._say(f"kernels ready after {seconds(event.seconds)}")
             case events.DataSetDone():
                 self._advance(event)
+            case events.BlockDone():
+                self._say(block_sentence(event.precision))
+                self._update(self.done, total=event.total)
             case events.WorkerDied():
                 sets = count(event.data_sets, "data set")
                 self._say(f"a worker process died ({event.reason}); repeating {sets} alone")
@@ -163,6 +167,8 @@ class Reporter(_Progress):
             parts.append(f"{event.reused} already stored")
         if event.left_aside:
             parts.append(f"{event.left_aside} stored ones set aside")
+        if event.at_most is not None and event.estimates:
+            parts.append(f"then in blocks until they are enough, {event.at_most} data sets of a cell at most")
         self._say(", ".join(parts))
         self._began = self._last
         if event.data_sets and sys.stderr.isatty():
@@ -174,6 +180,7 @@ class Reporter(_Progress):
     def _advance(self, event: Any) -> None:
         from ctid_cli.storage.columns import FAILURES
 
+        self.done = event.done
         self.failed += sum(row["status"] in FAILURES for row in event.rows)
         speed = event.done / max(self._clock() - self._began, 1e-9)
         rate = f"{speed:.2g}/s" if speed >= 0.1 else f"{60 * speed:.2g}/min"

@@ -54,7 +54,9 @@ def _workload(plan: Plan) -> str:
     tasks = plan.tasks()
     estimates = sum(len(plan.keys(task)) for task in tasks)
     sets, cells = count(len(tasks), "data set"), count(len(plan.data_cells), "data cell")
-    return f"{sets} ({cells}), {count(estimates, 'estimate')}"
+    text = f"{sets} ({cells}), {count(estimates, 'estimate')}"
+    section = plan.spec.monte_carlo
+    return text if section is None or section.until is None else f"{text}; at most {section.most} data sets of a cell"
 
 
 @guarded
@@ -110,10 +112,13 @@ def _tell(reporter: Reporter | None, as_json: bool, event: Event) -> None:
 def _intention(ready: PlanReady) -> str:
     text = f"{ready.experiment}: would compute {count(ready.estimates, 'estimate')} of "
     text += f"{count(ready.data_sets, 'data set')} into {ready.folder}; {ready.reused} are already stored"
-    return f"{text}, {ready.left_aside} stored ones set aside" if ready.left_aside else text
+    text += f", {ready.left_aside} stored ones set aside" if ready.left_aside else ""
+    more = f"; then in blocks until they are enough, {ready.at_most} data sets of a cell at most"
+    return text + more if ready.at_most is not None and ready.estimates else text
 
 
 def _conclusion(summary: RunSummary, out: Path) -> str:
+    from ctid_cli.reporting.precision_words import precision_lines
     from ctid_cli.reporting.results import out_option
     from ctid_cli.reporting.study import tables_of
 
@@ -124,6 +129,7 @@ def _conclusion(summary: RunSummary, out: Path) -> str:
         lines.append(f"  older results are now in {summary.moved_aside}")
     if summary.mixed:
         lines.append("  they mix code versions or processors, which tables will say")
+    lines += [f"  {line}" for line in precision_lines(summary.precision)]
     if summary.failed:
         lines.append(f"  {summary.failed} failed; to see why: ctid status {summary.experiment}{option}")
     if summary.stopped_by is not None:

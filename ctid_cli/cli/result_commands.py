@@ -22,6 +22,7 @@ def status(
     """
     from ctid_cli.reporting.overview import overview_text, status_object, status_text
     from ctid_cli.reporting.results import experiments_in, read_results
+    from ctid_cli.running.precision import cell_precisions
     from ctid_cli.storage.store import experiment_status
 
     if experiment is None:
@@ -36,8 +37,10 @@ def status(
         read_results(out, experiment)
     one = experiment_status(out / experiment)
     # A first run that is still going on has nothing to read yet.
-    rows = read_results(out, experiment).rows if one.done else []
-    answer(as_json, lambda: status_object(one, rows), lambda: status_text(one, rows, out))
+    results = read_results(out, experiment) if one.done else None
+    rows = [] if results is None else results.rows
+    cells = () if results is None else cell_precisions(results.manifest, results.stored.results)
+    answer(as_json, lambda: status_object(one, rows, cells), lambda: status_text(one, rows, out, cells))
 
 
 @guarded

@@ -6,7 +6,7 @@ more precise than they are, so that an interval at the end holds the truth a lit
 data sets fixed before (Y. S. Chow and H. Robbins, On the asymptotic theory of fixed-width sequential confidence
 intervals for the mean, Annals of Mathematical Statistics 36 (1965) 457-462). Blocks that grow keep the looks few, and
 the first one is large enough for the widths themselves to be known: of percentages up to 98 and of nearly normal
-errors the intervals hold the truth in 93 % of the cases or more, without a correction (docs/precision.md).
+errors the intervals hold the truth in 93 % of the cases or more, without a correction (docs/measures.md).
 """
 
 import math

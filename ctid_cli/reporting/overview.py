@@ -8,7 +8,9 @@ from typing import Any
 
 from ctid_cli.reporting.estimate import as_object
 from ctid_cli.reporting.layout import Table, number, picked
+from ctid_cli.reporting.precision_words import precision_table
 from ctid_cli.reporting.results import out_option
+from ctid_cli.running.precision import CellPrecision
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.store import ExperimentStatus
 
@@ -16,12 +18,19 @@ from ctid_cli.storage.store import ExperimentStatus
 LISTED = 10
 
 
-def status_object(status: ExperimentStatus, estimates: Sequence[Mapping[str, Any]] | None = None) -> dict[str, Any]:
+def status_object(
+    status: ExperimentStatus,
+    estimates: Sequence[Mapping[str, Any]] | None = None,
+    precision: Sequence[CellPrecision] = (),
+) -> dict[str, Any]:
     """Progress of an experiment for ``ctid status --json``."""
     content = asdict(status) | {"folder": str(status.folder), "todo": status.todo}
     before, after = ("estimator", "cell"), ("planned", "done", "todo", "failed")
     content["groups"] = [{**picked(group, before), **group.swept, **picked(group, after)} for group in status.groups]
-    return content if estimates is None else content | {"estimates": [as_object(row) for row in estimates]}
+    if estimates is None:
+        return content
+    cells = {"precision": [asdict(cell) for cell in precision]} if precision else {}
+    return content | cells | {"estimates": [as_object(row) for row in estimates]}
 
 
 def overview_text(found: Sequence[ExperimentStatus]) -> str:
@@ -33,8 +42,13 @@ def overview_text(found: Sequence[ExperimentStatus]) -> str:
     return Table(["experiment", "done", "planned", "failed", "set aside", ""], rows, "lrrrrl").draw()
 
 
-def status_text(status: ExperimentStatus, estimates: Sequence[Mapping[str, Any]], out: Path) -> str:
-    """Progress of one experiment: by estimator and data, by outcome, and the first failures."""
+def status_text(
+    status: ExperimentStatus,
+    estimates: Sequence[Mapping[str, Any]],
+    out: Path,
+    precision: Sequence[CellPrecision] = (),
+) -> str:
+    """Progress of one experiment: by estimator and data, by precision, by outcome, and the first failures."""
     remark = _remark(status)
     blocks = [f"{status.experiment} in {status.folder}: {status.done} of {status.planned} estimates done"]
     blocks[0] += f" ({remark})" if remark else ""
@@ -46,6 +60,8 @@ def status_text(status: ExperimentStatus, estimates: Sequence[Mapping[str, Any]]
         ]
         header = ["estimator", *swept, "done", "planned", "failed"]
         blocks.append(Table(header, rows, "l" * (1 + len(swept)) + "rrr").draw())
+    if precision:
+        blocks.append(precision_table(precision).draw())
     if estimates:
         blocks.append("\n".join(_outcomes(estimates)))
     if status.left_aside:

@@ -271,7 +271,7 @@ def _ready(plan: Plan, folder: Path, stored: set[Key]) -> events.PlanReady:
     planned = {slot.key for slot in slots(plan.manifest())}
     reused = len(planned & stored)
     counts = (len(_jobs(plan, stored)), len(planned) - reused, reused, len(stored - planned))
-    return events.PlanReady(plan.experiment, folder, *counts)
+    return events.PlanReady(plan.experiment, folder, *counts, at_most=_monte_carlo(plan).get("at_most"))
 
 
 def _look(
@@ -288,7 +288,7 @@ def _look(
 
 def _jobs(plan: Plan, stored: set[Key]) -> list[Job]:
     """The data sets of which estimates are missing, in the order of the plan."""
-    seed = (plan.spec.canonical().get("monte_carlo") or {}).get("seed")
+    seed = _monte_carlo(plan).get("seed")
     terms = plan.terms
     jobs = []
     for task in plan.tasks():
@@ -300,6 +300,10 @@ def _jobs(plan: Plan, stored: set[Key]) -> list[Job]:
         if wanted:
             jobs.append(Job(plan.data_cells[task.cell], task.replicate, seed, tuple(wanted.values()), terms))
     return jobs
+
+
+def _monte_carlo(plan: Plan) -> dict[str, Any]:
+    return plan.spec.canonical().get("monte_carlo") or {}
 
 
 def _check_first_records(jobs: list[Job]) -> None:

@@ -248,8 +248,12 @@ class Spec(Section):
             return
         if until.percent_half_width is not None and self.success is None:
             yield (*place, "percent_half_width"), "is of the estimates that meet the success rule; add success"
-        if until.rmse_relative is not None and self.system is None:
+        if until.rmse_relative is None:
+            return
+        if self.system is None:
             yield (*place, "rmse_relative"), "needs the true values of a simulated system; use percent_half_width"
+        elif self.system.own and not self.system.truth:
+            yield (*place, "rmse_relative"), "needs true values: system.truth: {gain: 1.0}"
 
     @property
     def measured(self) -> MeasuredSource | None:

@@ -1,5 +1,6 @@
 """What people see: help, progress, summaries, warnings, and errors that nobody expected."""
 
+import json
 import os
 import re
 import signal
@@ -8,6 +9,8 @@ import sys
 import time
 
 import pytest
+
+from ctid_cli.inference import precision
 
 COMMANDS = ["init", "run", "status", "table", "show", "export", "validate", "schema"]
 
@@ -64,6 +67,29 @@ def test_validate_counts_the_work(ctid, tiny):
     done = ctid("validate", tiny, "--set", "monte_carlo.runs=5")
     assert "ok, tiny: 10 data sets (2 data cells), 30 estimates" in done.stdout
     assert done.stderr == ""
+
+
+def test_a_run_until_it_is_precise_says_how_far_it_is(ctid, tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(precision, "AT_LEAST", 4)
+    until = "seed: 1, until: {percent_half_width: 49, rmse_relative: 0.9}, at_most: 200"
+    tiny.write_text(tiny.read_text(encoding="utf-8").replace("runs: 2, seed: 1", until), encoding="utf-8")
+    option = ("--out", tmp_path / "results")
+    assert "8 data sets (2 data cells), 24 estimates; at most 200 data sets of a cell" in ctid("validate", tiny).stdout
+    assert "then in blocks until they are enough" in ctid("run", tiny, "--dry-run", *option).stdout
+    # Of few data sets nobody knows much.
+    done = ctid("run", tiny, "--jobs", 1, *option)
+    assert "data cells need more data sets, up to 5; widest interval: snr_db = " in done.stderr
+    assert "data sets in each data cell: all intervals are as narrow as asked for" in done.stdout
+    status = ctid("status", "tiny", *option).stdout
+    assert status.count("precise enough") == 2
+    found = json.loads(ctid("status", "tiny", "--json", *option).stdout)
+    sizes = [cell["needed"] for cell in found["precision"]]
+    assert min(sizes) > 4
+    assert sum(group["done"] for group in found["groups"] if group["estimator"] == "known") == sum(sizes)
+    assert found["precision"][0]["widest"]["half_width"] <= found["precision"][0]["widest"]["asked"]
+    # A number on the command line comes before the rule of the file.
+    assert "6 of 6 estimates stored" in ctid("run", tiny, "--runs", 1, *option).stdout
+    assert "precision" not in json.loads(ctid("status", "tiny", "--json", *option).stdout)
 
 
 def test_run_tells_what_it_does_and_what_to_do_next(ctid, tiny, tmp_path):

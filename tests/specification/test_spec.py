@@ -144,6 +144,18 @@ BROKEN = {
     "no runs": ("runs: 10", "runs: 0", 17, 21, "monte_carlo.runs", "at least 1"),
     "no seed": (", seed: 1", "", 17, 1, "monte_carlo.seed", "is missing"),
     "no monte_carlo": ("monte_carlo: {runs: 10, seed: 1}\n", "", 1, 1, "monte_carlo", "is missing"),
+    "two numbers of data sets": (
+        "runs: 10", "runs: 10, until: {percent_half_width: 1}, at_most: 500", 17, 25, "monte_carlo.until", "keep runs"
+    ),
+    "no most data sets": (
+        "runs: 10", "until: {percent_half_width: 1}", 17, 1, "monte_carlo.at_most", "for example at_most: 5000"
+    ),
+    "few data sets": (
+        "runs: 10", "until: {percent_half_width: 1}, at_most: 100", 17, 56, "monte_carlo.at_most", "at least 200"
+    ),
+    "most data sets of no rule": ("runs: 10", "at_most: 500", 17, 15, "monte_carlo.at_most", "goes with until"),
+    "neither number nor rule": ("runs: 10, ", "", 17, 1, "monte_carlo.runs", "for example runs: 100"),
+    "no precision": ("runs: 10", "until: {}, at_most: 500", 17, 15, "monte_carlo.until", "rmse_relative: 0.05"),
     "no system": ("system: {numerator: [2], denominator: [0.25, 0.7, 1], delay: 8.0}\n", "", 1, 1, "system", "missing"),
     "empty success": ("{delay_relative_error: 0.01}", "{}", 18, 1, "success", "leave the section out"),
     "success that is always true": ("0.01", "0", 18, 33, "success.delay_relative_error", "above 0"),
@@ -180,6 +192,18 @@ def test_files_that_hold_no_mapping(tmp_path, name, text, message):
     (problem,) = problems(tmp_path, text)
     assert (problem.line, problem.column) == (1, 1)
     assert message in problem.message
+
+
+def test_a_precision_needs_something_that_it_is_the_precision_of(tmp_path):
+    asked = "until: {percent_half_width: 1, rmse_relative: 0.05}, at_most: 500"
+    text = changed(SIMULATED, ("runs: 10", asked), ("success: {delay_relative_error: 0.01}\n", ""))
+    (problem,) = problems(tmp_path, text)
+    assert (problem.key, problem.line) == ("monte_carlo.until.percent_half_width", 17)
+    assert "add success" in problem.message
+    (tmp_path / "record.csv").write_text(RECORD, encoding="utf-8")
+    (problem,) = problems(tmp_path, MEASURED + f"monte_carlo: {{{asked}, seed: 1}}\n")
+    assert problem.key == "monte_carlo.until"
+    assert "runs: 1" in problem.message
 
 
 def test_missing_file_and_folder(tmp_path):
