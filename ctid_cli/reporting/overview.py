@@ -10,7 +10,7 @@ from ctid_cli.reporting.estimate import as_object
 from ctid_cli.reporting.layout import Table, number, picked
 from ctid_cli.reporting.precision_words import precision_table
 from ctid_cli.reporting.results import out_option
-from ctid_cli.running.precision import CellPrecision
+from ctid_cli.running.cell_precision import CellPrecision
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.store import ExperimentStatus
 

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any
 
 from ctid_cli.errors import DataError, StorageError
 from ctid_cli.running import events
+from ctid_cli.running.cell_precision import CellPrecision, as_needed, stored_precisions
 from ctid_cli.running.job import Job
 from ctid_cli.running.own_check import check_components
-from ctid_cli.running.precision import CellPrecision, as_needed, stored_precisions
 from ctid_cli.running.stopping import StopRequest
 from ctid_cli.storage import folder as place
 from ctid_cli.storage import journal

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ctid_cli.running.precision import CellPrecision
+from ctid_cli.running.cell_precision import CellPrecision
 
 #: One estimate as plain data, with the keys documented in `ctid_cli.storage.manifest`.
 Row = Mapping[str, Any]

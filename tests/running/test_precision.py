@@ -15,8 +15,8 @@ from ctid_cli.inference import precision
 from ctid_cli.inference.monte_carlo import Sample, root_mean_square, wilson_interval
 from ctid_cli.inference.precision import AT_LEAST, GROWTH, Replications, Until, block_ends, decide
 from ctid_cli.running import events
+from ctid_cli.running.cell_precision import cell_precisions
 from ctid_cli.running.engine import RunSummary, preview, run_experiment
-from ctid_cli.running.precision import cell_precisions
 from ctid_cli.storage.store import read_stored
 from tests.running.fakes import FakePlan
 
