@@ -42,6 +42,13 @@ from .inference.status import Status as Status
 from .inference.diagnostics import fit_percent as fit_percent
 from .inference.finite_record import cramer_rao_bound as cramer_rao_bound
 
+# Results as text and as tables of pandas
+from .reporting.result_views import summary as summary, to_frame as to_frame
+
+# Experiments: what ctid run, table and export do
+from .reporting.experiment import ExperimentResults as ExperimentResults
+from .reporting.experiment import read_results as read_results, run_experiment as run_experiment
+
 # Useful redundancy for a cost of one's own
 from .filtering.lowpass import Lowpass as Lowpass
 from .filtering.filter_set import FilterSet as FilterSet, check_filters as check_filters

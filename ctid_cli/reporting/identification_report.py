@@ -137,7 +137,7 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
     for label, text in _asked_for(result, measurements, units):
         row(label, text)
     lines += ["", parameter_table(parameters_of(result, units)), wrapped(_covariance_line(result)), ""]
-    lines += [_derived_table(derived_of(result, units)), ""]
+    lines += [derived_table(derived_of(result, units)), ""]
     row("fit", f"{number(fit.fit_percent, 5)} % = {FIT_DEFINITION}")
     row("R2", f"{number(fit.r2, 6)} = {R2_DEFINITION}")
     row("", "y measured, x simulated, over the samples used")
@@ -232,7 +232,8 @@ def _covariance_line(result: Identification) -> str:
     return text + ". Monic denominator, descending powers."
 
 
-def _derived_table(rows: Sequence[UncertainValue]) -> str:
+def derived_table(rows: Sequence[UncertainValue]) -> str:
+    """Derived quantities as an aligned table."""
     header = ["derived", "estimate", "standard error", "95 % low", "95 % high", "unit"]
     cells = [
         [row.name, number(row.estimate), number(row.standard_error, 3), number(row.low), number(row.high), row.unit]

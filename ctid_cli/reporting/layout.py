@@ -1,6 +1,7 @@
 """How answers look: aligned text, Markdown or LaTeX, and how numbers are written in it."""
 
 import csv
+import html
 import io
 import json
 import math
@@ -23,6 +24,10 @@ class Table:
     def draw(self, style: str = "text") -> str:
         """Columns padded with blanks and a rule under the header, or Markdown (``md``), or ``latex`` with booktabs."""
         lines = [self.header, *self.rows]
+        if style == "html":
+            sides = ["left" if side == "l" else "right" for side in self.align]
+            found = ("".join(map(_html_cell, cells, sides)) for cells in lines)
+            return "<table>" + "\n".join(f"<tr>{cells}</tr>" for cells in found) + "</table>"
         if style == "latex":
             header, *body = (" & ".join(map(latex, cells)) + r" \\" for cells in lines)
             rules = [f"\\begin{{tabular}}{{{self.align}}}", r"\toprule", header, r"\midrule"]
@@ -53,6 +58,12 @@ class Report:
     def draw(self, style: str = "text") -> str:
         """The report for people, as text, as Markdown (``md``), or its tables in LaTeX with the rest as comments."""
         notes = [f"Note: {note}" for note in self.notes]
+        if style == "html":
+            items = [*(item for block in self.blocks for item in block), *notes]
+            return "\n".join(
+                item.draw("html") if isinstance(item, Table) else f"<p>{html.escape(item.removeprefix('### '))}</p>"
+                for item in items
+            )
         if style == "latex":
             items = [*(item for block in self.blocks for item in block), *notes]
             return "\n\n".join(
@@ -64,6 +75,10 @@ class Report:
             return "\n\n".join([*(item.draw("md") if isinstance(item, Table) else item for item in items), *notes])
         blocks = ["\n".join(map(_drawn, block)) for block in self.blocks if block]
         return "\n\n".join([*blocks, "\n".join(notes)] if notes else blocks)
+
+
+def _html_cell(text: str, side: str) -> str:
+    return f'<td style="text-align: {side}">{html.escape(text)}</td>'
 
 
 #: What LaTeX would read as something else.

@@ -13,6 +13,7 @@ from ctid_cli.canonical import plain
 from ctid_cli.frequency.automatic import Settings
 from ctid_cli.frequency.flags import MEANINGS, Flag
 from ctid_cli.frequency.record_track import RecordTrack
+from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.reporting.layout import Table, count, number
 from ctid_cli.signals.sampled_signal import SampledSignal
 from ctid_cli.text import warning_lines, wrapped
@@ -124,14 +125,14 @@ def flag_words(flags: int) -> str:
     return " ".join(str(flag.name).lower() for flag in Flag if flags & flag)
 
 
-def track_table(track: RecordTrack, start: float) -> dict[str, NDArray[Any]]:
+def track_table(track: FrequencyTrack, start: float) -> dict[str, NDArray[Any]]:
     """Columns of the file of a track."""
     tones = range(track.omega.shape[1])
     return {
         "t": start + track.t,
         **{f"omega_{k + 1}": track.omega[:, k] for k in tones},
         **{f"frequency_{k + 1}_hz": track.omega[:, k] / (2.0 * np.pi) for k in tones},
-        **{f"amplitude_{k + 1}": track.amplitudes[:, k] for k in tones},
+        **({f"amplitude_{k + 1}": track.amplitudes[:, k] for k in tones} if isinstance(track, RecordTrack) else {}),
         "valid": track.valid,
         "flags": np.array([flag_words(int(flags)) for flags in track.flags], dtype=object),
     }

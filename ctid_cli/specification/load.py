@@ -16,7 +16,15 @@ from ctid_cli.specification.option_sections import EstimatorSection
 from ctid_cli.specification.own_sections import names_code, own_places, with_own_kinds
 from ctid_cli.specification.sections import replaced, variants
 from ctid_cli.specification.spec import Spec
-from ctid_cli.specification.yaml_source import OVERRIDE_FILE, KeyPath, apply_overrides, path_text, read_yaml
+from ctid_cli.specification.yaml_source import (
+    OVERRIDE_FILE,
+    KeyPath,
+    apply_overrides,
+    parse_yaml,
+    path_text,
+    read_yaml,
+    written,
+)
 
 
 class _PartialSpec(Spec):
@@ -33,21 +41,26 @@ _Remainder = create_model(
 )
 
 
-def load_spec(path: Path, overrides: Sequence[str] = (), *, allow_code: bool = False) -> Spec:
-    """Read and check a specification; code that it names is run only if that is allowed.
+def load_spec(given: Path | Mapping[str, Any], overrides: Sequence[str] = (), *, allow_code: bool = False) -> Spec:
+    """Read and check a specification, of a file or as a mapping; code that it names is run only if that is allowed.
 
     Sampling is called slow, which is a warning and no error, if its (mean) interval exceeds pi / max |p| over the
     poles p [rad/s] of the system: its rate is then below twice the frequency of the fastest pole.
     """
-    source = read_yaml(Path(path))
+    if isinstance(given, Mapping):
+        folder, text = Path(), written(given)
+        source = parse_yaml(text, "(specification)")
+    else:
+        folder, source = given.parent, read_yaml(given)
+        text = given.read_text(encoding="utf-8-sig")
     apply_overrides(source, overrides)
     tree = source.tree
     if not isinstance(tree, dict):
         message = f"the file must hold a mapping that begins with 'experiment: name', not {shown(tree)}"
         raise SpecError([Problem(source.file, 1, 1, "", "the file is empty" if tree is None else message)])
     _require_allowed(tree, source.problem, allow_code)
-    spec, complaints = _validated(with_own_kinds(tree, Path(path).parent))
-    spec._folder, spec._source = Path(path).parent, source
+    spec, complaints = _validated(with_own_kinds(tree, folder))
+    spec._folder, spec._source = folder, source
     spec, about_files = _with_files(spec)
     broken = frozenset(str(where[0]) for where, _, _ in complaints if where)
     joint = joint_complaints(spec, broken, files_are_good=not about_files)
@@ -57,7 +70,7 @@ def load_spec(path: Path, overrides: Sequence[str] = (), *, allow_code: bool = F
         in_order = sorted(problems, key=lambda p: (p.file == OVERRIDE_FILE, p.line, p.column, p.key, p.message))
         raise SpecError(in_order)
     spec._warnings = tuple(str(source.problem(where, message)) for where, message in joint_warnings(spec))
-    spec._text = Path(path).read_text(encoding="utf-8-sig")
+    spec._text = text
     return spec
 
 

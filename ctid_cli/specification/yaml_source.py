@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import operator
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from pathlib import Path
@@ -25,6 +25,7 @@ from typing import Any
 
 import yaml
 
+from ctid_cli.canonical import plain
 from ctid_cli.errors import Problem, SpecError, UsageError
 from ctid_cli.text import did_you_mean
 
@@ -201,6 +202,15 @@ def read_yaml(path: Path) -> YamlSource:
         place = Place(str(path), before.count(b"\n") + 1, error.start - before.rfind(b"\n"))
         raise SpecError([place.problem((), "the file is not UTF-8 text; save it as UTF-8")]) from None
     return parse_yaml(text, str(path))
+
+
+def written(tree: Mapping[str, Any]) -> str:
+    """A mapping as YAML text."""
+    try:
+        return str(yaml.safe_dump(plain(tree), sort_keys=False, allow_unicode=True))
+    except yaml.YAMLError as error:
+        what = type(error.args[-1]).__name__
+        raise UsageError(f"a specification holds texts, numbers, lists and mappings, and here is a {what}") from None
 
 
 def parse_yaml(text: str, file: str, *, line: int = 1, column: int = 1) -> YamlSource:

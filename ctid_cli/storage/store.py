@@ -231,9 +231,13 @@ def _read_times(path: Path) -> dict[tuple[str, str], float]:
 
 def load_estimates(folder: Path) -> pd.DataFrame:
     """Estimates of the latest plan of an experiment as a table."""
+    return estimates_table(read_stored(folder))
+
+
+def estimates_table(stored: Stored) -> pd.DataFrame:
+    """Stored estimates as a table, with the units of its columns."""
     import pandas as pd
 
-    stored = read_stored(folder)
     rows = stored.rows()
     # Where there is no system, the columns of one would be empty.
     left_out = "systems" if is_of_signal(stored.manifest) else ""
@@ -242,6 +246,9 @@ def load_estimates(folder: Path) -> pd.DataFrame:
     types = own | dict.fromkeys(swept_names(stored.manifest)) | compared
     frame = pd.DataFrame({name: pd.Series([row.get(name) for row in rows], dtype=of) for name, of in types.items()})
     frame.attrs["mixed"] = stored.mixed
+    frame.attrs["units"] = {
+        column.name: column.unit for column in columns.COLUMNS if column.unit and column.name in types
+    }
     return frame
 
 

@@ -1,0 +1,198 @@
+"""Experiments from Python: run, read, and as tables of pandas; what the commands run and read."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ctid_cli.reporting import surprises as unexpected
+from ctid_cli.reporting.layout import count
+from ctid_cli.reporting.measures import default_measures, measure_rows
+from ctid_cli.reporting.paired_table import compare_estimators
+from ctid_cli.reporting.results import Results
+from ctid_cli.reporting.tables import experiment_report, notes_of
+from ctid_cli.running import engine
+from ctid_cli.running.plan import build_plan
+from ctid_cli.specification.load import load_spec
+from ctid_cli.storage.manifest import slots
+from ctid_cli.storage.store import estimates_table, read_stored
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class ExperimentResults(Results):
+    """Results of one experiment.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Where they are stored.
+    stored : Stored
+        The estimates, as they were read.
+
+    See Also
+    --------
+    read_results, run_experiment
+    """
+
+    def __repr__(self) -> str:
+        planned, stored = sum(1 for _ in slots(self.manifest)), len(self.rows)
+        estimators = ", ".join(dict.fromkeys(part["name"] for part in self.manifest["estimators"]))
+        head = f"{self.experiment}: {stored} of {planned} estimates by {estimators}, {self.failed} failed"
+        return f"{head}\n  in {count(len(self.manifest['data_cells']), 'data cell')}, {self.folder}"
+
+    def _repr_html_(self) -> str:
+        report = experiment_report(self, [*notes_of(self, self.out), *self.surprises])
+        return report.draw("html")
+
+    @property
+    def out(self) -> Path:
+        """The folder of results that this one lies in."""
+        return self.folder.parents[len(Path(self.experiment).parts) - 1]
+
+    @property
+    def estimates(self) -> pd.DataFrame:
+        """One row for each estimate, what ``ctid export`` writes; the units of columns are in ``attrs["units"]``."""
+        return estimates_table(self.stored)
+
+    @property
+    def surprises(self) -> list[str]:
+        """What the estimates show that theory does not expect, with its reasons; empty where there is nothing."""
+        return unexpected.surprises(self)
+
+    def measures(self, *names: str) -> pd.DataFrame:
+        """Measures with their Monte Carlo errors, what ``ctid table --measure`` prints.
+
+        Parameters
+        ----------
+        *names : str
+            Such as ``"bias"``, ``"rmse:delay"``, ``"coverage"``; those of the specification by default, or the
+            percentage of success, or bias and RMSE.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row for each cell, estimator, start, parameter and measure: ``value`` with its standard error ``error``
+            and 95 % interval from ``low`` to ``high``, in ``unit``, from ``n`` data sets.
+
+        Raises
+        ------
+        UsageError
+            If there is no such measure, or this experiment cannot have it.
+        """
+        import pandas as pd
+
+        return pd.DataFrame(measure_rows(self, names or default_measures(self) or ["percent"]))
+
+    def compare(self, first: str, second: str) -> pd.DataFrame:
+        """Differences of two estimators on the same data sets, what ``ctid table --compare`` prints.
+
+        Parameters
+        ----------
+        first, second : str
+            Names of estimators in the specification.
+
+        Returns
+        -------
+        pandas.DataFrame
+            First minus second: ``value`` with its 95 % interval from ``low`` to ``high``, ``p_value`` and
+            ``adjusted_p_value`` (Holm), of percentages, RMSE and CPU time.
+
+        Raises
+        ------
+        UsageError
+            If there is no such estimator, or they have too few data sets in common.
+        """
+        import pandas as pd
+
+        return pd.DataFrame(compare_estimators(self, f"{first},{second}", self.out).records)
+
+
+def read_results(folder: str | os.PathLike[str]) -> ExperimentResults:
+    """Results of an experiment that was run.
+
+    Parameters
+    ----------
+    folder : path
+        Its folder, such as ``results/quickstart``.
+
+    Returns
+    -------
+    ExperimentResults
+        The estimates, and what is measured of them.
+
+    Raises
+    ------
+    UsageError
+        If there are no results in the folder.
+
+    Examples
+    --------
+    >>> from ctid_cli import read_results
+    >>> results = read_results("results/quickstart")  # doctest: +SKIP
+    >>> results.measures("bias", "coverage")  # doctest: +SKIP
+    """
+    return ExperimentResults(Path(folder), read_stored(Path(folder)))
+
+
+def run_experiment(
+    spec: str | os.PathLike[str] | Mapping[str, Any],
+    out: str | os.PathLike[str] = "results",
+    *,
+    jobs: int | None = None,
+    runs: int | None = None,
+    overrides: Sequence[str] = (),
+    fresh: bool = False,
+    allow_mixed: bool = False,
+    allow_code: bool = False,
+) -> ExperimentResults:
+    """Run an experiment, as ``ctid run`` does; the same call again computes only what is missing.
+
+    Parameters
+    ----------
+    spec : path or mapping
+        A specification: the path of a YAML file, or its content.
+    out : path, default "results"
+        Folder of results; this experiment's own folder in it has its name.
+    jobs : int, optional
+        Worker processes; all processors by default.
+    runs : int, optional
+        Data sets per setting, not the specification's own number.
+    overrides : sequence of str, default ()
+        Values in the place of the specification's own, such as ``"noise.snr_db=15"``.
+    fresh : bool, default False
+        Move older results aside and start anew.
+    allow_mixed : bool, default False
+        Add to results of another version of the code or another processor.
+    allow_code : bool, default False
+        Run the code that the specification names as a kind.
+
+    Returns
+    -------
+    ExperimentResults
+        All that is stored, also where a signal stopped the run.
+
+    Raises
+    ------
+    SpecError
+        If the specification has mistakes; all of them are named.
+    RefusedError
+        If the folder holds another experiment or results of other code, or code may not be run.
+
+    Examples
+    --------
+    >>> from ctid_cli import run_experiment
+    >>> results = run_experiment("configs/quickstart.yaml", runs=5)  # doctest: +SKIP
+    >>> results.estimates.groupby("estimator").delay.std()  # doctest: +SKIP
+    """
+    given = spec if isinstance(spec, Mapping) else Path(spec)
+    plan = build_plan(load_spec(given, overrides, allow_code=allow_code), runs)
+    for warning in plan.spec.warnings:
+        warnings.warn(warning, stacklevel=2)
+    folder = Path(out) / plan.experiment
+    engine.run_experiment(plan, folder, jobs=jobs, fresh=fresh, allow_mixed=allow_mixed)
+    return read_results(folder)

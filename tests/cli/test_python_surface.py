@@ -1,0 +1,97 @@
+"""The Python surface gives what the commands print."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import ctid_cli
+from ctid_cli import (
+    CtidError,
+    HeldSignal,
+    Record,
+    SpecError,
+    Srivc,
+    TransferFunction,
+    read_results,
+    run_experiment,
+    simulate,
+    summary,
+    to_frame,
+)
+
+SPEC = {
+    "experiment": "group/study",
+    "system": {"numerator": [2], "denominator": [1, 1]},
+    "excitation": {"kind": "gaussian"},
+    "sampling": {"kind": "regular", "interval": 0.1, "samples": 200},
+    "noise": {"kind": "white", "variance": np.float64(0.01)},
+    "estimators": {
+        "one": {"kind": "srivc", "poles": 1, "zeros": 0},
+        "other": {"kind": "svf", "poles": 1, "zeros": 0, "svf_cutoff": 2.0},
+    },
+    "monte_carlo": {"runs": 6, "seed": 1},
+}
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    place = tmp_path_factory.mktemp("out")
+    run_experiment(SPEC, place, jobs=1)
+    return place
+
+
+def test_results_are_those_of_the_commands(out, ctid):
+    results = read_results(out / "group" / "study")
+    exported = pd.read_csv(io.StringIO(ctid("export", "group/study", "--out", out).stdout))
+    assert list(results.estimates["id"]) == list(exported["id"])
+    assert results.estimates.attrs["units"]["delay"] == "s"
+    table = pd.read_csv(
+        io.StringIO(ctid("table", "group/study", "--measure", "rmse", "--out", out, "--format", "csv").stdout)
+    )
+    np.testing.assert_allclose(results.measures("rmse")["value"], table["value"])
+    assert set(results.measures()["measure"]) == {"bias", "rmse"}
+    compared = ctid("table", "group/study", "--compare", "one,other", "--out", out, "--format", "csv").stdout
+    np.testing.assert_allclose(results.compare("one", "other")["value"], pd.read_csv(io.StringIO(compared))["value"])
+    assert results.surprises == []
+    assert repr(results).startswith("group/study: 12 of 12 estimates by one, other, 0 failed\n  in 1 data cell")
+    assert "<td" in results._repr_html_()
+
+
+def test_a_mapping_and_a_file_are_the_same_experiment(out, tmp_path):
+    file = tmp_path / "study.yaml"
+    file.write_text((out / "group" / "study" / "spec.yaml").read_text(encoding="utf-8"), encoding="utf-8")
+    again = run_experiment(file, out, jobs=1)
+    assert len(list((out / "group" / "study" / "provenance").glob("*.json"))) == 2
+    assert set(again.estimates["id"]) == set(read_results(out / "group" / "study").estimates["id"])
+
+
+def test_mistakes_are_named(tmp_path):
+    with pytest.raises(SpecError, match=r"\(specification\):3:3: system.numeratr: .* did you mean 'numerator'"):
+        run_experiment(SPEC | {"system": {"numeratr": [2], "denominator": [1, 1]}}, tmp_path)
+    with pytest.raises(CtidError, match="holds texts, numbers, lists and mappings, and here is a TransferFunction"):
+        run_experiment(SPEC | {"system": TransferFunction([2], [1, 1])}, tmp_path)
+    with pytest.raises(CtidError, match="there are no results in"):
+        read_results(tmp_path)
+
+
+def test_a_fit_as_text_and_as_a_table():
+    t = 0.1 * np.arange(300)
+    rng = np.random.default_rng(1)
+    u = HeldSignal(t, rng.standard_normal(t.size))
+    y = simulate(TransferFunction([2], [1, 1]), u, t) + 0.1 * rng.standard_normal(t.size)
+    fit = Srivc(poles=1, zeros=0).fit(Record(t, y, u), None)
+    frame = to_frame(fit)
+    assert frame["estimate"].to_dict() == fit.parameters
+    assert frame["standard_error"].to_dict() == fit.standard_errors
+    assert list(frame["unit"]) == ["1/s", "out/in/s"]
+    assert f"{fit.parameters['a1']:.6g}" in summary(fit)
+    assert f"fit {fit.fit_percent:.5g} % of 300 samples" in summary(fit)
+
+
+def test_completion_knows_the_public_names():
+    stub = Path(ctid_cli.__file__).with_suffix(".pyi").read_text(encoding="utf-8")
+    assert {"run_experiment", "read_results", "summary", "to_frame"} <= set(dir(ctid_cli))
+    assert all(f"as {name}" in stub for name in dir(ctid_cli) if name[0] != "_" and name.islower())
