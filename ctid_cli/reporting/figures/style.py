@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,18 +35,58 @@ _STYLE: dict[Any, Any] = {
 }
 
 
+#: Looks of the estimators of an experiment: the colours of Okabe and Ito, which the colour-blind tell apart, with a
+#: marker and a line for a grey print.
+LOOKS: tuple[dict[str, Any], ...] = (
+    {"color": "#0072b2", "marker": "o", "linestyle": "-"},
+    {"color": "#d55e00", "marker": "s", "linestyle": "--"},
+    {"color": "#000000", "marker": "x", "linestyle": ":"},
+    {"color": "#009e73", "marker": "^", "linestyle": "-."},
+    {"color": "#cc79a7", "marker": "D", "linestyle": (0, (5, 1, 1, 1))},
+    {"color": "#56b4e9", "marker": "v", "linestyle": (0, (3, 1, 1, 1, 1, 1))},
+    {"color": "#e69f00", "marker": "P", "linestyle": (0, (1, 2))},
+    {"color": "#6b6b6b", "marker": "*", "linestyle": (0, (6, 3))},
+)
+
+Format = Literal["svg", "png", "pdf"]
+#: What else each format would write down: when, and by which version of what.
+_METADATA: dict[Format, Any] = {"svg": {"Date": None}, "png": {"Software": None}, "pdf": {"CreationDate": None}}
+
+
+class Drawing(NamedTuple):
+    """A figure that is still to be drawn."""
+
+    width: float  # [inch]
+    height: float
+    draw: Callable[[Figure], None]
+
+    def figure(self) -> Figure:
+        """Draw it."""
+        from matplotlib.figure import Figure
+
+        with _style():
+            figure = Figure(figsize=(self.width, self.height), layout="constrained")
+            self.draw(figure)
+        return figure
+
+    def saved(self, style: Format = "svg") -> bytes:
+        """Draw it as a file; the same drawing always gives the same bytes."""
+        file, figure = io.BytesIO(), self.figure()
+        with _style():
+            figure.savefig(file, format=style, metadata=_METADATA[style], dpi=200)
+        return file.getvalue()
+
+
+def _style() -> Any:
+    """Not the user's own defaults: a published figure looks the same everywhere."""
+    import matplotlib.style
+
+    return matplotlib.style.context(["default", _STYLE])
+
+
 def svg(width: float, height: float, draw: Callable[[Figure], None]) -> bytes:
     """Draw a figure; the same drawing always gives the same bytes."""
-    import matplotlib.style
-    from matplotlib.figure import Figure
-
-    # Not the user's own defaults: a published figure looks the same everywhere.
-    with matplotlib.style.context(["default", _STYLE]):
-        figure = Figure(figsize=(width, height), layout="constrained")
-        draw(figure)
-        file = io.BytesIO()
-        figure.savefig(file, format="svg", metadata={"Date": None})
-    return file.getvalue()
+    return Drawing(width, height, draw).saved()
 
 
 def pointed(axes: Any, text: str, point: ArrayLike, place: ArrayLike, arrow: dict[str, Any], **style: Any) -> None:
