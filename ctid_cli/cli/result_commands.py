@@ -1,6 +1,7 @@
-"""The commands that read results: ``ctid status``, ``table``, ``show``, ``export`` and ``figure``."""
+"""The commands that read results: ``ctid status``, ``table``, ``show``, ``export``, ``figure`` and ``report``."""
 
 import json
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -160,26 +161,101 @@ def export(
 def figure(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME]...", help="Figure (2, additive/3) or study (additive)."),
+        typer.Argument(
+            metavar="[NAME]...", help="Experiment (quickstart), figure (2, additive/3) or study (additive)."
+        ),
+    ] = None,
+    kind: Annotated[
+        str | None, typer.Option("--kind", metavar="KIND", help="measure, box, errors, delays or convergence.")
+    ] = None,
+    measure: Annotated[
+        str | None, typer.Option("--measure", metavar="NAME", help="What is measured, such as rmse or rmse:delay.")
+    ] = None,
+    parameters: Annotated[
+        str | None, typer.Option("--parameters", metavar="NAMES", help="With --kind errors and box: a1,delay.")
+    ] = None,
+    style: Annotated[
+        Literal["svg", "png", "pdf"] | None, typer.Option("--format", help="Form of the files; svg by default.")
     ] = None,
     out: Out = Path("results"),
     file: Annotated[Path | None, typer.Option("--file", metavar="FILE", help="Where a single figure goes.")] = None,
 ) -> None:
-    """Draw figures of a study as SVG files.
+    """Draw figures of experiments and of studies.
 
-    Most are computed from the study's specifications and need no results: all of useful-redundancy, additive/2 and
-    additive/6. The others of additive are drawn from results in OUT; where these are missing, the answer says what to
-    run first. Each goes to OUT/<study>_figures/figure_<number>.svg, and its path is printed.
+    Of an experiment: measure, a percentage or another measure over all that was swept; box, the errors of each
+    parameter; errors, two of them against each other with what theory expects; delays, where the estimated delays lie;
+    convergence, the measure from the first data sets only. All with their 95 % intervals. Without --kind: the one that
+    tells most. It goes to OUT/<experiment>/figures, and its path is printed.
 
-    Without a name: all figures of the useful-redundancy study.
+    Of a study, as published, SVG: most are computed from the study's specifications and need no results. Each goes to
+    OUT/<study>_figures/figure_<number>.svg. Without a name: all figures of the useful-redundancy study.
     """
-    from ctid_cli.studies.catalogue import find_figures, require_results
+    from ctid_cli.reporting.figures.experiment_plot import chosen_kind, experiment_drawing
+    from ctid_cli.reporting.results import read_results
+    from ctid_cli.studies.catalogue import find_figures, require_results, sorted_names
 
-    figures = find_figures(names or [])
-    if file is not None and len(figures) != 1:
-        raise UsageError(f"--file takes one figure, not {len(figures)}; --out names the folder of several")
+    experiments, others = sorted_names(names or [], out)
+    figures = find_figures(others, out) if others or not experiments else []
+    count = len(figures) + len(experiments)
+    if file is not None and count != 1:
+        raise UsageError(f"--file takes one figure, not {count}; --out names the folder of several")
+    if figures and (kind, measure, parameters, style or "svg") != (None, None, None, "svg"):
+        raise UsageError(
+            "figures of studies are SVG files as published; --kind, --measure, --parameters and --format "
+            "are for those of experiments"
+        )
     require_results(figures, out)
+    style = style or _format_of(file)
     for item in figures:
         path = out / item.place if file is None else file
         write_files({path: item.svg(out)})
         typer.echo(path)
+    for name in experiments:
+        results = read_results(out, name)
+        chosen = chosen_kind(results, kind, measure)
+        drawing = experiment_drawing(results, chosen, measure, parameters.split(",") if parameters else ())
+        words = [chosen, measure, *(parameters or "").split(",")]
+        stem = "_".join(re.sub(r"[^\w.]+", "-", word) for word in words if word)
+        path = results.folder / "figures" / f"{stem}.{style}" if file is None else file
+        write_files({path: drawing.saved(style)})
+        typer.echo(path)
+
+
+def _format_of(file: Path | None) -> Literal["svg", "png", "pdf"]:
+    suffix = "" if file is None else file.suffix.lower()
+    return "png" if suffix == ".png" else "pdf" if suffix == ".pdf" else "svg"
+
+
+@guarded
+def report(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Experiment (quickstart) or study (additive).")],
+    out: Out = Path("results"),
+    file: Annotated[
+        Path | None,
+        typer.Option("--file", metavar="FILE", help="Where the page goes; OUT/<experiment>/report.html by default."),
+    ] = None,
+) -> None:
+    """Write a page about an experiment or a study, to read, print or send.
+
+    One HTML file that opens anywhere and loads nothing: the question, tables, figures, differences of the estimators on
+    the same data sets, what went wrong and the commands that show it, how all of it was computed, and how to cite it.
+    """
+    from ctid_cli.reporting.pages.experiment_page import experiment_page
+    from ctid_cli.reporting.results import experiments_in, read_results
+    from ctid_cli.studies.catalogue import all_studies
+    from ctid_cli.studies.study_page import study_page
+    from ctid_cli.text import did_you_mean
+
+    known, studies = experiments_in(out), all_studies()
+    if name in known:
+        results = read_results(out, name)
+        page, path = experiment_page(results, out), results.folder / "report.html"
+    elif name in studies:
+        page, path = study_page(studies[name], out), out / f"{studies[name].folder.name}_report.html"
+    else:
+        hint = did_you_mean(name, [*known, *studies]) or "."
+        wrong = f"{name!r} is neither an experiment with results in {out} nor a study{hint}"
+        raise UsageError(f"{wrong} Known: {', '.join([*known, *studies])}")
+    path = path if file is None else file
+    write_files({path: page.encode()})
+    typer.echo(path)

@@ -76,16 +76,17 @@ def status_text(
 
 def _outcomes(estimates: Sequence[Mapping[str, Any]]) -> list[str]:
     """How often each status came, and the first failures."""
-    outcomes = Counter((str(row["status"]), _sentence(row)) for row in estimates).most_common()
+    outcomes = Counter((str(row["status"]), sentence_of(row)) for row in estimates).most_common()
     lines = [f"{n} {name}" + ("" if name in FAILURES else f": {text}") for (name, text), n in outcomes]
     failures = [row for row in estimates if row["status"] in FAILURES]
     for row in failures[:LISTED]:
         place = f"{row['estimator']}, replicate {row['replicate']}, start {row['start']}"
-        lines.append(f"  {row['id']}  {place}: {_sentence(row)}")
+        lines.append(f"  {row['id']}  {place}: {sentence_of(row)}")
     return [*lines, f"  and {len(failures) - LISTED} more"] if len(failures) > LISTED else lines
 
 
-def _sentence(row: Mapping[str, Any]) -> str:
+def sentence_of(row: Mapping[str, Any]) -> str:
+    """How an estimate ended, in a sentence."""
     # A failure's message goes on with the places in the code that it came from.
     return str(row.get("message") or "").split("\n", 1)[0]
 

@@ -119,35 +119,49 @@ def parameter_estimates(results: Results) -> list[ParameterEstimates]:
 
 def least_variances(results: Results) -> dict[Group, dict[str, float]]:
     """Variances that theory gives the estimates of each group at their number of samples, where there is a theory."""
+    covariances = least_covariances(results, results.groups())
+    return {
+        group: dict(zip(names, covariance.diagonal().tolist(), strict=True))
+        for group, (names, covariance) in covariances.items()
+    }
+
+
+def least_covariances(results: Results, groups: Iterable[Group]) -> dict[Group, tuple[tuple[str, ...], Array]]:
+    """Names of parameters and the covariance that theory gives their estimates, for those groups that have a theory."""
     try:
         plan = build_plan(spec_from_canonical(results.settings))
     except CtidError:  # it names code, which is not run to read results, or is of another version
         return {}
-    places = {group: place_of(results, group) for group in results.groups()}
-    known = {place: _variances(plan, *place) for place in set(places.values())}
-    found = {group: variances for group, place in places.items() if (variances := known[place])}
+    places = {group: place_of(results, group) for group in groups}
     truths = [true_values(cell) for cell in results.manifest["data_cells"]]
-    return {group: _under_true_names(variances, truths[places[group][0]]) for group, variances in found.items()}
+    known = {place: _covariance(plan, *place, truths[place[0]]) for place in set(places.values())}
+    return {group: found for group, place in places.items() if (found := known[place])}
 
 
-def _variances(plan: Plan, k: int, j: int) -> dict[str, float]:
-    """Variances of the parameters in one cell by theory; empty where there is none."""
+def _covariance(plan: Plan, k: int, j: int, truth: Iterable[str]) -> tuple[tuple[str, ...], Array] | None:
+    """Names of the parameters in one cell and their covariance by theory; None where there is no theory."""
     source = plan.data_cells[k].source
     if not isinstance(source, SimulatedSource):
-        return {}
+        return None
     try:
         expected = expected_accuracy(source, plan.estimators[j].estimator, plan.terms).parameters
     except DataError:
-        return {}
-    return dict(zip(expected.names, expected.covariance.diagonal().tolist(), strict=True))
+        return None
+    names = _true_names(expected.names, truth)
+    kept = np.flatnonzero([name is not None for name in names])
+    return tuple(name for name in names if name is not None), expected.covariance[np.ix_(kept, kept)]
 
 
-def _under_true_names(variances: dict[str, float], true: Mapping[str, float]) -> dict[str, float]:
-    """The same where the estimated numerator is longer than the true one: coefficients go together by their power."""
-    shift = sum(re.fullmatch(r"b\d+", name) is not None for name in variances)
+def _true_names(estimated: Sequence[str], true: Iterable[str]) -> list[str | None]:
+    """Names that parameters have in the true system, None of those that it lacks.
+
+    Where the estimated numerator is longer than the true one, coefficients go together by their power.
+    """
+    true = list(true)
+    shift = sum(re.fullmatch(r"b\d+", name) is not None for name in estimated)
     shift -= sum(re.fullmatch(r"b\d+", name) is not None for name in true)
-    moved = {name: f"b{int(name[1:]) + shift}" if re.fullmatch(r"b\d+", name) else name for name in true}
-    return {name: variances[source] for name, source in moved.items() if source in variances}
+    moved = (f"b{int(name[1:]) - shift}" if re.fullmatch(r"b\d+", name) else name for name in estimated)
+    return [name if name in true else None for name in moved]
 
 
 def place_of(results: Results, group: Group) -> tuple[int, int]:

@@ -1,5 +1,6 @@
 """What is worth knowing about a run that does not belong among its results: command, host, versions."""
 
+import json
 import os
 import platform
 import sys
@@ -8,7 +9,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from ctid_cli.storage.folder import PROVENANCE
 from ctid_cli.storage.identity import Origin, numeric_platform, package_versions
+
+#: What may be published of a session: nothing that names a machine, a user or a folder.
+PUBLIC = (
+    *("started", "stopped", "computed", "failed", "jobs", "processors"),
+    *("code_version", "numeric_platform", "packages"),
+)
 
 
 def now() -> str:
@@ -32,6 +40,13 @@ def session_info(spec_text: str, spec_folder: Path, origins: Mapping[str, Origin
         "spec_folder": str(spec_folder.resolve()),
         "spec": spec_text,
     }
+
+
+def public_sessions(folder: Path) -> list[dict[str, Any]]:
+    """The sessions that computed an experiment, as far as they may be published."""
+    files = sorted((folder / PROVENANCE).glob("*.json"))
+    read = [json.loads(file.read_text(encoding="utf-8")) for file in files]
+    return [{key: session.get(key) for key in PUBLIC} for session in read]
 
 
 def git_commit(root: Path) -> str | None:

@@ -145,7 +145,21 @@ class StudyFigure:
         return bytes(draw(*(read_results(out, name) for name in self.experiments)))
 
 
-def find_figures(names: Sequence[str]) -> list[StudyFigure]:
+def sorted_names(names: Sequence[str], out: Path) -> tuple[list[str], list[str]]:
+    """Names of experiments with results, and all others: those of figures come first where both have a name."""
+    taken, known = set(_figure_names()), experiments_in(out)
+    own = [name for name in names if name in known and name not in taken]
+    return list(dict.fromkeys(own)), [name for name in names if name not in own]
+
+
+def _figure_names() -> list[str]:
+    """Everything that names published figures."""
+    studies = [study for study in all_studies().values() if study.figures]
+    names = [*find_study(DEFAULT_STUDY).figures]
+    return names + [entry for s in studies for entry in (s.name, *(f"{s.name}/{k}" for k in s.figures))]
+
+
+def find_figures(names: Sequence[str], out: Path | None = None) -> list[StudyFigure]:
     """The figures that were asked for."""
     studies = {name: study for name, study in all_studies().items() if study.figures}
     found: list[StudyFigure] = []
@@ -159,10 +173,11 @@ def find_figures(names: Sequence[str]) -> list[StudyFigure]:
         elif place in studies and number.isdigit():
             raise UsageError(f"{place} has no figure {number}; it has {', '.join(studies[place].figures)}")
         else:
-            known = [*studies[DEFAULT_STUDY].figures]
-            known += [entry for s in studies.values() for entry in (s.name, *(f"{s.name}/{k}" for k in s.figures))]
+            own = [] if out is None else experiments_in(out)
+            known = [*_figure_names(), *own]
             hint = did_you_mean(name, known) or "."
-            raise UsageError(f"{name!r} is neither a figure nor a study with figures{hint} Known: {', '.join(known)}")
+            wrong = f"{name!r} is neither a figure, nor a study with figures, nor an experiment with results"
+            raise UsageError(f"{wrong}{f' in {out}' if out else ''}{hint} Known: {', '.join(known)}")
     return list(dict.fromkeys(found))
 
 

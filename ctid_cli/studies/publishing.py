@@ -11,16 +11,10 @@ from pathlib import Path
 from ctid_cli.errors import RefusedError, UsageError
 from ctid_cli.reporting.layout import csv_text
 from ctid_cli.reporting.study import data_folder
-from ctid_cli.storage.folder import PROVENANCE
 from ctid_cli.storage.identity import present_versions
+from ctid_cli.storage.provenance import public_sessions
 from ctid_cli.studies.catalogue import StudyFigure, StudyFolder, StudyResults, last_part
 from ctid_cli.studies.claim import COLUMNS, Claim, claims_table
-
-#: What is kept of a session: nothing that names a machine, a user or a folder.
-KEPT = (
-    *("started", "stopped", "computed", "failed", "jobs", "processors"),
-    *("code_version", "numeric_platform", "packages"),
-)
 
 
 def published_folder(study: StudyFolder) -> Path:
@@ -103,12 +97,7 @@ def publish(found: StudyResults, claims: Sequence[Claim], target: Path) -> None:
 
 
 def _sessions(found: StudyResults) -> dict[str, list[dict[str, object]]]:
-    sessions = {}
-    for short, results in found.experiments.items():
-        files = sorted((results.folder / PROVENANCE).glob("*.json"))
-        read = [json.loads(file.read_text(encoding="utf-8")) for file in files]
-        sessions[short] = [{key: session[key] for key in KEPT} for session in read]
-    return sessions
+    return {short: public_sessions(results.folder) for short, results in found.experiments.items()}
 
 
 def against_published(claims: Sequence[Claim], folder: Path) -> list[Claim]:

@@ -39,11 +39,11 @@ _STYLE: dict[Any, Any] = {
 #: marker and a line for a grey print.
 LOOKS: tuple[dict[str, Any], ...] = (
     {"color": "#0072b2", "marker": "o", "linestyle": "-"},
-    {"color": "#d55e00", "marker": "s", "linestyle": "--"},
+    {"color": "#d55e00", "marker": "s", "markerfacecolor": "white", "linestyle": "--"},
     {"color": "#000000", "marker": "x", "linestyle": ":"},
-    {"color": "#009e73", "marker": "^", "linestyle": "-."},
-    {"color": "#cc79a7", "marker": "D", "linestyle": (0, (5, 1, 1, 1))},
-    {"color": "#56b4e9", "marker": "v", "linestyle": (0, (3, 1, 1, 1, 1, 1))},
+    {"color": "#009e73", "marker": "^", "markerfacecolor": "white", "linestyle": "-."},
+    {"color": "#cc79a7", "marker": "D", "markerfacecolor": "white", "linestyle": (0, (5, 1, 1, 1))},
+    {"color": "#56b4e9", "marker": "v", "markerfacecolor": "white", "linestyle": (0, (3, 1, 1, 1, 1, 1))},
     {"color": "#e69f00", "marker": "P", "linestyle": (0, (1, 2))},
     {"color": "#6b6b6b", "marker": "*", "linestyle": (0, (6, 3))},
 )
@@ -82,6 +82,32 @@ def _style() -> Any:
     import matplotlib.style
 
     return matplotlib.style.context(["default", _STYLE])
+
+
+def look(k: int) -> dict[str, Any]:
+    """The look of the k-th estimator."""
+    return LOOKS[k % len(LOOKS)]
+
+
+def panels_of(figure: Figure, n: int, columns: int | None = None, **shared: Any) -> list[Any]:
+    """So many panels in rows; where panels share an axis, the lowest of each column still has its numbers."""
+    across = columns or columns_for(n)
+    panels = list(figure.subplots(-(-n // across), across, squeeze=False, **shared).flat)
+    for k, axes in enumerate(panels):
+        axes.set_visible(k < n)
+        if shared.get("sharex"):
+            axes.tick_params(labelbottom=k + across >= n)
+    return panels[:n]
+
+
+def columns_for(n: int) -> int:
+    """How many of n panels stand side by side."""
+    return 2 if n in (2, 4) else min(n, 3)
+
+
+def size_for(n: int, columns: int | None = None) -> tuple[float, float]:
+    """Width and height of a figure with n panels, a title and a legend [inch]."""
+    return (7.5, 1.2 + 2.2 * -(-n // (columns or columns_for(n)))) if n > 1 else (5.5, 4.2)
 
 
 def svg(width: float, height: float, draw: Callable[[Figure], None]) -> bytes:

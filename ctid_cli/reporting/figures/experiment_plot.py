@@ -1,0 +1,74 @@
+"""The figures that the results of any experiment can be drawn as."""
+
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+from ctid_cli.errors import UsageError
+from ctid_cli.reporting.figures.estimate_plot import box_drawing, delays_drawing, errors_drawing
+from ctid_cli.reporting.figures.measure_plot import convergence_drawing, measure_drawing
+from ctid_cli.reporting.figures.style import Drawing
+from ctid_cli.reporting.measures import default_measures
+from ctid_cli.reporting.parameter_errors import estimates_by_group
+from ctid_cli.reporting.results import Results
+from ctid_cli.storage.manifest import true_values
+from ctid_cli.text import did_you_mean
+
+Kind = Literal["measure", "errors", "delays", "box", "convergence"]
+
+
+def kinds_of(results: Results) -> list[Kind]:
+    """The figures that an experiment has, the most telling one first."""
+    if not results.rows:
+        raise UsageError(f"{results.experiment} has no stored estimates yet; run it first")
+    if results.settings.get("data") is not None:
+        one = f"{results.experiment} is about one measured record, so that there is nothing to draw over data sets"
+        raise UsageError(f"{one}; ctid fit draws a fit")
+    kinds: list[Kind] = ["measure"]
+    if any(map(true_values, results.manifest["data_cells"])):
+        names = [one.names for one in estimates_by_group(results)]
+        kinds += ["box"]
+        kinds += ["errors"] if any(len(own) > 1 for own in names) else []
+        kinds += ["delays"] if any("delay" in own for own in names) else []
+    kinds += ["convergence"]
+    alone = len(results.groups()) == 1 and "box" in kinds
+    return sorted(kinds, key=lambda kind: kind != "box") if alone else kinds
+
+
+def main_measure(results: Results) -> str:
+    """What is measured where nothing is said: what the specification asks for, its rule of success, or the errors."""
+    asked = results.settings.get("measures")
+    if not asked and results.settings.get("success"):
+        return "percent"
+    # The last one of bias and root mean square error tells more.
+    return next(reversed(default_measures(results) if not asked else asked[:1]), "cpu")
+
+
+def chosen_kind(results: Results, kind: str | None = None, measure: str | None = None) -> Kind:
+    """The kind of figure that was asked for, or the most telling one."""
+    known = kinds_of(results)
+    if kind is None:
+        return "measure" if measure is not None else known[0]
+    if kind not in get_args(Kind):
+        hint = did_you_mean(kind, get_args(Kind)) or ";"
+        raise UsageError(f"there is no kind of figure {kind!r}{hint} there are {', '.join(get_args(Kind))}")
+    if kind not in known:
+        raise UsageError(f"{results.experiment} has nothing to draw as {kind}; it has {', '.join(known)}")
+    return kind
+
+
+def experiment_drawing(
+    results: Results, kind: str | None = None, measure: str | None = None, parameters: Sequence[str] = ()
+) -> Drawing:
+    """A figure of an experiment."""
+    chosen = chosen_kind(results, kind, measure)
+    if chosen in ("measure", "convergence"):
+        if parameters:
+            one = f"for one parameter: --measure rmse:{parameters[0]}"
+            raise UsageError(f"--parameters goes with --kind errors and box; {one}")
+        draw = measure_drawing if chosen == "measure" else convergence_drawing
+        return draw(results, measure or main_measure(results))
+    if measure is not None:
+        raise UsageError(f"--measure goes with --kind measure and convergence, not {chosen}")
+    if chosen == "delays":
+        return delays_drawing(results)
+    return (errors_drawing if chosen == "errors" else box_drawing)(results, parameters)

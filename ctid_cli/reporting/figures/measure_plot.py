@@ -1,0 +1,239 @@
+"""Drawings of a measure: over what an experiment varies, and over the number of data sets that it is known from.
+
+Over several settings at once it is a nested loop plot: all combinations side by side, the last setting varying fastest,
+with stairs below that say which is which (G. Rücker and G. Schwarzer, Presenting simulation results in a nested loop
+plot, BMC Medical Research Methodology 14 (2014) 129). Bars and bands are 95 % intervals of the Monte Carlo error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import groupby
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ctid_cli.arrays import Array
+from ctid_cli.inference.monte_carlo import MEASURES
+from ctid_cli.reporting.figures.settings import Scale, Settings, part_of, scale_of, settings_in, value_text
+from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, panels_of, size_for
+from ctid_cli.reporting.layout import count
+from ctid_cli.reporting.measures import measure_rows
+from ctid_cli.reporting.percentages import Row
+from ctid_cli.reporting.results import Results
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: What a measure of a good estimator is.
+IDEAL = {"bias": 0.0, "median_bias": 0.0, "coverage": 95.0, "error_ratio": 1.0, "efficiency": 100.0}
+#: Panels at most, and numbers of data sets at which a measure is followed.
+PANELS, STEPS = 12, 12
+#: Heights of a panel of a nested loop plot, and of a flight of its stairs [inch].
+NESTED, FLIGHT = 1.9, 0.42
+#: Fewest data sets that a measure is followed from.
+FEWEST = 10
+#: An axis is logarithmic where positive values span so much.
+SPAN = 8.0
+#: Stretches of the stairs that are labelled.
+LABELLED = 24
+
+
+def measure_drawing(results: Results, measure: str) -> Drawing:
+    """A measure over what an experiment varies, one panel for each parameter."""
+    rows = [row for row in measure_rows(results, [measure]) if row["n"]]
+    settings = settings_in(rows, results)
+    names = list(dict.fromkeys(row["parameter"] for row in rows))[:PANELS]
+    scale, flights = scale_of(settings), len(settings.names) if len(settings.names) > 1 else 0
+
+    def draw(figure: Figure) -> None:
+        if flights:
+            # One below the other, above the stairs that all of them share.
+            heights = [*[NESTED] * len(names), FLIGHT * flights]
+            column = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+            panels = list(column[:-1])
+            _draw_stairs(column[-1], settings)
+            scale.apply(column[-1])
+        else:
+            panels = panels_of(figure, len(names), sharex=True)
+            for axes in panels:
+                scale.apply(axes)
+                axes.set_xlabel(", ".join(settings.titles))
+        for axes, name in zip(panels, names, strict=True):
+            own = [row for row in rows if row["parameter"] == name]
+            _draw_panel(axes, own, settings, scale)
+            _label(axes, own, measure)
+        _legend(figure, rows, settings)
+        figure.suptitle(_title(results, measure, rows))
+
+    return Drawing(*((7.5, 1.2 + NESTED * len(names) + FLIGHT * flights) if flights else size_for(len(names))), draw)
+
+
+def _draw_panel(axes: Axes, rows: Sequence[Row], settings: Settings, scale: Scale) -> None:
+    for k, method in enumerate(settings.methods):
+        own = [row for row in rows if row["method"] == method]
+        found = [settings.row_at(point, own) for point in settings.points]
+        places = np.array(scale.shifted(k, len(settings.methods)))
+        _draw_series(axes, places, found, _breaks(settings), look(k), joined=bool(settings.names))
+
+
+def _breaks(settings: Settings) -> list[int]:
+    """Points at which another setting than the last changes: lines stop there."""
+    return [k for k, point in enumerate(settings.points) if k and point[:-1] != settings.points[k - 1][:-1]]
+
+
+def _draw_series(
+    axes: Axes,
+    places: Array,
+    found: Sequence[Row | None],
+    breaks: Sequence[int],
+    style: Mapping[str, Any],
+    *,
+    joined: bool = True,
+) -> None:
+    """Values with their intervals."""
+    value, low, high = (np.array([_number(row, key) for row in found]) for key in ("value", "low", "high"))
+    # An interval without an end is not known; the value is drawn without a bar.
+    known = np.isfinite(value) & np.isfinite(low) & np.isfinite(high)
+    bars = np.abs(np.array([value - low, high - value]))[:, known]
+    axes.errorbar(places[known], value[known], bars, fmt="none", ecolor=style["color"], elinewidth=0.9, capsize=1.8)
+    axes.plot(places, value, **{**style, "linestyle": "none"}, markersize=4.0)
+    for part in np.split(np.arange(places.size), breaks) if joined else ():
+        axes.plot(places[part], value[part], **{**style, "marker": "none"}, linewidth=0.9)
+
+
+def _number(row: Row | None, key: str) -> float:
+    return np.nan if row is None or row[key] is None else float(row[key])
+
+
+def _label(axes: Axes, rows: Sequence[Row], measure: str) -> None:
+    """Title, unit and vertical scale of a panel."""
+    row, base = rows[0], measure.partition(":")[0]
+    unit = f" [{row['unit']}]" if row["unit"] not in ("", "-") else ""
+    axes.set_ylabel(f"{(measure if row['parameter'] is None else base).replace('_', ' ')}{unit}")
+    if row["parameter"] is not None:
+        axes.set_title(str(row["parameter"]), loc="left")
+    if base in IDEAL:
+        axes.axhline(IDEAL[base], color=DARK, linewidth=0.7, zorder=0.5)
+    values = [row["value"] for row in rows if row["value"] is not None]
+    if row["unit"] == "%" and base in ("percent", "coverage", "failures"):
+        low, high = axes.get_ylim()
+        axes.set_ylim(max(low, -3.0), min(high, 103.0))
+    elif values and base not in ("bias", "median_bias") and min(values) > 0 and max(values) > SPAN * min(values):
+        axes.set_yscale("log")
+
+
+def _draw_stairs(axes: Axes, settings: Settings) -> None:
+    """Which settings each place stands for: one flight for each, higher steps for later values."""
+    for k in range(len(settings.names)):
+        values = [point[k] for point in settings.points]
+        levels = list(dict.fromkeys(values))
+        base = float(len(settings.names) - 1 - k)
+        heights = base + 0.5 * np.array([levels.index(value) for value in values]) / max(len(levels) - 1, 1)
+        axes.step(range(len(values)), heights, where="mid", color="#000000", linewidth=0.9)
+        stretches = [(value, len(list(group))) for value, group in groupby(values)]
+        start = 0
+        for value, length in stretches:
+            if len(stretches) <= LABELLED:
+                middle = start + 0.5 * (length - 1)
+                axes.annotate(
+                    value_text(value),
+                    (middle, heights[start]),
+                    (0, 1.5),
+                    textcoords="offset points",
+                    ha="center",
+                    fontsize=7,
+                )
+            start += length
+    axes.set_yticks([len(settings.names) - 0.75 - k for k in range(len(settings.names))], settings.titles, fontsize=8)
+    axes.set_ylim(-0.15, len(settings.names) - 0.05)
+    axes.tick_params(axis="both", length=0)
+    axes.grid(False)
+    for side in axes.spines.values():
+        side.set_color(LIGHT)
+
+
+def _legend(figure: Figure, rows: Sequence[Row], settings: Settings) -> None:
+    """Estimators, and how many of their estimates have no value."""
+    from matplotlib.lines import Line2D
+
+    handles = [
+        Line2D([], [], **look(k), markersize=4, linewidth=0.9, label=method + _lost(rows, method))
+        for k, method in enumerate(settings.methods)
+    ]
+    longest = max(len(str(handle.get_label())) for handle in handles)
+    columns = max(1, min(len(handles), 90 // (longest + 8)))
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False)
+
+
+def _lost(rows: Sequence[Row], method: str) -> str:
+    """How many estimates of an estimator failed, or have no value of some parameter."""
+    counts: dict[str | None, list[tuple[int, int, int]]] = {}
+    for row in rows:
+        if row["method"] == method:
+            counts.setdefault(row["parameter"], []).append((row["n"], row["failed"], row["without_value"]))
+    runs, failed, without = np.max([np.sum(own, axis=0) for own in counts.values()], axis=0)
+    notes = [f"{failed} of {runs} failed"] if failed else []
+    notes += [f"{without} without a value"] if without > failed else []
+    return f" ({', '.join(notes)})" if notes else ""
+
+
+def _title(results: Results, measure: str, rows: Sequence[Row]) -> str:
+    runs = [row["n"] for row in rows]
+    sets = count(max(runs), "data set") if min(runs) == max(runs) else f"{min(runs)} to {max(runs)} data sets"
+    return f"{results.experiment}: {MEASURES[measure.partition(':')[0]].meaning}\n{sets} a point, 95 % intervals"
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Convergence
+
+
+def convergence_drawing(results: Results, measure: str) -> Drawing:
+    """A measure over the number of data sets that it is computed from: one panel for each combination of settings."""
+    by_size = {n: [row for row in measure_rows(_first(results, n), [measure]) if row["n"]] for n in _sizes(results)}
+    last = list(by_size.values())[-1]
+    settings = settings_in(last, results)
+    names = list(dict.fromkeys(row["parameter"] for row in last))
+    # One parameter; the delay is what most experiments are about.
+    name = "delay" if "delay" in names else names[0]
+    points = settings.points[:PANELS]
+
+    def draw(figure: Figure) -> None:
+        for axes, point in zip(panels_of(figure, len(points), sharex=True, sharey=True), points, strict=True):
+            for k, method in enumerate(settings.methods):
+                found = [
+                    settings.row_at(point, [r for r in rows if (r["method"], r["parameter"]) == (method, name)])
+                    for rows in by_size.values()
+                ]
+                _draw_band(axes, np.array([*by_size], dtype=float), found, look(k))
+            _label(axes, [row for row in last if row["parameter"] == name], measure)
+            Scale([float(n) for n in (min(by_size), max(by_size))], True, None).apply(axes)
+            axes.set_title(settings.words(point) or (name or ""), loc="left", fontsize=8)
+            axes.set_xlabel("data sets")
+        _legend(figure, last, settings)
+        what = MEASURES[measure.partition(":")[0]].meaning + (f" of {name}" if name else "")
+        figure.suptitle(
+            f"{results.experiment}: {what}\nfrom the first data sets{part_of(points, settings.points)}, 95 % bands"
+        )
+
+    return Drawing(*size_for(len(points)), draw)
+
+
+def _draw_band(axes: Axes, sizes: Array, found: Sequence[Row | None], style: Mapping[str, Any]) -> None:
+    value, low, high = (np.array([_number(row, key) for row in found]) for key in ("value", "low", "high"))
+    axes.fill_between(sizes, low, high, color=style["color"], alpha=0.15, linewidth=0)
+    axes.plot(sizes, value, **style, markersize=3, linewidth=0.9)
+
+
+def _sizes(results: Results) -> list[int]:
+    """Numbers of data sets at which a measure is followed, evenly spaced on a logarithmic axis."""
+    runs = max(cell["replicates"] for cell in results.manifest["data_cells"])
+    return [int(n) for n in np.unique(np.geomspace(min(FEWEST, runs), runs, STEPS).round().astype(int))]
+
+
+def _first(results: Results, n: int) -> Results:
+    """The results of the first data sets of every cell."""
+    kept = {key: value for key, value in results.stored.results.items() if key.replicate < n}
+    return replace(results, stored=replace(results.stored, results=kept))

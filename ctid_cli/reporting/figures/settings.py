@@ -1,0 +1,151 @@
+"""Where the points of a figure lie: the settings that an experiment varies, and the words for them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ctid_cli.kinds import KINDS, resolve
+from ctid_cli.reporting.layout import delay_label, number
+from ctid_cli.reporting.percentages import Row, settings_of
+from ctid_cli.reporting.results import Results
+from ctid_cli.specification.option_docs import option_docs
+from ctid_cli.specification.system_sections import AdditiveSystemSection
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: Values of the settings that vary, in the order of their names.
+Point = tuple[Any, ...]
+
+
+class Settings(NamedTuple):
+    """What varies from group to group of the estimates of an experiment."""
+
+    #: Keys of rows, the last one varying fastest.
+    names: tuple[str, ...]
+    #: Their titles with units.
+    titles: tuple[str, ...]
+    points: list[Point]
+    methods: list[str]
+
+    def row_at(self, point: Point, rows: Sequence[Row]) -> Row | None:
+        """The row of a point; one that does not have a setting, such as an initial delay, is the same at all of its."""
+        at = list(zip(self.names, point, strict=True))
+        return next((row for row in rows if all(row[name] in (None, value) for name, value in at)), None)
+
+    def words(self, point: Point) -> str:
+        """A point as the title of a panel."""
+        titles = (title.partition(" [") for title in self.titles)
+        named = zip(titles, map(value_text, point), strict=True)
+        return ", ".join(f"{title} {text} {unit.rstrip(']')}".strip() for (title, _, unit), text in named)
+
+
+def settings_in(rows: Sequence[Row], results: Results) -> Settings:
+    """What varies in the rows of an experiment."""
+    values = {name: _ordered(row[name] for row in rows) for name in [*settings_of(rows), "initial_delay"]}
+    varied = {name: found for name, found in values.items() if len(found) > 1}
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    titles = tuple(title_of(name, results.settings) for name in varied)
+    every = Settings(tuple(varied), titles, list(itertools.product(*varied.values())), methods)
+    # Estimators of one name may differ in options that only some of them have: not every combination is planned.
+    return every._replace(points=[point for point in every.points if every.row_at(point, rows) is not None])
+
+
+def part_of(shown: Sequence[Any], found: Sequence[Any]) -> str:
+    """That there is more than what is shown."""
+    return f", the first {len(shown)} of {len(found)} settings" if len(shown) < len(found) else ""
+
+
+def _ordered(values: Any) -> list[Any]:
+    """Values without repetition, numbers by size and before words."""
+    found = [value for value in dict.fromkeys(map(_hashable, values)) if value is not None]
+    return sorted(found, key=lambda value: (0, value) if _is_number(value) else (1, 0.0))
+
+
+def _hashable(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def value_text(value: Any) -> str:
+    """A value of a setting."""
+    return number(value)
+
+
+def documentation(section: str, content: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
+    """What a section of a specification is, and the text about each of its keys; nothing of what is not our own."""
+    if section == "system":
+        target: type | None = AdditiveSystemSection
+    else:
+        kind = content.get("kind")
+        target = resolve(section, kind) if kind in KINDS.get(section, {}) else None
+    if target is None:
+        return "", {}
+    return (target.__doc__ or "").strip().splitlines()[0].replace("``", ""), option_docs(target)
+
+
+def unit_in(text: str) -> str:
+    """The unit that the text about an option names; empty where it names none."""
+    unit = re.search(r"\[([^],…]+)\]", text)
+    return unit[1] if unit and unit[1] != "-" else ""
+
+
+def title_of(name: str, settings: Mapping[str, Any]) -> str:
+    """The name of a swept setting with its unit."""
+    if name == "initial_delay":
+        return "initial delay [s]"
+    key = name.rpartition(".")[2]
+    sections = [(section, item) for section, item in settings.items() if isinstance(item, Mapping)]
+    sections += [("estimator", item) for item in settings["estimators"].values()]
+    for section, content in sections:
+        if key in content and (unit := unit_in(documentation(section, content)[1].get(key, ""))):
+            return f"{'SNR' if name == 'snr_db' else name.replace('_', ' ')} [{unit}]"
+    return name.replace("_", " ")
+
+
+class Scale(NamedTuple):
+    """Where the points of a figure stand along its horizontal axis."""
+
+    places: list[float]
+    logarithmic: bool
+    #: Labels of the places; none where the places are the values themselves.
+    labels: list[str] | None
+
+    def shifted(self, k: int, n: int) -> list[float]:
+        """Places of the k-th of n series, side by side."""
+        moved = [math.log(place) if self.logarithmic else place for place in self.places]
+        gaps = [abs(b - a) for a, b in itertools.pairwise(moved) if a != b]
+        shift = 0.08 * min(gaps, default=1.0) * (k - 0.5 * (n - 1))
+        return [math.exp(place + shift) if self.logarithmic else place + shift for place in moved]
+
+    def apply(self, axes: Axes) -> None:
+        """Give a panel this axis."""
+        if self.logarithmic:
+            from matplotlib.ticker import NullFormatter, NullLocator
+
+            axes.set_xscale("log")
+            axes.set_xticks(self.places, [number(place, 3) for place in self.places])
+            axes.xaxis.set_minor_locator(NullLocator())
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        elif self.labels is not None:
+            axes.set_xticks(self.places, self.labels)
+            axes.set_xlim(min(self.places) - 0.6, max(self.places) + 0.6)
+
+
+def scale_of(settings: Settings) -> Scale:
+    """Numbers of a single setting where they are, by their logarithms if they span decades; all else side by side."""
+    if len(settings.names) == 1 and all(_is_number(value) for (value,) in settings.points):
+        places = [float(value) for (value,) in settings.points]
+        return Scale(places, places[0] > 0 and places[-1] >= 16 * places[0], None)
+    if len(settings.names) == 1:
+        labels = [delay_label(v) if settings.names[0] == "initial_delay" else value_text(v) for (v,) in settings.points]
+    else:
+        labels = [""] * len(settings.points)
+    return Scale([float(k) for k in range(len(settings.points))], False, labels)

@@ -1,0 +1,66 @@
+"""How a page is put together: a template filled with reports and figures, with every text of others escaped."""
+
+import re
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ctid_cli.reporting.layout import Report, Table
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+    from markupsafe import Markup
+
+#: Rows of a table that a page shows; the tables of ``ctid table`` have all of them.
+ROWS = 200
+
+
+def written(template: str, **content: Any) -> str:
+    """A page from one of the templates, each of which extends ``base.html``."""
+    return _environment().get_template(template).render(content)
+
+
+@cache
+def _environment() -> "Environment":
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    folder = FileSystemLoader(Path(__file__).parent / "templates")
+    environment = Environment(
+        loader=folder, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.tests["table"] = lambda item: isinstance(item, Table)
+    environment.globals["row_limit"] = ROWS
+    return environment
+
+
+def inline(svg: bytes, name: str) -> "Markup":
+    """A drawing as part of a page; its names get a prefix, since those of all drawings are the same."""
+    from markupsafe import Markup
+
+    text = svg.decode("utf-8")
+    drawn = text[text.index("<svg") :]
+    drawn = re.sub(r'\bid="', f'id="{name}-', drawn)
+    drawn = re.sub(r'href="#', f'href="#{name}-', drawn).replace("url(#", f"url(#{name}-")
+    # The drawing's own description holds nothing but addresses of vocabularies.
+    drawn = re.sub(r"<metadata>.*?</metadata>", "", drawn, flags=re.DOTALL)
+    return Markup(drawn.replace("<svg ", '<svg role="img" ', 1))
+
+
+def report_of(markdown: str) -> Report:
+    """Markdown as the house writes it: headings, paragraphs and tables."""
+    blocks: list[list[str | Table]] = []
+    for part in re.split(r"\n\s*\n", markdown.strip()):
+        lines = part.splitlines()
+        if lines[0].startswith("|") and len(lines) > 1:
+            header, rule, *rows = ([cell.strip() for cell in _cells(line)] for line in lines)
+            blocks.append([Table(header, rows, "".join("r" if cell.endswith("-:") else "l" for cell in rule))])
+        elif lines[0].startswith("#"):
+            blocks.append(["### " + lines[0].lstrip("# ")])
+            blocks += [[" ".join(lines[1:])]] if lines[1:] else []
+        else:
+            blocks.append([" ".join(lines)])
+    return Report(blocks)
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line.strip())[1:-1]]
