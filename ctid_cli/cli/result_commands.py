@@ -187,8 +187,11 @@ def figure(
     convergence, the measure from the first data sets only. All with their 95 % intervals. Without --kind: the one that
     tells most. It goes to OUT/<experiment>/figures, and its path is printed.
 
-    Of a study, as published, SVG: most are computed from the study's specifications and need no results. Each goes to
-    OUT/<study>_figures/figure_<number>.svg. Without a name: all figures of the useful-redundancy study.
+    Of a study, as SVG: most are computed from the study's specifications and need no results: all of useful-redundancy,
+    additive/2 and additive/6. The others of additive are drawn from results in OUT; where these are missing, the answer
+    says what to run first. Each goes to OUT/<study>_figures/figure_<number>.svg.
+
+    Without a name: all figures of the useful-redundancy study.
     """
     from ctid_cli.reporting.figures.experiment_plot import chosen_kind, experiment_drawing
     from ctid_cli.reporting.results import read_results

@@ -85,7 +85,9 @@ def bootstrap_difference(statistic: Callable[[Array], Array], first: Array, seco
 
     value = float(difference(np.arange(n)))
     drawn = np.concatenate([difference(rng.integers(n, size=(BLOCK, n))) for _ in range(DRAWS // BLOCK)])
-    without = np.array([float(difference(np.delete(np.arange(n), k))) for k in _left_out(n)])
+    left_out = _left_out(n)[:, None]
+    parts = (left_out[k : k + BLOCK] for k in range(0, len(left_out), BLOCK))
+    without = np.concatenate([difference(np.arange(n - 1) + (np.arange(n - 1) >= part)) for part in parts])
     spread = without.mean() - without
     scale = float(np.sum(spread**2)) ** 1.5
     acceleration = float(np.sum(spread**3)) / (6 * scale) if scale else 0.0

@@ -21,7 +21,7 @@ import operator
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import lru_cache, reduce
 from types import SimpleNamespace
 from typing import Any
 
@@ -175,6 +175,7 @@ def place_of(results: Results, group: Group) -> tuple[int, int]:
     return cells.index(group.cell), parts.index((group.estimator, group.options))
 
 
+@lru_cache(maxsize=2)
 def estimates_by_group(results: Results) -> list[ParameterEstimates]:
     """Estimates of the parameters of simulated systems, by estimator, data cell and start."""
     groups = results.groups()

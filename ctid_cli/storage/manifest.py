@@ -8,6 +8,7 @@ a row of the table of estimates holds.
 import hashlib
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -135,6 +136,13 @@ def true_values(cell: Mapping[str, Any]) -> dict[str, float]:
     return values | {"delay": float(system.get("delay") or 0.0)}
 
 
+@cache
+def _coefficients(names: tuple[str, ...]) -> tuple[int, int]:
+    """How many of these names are coefficients of a denominator, and of a numerator."""
+    poles, zeros = (sum(re.fullmatch(rf"{letter}\d+", name) is not None for name in names) for letter in "ab")
+    return poles, zeros
+
+
 def found_values(
     row: Mapping[str, Any], names: Iterable[str]
 ) -> tuple[dict[str, float | None], dict[str, float | None]]:
@@ -143,14 +151,14 @@ def found_values(
     Coefficients go together by their power of s: of a model with more zeros than the system, ``b1`` may be what is
     ``b0`` in truth. Those of a model with another number of poles have nothing to be compared with.
     """
-    wanted, errors = list(names), dict(row.get("standard_errors") or {})
+    wanted, errors = tuple(names), dict(row.get("standard_errors") or {})
     values = dict(row.get("parameters") or {}) | {"delay": row.get("delay")}
     b, a = row.get("numerator"), row.get("denominator")
-    poles, zeros = (sum(re.fullmatch(rf"{letter}\d+", name) is not None for name in wanted) for letter in "ab")
+    poles, zeros = _coefficients(wanted)
     if a is not None and b is not None and poles == len(a) - 1 > 0:
         values |= {f"a{k}": value for k, value in enumerate(a[1:], start=1)}
         # A leading zero is dropped by the model; names keep their powers.
-        own = max(len(b), sum(re.fullmatch(r"b\d+", name) is not None for name in errors))
+        own = max(len(b), _coefficients(tuple(errors))[1])
         padded = dict(enumerate(b, start=own - len(b)))
         shift = own - zeros
         values |= {f"b{k}": padded.get(k + shift, 0.0) for k in range(zeros)}

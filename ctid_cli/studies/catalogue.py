@@ -176,8 +176,9 @@ def find_figures(names: Sequence[str], out: Path | None = None) -> list[StudyFig
             own = [] if out is None else experiments_in(out)
             known = [*_figure_names(), *own]
             hint = did_you_mean(name, known) or "."
-            wrong = f"{name!r} is neither a figure, nor a study with figures, nor an experiment with results"
-            raise UsageError(f"{wrong}{f' in {out}' if out else ''}{hint} Known: {', '.join(known)}")
+            wrong = f"{name!r} is neither a figure nor a study with figures"
+            wrong += f", nor an experiment with results in {out}" if out else ""
+            raise UsageError(f"{wrong}{hint} Known: {', '.join(known)}")
     return list(dict.fromkeys(found))
 
 

@@ -13,7 +13,7 @@ from ctid_cli.errors import CtidError, UsageError
 from ctid_cli.inference.monte_carlo import NORMAL_MAD, quantile, share
 from ctid_cli.reporting.figures.measure_plot import PANELS
 from ctid_cli.reporting.figures.settings import Scale, Settings, part_of, settings_in, value_text
-from ctid_cli.reporting.figures.style import DARK, MARK, MIDDLE, Drawing, columns_for, look, panels_of, size_for
+from ctid_cli.reporting.figures.style import DARK, MARK, MIDDLE, Drawing, columns_for, look, panels_of, plain, size_for
 from ctid_cli.reporting.measures import parameter_unit
 from ctid_cli.reporting.parameter_errors import ParameterEstimates, estimates_by_group, least_covariances
 from ctid_cli.reporting.percentages import Row, labelled_groups
@@ -62,7 +62,7 @@ def _errors(estimates: ParameterEstimates, name: str) -> Array:
 
 def _labelled(name: str, rows: Sequence[Row], what: str = "error of ") -> str:
     unit = next((parameter_unit(name, row["value"].names) for row in rows if name in row["value"].names), "-")
-    return f"{what}{name}" + ("" if unit == "-" else f" [{unit}]")
+    return f"{what}{plain(name)}" + ("" if unit == "-" else f" [{unit}]")
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -90,10 +90,8 @@ def errors_drawing(results: Results, asked: Sequence[str] = ()) -> Drawing:
             axes.set_ylabel(_labelled(pair[1], rows))
         _legend(figure, settings, bool(theory))
         runs = max(row["value"].runs for row in rows)
-        part = f", {size} of {runs} data sets each" if size < runs else ""
-        figure.suptitle(
-            f"{results.experiment}: errors of {pair[0]} and {pair[1]}{part_of(points, settings.points)}{part}"
-        )
+        part = part_of(points, settings.points) + (f", {size} of {runs} data sets each" if size < runs else "")
+        figure.suptitle(f"{results.experiment}: errors of {plain(pair[0])} and {plain(pair[1])}{part}")
 
     return Drawing(*size_for(len(points)), draw)
 
@@ -108,7 +106,8 @@ def _theory(results: Results, shown: Sequence[ParameterEstimates]) -> dict[Any, 
     """Names and covariance of the parameters of each group; of none where the specification cannot be built again."""
     try:
         return least_covariances(results, [one.group for one in shown])
-    except CtidError:
+    except (CtidError, ValueError):
+        # Results of an older version, or of components whose code is not here.
         return {}
 
 

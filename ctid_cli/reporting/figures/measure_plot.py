@@ -8,7 +8,6 @@ plot, BMC Medical Research Methodology 14 (2014) 129). Bars and bands are 95 % i
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.inference.monte_carlo import MEASURES
 from ctid_cli.reporting.figures.settings import Scale, Settings, part_of, scale_of, settings_in, value_text
-from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, panels_of, size_for
+from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, panels_of, plain, size_for
 from ctid_cli.reporting.layout import count
 from ctid_cli.reporting.measures import measure_rows
 from ctid_cli.reporting.percentages import Row
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
 #: What a measure of a good estimator is.
 IDEAL = {"bias": 0.0, "median_bias": 0.0, "coverage": 95.0, "error_ratio": 1.0, "efficiency": 100.0}
 #: Panels at most, and numbers of data sets at which a measure is followed.
-PANELS, STEPS = 12, 12
+PANELS, STEPS = 12, 8
 #: Heights of a panel of a nested loop plot, and of a flight of its stairs [inch].
 NESTED, FLIGHT = 1.9, 0.42
 #: Fewest data sets that a measure is followed from.
@@ -114,7 +113,7 @@ def _label(axes: Axes, rows: Sequence[Row], measure: str) -> None:
     unit = f" [{row['unit']}]" if row["unit"] not in ("", "-") else ""
     axes.set_ylabel(f"{(measure if row['parameter'] is None else base).replace('_', ' ')}{unit}")
     if row["parameter"] is not None:
-        axes.set_title(str(row["parameter"]), loc="left")
+        axes.set_title(plain(str(row["parameter"])), loc="left")
     if base in IDEAL:
         axes.axhline(IDEAL[base], color=DARK, linewidth=0.7, zorder=0.5)
     values = [row["value"] for row in rows if row["value"] is not None]
@@ -192,7 +191,7 @@ def _title(results: Results, measure: str, rows: Sequence[Row]) -> str:
 
 def convergence_drawing(results: Results, measure: str) -> Drawing:
     """A measure over the number of data sets that it is computed from: one panel for each combination of settings."""
-    by_size = {n: [row for row in measure_rows(_first(results, n), [measure]) if row["n"]] for n in _sizes(results)}
+    by_size = {n: [row for row in measure_rows(results.first(n), [measure]) if row["n"]] for n in _sizes(results)}
     last = list(by_size.values())[-1]
     settings = settings_in(last, results)
     names = list(dict.fromkeys(row["parameter"] for row in last))
@@ -201,19 +200,21 @@ def convergence_drawing(results: Results, measure: str) -> Drawing:
     points = settings.points[:PANELS]
 
     def draw(figure: Figure) -> None:
-        for axes, point in zip(panels_of(figure, len(points), sharex=True, sharey=True), points, strict=True):
+        panels = panels_of(figure, len(points), sharex=True, sharey=True)
+        for axes, point in zip(panels, points, strict=True):
             for k, method in enumerate(settings.methods):
                 found = [
                     settings.row_at(point, [r for r in rows if (r["method"], r["parameter"]) == (method, name)])
                     for rows in by_size.values()
                 ]
                 _draw_band(axes, np.array([*by_size], dtype=float), found, look(k))
+        for axes, point in zip(panels, points, strict=True):
             _label(axes, [row for row in last if row["parameter"] == name], measure)
             Scale([float(n) for n in (min(by_size), max(by_size))], True, None).apply(axes)
-            axes.set_title(settings.words(point) or (name or ""), loc="left", fontsize=8)
+            axes.set_title(settings.words(point) or plain(name or ""), loc="left", fontsize=8)
             axes.set_xlabel("data sets")
         _legend(figure, last, settings)
-        what = MEASURES[measure.partition(":")[0]].meaning + (f" of {name}" if name else "")
+        what = MEASURES[measure.partition(":")[0]].meaning + (f" of {plain(name)}" if name else "")
         figure.suptitle(
             f"{results.experiment}: {what}\nfrom the first data sets{part_of(points, settings.points)}, 95 % bands"
         )
@@ -231,9 +232,3 @@ def _sizes(results: Results) -> list[int]:
     """Numbers of data sets at which a measure is followed, evenly spaced on a logarithmic axis."""
     runs = max(cell["replicates"] for cell in results.manifest["data_cells"])
     return [int(n) for n in np.unique(np.geomspace(min(FEWEST, runs), runs, STEPS).round().astype(int))]
-
-
-def _first(results: Results, n: int) -> Results:
-    """The results of the first data sets of every cell."""
-    kept = {key: value for key, value in results.stored.results.items() if key.replicate < n}
-    return replace(results, stored=replace(results.stored, results=kept))

@@ -9,15 +9,20 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ctid_cli.kinds import KINDS, resolve
+from ctid_cli.reporting.figures.style import plain
 from ctid_cli.reporting.layout import delay_label, number
 from ctid_cli.reporting.percentages import Row, settings_of
 from ctid_cli.reporting.results import Results
+from ctid_cli.signals.recorder import Recorder
+from ctid_cli.specification.loop_section import LoopSection
 from ctid_cli.specification.option_docs import option_docs
-from ctid_cli.specification.system_sections import AdditiveSystemSection
+from ctid_cli.specification.start_sections import StartsSection
+from ctid_cli.specification.system_sections import AdditiveSystemSection, SystemSection
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+_SECTIONS = {"system": SystemSection, "starts": StartsSection, "loop": LoopSection, "recorder": Recorder}
 #: Values of the settings that vary, in the order of their names.
 Point = tuple[Any, ...]
 
@@ -76,16 +81,16 @@ def _is_number(value: Any) -> bool:
 
 def value_text(value: Any) -> str:
     """A value of a setting."""
-    return number(value)
+    return plain(number(value))
 
 
 def documentation(section: str, content: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
     """What a section of a specification is, and the text about each of its keys; nothing of what is not our own."""
-    if section == "system":
-        target: type | None = AdditiveSystemSection
+    kind = content.get("kind")
+    if kind in KINDS.get(section, {}):
+        target: type | None = resolve(section, kind)
     else:
-        kind = content.get("kind")
-        target = resolve(section, kind) if kind in KINDS.get(section, {}) else None
+        target = AdditiveSystemSection if "additive" in content else _SECTIONS.get(section) if kind is None else None
     if target is None:
         return "", {}
     return (target.__doc__ or "").strip().splitlines()[0].replace("``", ""), option_docs(target)

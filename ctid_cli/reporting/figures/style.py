@@ -84,6 +84,11 @@ def _style() -> Any:
     return matplotlib.style.context(["default", _STYLE])
 
 
+def plain(text: str) -> str:
+    """A text of others, in which nothing is a formula."""
+    return text.replace("$", r"\$")
+
+
 def look(k: int) -> dict[str, Any]:
     """The look of the k-th estimator."""
     return LOOKS[k % len(LOOKS)]

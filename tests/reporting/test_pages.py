@@ -1,0 +1,129 @@
+"""Pages: well-formed, complete in themselves, and safe whatever messages and files hold."""
+
+import re
+from collections import Counter
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from ctid_cli.reporting.layout import Report, Table
+from ctid_cli.reporting.pages.experiment_page import experiment_page
+from ctid_cli.reporting.pages.page import ROWS, inline, report_of
+from ctid_cli.reporting.pages.question import equation, polynomial
+from ctid_cli.storage.folder import SPEC
+
+HOSTILE = "<script>alert(1)</script> & \"quotes\" 'too' --> {{ 7 * 7 }} {% include 'x' %}"
+VOID = {"meta", "link", "br", "img", "input", "hr"}
+
+
+class Page(HTMLParser):
+    """What a page holds; refuses tags that are not closed in order."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.tags, self.attributes, self.text = [], Counter(), [], ""
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags[tag] += 1
+        self.attributes += attrs
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags[tag] += 1
+        self.attributes += attrs
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.fixture
+def results(make_results, estimate, add_estimator, tmp_path):
+    right = [estimate(delay) for delay in (8.1, 7.9, 8.05, 8.02)]
+    failed = [*right[:3], estimate(None, status="FAILED", message=HOSTILE)]
+    found = make_results({(5.0, "0.0"): failed, (15.0, "0.0"): right})
+    (tmp_path / SPEC).write_text(f"# {HOSTILE}\nexperiment: hostile\n", encoding="utf-8")
+    add_estimator(found, "startless", {(snr, None): right for snr in (5.0, 15.0)})
+    return found
+
+
+@pytest.fixture
+def page(results):
+    return Page(experiment_page(results, Path("results")))
+
+
+def test_a_page_says_all_that_it_should(page, results):
+    titles = ["Question", "Tables", "Figures", "What went wrong", "Provenance", "How to cite"]
+    assert all(title in page.text for title in titles)
+    assert page.tags["svg"] == 5
+    assert "2 estimators on 8 data sets in 2 settings: 16 estimates, 1 of them failed." in page.text
+    assert "percent of the data sets whose delay estimate lies within 1 % of the true delay" in page.text
+    failed = next(row["id"] for row in results.rows if row["status"] == "FAILED")
+    assert f"ctid show {failed}" in page.text
+    assert "Huong Ha" not in page.text  # nobody's method but td_srivc's
+    assert "doi:10.1016/j.jprocont.2014.10.003" in page.text
+
+
+def test_a_page_needs_nothing_but_itself(page):
+    assert page.tags["script"] == page.tags["link"] == page.tags["img"] == page.tags["iframe"] == 0
+    places = [value for name, value in page.attributes if name in ("href", "xlink:href", "src", "action")]
+    assert places
+    assert all(value.startswith("#") for value in places)
+    names = Counter(value for name, value in page.attributes if name == "id")
+    assert max(names.values()) == 1
+    assert {value[1:] for value in places} <= names.keys()
+
+
+def test_text_of_others_stays_text(page, results):
+    assert page.text.count("<script>alert(1)</script>") == 2  # the reason of a failure, and the specification
+    assert "{{ 7 * 7 }}" in page.text
+    assert not [name for name, _ in page.attributes if name.startswith("on")]
+
+
+def test_long_tables_are_cut_and_say_so(results, monkeypatch):
+    from ctid_cli.reporting.pages import experiment_page as module
+
+    table = Table(["a"], [[str(k)] for k in range(ROWS + 5)], "r")
+    monkeypatch.setattr(module, "_tables", lambda results: [Report([[table]])])
+    monkeypatch.setattr(module, "_figures", lambda results: [])
+    text = Page(experiment_page(results, Path("results"))).text
+    assert f"The first {ROWS} of {ROWS + 5} rows" in text
+    assert f"{ROWS - 1}" in text
+
+
+def test_drawings_do_not_share_names():
+    inside = '<metadata>a</metadata><path id="a"/><use xlink:href="#a" s="url(#a)"/>'
+    drawing = f'<?xml version="1.0"?>\n<svg x="1">{inside}</svg>'.encode()
+    assert inline(drawing, "f") == (
+        '<svg role="img" x="1"><path id="f-a"/><use xlink:href="#f-a" s="url(#f-a)"/></svg>'
+    )
+
+
+def test_equations_are_read_from_the_specification():
+    assert polynomial([0.25, -1, 0, 1]) == [("", "0.25", 3), ("−", "", 2), ("+", "1", 0)]
+    assert polynomial([0.0]) == [("", "0", 0)]
+    (one,), delayed = equation({"system": {"numerator": [2], "denominator": [1, 1], "delay": [0.0, 1.0]}})
+    assert (one.numerator, one.denominator, delayed) == ([("", "2", 0)], [("", "", 1), ("+", "1", 0)], True)
+    two, delayed = equation({"system": {"additive": [{"numerator": [1], "denominator": [1, 2], "integrators": 1}] * 2}})
+    assert ([part.integrators for part in two], delayed) == ([1, 1], False)
+    assert equation({"system": {"kind": "own.py:Tank", "truth": {"k": 1.0}}}) is None
+
+
+def test_markdown_of_the_house_is_read_back():
+    report = Report([["### Title"], ["Some words."], [Table(["a | b", "n"], [["x", "1"], ["y", "2"]], "lr")]])
+    again = report_of(report.draw("md"))
+    assert again.blocks == report.blocks
+
+
+def test_styles_are_those_of_print_and_phones():
+    css = re.sub(r"\s+", " ", (Path(experiment_page.__code__.co_filename).parent / "templates/style.css").read_text())
+    assert "@media print" in css
+    assert "overflow-x: auto" in css
+    assert "http" not in css
