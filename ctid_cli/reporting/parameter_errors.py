@@ -130,7 +130,7 @@ def least_covariances(results: Results, groups: Iterable[Group]) -> dict[Group, 
     """Names of parameters and the covariance that theory gives their estimates, for those groups that have a theory."""
     try:
         plan = build_plan(spec_from_canonical(results.settings))
-    except CtidError:  # it names code, which is not run to read results, or is of another version
+    except (CtidError, ValueError):  # it names code, which is not run to read results, or is of another version
         return {}
     places = {group: place_of(results, group) for group in groups}
     truths = [true_values(cell) for cell in results.manifest["data_cells"]]

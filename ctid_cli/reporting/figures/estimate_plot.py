@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.errors import CtidError, UsageError
+from ctid_cli.errors import UsageError
 from ctid_cli.inference.monte_carlo import NORMAL_MAD, quantile, share
 from ctid_cli.reporting.figures.measure_plot import PANELS
 from ctid_cli.reporting.figures.settings import Scale, Settings, part_of, settings_in, value_text
@@ -79,7 +79,7 @@ def errors_drawing(results: Results, asked: Sequence[str] = ()) -> Drawing:
     settings = settings_in(rows, results)
     points = settings.points[:PANELS]
     shown = [list(_at(settings, point, rows)) for point in points]
-    theory = _theory(results, [row["value"] for found in shown for row in found if row])
+    theory = least_covariances(results, [row["value"].group for found in shown for row in found if row])
     size = min(CLOUD, ALL_CLOUDS // max(1, len(points) * len(settings.methods)))
 
     def draw(figure: Figure) -> None:
@@ -100,15 +100,6 @@ def _at(settings: Settings, point: Any, rows: Sequence[Row]) -> Iterator[Row | N
     """The row of every estimator at a point."""
     for method in settings.methods:
         yield settings.row_at(point, [row for row in rows if row["method"] == method])
-
-
-def _theory(results: Results, shown: Sequence[ParameterEstimates]) -> dict[Any, tuple[tuple[str, ...], Array]]:
-    """Names and covariance of the parameters of each group; of none where the specification cannot be built again."""
-    try:
-        return least_covariances(results, [one.group for one in shown])
-    except (CtidError, ValueError):
-        # Results of an older version, or of components whose code is not here.
-        return {}
 
 
 def _draw_clouds(

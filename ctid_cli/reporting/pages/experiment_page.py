@@ -17,6 +17,7 @@ from ctid_cli.reporting.pages.page import inline, written
 from ctid_cli.reporting.pages.question import equation, estimators, parts, references
 from ctid_cli.reporting.paired_table import compare_estimators
 from ctid_cli.reporting.results import Results, out_option
+from ctid_cli.reporting.surprises import surprises
 from ctid_cli.reporting.table_blocks import success_sentence
 from ctid_cli.reporting.tables import experiment_report, notes_of
 from ctid_cli.storage.folder import SPEC
@@ -43,6 +44,7 @@ def experiment_page(results: Results, out: Path) -> str:
     """The page as HTML."""
     settings, rows = results.settings, results.rows
     sessions = public_sessions(results.folder)
+    sizes = [cell["replicates"] for cell in results.manifest["data_cells"]]
     return written(
         "experiment.html",
         title=results.experiment,
@@ -52,7 +54,7 @@ def experiment_page(results: Results, out: Path) -> str:
         equation=equation(settings),
         parts=list(parts(settings)),
         estimators=list(estimators(settings)),
-        runs=results.manifest["runs"],
+        runs=" to ".join(map(str, dict.fromkeys((min(sizes), max(sizes))))),
         seed=results.manifest["seed"],
         success=success_sentence(settings) if settings.get("success") else "",
         reports=_tables(results),
@@ -60,7 +62,7 @@ def experiment_page(results: Results, out: Path) -> str:
         comparisons=list(_comparisons(results, out)),
         outcomes=_outcomes(rows, out),
         notes=notes_of(results, out),
-        surprises=[],
+        surprises=surprises(results),
         spec_hash=results.manifest["spec_hash"],
         origins=results.stored.origins,
         sessions=sessions,

@@ -73,7 +73,7 @@ def _part(title: str, section: str, content: Mapping[str, Any]) -> Part:
     options = [
         Option(name, _text(value), *_unit_and_meaning(docs.get(name, "")))
         for name, value in content.items()
-        if name != "kind" and value is not None and not (section == "system" and name != "delay")
+        if name != "kind" and value is not None and name not in ("numerator", "denominator", "additive")
     ]
     return Part(title, str(content.get("kind") or ""), summary if content.get("kind") else "", options)
 
