@@ -42,8 +42,8 @@ from .inference.status import Status as Status
 from .inference.diagnostics import fit_percent as fit_percent
 from .inference.finite_record import cramer_rao_bound as cramer_rao_bound
 
-# Results as text and as tables of pandas
-from .reporting.result_views import summary as summary, to_frame as to_frame
+# Results as text, as tables of pandas and as figures
+from .reporting.result_views import plot as plot, summary as summary, to_frame as to_frame
 
 # Experiments: what ctid run, table and export do
 from .reporting.experiment import ExperimentResults as ExperimentResults

@@ -78,6 +78,8 @@ class Identification:
         What the user should know before using the model, one sentence or more each.
     validation : Validation or None
         The model on another record.
+    records : tuple of Record
+        What it was estimated from.
     """
 
     options: DelayProfile
@@ -93,6 +95,7 @@ class Identification:
     r_t_squared: float
     warnings: tuple[str, ...]
     validation: Validation | None = None
+    records: tuple[Record, ...] = ()
 
     def __repr__(self) -> str:
         return f"Identification: {self.uncertainty.kind} covariance, {len(self.warnings)} warnings\n{self.fit!r}"
@@ -189,6 +192,7 @@ def identify(
         r_t_squared=criteria_of.r_t_squared(residuals, output),
         warnings=(),
         validation=judged,
+        records=tuple(records),
     )
     look = look_again(refinement, linear, records, holds=options.loss == "squares")
     return replace(found, warnings=tuple(_warnings(found, look, hessian, _gains(options, refinement, linear))))

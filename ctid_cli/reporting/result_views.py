@@ -1,18 +1,22 @@
-"""Results of fits and tracks as text and as tables of pandas."""
+"""Results of fits and tracks as text, as tables of pandas and as figures."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from ctid_cli.estimators.identification import Identification
+from ctid_cli.frequency.record_track import RecordTrack
 from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
+from ctid_cli.reporting.identification_plot import identification_svg
 from ctid_cli.reporting.identification_report import derived_of, derived_table, parameters_of
 from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.measures import parameter_unit
+from ctid_cli.reporting.track_plot import track_svg
 from ctid_cli.reporting.track_report import track_table
+from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import warning_lines, wrapped
 
 if TYPE_CHECKING:
@@ -71,6 +75,33 @@ def to_frame(result: Fit | Identification | FrequencyTrack) -> pd.DataFrame:
     if isinstance(result, FrequencyTrack):
         return pd.DataFrame(track_table(result, 0.0)).set_index("t")
     return pd.DataFrame([parameter_object(item) for item in _parameters(result)]).set_index("name")
+
+
+class Picture(bytes):
+    """An SVG file, which a notebook shows."""
+
+    def _repr_svg_(self) -> str:
+        return self.decode()
+
+
+def plot(result: Identification | RecordTrack) -> Picture:
+    """The figure of a result, as ``ctid fit`` and ``ctid track`` draw it.
+
+    Parameters
+    ----------
+    result : Identification or RecordTrack
+        What was found; a single fit does not hold the record that it would be drawn with,
+        :func:`~ctid_cli.estimators.identification.identify` does.
+
+    Returns
+    -------
+    Picture
+        The bytes of an SVG file, such as for ``Path("fit.svg").write_bytes``; a notebook shows it.
+    """
+    if isinstance(result, RecordTrack):
+        return Picture(track_svg(result, 0.0, None, "frequencies"))
+    measured = [Measurement(record, None, None, None, "t", "u", "y") for record in result.records]
+    return Picture(identification_svg(result, measured, Units()))
 
 
 def _parameters(result: Fit | Identification) -> list[UncertainValue]:

@@ -10,11 +10,15 @@ import pytest
 import ctid_cli
 from ctid_cli import (
     CtidError,
+    DelayProfile,
     HeldSignal,
     Record,
     SpecError,
     Srivc,
     TransferFunction,
+    identify,
+    plot,
+    read_record,
     read_results,
     run_experiment,
     simulate,
@@ -91,7 +95,28 @@ def test_a_fit_as_text_and_as_a_table():
     assert f"fit {fit.fit_percent:.5g} % of 300 samples" in summary(fit)
 
 
+def test_an_identification_is_shown_as_by_the_command(tmp_path, ctid):
+    t = 0.1 * np.arange(200)
+    rng = np.random.default_rng(1)
+    u = HeldSignal(t, rng.standard_normal(t.size))
+    y = simulate(TransferFunction([2], [1, 1]), u, t) + 0.1 * rng.standard_normal(t.size)
+    pd.DataFrame({"t": t, "u": u.values, "y": y}).to_csv(tmp_path / "record.csv", index=False)
+    printed = ctid("fit", tmp_path / "record.csv", "--poles", 1, "--out", tmp_path).stdout
+    found = identify(DelayProfile(1, 0, (0.0, 0.0), nested=True), [read_record(tmp_path / "record.csv")])
+    # The file names no units either.
+    tables = summary(found).split("\n\n")[:2]
+    assert all(table.splitlines()[2].split()[:3] == shown for table, shown in zip(tables, rows(printed), strict=True))
+    assert plot(found).startswith(b"<?xml")
+    assert plot(found)._repr_svg_().count("measured") >= 1
+
+
+def rows(printed):
+    lines = printed.splitlines()
+    heads = [next(k for k, line in enumerate(lines) if line.startswith(word)) for word in ("parameter ", "derived ")]
+    return [lines[k + 2].split()[:3] for k in heads]
+
+
 def test_completion_knows_the_public_names():
     stub = Path(ctid_cli.__file__).with_suffix(".pyi").read_text(encoding="utf-8")
-    assert {"run_experiment", "read_results", "summary", "to_frame"} <= set(dir(ctid_cli))
+    assert {"run_experiment", "read_results", "summary", "to_frame", "plot"} <= set(dir(ctid_cli))
     assert all(f"as {name}" in stub for name in dir(ctid_cli) if name[0] != "_" and name.islower())
