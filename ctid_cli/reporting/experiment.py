@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.reporting import surprises as unexpected
+from ctid_cli.reporting.figures.experiment_plot import experiment_drawing
 from ctid_cli.reporting.layout import count
 from ctid_cli.reporting.measures import default_measures, measure_rows
 from ctid_cli.reporting.paired_table import compare_estimators
+from ctid_cli.reporting.result_views import Picture
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.tables import experiment_report, notes_of
 from ctid_cli.running import engine
@@ -110,6 +112,30 @@ class ExperimentResults(Results):
         import pandas as pd
 
         return pd.DataFrame(compare_estimators(self, f"{first},{second}", self.out).records)
+
+    def figure(self, kind: str | None = None, measure: str | None = None, parameters: Sequence[str] = ()) -> Picture:
+        """A figure of the experiment, what ``ctid figure`` draws.
+
+        Parameters
+        ----------
+        kind : {"measure", "box", "errors", "delays", "convergence"}, optional
+            What is drawn; by default what tells most.
+        measure : str, optional
+            With ``measure`` and ``convergence``: such as ``"rmse"`` or ``"rmse:delay"``.
+        parameters : sequence of str, default ()
+            With ``errors`` and ``box``: of which parameters; of all by default.
+
+        Returns
+        -------
+        Picture
+            The bytes of an SVG file, which a notebook shows.
+
+        Raises
+        ------
+        UsageError
+            If the experiment has nothing to draw in this way.
+        """
+        return Picture(experiment_drawing(self, kind, measure, parameters).saved())
 
 
 def read_results(folder: str | os.PathLike[str]) -> ExperimentResults:

@@ -60,6 +60,8 @@ def test_results_are_those_of_the_commands(out, ctid):
     compared = ctid("table", "group/study", "--compare", "one,other", "--out", out, "--format", "csv").stdout
     np.testing.assert_allclose(results.compare("one", "other")["value"], pd.read_csv(io.StringIO(compared))["value"])
     assert results.surprises == []
+    drawn = ctid("figure", "group/study", "--kind", "box", "--out", out, "--file", out / "box.svg")
+    assert (out / "box.svg").read_bytes() == results.figure("box"), drawn.stderr
     assert repr(results).startswith("group/study: 12 of 12 estimates by one, other, 0 failed\n  in 1 data cell")
     assert "<td" in results._repr_html_()
 
