@@ -1,6 +1,6 @@
 """Measures of an experiment as tables: what is measured of the same parameters side by side."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from ctid_cli.inference.monte_carlo import MEASURES, requested
@@ -9,6 +9,9 @@ from ctid_cli.reporting.measures import measure_rows
 from ctid_cli.reporting.percentages import Row, settings_of
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.table_blocks import NOT_RUN, setting_text, setting_title
+
+#: What stands before the measures beside the swept fields, and how it is written.
+TEXTS: dict[str, Callable[[Any], str]] = {"initial_delay": delay_label, "method": str, "parameter": number}
 
 
 def measure_report(results: Results, names: Sequence[str], notes: Sequence[str] = ()) -> Report:
@@ -31,27 +34,22 @@ def measure_report(results: Results, names: Sequence[str], notes: Sequence[str] 
 def _table(results: Results, rows: Sequence[Row], names: Sequence[str]) -> Table:
     """Swept fields, starts, estimators and parameters down, measures across."""
     fields = [key for key in settings_of(rows) if any(row[key] is not None for row in rows)]
-    with_start = any(row["initial_delay"] is not None for row in rows)
-    parameters = any(row["parameter"] is not None for row in rows)
+    keys = [*fields, *(key for key in TEXTS if any(row[key] is not None for row in rows))]
     lacking = any(row["without_value"] for row in rows)
     lines: dict[tuple[Any, ...], dict[str, Row]] = {}
     for row in rows:
-        place = (*(row[key] for key in fields), row["initial_delay"], row["method"], row["parameter"])
-        lines.setdefault(place, {})[row["measure"]] = row
+        lines.setdefault(tuple(row[key] for key in keys), {})[row["measure"]] = row
     body = []
-    for (*settings, start, method, parameter), found in lines.items():
+    for place, found in lines.items():
         some = next(iter(found.values()))
-        cells = [*map(setting_text, fields, settings), *([delay_label(start)] if with_start else []), method]
-        cells += [number(parameter)] if parameters else []
+        cells = [TEXTS[key](at) if key in TEXTS else setting_text(key, at) for key, at in zip(keys, place, strict=True)]
         cells += [_cell(found.get(name)) for name in names]
         cells += [str(some["n"]), str(some["failed"])] if some["n"] else [NOT_RUN, ""]
         body.append(cells + ([str(some["without_value"])] if lacking else []))
-    header = [*map(setting_title, fields), *(["initial delay"] if with_start else []), "method"]
-    header += ["status" if "failures" in names else "parameter"] if parameters else []
-    left = len(header)
-    header += [_title(name) for name in names]
-    header += ["n", "failed", *(["no value"] if lacking else [])]
-    return Table(header, body, "l" * left + "r" * (len(header) - left))
+    titles = {"initial_delay": "initial delay", "parameter": "status" if "failures" in names else "parameter"}
+    header = [titles.get(key) or setting_title(key) for key in keys]
+    header += [*map(_title, names), "n", "failed", *(["no value"] if lacking else [])]
+    return Table(header, body, "l" * len(keys) + "r" * (len(header) - len(keys)))
 
 
 def _title(name: str) -> str:

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 from ctid_cli.canonical import content_hash
@@ -80,19 +81,23 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
                 truth, own = content["system"]["truth"], content["system"]
                 # The name of an option stands for its value.
                 own["truth"] = {name: own[value] if isinstance(value, str) else value for name, value in truth.items()}
-            if loop is not None:
-                loop = dataclasses.replace(loop, reference=located(loop.reference, folder))
-                loop = loop.at(options["sampling"].interval)
-            excitation, noise = located(options.get("excitation"), folder), options.get("noise")
-            # Any seed will do where nothing is random.
-            drawn = (options["sampling"], noise, seed or 0, loop, options.get("recorder", Recorder()))
             fresh = "fresh_fit" in (spec.measures or ())
             # What is measured of an estimate is stored with it, so that it belongs to its identity.
             content |= {"fresh_fit": True} if fresh else {}
-            source = SimulatedSource(options["system"], excitation, *drawn, fresh)
+            # Any seed will do where nothing is random.
+            source = _simulated_source(options, seed or 0, folder, fresh=fresh)
         swept = {names[name, *path]: value for name, v in chosen.items() for path, value in v.swept.items()}
         cells.append(DataCell(content, content_hash(content), swept, source))
     return tuple(cells)
+
+
+def _simulated_source(options: Mapping[str, Any], seed: int, folder: Path, *, fresh: bool) -> SimulatedSource:
+    """What simulates the data sets of a cell, from the options of its sections."""
+    sampling, loop = options["sampling"], options.get("loop")
+    if loop is not None:
+        loop = dataclasses.replace(loop, reference=located(loop.reference, folder)).at(sampling.interval)
+    excitation, recorder = located(options.get("excitation"), folder), options.get("recorder", Recorder())
+    return SimulatedSource(options["system"], excitation, sampling, options.get("noise"), seed, loop, recorder, fresh)
 
 
 def _measuring(spec: Spec) -> Measuring:

@@ -228,16 +228,7 @@ def taken(found: Any, record: Record, what: str) -> Fit:
         if not np.isfinite(values).all():
             raise ContractError(f"{what} returned a model with a coefficient that is not finite")
         return found
-    if not isinstance(found, Mapping):
-        wanted = "a Fit or a mapping with parameters, standard_errors and status is expected"
-        raise ContractError(f"{what} returned {type(found).__name__}, and {wanted}")
-    for key in found:
-        if key not in KEYS:
-            raise ContractError(f"{what} returned the key {key!r}{did_you_mean(str(key), KEYS) or ';'} allowed: {KEYS}")
-    name = found.get("status", "CONVERGED")
-    if not isinstance(name, str) or name not in Status.__members__:
-        raise ContractError(f"{what} returned the status {name!r}; allowed: {', '.join(Status.__members__)}")
-    status = Status[name]
+    status = _stated(found, what)
     named = _numbers(found.get("parameters"), f"{what} returned parameters", finite=status.succeeded)
     errors = _numbers(found.get("standard_errors") or {}, f"{what} returned standard_errors", finite=False)
     if not named:
@@ -263,6 +254,20 @@ def taken(found: Any, record: Record, what: str) -> Fit:
         named_errors={name: errors.get(name, float("nan")) for name in names},
         message=str(found.get("message") or "The estimator says so."),
     )
+
+
+def _stated(found: Any, what: str) -> Status:
+    """The status of a mapping that has only keys which it may have."""
+    if not isinstance(found, Mapping):
+        wanted = "a Fit or a mapping with parameters, standard_errors and status is expected"
+        raise ContractError(f"{what} returned {type(found).__name__}, and {wanted}")
+    for key in found:
+        if key not in KEYS:
+            raise ContractError(f"{what} returned the key {key!r}{did_you_mean(str(key), KEYS) or ';'} allowed: {KEYS}")
+    name = found.get("status", "CONVERGED")
+    if not isinstance(name, str) or name not in Status.__members__:
+        raise ContractError(f"{what} returned the status {name!r}; allowed: {', '.join(Status.__members__)}")
+    return Status[name]
 
 
 def _numbers(found: Any, what: str, *, finite: bool) -> dict[str, float]:

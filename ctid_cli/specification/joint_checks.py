@@ -161,19 +161,24 @@ def _start_complaints(spec: Spec, starts: StartsSection, broken: frozenset[str])
         path = ("starts", "parameters", k)
         if not isinstance(parameters, RelativeStart):
             yield from _structure_complaints(spec, path, parameters.options())
-        elif k != drawn[0]:
-            continue  # all of them have the structure of the system
-        elif spec.data is not None:
-            yield path, "the parameters of a measured record are not known; give values: {additive: [submodels]}"
-        elif spec.system is not None and spec.system.own:
-            yield path, "a system of one's own has no known structure; give values: {additive: [submodels]}"
-        elif spec.system is not None:
-            try:
-                model = additive_form(variants(spec.system)[0].options)
-            except DataError as error:
-                yield path, f"the system cannot be written as a sum of submodels: {error}; give values: {{additive: …}}"
-            else:
-                yield from _structure_complaints(spec, path, model)
+        elif k == drawn[0]:
+            # All of them have the structure of the system.
+            yield from _of_relative_start(spec, path)
+
+
+def _of_relative_start(spec: Spec, path: KeyPath) -> Iterator[Complaint]:
+    """What a start around the true parameters has against the system."""
+    if spec.data is not None:
+        yield path, "the parameters of a measured record are not known; give values: {additive: [submodels]}"
+    elif spec.system is not None and spec.system.own:
+        yield path, "a system of one's own has no known structure; give values: {additive: [submodels]}"
+    elif spec.system is not None:
+        try:
+            model = additive_form(variants(spec.system)[0].options)
+        except DataError as error:
+            yield path, f"the system cannot be written as a sum of submodels: {error}; give values: {{additive: …}}"
+        else:
+            yield from _structure_complaints(spec, path, model)
 
 
 def _structure_complaints(spec: Spec, path: KeyPath, model: AdditiveModel) -> Iterator[Complaint]:

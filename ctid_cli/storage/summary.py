@@ -15,7 +15,7 @@ counts in every percentage. Without ``success``, or without true values to compa
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.inference.monte_carlo import wilson_interval
@@ -81,15 +81,19 @@ def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:
         if name not in parts:
             flat[name] = estimates[name]
             continue
-        # As mappings, coefficients are numbered from 0; the first one of a denominator is 1 and left out.
-        rows: list[Any] = [dict(enumerate(row)) if isinstance(row, list) else row or {} for row in estimates[name]]
-        found: list[Any] = parts[name].names(rows) if parts[name].type == "by name" else []
-        found = found or sorted({k for row in rows for k in row if k or name != "denominator"})
-        for part in found:
-            values = [row.get(part) for row in rows]
+        for part, values in _parts(parts[name], estimates[name]):
             key, column = f"{parts[name].prefix}{part}", pd.Series(values, dtype="float64", index=estimates.index)
             # Parameters that make a model are its coefficients too; other names that are taken get a longer one.
             if key in estimates.columns and key != "delay":
                 key = f"parameters.{key}"
             flat[key] = flat[key].combine_first(column) if key in flat else column
     return pd.DataFrame(flat)
+
+
+def _parts(column: columns.Column, cells: Iterable[Any]) -> Iterator[tuple[Any, list[float | None]]]:
+    """The parts of a column with several numbers in a cell, each with its values."""
+    # As mappings, coefficients are numbered from 0; the first one of a denominator is 1 and left out.
+    rows: list[Any] = [dict(enumerate(row)) if isinstance(row, list) else row or {} for row in cells]
+    found: list[Any] = column.names(rows) if column.type == "by name" else []
+    for part in found or sorted({k for row in rows for k in row if k or column.name != "denominator"}):
+        yield part, [row.get(part) for row in rows]

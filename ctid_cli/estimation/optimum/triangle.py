@@ -208,6 +208,17 @@ def _read(rows: Array, free: int, readout: Array, result: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
+def _held_input(data: FilterData, j: int, period: float) -> tuple[float, float, float]:
+    """The input from a break on, its change up to the next one, and how long that takes."""
+    u, tu = data.u, data.tu
+    if data.input_foh and j + 1 < tu.size:
+        return u[j], u[j + 1] - u[j], tu[j + 1] - tu[j]
+    if data.input_foh and period > 0.0:
+        return u[j], u[0] - u[j], tu[0] + period - tu[j]
+    return u[j], 0.0, 1.0
+
+
+@njit(cache=True, nogil=True)
 def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wanted: Array) -> Array:
     """Rows ``[z, u, free response, 1, y]`` that have the second moments of those of all used samples.
 
@@ -220,7 +231,7 @@ def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wa
     triangle, block, read = np.zeros((q, q)), np.zeros((q, BLOCK)), np.zeros((BLOCK, q - 1))
     every = np.zeros((np.count_nonzero(data.use) if whole else 0, wanted.shape[1]))
     readout = _readout(chain, delay, data.interval)
-    tu, u, breaks = data.tu, data.u, data.tu.size
+    tu, breaks = data.tu, data.tu.size
     alone = _free_states(chain, data)
     regular = data.interval > 0.0
     shift, slack = 0, 0.0
@@ -264,13 +275,7 @@ def rows_of(chain: ChainState, delay: Delay, data: FilterData, period: float, wa
             begin, end = end, min(end + STRETCH, breaks - 1)
             _follow(states, begin, end, way, data, period)
         # The input that is held there, and its change up to the next break, after the last one that of the first.
-        value, change, length = 0.0, 0.0, 1.0
-        if j >= 0:
-            value = u[j]
-            if data.input_foh and j + 1 < breaks:
-                change, length = u[j + 1] - value, tu[j + 1] - tu[j]
-            elif data.input_foh and period > 0.0:
-                change, length = u[0] - value, tu[0] + period - tu[j]
+        value, change, length = _held_input(data, j, period) if j >= 0 else (0.0, 0.0, 1.0)
         for i in range(n):
             now[i] = states[j - begin, i] if j >= 0 else 0.0
         now[n], now[n + 1] = value, change / length
