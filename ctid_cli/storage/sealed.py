@@ -26,6 +26,10 @@ from ctid_cli.storage.manifest import Key, Manifest, assemble, refuse_newer, row
 #: Raised by one whenever an older ctid could misread the file.
 FORMAT = 1
 KIND = "ctid runs"
+#: Bytes before the HDF5 data, which HDF5 leaves to the user.
+USER_BLOCK = 512
+#: How a file without a user block begins, as older versions wrote them.
+_SIGNATURE = b"\x89HDF"
 #: Stands for a missing whole number.
 _MISSING = -1
 
@@ -46,7 +50,7 @@ def seal_image(
     """The sealed file as bytes, its checksum, and the number of estimates in it."""
     stored = [slot for slot in slots(manifest) if slot.key in results]
     rows = [assemble(slot, manifest, results[slot.key], None, None) for slot in stored]
-    with h5py.File("runs.h5", "w", driver="core", backing_store=False) as file:
+    with h5py.File("runs.h5", "w", driver="core", backing_store=False, userblock_size=USER_BLOCK) as file:
         _write_plan(file, manifest, sorted(origins))
         group = file.create_group("estimates")
         _write(group, "estimator_hash", _encode([slot.key.estimator_hash for slot in stored]))
@@ -63,7 +67,17 @@ def seal_image(
         checksum = _content_checksum(file)
         file.attrs["checksum"] = checksum
         file.flush()
-        return file.id.get_file_image(), checksum, len(rows)
+        return headed(file.id.get_file_image()), checksum, len(rows)
+
+
+def headed(image: bytes) -> bytes:
+    """HDF5 data behind their user block."""
+    return _head(hashlib.sha256(image).hexdigest()) + image
+
+
+def _head(sha256: str) -> bytes:
+    text = f"Written by ctid. HDF5 data begin at byte {USER_BLOCK}; their SHA-256 is {sha256}\n"
+    return text.encode().ljust(USER_BLOCK, b"\0")
 
 
 def read_sealed(path: Path) -> SealedRuns:
@@ -91,6 +105,7 @@ def verify_sealed(path: Path) -> str:
 @contextmanager
 def _checked(path: Path) -> Iterator[tuple[h5py.File, str]]:
     try:
+        _require_intact(path)
         with _open(path) as file:
             if file.attrs.get("format") != KIND:
                 raise StorageError(f"{path} is an HDF5 file, but not one that 'ctid run' has written")
@@ -102,6 +117,14 @@ def _checked(path: Path) -> Iterator[tuple[h5py.File, str]]:
     # HDF5 reports damage as whatever exception the damaged part happens to cause.
     except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, UnicodeError) as error:
         raise StorageError(f"{path} cannot be read ({error})") from error
+
+
+def _require_intact(path: Path) -> None:
+    """Refuse a damaged file before HDF5 sees it, which may go round in circles in there."""
+    with path.open("rb") as file:
+        head = file.read(USER_BLOCK)
+        if not head.startswith(_SIGNATURE) and head != _head(hashlib.file_digest(file, "sha256").hexdigest()):
+            raise StorageError(f"{path} is damaged: its bytes do not agree with the checksum that it begins with")
 
 
 def _open(path: Path) -> h5py.File:
