@@ -44,7 +44,7 @@ def summary(result: Fit | Identification) -> str:
     >>> u = HeldSignal(t, np.sign(np.sin(t)))
     >>> y = simulate(TransferFunction([2], [1, 1]), u, t)
     >>> print(summary(Svf(poles=1, zeros=0, svf_cutoff=2.0).fit(Record(t, y, u), None)).splitlines()[0])
-    parameter  estimate  standard error  relative %  95 % low  95 % high  unit  status
+    parameter  estimate  standard error  relative %  95 % low  95 % high  unit      status
     """
     fit = result.fit if isinstance(result, Identification) else result
     parts = [parameter_table(_parameters(result))]

@@ -98,7 +98,7 @@ def test_the_beam_is_the_printed_model_and_says_that_it_is_simulated():
     assert plan.starts[0].draw(1, 0, None).model.theta.tolist() == pytest.approx(begun, rel=1e-15)
     assert source.system.delay * 4096 == plan.estimators[0].estimator.delay * 4096 == 4
     assert source.sampling.interval * 4096 == 1
-    assert source.excitation.frequencies / np.pi == pytest.approx(np.arange(1, 1001))
+    assert source.excitation.frequencies_used / np.pi == pytest.approx(np.arange(1, 1001))
     assert "SIMULATED" in published("flexible_beam.yaml").text
 
 
