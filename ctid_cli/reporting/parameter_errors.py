@@ -128,17 +128,27 @@ def least_variances(results: Results) -> dict[Group, dict[str, float]]:
 
 def least_covariances(results: Results, groups: Iterable[Group]) -> dict[Group, tuple[tuple[str, ...], Array]]:
     """Names of parameters and the covariance that theory gives their estimates, for those groups that have a theory."""
-    try:
-        plan = build_plan(spec_from_canonical(results.settings))
-    except (CtidError, ValueError):  # it names code, which is not run to read results, or is of another version
+    plan = readable_plan(results)
+    if plan is None:
         return {}
     places = {group: place_of(results, group) for group in groups}
-    truths = [true_values(cell) for cell in results.manifest["data_cells"]]
+    truths = [tuple(true_values(cell)) for cell in results.manifest["data_cells"]]
     known = {place: _covariance(plan, *place, truths[place[0]]) for place in set(places.values())}
     return {group: found for group, place in places.items() if (found := known[place])}
 
 
-def _covariance(plan: Plan, k: int, j: int, truth: Iterable[str]) -> tuple[tuple[str, ...], Array] | None:
+@lru_cache(maxsize=2)
+def readable_plan(results: Results) -> Plan | None:
+    """The plan, unless it names code, which is not run to read results, or is of another version."""
+    try:
+        return build_plan(spec_from_canonical(results.settings))
+    except (CtidError, ValueError):
+        return None
+
+
+# Tables, sentences and figures of one page ask for the same; theory for coloured noise takes a second.
+@lru_cache(maxsize=1024)
+def _covariance(plan: Plan, k: int, j: int, truth: tuple[str, ...]) -> tuple[tuple[str, ...], Array] | None:
     """Names of the parameters in one cell and their covariance by theory; None where there is no theory."""
     source = plan.data_cells[k].source
     if not isinstance(source, SimulatedSource):

@@ -11,21 +11,17 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from statistics import NormalDist
 from typing import Any, NamedTuple
 
-from ctid_cli.errors import CtidError
 from ctid_cli.inference.monte_carlo import QUANTILE
 from ctid_cli.inference.paired import holm
 from ctid_cli.reporting.expected_accuracy import why_biased
 from ctid_cli.reporting.layout import delay_label
 from ctid_cli.reporting.measures import measure_rows
-from ctid_cli.reporting.parameter_errors import place_of
+from ctid_cli.reporting.parameter_errors import place_of, readable_plan
 from ctid_cli.reporting.percentages import Row, labelled_groups, settings_of
 from ctid_cli.reporting.results import Group, Results, lookup
 from ctid_cli.reporting.table_blocks import setting_text, setting_title
-from ctid_cli.running.cells import Plan
-from ctid_cli.running.plan import build_plan
 from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.specification.joint_warnings import joint_warnings
-from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.manifest import is_of_signal, true_values
 
 #: Chance of a sentence about an experiment that is as theory expects it.
@@ -130,7 +126,7 @@ class _Reasons:
 
     def __init__(self, results: Results, tested: Iterable[Finding]) -> None:
         self.results = results
-        self.plan = _plan_of(results)
+        self.plan = readable_plan(results)
         self.far = {f.group.estimator for f in tested if (f.parameter, f.kind) == ("delay", "rmse") and f.size >= FAR}
         warned = [] if self.plan is None else joint_warnings(self.plan.spec)
         self.input_is_late = any(path[:2] == ("sampling", "input_record") for path, _ in warned)
@@ -158,14 +154,6 @@ class _Reasons:
         treated = [key for key in ("initial_state", "offset") if part["content"].get(key) == "estimate"]
         if finding.kind == "rmse" and treated:
             yield f"theory does not count what else is estimated (estimators.{part['name']}.{treated[0]}: estimate)"
-
-
-def _plan_of(results: Results) -> Plan | None:
-    """The plan, unless it names code, which is not run to read results, or is of another version."""
-    try:
-        return build_plan(spec_from_canonical(results.settings))
-    except CtidError:
-        return None
 
 
 # --- words ----------------------------------------------------------------------------------------------------------
