@@ -8,8 +8,10 @@ from typing import Any
 
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.percentages import Row
-from ctid_cli.reporting.study import DEFAULT_STUDY, data_folder
-from ctid_cli.storage.identity import present_versions
+from ctid_cli.reporting.study import DEFAULT_STUDY, data_folder, study_contents
+from ctid_cli.running.origins import current_versions
+from ctid_cli.running.plan import build_plan
+from ctid_cli.specification.load import load_spec
 
 #: Columns that tables must have to be compared with.
 NEEDED = ("table", "experiment", "initial_delay", "method", "n", "converged")
@@ -21,24 +23,32 @@ def committed_tables(study: str = DEFAULT_STUDY) -> Path | None:
     return folder / "tables.csv" if (folder / "tables.csv").is_file() else None
 
 
-def made_by(tables: Path) -> str:
-    """Which code computed committed tables, as a participle clause; empty where it is the present one."""
+def made_by(published: Path, study: str = DEFAULT_STUDY) -> str:
+    """Which code computed the published results in a folder, as a participle clause; empty where it is the present."""
     try:
-        environment = json.loads((tables.parent / "environment.json").read_text(encoding="utf-8"))
+        environment = json.loads((published / "environment.json").read_text(encoding="utf-8"))
     except OSError:
         return ""
+    # Older ones are the sessions themselves.
     sessions = environment.get("sessions", environment)
-    versions = {version for name in sessions for session in sessions[name] for version in _versions(session)}
-    if versions <= present_versions():
+    if all(_versions(own) <= _present(study, short) for short, own in sessions.items()):
         return ""
     commit = f" (commit {environment['commit'][:12]})" if "commit" in environment else ""
     return f"computed by an earlier version of the code or of its numerical libraries{commit}"
 
 
-def _versions(session: Mapping[str, Any]) -> Iterable[str]:
-    """The code versions of a run; those of older ones were the same for all estimators."""
-    found = session["code_version"]
-    return [found] if isinstance(found, str) else found.values()
+def _present(study: str, short: str) -> set[str]:
+    """The code versions that the estimates of an experiment of a study would have now."""
+    described = study_contents()[study]["experiments"].get(f"{study}/{short}")
+    if described is None:
+        return set()
+    return current_versions(build_plan(load_spec(data_folder("configs") / described["config"])))
+
+
+def _versions(sessions: Iterable[Mapping[str, Any]]) -> set[str]:
+    """The code versions of runs; those of older ones were the same for all estimators."""
+    found = [session["code_version"] for session in sessions]
+    return {version for one in found for version in ([one] if isinstance(one, str) else one.values())}
 
 
 def read_tables(file: Path) -> list[Row]:

@@ -90,7 +90,7 @@ def check_tables(names: Sequence[str], out: Path, reference: Path | None = None)
     rows = [row for table in tables for row in table.records]
     notes = list(dict.fromkeys(note for table in tables for note in table.notes))
     shown = None if file is None else shown_path(file)
-    if file is not None and reference is None and (maker := made_by(file)):
+    if file is not None and reference is None and (maker := made_by(file.parent)):
         notes.append(f"the percentages in {shown} were {maker}")
     comparison = compare(rows, committed, study, shown, notes)
     if comparison.decisive:

@@ -84,7 +84,7 @@ def _study_report(study: Study, number: int, out: Path, style: str, committed: b
     file = committed_tables(study.name) if committed and not found else None
     if file is not None:
         rows = [row | {"table": number} for row in read_tables(file) if row["table"] == str(number)]
-        remark = made_by(file)
+        remark = made_by(file.parent, study.name)
         notes.insert(0, f"these are the committed results of {shown_path(file)}" + (f", {remark}" if remark else ""))
     published = {place.method for place in table.published}
     missing = [method for method in study.methods if known and method in published - known]

@@ -22,12 +22,13 @@ from ctid_cli.errors import DataError, StorageError
 from ctid_cli.running import events
 from ctid_cli.running.cell_precision import CellPrecision, as_needed, stored_precisions
 from ctid_cli.running.job import Job
+from ctid_cli.running.origins import current_origins
 from ctid_cli.running.own_check import check_components
 from ctid_cli.running.stopping import StopRequest
 from ctid_cli.storage import folder as place
 from ctid_cli.storage import journal
 from ctid_cli.storage.columns import FAILURES
-from ctid_cli.storage.identity import Origin, are_mixed, origin_of
+from ctid_cli.storage.identity import Origin, are_mixed
 from ctid_cli.storage.manifest import Key, Slot, assemble, slots
 from ctid_cli.storage.provenance import now, session_info
 from ctid_cli.storage.store import seal
@@ -257,13 +258,6 @@ def preview(plan: Plan, folder: Path, *, fresh: bool = False, allow_mixed: bool 
     """What a run would do, without doing or writing anything."""
     needed, stored = _look(plan, folder, current_origins(plan), fresh=fresh, allow_mixed=allow_mixed)
     return _ready(needed, folder, stored)
-
-
-def current_origins(plan: Plan) -> dict[str, Origin]:
-    """Where the estimates of each estimator will come from, by hash."""
-    # All data cells are made by the same classes; only the values of their fields differ.
-    source = plan.data_cells[0].source
-    return {cell.hash: origin_of(source, cell.estimator) for cell in plan.estimators}
 
 
 def _ready(plan: Plan, folder: Path, stored: set[Key]) -> events.PlanReady:

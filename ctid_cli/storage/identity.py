@@ -31,7 +31,6 @@ from typing import Any, Self, TypeGuard
 
 from ctid_cli import own_code
 from ctid_cli.canonical import content_hash
-from ctid_cli.kinds import KINDS
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Parts of the package whose sources decide what is computed.
@@ -97,15 +96,6 @@ def origin_of(source: Any, estimator: Any) -> Origin:
     """Where estimates computed by this process and its workers come from."""
     packages = (("python", platform.python_version()), *package_versions(NUMERICAL_LIBRARIES).items())
     return Origin(code_version(modules_of(source), modules_of(estimator)), numeric_platform(), packages)
-
-
-def present_versions() -> set[str]:
-    """The code versions that the estimators of this package have now."""
-    systems, signals = "ctid_cli.simulation.dataset", "ctid_cli.simulation.frequency_runs"
-    found = {code_version({systems}, {place.partition(":")[0]}) for place in KINDS["estimator"].values()}
-    return found | {
-        code_version({signals}, {signals, place.partition(":")[0]}) for place in KINDS["frequency_estimator"].values()
-    }
 
 
 def code_version(data: Iterable[str], estimator: Iterable[str], root: Path = ROOT) -> str:

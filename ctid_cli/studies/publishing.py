@@ -10,9 +10,8 @@ from pathlib import Path
 
 from ctid_cli.errors import RefusedError, UsageError
 from ctid_cli.reporting.layout import csv_text
-from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.study import data_folder
-from ctid_cli.running.engine import current_origins
+from ctid_cli.running.origins import current_versions
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.provenance import public_sessions
@@ -46,19 +45,14 @@ def commit_of(found: StudyResults) -> str:
     for results in found.experiments.values():
         if results.stored.mixed:
             raise RefusedError(f"{results.experiment} mixes results of different code versions or processors")
-        if not {origin.code_version for origin in results.stored.origins} <= _present(results):
+        present = current_versions(build_plan(spec_from_canonical(results.settings)))
+        if not {origin.code_version for origin in results.stored.origins} <= present:
             other = f"{results.experiment} was not computed by the code that is checked out"
             raise RefusedError(f"{other}; check out the commit that computed it, or run it again with --fresh")
     origins = [origin for results in found.experiments.values() for origin in results.stored.origins]
     if len({(origin.platform, origin.packages) for origin in origins}) > 1:
         raise RefusedError(f"the experiments of {found.study.name} were computed on different platforms")
     return _git("rev-parse", "HEAD")
-
-
-def _present(results: Results) -> set[str]:
-    """The code versions that the estimates of an experiment would have now."""
-    origins = current_origins(build_plan(spec_from_canonical(results.settings)))
-    return {origin.code_version for origin in origins.values()}
 
 
 def _git(*arguments: str) -> str:

@@ -30,7 +30,7 @@ def study_page(study: StudyFolder, out: Path) -> str:
         origin = [f"Results in {out.name}: {', '.join(study.configs)}."]
     elif published.is_dir():
         texts = {file.name: file.read_text(encoding="utf-8") for file in sorted(published.glob("*.md"))}
-        origin = list(_published_origin(published))
+        origin = list(_published_origin(published, study.name))
     else:
         command = f"ctid study run {study.name}{out_option(out)}"
         raise UsageError(f"an installed package does not hold the results of {study.name}; run first: {command}")
@@ -77,7 +77,7 @@ def _figures(study: StudyFolder, out: Path, published: Path, *, own: bool) -> It
             yield {"svg": inline(svg, f"figure-{number}"), "caption": f"Figure {number}", "command": command}
 
 
-def _published_origin(published: Path) -> Iterator[str]:
+def _published_origin(published: Path, study: str) -> Iterator[str]:
     """What made the published results."""
     try:
         environment = json.loads((published / "environment.json").read_text(encoding="utf-8"))
@@ -92,5 +92,5 @@ def _published_origin(published: Path) -> Iterator[str]:
     yield f"Published{where}: {computed} estimates in {count(len(sessions), 'session')} until {last}."
     packages = sessions[-1]["packages"].items()
     yield "Made with " + ", ".join(f"{name} {version}" for name, version in packages) + "."
-    if remark := made_by(published / "tables.csv"):
+    if remark := made_by(published, study):
         yield f"These results were {remark}."

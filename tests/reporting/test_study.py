@@ -6,10 +6,12 @@ from ctid_cli.errors import UsageError
 from ctid_cli.reporting.committed import made_by
 from ctid_cli.reporting.layout import Report, write_reports
 from ctid_cli.reporting.percentages import pooled_rows, study_rows
-from ctid_cli.reporting.study import load_study
+from ctid_cli.reporting.study import data_folder, load_study
 from ctid_cli.reporting.table_blocks import study_blocks
 from ctid_cli.reporting.tables import build_tables
-from ctid_cli.storage.identity import present_versions
+from ctid_cli.running.origins import current_versions
+from ctid_cli.running.plan import build_plan
+from ctid_cli.specification.load import load_spec
 from experiments.useful_redundancy.tables import failures, searches
 
 RANDOM = "uniform(0, 9)"
@@ -83,16 +85,19 @@ def test_in_a_fresh_clone_the_committed_tables_stand_in(tmp_path):
 
 
 def test_results_of_earlier_code_are_called_so(tmp_path):
-    tables, current = tmp_path / "tables.csv", {"code_version": dict.fromkeys("ab", min(present_versions()))}
+    plan = build_plan(load_spec(data_folder("configs") / "useful_redundancy" / "case1_regular.yaml"))
+    current = {"code_version": dict(enumerate(current_versions(plan)))}
     environment = tmp_path / "environment.json"
-    assert made_by(tables) == ""
-    environment.write_text(json.dumps({"case1": [current]}), encoding="utf-8")
-    assert made_by(tables) == ""
-    old = {"case1": [current], "case2": [{"code_version": "0" * 16}]}
-    environment.write_text(json.dumps(old), encoding="utf-8")
-    assert made_by(tables) == "computed by an earlier version of the code or of its numerical libraries"
+    assert made_by(tmp_path) == ""
+    environment.write_text(json.dumps({"case1-regular": [current]}), encoding="utf-8")
+    assert made_by(tmp_path) == ""
+    # By the present code of other estimators, and by a specification that is no more.
+    for other in ({"as-printed-case1-regular": [current]}, {"case0": [current]}):
+        environment.write_text(json.dumps(other), encoding="utf-8")
+        assert made_by(tmp_path) == "computed by an earlier version of the code or of its numerical libraries"
+    old = {"case1-regular": [current, {"code_version": "0" * 16}]}
     environment.write_text(json.dumps({"commit": "abcdef" * 7, "sessions": old}), encoding="utf-8")
-    assert made_by(tables).endswith(" libraries (commit abcdefabcdef)")
+    assert made_by(tmp_path).endswith(" libraries (commit abcdefabcdef)")
 
 
 @pytest.mark.parametrize("name", ["5", "useful-redundancy/0", "quickstrat", "other-study/1"])

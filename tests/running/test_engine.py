@@ -20,8 +20,9 @@ import pytest
 
 from ctid_cli.errors import DataError, RefusedError, StorageError
 from ctid_cli.running import engine, events
-from ctid_cli.running.engine import RunSummary, current_origins, preview, run_experiment
+from ctid_cli.running.engine import RunSummary, preview, run_experiment
 from ctid_cli.running.job_order import JobQueue
+from ctid_cli.running.origins import current_origins
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import folder, journal

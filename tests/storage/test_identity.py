@@ -24,7 +24,6 @@ from ctid_cli.storage.identity import (
     modules_behind,
     modules_of,
     numeric_platform,
-    present_versions,
 )
 from ctid_cli.storage.provenance import git_commit
 
@@ -175,10 +174,6 @@ def test_the_hash_is_the_same_with_and_without_what_was_kept(tree: Path) -> None
     identity._TREES.write_text("damaged")
     identity._known_trees.cache_clear()
     assert versions(PLANS["system"], tree) == first
-
-
-def test_the_versions_of_the_present_code_are_known_without_a_plan() -> None:
-    assert {version for plan in PLANS.values() for version in versions(plan, ROOT).values()} <= present_versions()
 
 
 def test_origins_are_gathered_and_compared() -> None:

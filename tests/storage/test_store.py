@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import RefusedError, StorageError, UsageError
-from ctid_cli.running.engine import current_origins, run_experiment
+from ctid_cli.running.engine import run_experiment
+from ctid_cli.running.origins import current_origins
 from ctid_cli.storage.columns import failed, no_result
 from ctid_cli.storage.folder import experiment_folders
 from ctid_cli.storage.identity import origin_of
