@@ -96,3 +96,9 @@ class MismatchError(CtidError):
     """A comparison or verification found a difference."""
 
     exit_code = 7
+
+
+class MachineError(CtidError):
+    """The machine did not let estimates finish (memory, descriptors, killed processes); they are not stored."""
+
+    exit_code = 8

@@ -150,14 +150,16 @@ class Reporter(_Progress):
             case events.KernelsCompiled():
                 if event.seconds > QUICK:
                     self._say(f"kernels ready after {seconds(event.seconds)}")
-            case events.DataSetDone():
+            case events.EstimatesDone():
                 self._advance(event)
             case events.BlockDone():
                 self._say(block_sentence(event.precision))
                 self._update(self.done, total=event.total)
             case events.WorkerDied():
-                sets = count(event.data_sets, "data set")
-                self._say(f"a worker process died ({event.reason}); repeating {sets} alone")
+                what = count(event.estimates, "estimate")
+                self._say(f"a worker process died ({event.reason}); computing {what} once more, alone")
+            case events.GivenUp():
+                self._say(f"{count(event.estimates, 'estimate')} given up, not stored: {event.reason}")
             case events.Stopping():
                 self._say(f"stopping ({event.reason}): storing what is finished; once more to stop at once")
 
@@ -195,7 +197,7 @@ def json_lines(event: Event) -> list[str]:
     from ctid_cli.reporting.estimate import as_object
     from ctid_cli.running import events
 
-    if isinstance(event, events.DataSetDone):
+    if isinstance(event, events.EstimatesDone):
         return [json.dumps({"event": "estimate", **as_object(row)}, allow_nan=False) for row in event.rows]
     # PlanReady is "plan", KernelsCompiling "kernels_compiling".
     name = re.sub("(?<=.)([A-Z])", r"_\1", type(event).__name__).lower().removesuffix("_ready")

@@ -8,39 +8,45 @@ from __future__ import annotations
 
 import json
 import os
-import threading
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ctid_cli.errors import DataError, StorageError
+from ctid_cli.errors import DataError, MachineError, StorageError
 from ctid_cli.running import events
 from ctid_cli.running.cell_precision import CellPrecision, as_needed, stored_precisions
+from ctid_cli.running.dispatch import Died, GivenUp, Unable, run_jobs
+from ctid_cli.running.executor import Computed, Executor
 from ctid_cli.running.job import Job
+from ctid_cli.running.limits import Limits
 from ctid_cli.running.origins import current_origins
 from ctid_cli.running.own_check import check_components
-from ctid_cli.running.stopping import StopRequest
+from ctid_cli.running.pool import LokyPool
+from ctid_cli.running.stopping import MACHINE, StopAt, StopRequest
 from ctid_cli.storage import folder as place
 from ctid_cli.storage import journal
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.identity import Origin, are_mixed
-from ctid_cli.storage.manifest import Key, Slot, assemble, slots
+from ctid_cli.storage.manifest import Key, Outcome, Slot, assemble, slots
 from ctid_cli.storage.provenance import now, session_info
 from ctid_cli.storage.store import seal
 
 if TYPE_CHECKING:
     from ctid_cli.running.cells import Plan
 
-#: Finished data sets are committed after this time [s], or when there are this many of them.
+#: Finished estimates are committed after this time [s], or when there are this many of them.
 COMMIT_SECONDS = 0.2
-COMMIT_DATA_SETS = 50
+COMMIT_ESTIMATES = 200
 
-_EXIT_CODES = {None: 0, "SIGINT": 130, "SIGTERM": 143, "stop": 5}
+_EXIT_CODES = {"SIGINT": 130, "SIGTERM": 143, MACHINE: MachineError.exit_code}
+#: Exit code after any other stop.
+STOPPED = 5
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,9 @@ class RunSummary:
     stopped_by: str | None
     #: How well each data cell is known; empty where the number of data sets was given.
     precision: tuple[CellPrecision, ...] = ()
+    #: Estimates that the machine did not let finish, and what was in their way.
+    given_up: int = 0
+    hindrance: str = ""
 
     @property
     def missing(self) -> int:
@@ -69,8 +78,11 @@ class RunSummary:
 
     @property
     def exit_code(self) -> int:
-        """What a command should answer: 0 if everything is stored, 130 or 143 after a signal, 5 after another stop."""
-        return _EXIT_CODES[self.stopped_by]
+        """What a command should answer: 0 if everything is stored, 130 or 143 after a signal, 5 after another stop.
+
+        8 where the machine stood in the way.
+        """
+        return 0 if self.stopped_by is None else _EXIT_CODES.get(self.stopped_by, STOPPED)
 
 
 def run_experiment(
@@ -81,19 +93,24 @@ def run_experiment(
     on_event: events.OnEvent = events.ignore,
     fresh: bool = False,
     allow_mixed: bool = False,
-    stop: threading.Event | None = None,
+    stop: StopAt | None = None,
     warm: Callable[[], float] | None = None,
+    executor: Callable[[Limits], Executor] | None = None,
 ) -> RunSummary:
-    """Compute the missing estimates of a plan and seal all of them."""
+    """Compute the missing estimates of a plan and seal all of them.
+
+    An executor is made for the limits that it is to watch; by default `jobs` processes on this machine.
+    """
     begun = time.monotonic()
     origins = current_origins(plan)
+    limits = Limits.of(plan.spec.canonical())
     with StopRequest(stop) as stopping, ExitStack() as stack:
         begun_with, peek = _look(plan, folder, origins, fresh=fresh, allow_mixed=allow_mixed)
         todo = _jobs(begun_with, peek)
         if todo:
             on_event(events.KernelsCompiling())
             on_event(events.KernelsCompiled(warm() if warm else _compile_kernels(plan)))
-            if not check_components(plan):
+            if not check_components(plan, limits, stopping):
                 _check_first_records(todo)
         moved = place.move_aside(folder) if fresh else None
         with _writing(folder):
@@ -106,7 +123,10 @@ def run_experiment(
         except StorageError as error:
             raise StorageError(f"{error}. {place.what_is_safe(folder)}") from error
         stack.callback(log.close)
-        run = _Run(as_needed(plan, log), folder, log, origins, on_event, jobs or usable_processors())
+        workers = jobs or usable_processors()
+        computing = executor(limits) if executor else LokyPool(workers, limits)
+        stack.callback(computing.close)
+        run = _Run(as_needed(plan, log), folder, log, origins, on_event, computing, workers)
         stack.callback(run.cleanup)
         run.start()
         run.compute(stopping)
@@ -132,13 +152,15 @@ class _Run:
         log: journal.Journal,
         origins: Mapping[str, Origin],
         on_event: events.OnEvent,
+        executor: Executor,
         workers: int,
     ) -> None:
         self.plan, self.folder, self.log, self.origins = plan, folder, log, origins
-        self.on_event, self.workers = on_event, workers
+        self.on_event, self.executor, self.workers = on_event, executor, workers
         #: Estimates that were stored when the run began.
         self.stored = log.keys()
-        self.computed = self.done = self.total = 0
+        self.computed = self.done = self.total = self.given_up = 0
+        self.hindrance = ""
         self.precision: tuple[CellPrecision, ...] = ()
         self.started = now()
         self._lay_out()
@@ -179,46 +201,57 @@ class _Run:
         return True
 
     def compute(self, stopping: StopRequest) -> None:
-        from ctid_cli.running.pool import Died, Finished, kill_workers, run_jobs
-
-        unfinished = {(job.cell.hash, job.replicate): len(job.wanted) for job in self.jobs}
-        batch: list[Finished] = []
+        self.unfinished = {(job.cell.hash, job.replicate): len(job.wanted) for job in self.jobs}
+        batch: list[Outcome] = []
         since = time.monotonic()
         told = False
         try:
-            for item in run_jobs(self.jobs, self.workers, stopping):
+            for item in run_jobs(self.jobs, self.executor, stopping):
                 if stopping() and not told:
                     told = True
                     self.on_event(events.Stopping(stopping.reason or ""))
-                if isinstance(item, Died):
-                    self.on_event(events.WorkerDied(item.jobs, item.reason))
-                elif isinstance(item, Finished):
-                    batch.append(item)
+                if isinstance(item, Computed):
+                    batch += item.outcomes
+                elif item is not None:
+                    self._note(item, stopping)
                 late = time.monotonic() - since >= COMMIT_SECONDS
-                if batch and (late or len(batch) >= COMMIT_DATA_SETS):
-                    self._commit(batch, unfinished)
+                if batch and (late or len(batch) >= COMMIT_ESTIMATES):
+                    self._commit(batch)
                     batch = []
                 if late:
                     since = time.monotonic()
             if batch:
-                self._commit(batch, unfinished)
+                self._commit(batch)
         except BaseException:
-            kill_workers()
+            self.executor.stop()
             raise
 
-    def _commit(self, batch: list[Any], unfinished: dict[tuple[str, int], int]) -> None:
-        self.log.add([outcome for item in batch for outcome in item.outcomes], self.session)
-        for item in batch:
-            data_set = (item.job.cell.hash, item.job.replicate)
-            unfinished[data_set] -= len(item.outcomes)
-            self.done += unfinished[data_set] == 0
-            self.computed += len(item.outcomes)
+    def _note(self, item: Died | GivenUp | Unable, stopping: StopRequest) -> None:
+        """Take note of what is not a result."""
+        match item:
+            case Died():
+                self.on_event(events.WorkerDied(item.estimates, item.reason))
+            case GivenUp():
+                self.given_up += len(item.keys)
+                self.hindrance = item.reason
+                self.on_event(events.GivenUp(len(item.keys), item.reason))
+            case Unable():
+                self.hindrance = item.reason
+                stopping.ask(MACHINE)
+
+    def _commit(self, batch: Sequence[Outcome]) -> None:
+        self.log.add(batch, self.session)
+        for data_set, found in groupby(batch, key=lambda outcome: outcome.key[:2]):
+            outcomes = list(found)
+            self.unfinished[data_set] -= len(outcomes)
+            self.done += self.unfinished[data_set] == 0
+            self.computed += len(outcomes)
             rows = tuple(
                 assemble(slot, self.manifest, outcome.result, outcome.seconds, outcome.cpu_seconds)
-                for outcome in item.outcomes
+                for outcome in outcomes
                 for slot in self.slots[outcome.key]
             )
-            self.on_event(events.DataSetDone(self.done, self.total, rows))
+            self.on_event(events.EstimatesDone(self.done, self.total, rows))
         self._announce()
 
     def _announce(self) -> None:
@@ -229,6 +262,7 @@ class _Run:
         statuses = self.log.statuses()
         failed = sum(statuses.get(key) in FAILURES for key in self.slots)
         missing = self.ready.estimates - self.computed
+        reason = reason or (MACHINE if self.given_up else None)
         stopped, ended = now(), "finished" if not missing else reason or "unfinished"
         self.log.end(self.session, stopped, ended)
         counts = {"planned": len(self.slots), "reused": self.ready.reused, "computed": self.computed, "failed": failed}
@@ -247,6 +281,8 @@ class _Run:
             seconds=time.monotonic() - begun,
             stopped_by=reason if missing else None,
             precision=self.precision,
+            given_up=self.given_up,
+            hindrance=self.hindrance,
         )
 
     def cleanup(self) -> None:

@@ -39,8 +39,8 @@ class KernelsCompiled:
 
 
 @dataclass(frozen=True)
-class DataSetDone:
-    """Estimates of one data set are safely stored: all of them, or those of one estimator."""
+class EstimatesDone:
+    """Estimates of one data set are safely stored: some of them, or the last ones."""
 
     done: int
     total: int
@@ -58,9 +58,17 @@ class BlockDone:
 
 @dataclass(frozen=True)
 class WorkerDied:
-    """A worker process died; the estimates in work are repeated one by one to find out which of them did it."""
+    """A worker process died; the estimates that it was at are computed once more, each in a process of its own."""
 
-    data_sets: int
+    estimates: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class GivenUp:
+    """Estimates that the machine did not let finish, twice; they are not stored."""
+
+    estimates: int
     reason: str
 
 
@@ -80,7 +88,17 @@ class Sealed:
     checksum: str
 
 
-Event = PlanReady | KernelsCompiling | KernelsCompiled | DataSetDone | BlockDone | WorkerDied | Stopping | Sealed
+Event = (
+    PlanReady
+    | KernelsCompiling
+    | KernelsCompiled
+    | EstimatesDone
+    | BlockDone
+    | WorkerDied
+    | GivenUp
+    | Stopping
+    | Sealed
+)
 OnEvent = Callable[[Event], None]
 
 

@@ -13,6 +13,7 @@ from ctid_cli.errors import SpecError
 from ctid_cli.own_code import reason
 from ctid_cli.running.cells import Plan, Task
 from ctid_cli.running.job import Job
+from ctid_cli.running.limits import Limits
 from ctid_cli.running.pool import in_worker
 from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.simulation.own_components import (
@@ -35,11 +36,11 @@ MISTAKES = (NameError, AttributeError, TypeError, ImportError)
 GLOBAL = "depends on the global random state, so that no run could be repeated; draw from"
 
 
-def check_components(plan: Plan) -> bool:
+def check_components(plan: Plan, limits: Limits | None = None, stopping: Callable[[], bool] = lambda: False) -> bool:
     """Refuse components that fail on the first data set, or come out otherwise the second time.
 
-    A component that ends the process is left to the run, which stores that for every estimate. Says whether data are
-    made by a component of one's own, so that no other process but a worker should make them.
+    A component that ends the process, or takes too long, is left to the run, which stores that for every estimate. Says
+    whether data are made by a component of one's own, so that no other process but a worker should make them.
     """
     task = Task(0, 0)
     cell = plan.data_cells[task.cell]
@@ -48,7 +49,8 @@ def check_components(plan: Plan) -> bool:
     if not wanted and not makes_data:
         return False
     seed = (plan.spec.canonical().get("monte_carlo") or {}).get("seed")
-    found: list[Complaint] = in_worker(look, Job(cell, task.replicate, seed, tuple(wanted), plan.terms)) or []
+    job = Job(cell, task.replicate, seed, tuple(wanted), plan.terms)
+    found: list[Complaint] = in_worker(look, job, limits=limits or Limits(), stopping=stopping) or []
     if found:
         raise SpecError([plan.spec.problem(path, message) for path, message in found])
     return makes_data

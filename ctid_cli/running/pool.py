@@ -1,189 +1,316 @@
-"""A pool of worker processes that survives the death of any of them.
+"""Worker processes on this machine: joblib's loky, one executor for each, so that the death of one hurts no other.
 
-joblib's loky backend does the work. It is used for one job at a time as well, because only separate processes can be
-lost without losing the run, and only they can be given one BLAS thread: with more, results have other last bits.
-
-When a worker dies, the backend drops every unfinished job and does not say which one did it. So their estimates are
-repeated one by one, and those whose worker dies again are ``CRASHED``.
+Separate processes are used for one job at a time as well, because only they can be lost without losing the run, and
+only they can be given one BLAS thread: with more, results have other last bits.
 """
 
-import logging
+from __future__ import annotations
+
+import itertools
 import os
 import queue
 import re
+import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import BrokenExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from ctid_cli import own_code
-from ctid_cli.running.job import Job, run_job
-from ctid_cli.running.job_order import JobQueue
-from ctid_cli.running.worker import initialise
-from ctid_cli.storage.columns import failed
-from ctid_cli.storage.manifest import Outcome
+from ctid_cli.running.executor import Cause, Computed, Done, Hindered, Lost, Message
+from ctid_cli.running.job import Job, Short, shortage
+from ctid_cli.running.limits import Limits, Usage, usage
+from ctid_cli.running.progress import ProgressReader
+from ctid_cli.running.worker import Mark, Received, call, compute, initialise
+from ctid_cli.storage.manifest import Key, Outcome
 
-#: How often the caller gets a chance to do something else while nothing is finished [s].
+#: How often running jobs are looked at [s].
 TICK = 0.05
-#: How long running jobs may go on after a request to stop [s].
-DRAIN = 1.0
+#: The most that counts between two looks [s]: this process may have been stopped meanwhile, and its workers too.
+LONGEST_LOOK = 1.0
+#: Idle workers end after this time [s].
+IDLE = 300.0
+_LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA", "NUMEXPR")
+_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in _LIBRARIES}
+#: Signals that no estimate sends itself by mistake: something else ended its process.
+_FROM_OUTSIDE = {"SIGKILL", "SIGTERM", "SIGINT", "SIGHUP", "SIGQUIT", "SIGXCPU", "SIGXFSZ"}
 
 
-@dataclass(frozen=True)
-class Died:
-    """A worker process died."""
+class LokyPool:
+    """An executor of worker processes on this machine; they are kept for the next one."""
 
-    jobs: int
-    reason: str
+    def __init__(self, workers: int, limits: Limits | None = None) -> None:
+        self._limits = limits or Limits()
+        self._workers = [_idle.pop() if _idle else _Worker() for _ in range(workers)]
+        end_idle_workers()
+        self._folder = tempfile.TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True)
+        self._numbers = itertools.count()
+        self._over: queue.SimpleQueue[tuple[_Worker, Any]] = queue.SimpleQueue()
+        self._messages: list[Message] = []
+        #: Jobs for which no process could be started while others were at work.
+        self._held: list[Job] = []
+        #: Time that was watched [s].
+        self._clock, self._looked = 0.0, time.monotonic()
 
+    @property
+    def room(self) -> int:
+        """How many further jobs it would begin now."""
+        return max(sum(worker.job is None for worker in self._workers) - len(self._held), 0)
 
-@dataclass(frozen=True)
-class Finished:
-    """A job is finished, or as much of it as was split off."""
-
-    job: Job
-    outcomes: list[Outcome]
-
-
-def run_jobs(jobs: Sequence[Job], workers: int, stopping: Callable[[], bool]) -> Iterator[Finished | Died | None]:
-    """Run jobs in worker processes."""
-    waiting = JobQueue(jobs)
-    while waiting and not stopping():
-        lost, reason = yield from _round(waiting, workers, stopping)
-        if lost and not stopping():
-            yield Died(len(lost), reason)
-            for job in lost:
-                yield from _alone(job, stopping)
-
-
-def _alone(job: Job, stopping: Callable[[], bool]) -> Iterator[Finished | Died | None]:
-    for one in job.wanted:
-        part = replace(job, wanted=(one,))
-        lost, reason = yield from _round(JobQueue([part]), 1, stopping)
-        if lost and not stopping():
-            message = f"the worker process died each time this was computed, the last time alone ({reason})"
-            yield Finished(part, [Outcome(key, failed(message, "CRASHED"), None) for key, _, _ in part.wanted])
-
-
-def _round(
-    waiting: JobQueue, workers: int, stopping: Callable[[], bool]
-) -> Generator[Finished | None, None, tuple[list[Job], str]]:
-    """Run jobs until all are finished or a worker dies; return the jobs that were lost, and why."""
-    import joblib
-
-    logging.getLogger("concurrent.futures").addFilter(_no_failed_callback)
-    running: dict[int, Job] = {}
-
-    def calls() -> Iterator[Any]:
-        # joblib asks for the next job from a thread of its own whenever one is finished.
-        while waiting and not stopping():
-            job = waiting.pop()
-            running[id(job)] = job
-            yield joblib.delayed(_numbered)(own_code.served(), id(job), job)
-
-    with _workers(workers):
-        parallel = joblib.Parallel(
-            return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs" if workers > 1 else 1
-        )
-    try:
-        results = parallel(calls())
-    except Exception as error:
-        # The pool can break while the first jobs are handed to it.
-        return list(running.values()), _reason(error)
-    inbox: queue.SimpleQueue[tuple[int, list[Outcome]] | BaseException | None] = queue.SimpleQueue()
-    # The pool itself was started above, by the calling thread: workers die with the thread that started them.
-    threading.Thread(target=_collect, args=(results, inbox), name="ctid-collect", daemon=True).start()
-    deadline: float | None = None
-    reason = ""
-    while True:
-        if deadline is None and stopping():
-            deadline = time.monotonic() + DRAIN
+    def submit(self, job: Job, *, alone: bool = False) -> None:
+        """Take a job."""
         try:
-            item = inbox.get(timeout=TICK)
-        except queue.Empty:
-            if deadline is not None and time.monotonic() > deadline:
-                kill_workers()
-                break
-            yield None
-            continue
-        if item is None:
-            break
-        if isinstance(item, BaseException):
-            reason = _reason(item)
-            break
-        number, outcomes = item
-        waiting.learn(outcomes)
-        yield Finished(running.pop(number), outcomes)
-    return list(running.values()), reason
+            packed = _packed(job)
+        except Exception as error:
+            self._messages.append(Lost(job, "crash", _in_one_line(error)))
+            return
+        # What is to be alone gets a new process, other jobs one that is there.
+        idle = [worker for worker in self._workers if worker.job is None]
+        worker = min(idle, key=lambda one: one.used == alone)
+        if alone:
+            worker.end()
+        worker.take(job, Path(self._folder.name) / str(next(self._numbers)))
+        try:
+            future = worker.start(compute, str(worker.reader.path), packed)
+        except Exception as error:
+            self._not_begun(worker, job, _in_one_line(error))
+            return
+        future.add_done_callback(lambda future: self._over.put((worker, future)))
+
+    def _not_begun(self, worker: _Worker, job: Job, reason: str) -> None:
+        """A process could not be started, or ended before it had its job: there may be room for fewer."""
+        was_used = worker.used
+        worker.end()
+        worker.leave()
+        if was_used:
+            # It ended while it was idle.
+            self._held.append(job)
+        elif any(other.job is not None for other in self._workers):
+            self._workers.remove(worker)
+            self._held.append(job)
+        else:
+            self._messages.append(Lost(job, "machine", f"no worker process could be started ({reason})"))
+
+    def collect(self, seconds: float) -> list[Message]:
+        """What has happened since the last call."""
+        if not self._messages:
+            with suppress(queue.Empty):
+                self._finish(*self._over.get(timeout=seconds))
+        with suppress(queue.Empty):
+            while True:
+                self._finish(*self._over.get_nowait())
+        if time.monotonic() - self._looked >= TICK:
+            self._look()
+        while self._held and any(worker.job is None for worker in self._workers):
+            self.submit(self._held.pop())
+        messages, self._messages = self._messages, []
+        return messages
+
+    def _finish(self, worker: _Worker, future: Any) -> None:
+        """A worker is through with its job, or its process has died."""
+        job = worker.job
+        if job is None or future is not worker.future:
+            return
+        error = future.exception()
+        self._read(worker, job)
+        if isinstance(error, BrokenExecutor) and not worker.process:
+            self._not_begun(worker, job, _ending(error)[1])
+            return
+        if error is None:
+            worker.used = True
+            self._messages.append(Done(job))
+        else:
+            self._messages.append(Lost(job, *_cause(error), worker.keys))
+            worker.end()
+        worker.leave()
+
+    def _read(self, worker: _Worker, job: Job) -> None:
+        """What the progress of a worker's job says that is new."""
+        outcomes = []
+        for entry in worker.reader.news():
+            match entry:
+                case Received():
+                    worker.process = entry.process
+                case Mark():
+                    worker.keys, worker.mark, worker.since = entry.began.keys, entry, self._clock
+                case Outcome():
+                    outcomes.append(entry)
+                    worker.keys = tuple(key for key in worker.keys if key != entry.key)
+                case Short():
+                    self._messages.append(Hindered(job, entry.keys, entry.reason))
+                    worker.keys = tuple(key for key in worker.keys if key not in entry.keys)
+        if outcomes:
+            self._messages.append(Computed(job, outcomes))
+
+    def _look(self) -> None:
+        """Read what all workers have written, and end those that exceed a limit."""
+        now = time.monotonic()
+        self._clock += min(now - self._looked, LONGEST_LOOK)
+        self._looked = now
+        for worker in self._workers:
+            if worker.job is not None:
+                self._read(worker, worker.job)
+                if self._limits:
+                    self._watch(worker, worker.job)
+
+    def _watch(self, worker: _Worker, job: Job) -> None:
+        """End a process whose estimate exceeds a limit."""
+        blamed, exceeded = worker.keys, self._exceeded(worker)
+        if not blamed or exceeded is None:
+            return
+        _end([worker])
+        # It may have been finished just before.
+        self._read(worker, job)
+        left = tuple(key for key in worker.keys if key in blamed)
+        self._messages.append(Lost(job, *exceeded, left) if left else Lost(job, "chance", "another was in work"))
+        worker.leave()
+
+    def _exceeded(self, worker: _Worker) -> tuple[Cause, str] | None:
+        mark = worker.mark
+        if mark is None:
+            return None
+        wall, cpu = mark.began.spent
+        now = usage(worker.process) if mark.used is not None and self._limits.of_processes else None
+        grown = Usage(0.0, 0.0) if now is None or mark.used is None else now - mark.used
+        return self._limits.exceeded(wall + self._clock - worker.since, cpu + grown.cpu, grown.memory)
+
+    def stop(self) -> None:
+        """Abandon what is in work at once."""
+        _end(self._workers)
+        for worker in self._workers:
+            worker.leave()
+        self._held.clear()
+
+    def close(self) -> None:
+        """Keep idle processes for another run."""
+        if any(worker.job is not None for worker in self._workers):
+            self.stop()
+        _idle.extend(worker for worker in self._workers if worker.used)
+        self._workers = []
+        self._folder.cleanup()
 
 
-def in_worker(call: Callable[..., Any], *given: Any) -> Any:
-    """What a call answers in a worker process; None if the process died of it."""
-    import joblib
+class _Worker:
+    """One process at a time, and the job that it has."""
 
-    with _workers(2):
-        parallel = joblib.Parallel(return_as="list")
+    def __init__(self) -> None:
+        self._executor: Any = None
+        #: Whether the process has done something.
+        self.used = False
+        self.take(None, Path())
+
+    def leave(self) -> None:
+        """Forget the job, finished or not."""
+        with suppress(OSError):
+            self.reader.path.unlink(missing_ok=True)
+        self.take(None, Path())
+
+    def take(self, job: Job | None, path: Path) -> None:
+        """Note a job, and where its progress is written."""
+        self.job, self.reader = job, ProgressReader(path)
+        self.future: Any = None
+        #: Number of the process, once it has the job; what it is at, and since when.
+        self.process = 0
+        self.keys: tuple[Key, ...] = ()
+        self.mark: Mark | None = None
+        self.since = 0.0
+
+    def start(self, function: Callable[..., Any], path: str, packed: bytes) -> Any:
+        """Have a function called in the process."""
+        if self._executor is None:
+            self._executor = _executor()
+        self.future = self._executor.submit(function, path, packed)
+        return self.future
+
+    def end(self) -> threading.Thread | None:
+        """End the process, and what it has started; the thread that sees to it is over when they are gone."""
+        executor, self._executor, self.used = self._executor, None, False
+        if executor is None:
+            return None
+        thread: threading.Thread | None = executor._executor_manager_thread
+        with suppress(Exception), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            # Otherwise what is on its way to a process that is gone would be waited for.
+            executor._call_queue._reader.close()
+            executor.shutdown(wait=False, kill_workers=True)
+        return thread
+
+
+def _executor() -> Any:
+    from joblib.externals.loky import ProcessPoolExecutor
+
+    return ProcessPoolExecutor(1, timeout=IDLE, initializer=initialise, initargs=(os.getpid(),), env=_ONE_THREAD)
+
+
+#: Workers that another run has left behind.
+_idle: list[_Worker] = []
+
+
+def _end(workers: Sequence[_Worker]) -> None:
+    """End processes, and wait until they are gone."""
+    for thread in [worker.end() for worker in workers]:
+        if thread is not None:
+            thread.join()
+
+
+def end_idle_workers() -> None:
+    """End the processes that are kept for another run."""
+    workers = list(_idle)
+    _idle.clear()
+    _end(workers)
+
+
+def in_worker(
+    function: Callable[..., Any], *given: Any, limits: Limits, stopping: Callable[[], bool] = lambda: False
+) -> Any:
+    """What a function answers in a worker process; None if the process died of it, or took more than is allowed."""
+    worker = _idle.pop() if _idle else _Worker()
     try:
-        return parallel([joblib.delayed(_called)(own_code.served(), call, given)])[0]
-    except KeyboardInterrupt:
-        kill_workers()
-        raise
+        future = worker.start(call, "", _packed(function, given))
+        begun = time.monotonic()
+        while not stopping() and limits.exceeded(time.monotonic() - begun, 0.0, 0.0) is None:
+            with suppress(TimeoutError):
+                answer = future.result(timeout=TICK)
+                worker.used = True
+                _idle.append(worker)
+                return answer
     except Exception:
-        return None
+        pass
+    finally:
+        if worker not in _idle:
+            _end([worker])
+    return None
 
 
-def _workers(count: int) -> Any:
-    import joblib
+def _packed(*content: Any) -> bytes:
+    """Content for a worker, after the code of one's own that it needs to read it."""
+    from joblib.externals.loky.backend.reduction import dumps
 
-    # joblib would run a single job at a time in this very process; two workers, one of them idle, keep it out.
-    return joblib.parallel_config(
-        backend="loky", n_jobs=max(count, 2), inner_max_num_threads=1, initializer=initialise, initargs=(os.getpid(),)
-    )
+    return bytes(dumps((own_code.served(), *content)))
 
 
-def _called(own: own_code.Served, call: Callable[..., Any], given: tuple[Any, ...]) -> Any:
-    return call(*given)
-
-
-def _no_failed_callback(record: logging.LogRecord) -> bool:
-    """Whether a log record is anything but a callback that met a pool being torn down.
-
-    joblib starts the next job from such a callback. When a run ends early the pool may be gone by then; the backend
-    logs a traceback, although nothing is wrong and the outcome of every job reaches us as a result.
-    """
-    return not str(record.msg).startswith("exception calling callback")
-
-
-def _numbered(own: own_code.Served, number: int, job: Job) -> tuple[int, list[Outcome]]:
-    return number, run_job(job)
-
-
-def _collect(results: Iterator[Any], inbox: queue.SimpleQueue[Any]) -> None:
-    try:
-        for result in results:
-            inbox.put(result)
-    except BaseException as error:
-        inbox.put(error)
-    else:
-        inbox.put(None)
-
-
-def _reason(error: BaseException) -> str:
-    # loky names how its workers ended somewhere in a long explanation; how many did so is a matter of chance.
-    endings = sorted(set(re.findall(r"SIG[A-Z0-9]+|EXIT\(\d+\)", str(error))))
-    if endings:
-        return " ".join(endings)
+def _in_one_line(error: BaseException) -> str:
     first = str(error).strip().partition("\n")[0]
     return f"{type(error).__name__}: {first}"
 
 
-def kill_workers() -> None:
-    """End the pool's processes at once, finished or not."""
-    from joblib.externals.loky import get_reusable_executor
+def _cause(error: BaseException) -> tuple[Cause, str]:
+    """Why a job was lost."""
+    if isinstance(error, BrokenExecutor):
+        return _ending(error)
+    short = shortage(error)
+    return ("machine", short) if short else ("crash", _in_one_line(error))
 
-    with suppress(Exception), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        get_reusable_executor(reuse=True).shutdown(wait=True, kill_workers=True)
+
+def _ending(error: BaseException) -> tuple[Cause, str]:
+    """How a process ended, in the words of loky's long explanation."""
+    found = re.search(r"(SIG[A-Z0-9]+|EXIT|UNKNOWN)\((-?\d+)\)", str(error))
+    if found is None:
+        return "machine", _in_one_line(error)
+    name, number = found.groups()
+    how = name if name.startswith("SIG") else f"exit code {number}"
+    return ("machine" if name in _FROM_OUTSIDE else "crash"), how

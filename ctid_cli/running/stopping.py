@@ -1,12 +1,30 @@
-"""Requests to stop: an interrupt (Ctrl-C), a termination signal, or an event set by the caller."""
+"""Requests to stop: an interrupt (Ctrl-C), a termination signal, an event set by the caller, a budget of time."""
 
 import os
 import signal
 import threading
+import time
+from dataclasses import dataclass
 from types import FrameType, TracebackType
 from typing import Any, Self
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+#: Reasons that are neither signals nor the caller's event.
+TIME_BUDGET, FAILURES, MACHINE = "time budget", "failures", "machine"
+
+
+@dataclass(frozen=True)
+class StopAt:
+    """When a run is to stop although it is not finished."""
+
+    #: Set by the caller.
+    event: threading.Event | None = None
+    #: So many estimates of this run that failed.
+    failures: int | None = None
+    #: So long after its beginning [s].
+    seconds: float | None = None
 
 
 class StopRequest:
@@ -16,9 +34,11 @@ class StopRequest:
     nobody had listened; the workers end with it, and the journal is made for that.
     """
 
-    def __init__(self, event: threading.Event | None = None) -> None:
-        self._event = event
+    def __init__(self, at: StopAt | None = None) -> None:
+        self.at = at or StopAt()
+        self._deadline = None if self.at.seconds is None else time.monotonic() + self.at.seconds
         self._signal: signal.Signals | None = None
+        self._reason: str | None = None
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
@@ -41,13 +61,21 @@ class StopRequest:
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
 
+    def ask(self, reason: str) -> None:
+        """Ask for a stop; the first reason counts."""
+        self._reason = self._reason or reason
+
     def __call__(self) -> bool:
         """Whether a stop was asked for."""
-        return self._signal is not None or (self._event is not None and self._event.is_set())
+        if self._signal is not None:
+            self.ask(self._signal.name)
+        elif self.at.event is not None and self.at.event.is_set():
+            self.ask("stop")
+        elif self._deadline is not None and time.monotonic() > self._deadline:
+            self.ask(TIME_BUDGET)
+        return self._reason is not None
 
     @property
     def reason(self) -> str | None:
-        """Name of the signal, ``"stop"`` for the caller's event, or None."""
-        if self._signal is not None:
-            return self._signal.name
-        return "stop" if self() else None
+        """Name of the signal, ``"stop"`` for the caller's event, another reason, or None."""
+        return self._reason if self() else None

@@ -1,15 +1,56 @@
-"""Worker processes: how they are set up, and how they end with their parent."""
+"""Worker processes: how they are set up, what they do with a job, and how they end with their parent."""
 
 import ctypes
 import faulthandler
 import os
+import pickle
 import signal
 import sys
 import threading
 import time
 import warnings
+from dataclasses import dataclass
+from typing import Any
+
+from ctid_cli.running.job import Began, run_job
+from ctid_cli.running.limits import Usage, usage
+from ctid_cli.running.progress import ProgressWriter
 
 _PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True)
+class Received:
+    """A worker has got a job; what happens now is of the job's making."""
+
+    process: int
+
+
+@dataclass(frozen=True)
+class Mark:
+    """What begins, and what the process has used up to then."""
+
+    began: Began
+    used: Usage | None
+
+
+def compute(path: str, packed: bytes) -> None:
+    """Compute a job, and write what comes of it to its file."""
+    progress = ProgressWriter(path)
+    try:
+        progress.write(Received(os.getpid()))
+        # Code of one's own is imported here.
+        _, job = pickle.loads(packed)
+        for entry in run_job(job):
+            progress.write(Mark(entry, usage("self")) if isinstance(entry, Began) else entry)
+    finally:
+        progress.close()
+
+
+def call(path: str, packed: bytes) -> Any:
+    """What a function answers."""
+    _, function, given = pickle.loads(packed)
+    return function(*given)
 
 
 def initialise(parent: int) -> None:

@@ -18,7 +18,7 @@ def plan(seconds: float = 0.02, runs: int = 20) -> FakePlan:
 
 
 def report(event: events.Event) -> None:
-    if isinstance(event, events.DataSetDone):
+    if isinstance(event, events.EstimatesDone):
         print(*[row["id"] for row in event.rows], flush=True)
     elif isinstance(event, events.PlanReady):
         print("ready", flush=True)

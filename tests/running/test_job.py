@@ -10,9 +10,9 @@ import pytest
 from ctid_cli.canonical import plain
 from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.running.job import Job, failure, run_job
+from ctid_cli.running.job import Job, Short, failure, run_job
 from ctid_cli.storage.columns import no_result
-from ctid_cli.storage.manifest import Key
+from ctid_cli.storage.manifest import Key, Outcome
 from tests.running.fakes import (
     STARTS,
     FakeCell,
@@ -40,7 +40,11 @@ PREPARED: list[int] = []
 
 class Broken(FakeCell):
     def dataset(self, replicate: int) -> Any:
-        raise MemoryError("no room")
+        raise self.swept["error"]
+
+
+def outcomes_of(wanted: Job) -> list[Outcome]:
+    return [entry for entry in run_job(wanted) if isinstance(entry, Outcome)]
 
 
 def job(*toys: Toy, cell: FakeCell | None = None, replicate: int = 2) -> Job:
@@ -54,19 +58,19 @@ def job(*toys: Toy, cell: FakeCell | None = None, replicate: int = 2) -> Job:
 
 def test_a_record_is_prepared_once_for_all_starts() -> None:
     PREPARED.clear()
-    outcomes = run_job(job(Counting(), Counting(order=3), replicate=4))
+    outcomes = outcomes_of(job(Counting(), Counting(order=3), replicate=4))
     assert PREPARED == [4, 4]
     assert [outcome.key.estimator_hash for outcome in outcomes] == ["toy0", "toy0", "toy1", "toy1"]
 
 
 def test_results_do_not_depend_on_what_else_is_wanted() -> None:
-    together = run_job(job(Toy(), Toy(order=3)))
-    alone = run_job(job(Toy()))
+    together = outcomes_of(job(Toy(), Toy(order=3)))
+    alone = outcomes_of(job(Toy()))
     assert [(o.key, o.result) for o in alone] == [(o.key, o.result) for o in together[:2]]
 
 
 def test_results_are_plain_and_complete() -> None:
-    for outcome in run_job(job(Toy(at=2))):
+    for outcome in outcomes_of(job(Toy(at=2))):
         assert list(outcome.result) == list(no_result())
         assert json.loads(json.dumps(outcome.result, allow_nan=False)) == outcome.result
         assert outcome.result["standard_errors"] == {"b0": 0.1, "delay": None}
@@ -75,15 +79,39 @@ def test_results_are_plain_and_complete() -> None:
 
 
 def test_one_failing_estimator_leaves_the_others_alone() -> None:
-    outcomes = run_job(job(Toy("raise", at=2), Toy("unusable"), Toy()))
+    outcomes = outcomes_of(job(Toy("raise", at=2), Toy("unusable"), Toy()))
     assert [outcome.result["status"] for outcome in outcomes] == ["FAILED"] * 4 + ["CONVERGED"] * 2
     assert outcomes[2].result["message"].startswith("DataError: the input is constant")
 
 
 def test_a_data_set_that_cannot_be_made_fails_every_estimate() -> None:
-    outcomes = run_job(job(Toy(), cell=Broken({}, {})))
+    outcomes = outcomes_of(job(Toy(), cell=Broken({}, {"error": ArithmeticError("no sample")})))
     assert [outcome.result["status"] for outcome in outcomes] == ["FAILED", "FAILED"]
-    assert outcomes[0].result["message"].startswith("MemoryError: no room\n  job.py:")
+    assert outcomes[0].result["message"].startswith("ArithmeticError: no sample\n  job.py:")
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (MemoryError("no room"), "out of memory: no room"),
+        (OSError(24, "Too many open files"), "[Errno 24] Too many open files"),
+        (BlockingIOError(11, "no more processes"), "[Errno 11] no more processes"),
+    ],
+)
+def test_what_the_machine_is_short_of_is_no_result(error: Exception, reason: str) -> None:
+    def wrapped() -> Exception:
+        try:
+            try:
+                raise error
+            except Exception as first:
+                raise ValueError("the record cannot be read") from first
+        except ValueError as second:
+            return second
+
+    for raised in (error, wrapped()):
+        wanted = job(Toy(), cell=Broken({}, {"error": raised}))
+        assert outcomes_of(wanted) == []
+        assert Short(wanted.keys, reason) in list(run_job(wanted))
 
 
 def test_messages_are_the_same_in_every_process() -> None:
@@ -145,11 +173,11 @@ def test_starts_are_told_the_true_system_and_fractions_the_submodels_to_find() -
 
     cell = FakeEstimatorCell("fraction", Fraction(), ())
     wanted = ((Key("data", 3, "fraction", "near"), cell, Start()),)
-    (untouched,) = run_job(Job(Source({}, {}), 3, 7, wanted))  # type: ignore[arg-type]
+    (untouched,) = outcomes_of(Job(Source({}, {}), 3, 7, wanted))  # type: ignore[arg-type]
     assert told == [(7, 3, "the truth")]
     assert untouched.result["parameters"] is None
     assert untouched.result["standard_errors"].keys() == {"b0", "a1", "a2"}
-    (factored,) = run_job(Job(Source({}, {}), 3, 7, wanted, (Term(2, 0),)))  # type: ignore[arg-type]
+    (factored,) = outcomes_of(Job(Source({}, {}), 3, 7, wanted, (Term(2, 0),)))  # type: ignore[arg-type]
     assert factored.result["parameters"] == pytest.approx({"g1_a1": 0.75, "g1_a2": 0.25, "g1_b0": 0.5, "g1_b1": 0.0})
     # a_1 = a1/a2: the relative variances of both add up.
     assert factored.result["standard_errors"]["g1_a1"] == pytest.approx(0.75 * np.hypot(0.1 / 3, 0.2 / 4))
@@ -159,7 +187,7 @@ def test_starts_are_told_the_true_system_and_fractions_the_submodels_to_find() -
 
 def test_processor_time_does_not_pass_while_an_estimator_waits() -> None:
     # Of a busy one it does, however many others share the processor.
-    (waits, *_), (works, *_) = run_job(job(Toy(seconds=0.2))), run_job(job(Toy(seconds=0.2, busy=True)))
+    (waits, *_), (works, *_) = outcomes_of(job(Toy(seconds=0.2))), outcomes_of(job(Toy(seconds=0.2, busy=True)))
     assert waits.seconds is not None
     assert waits.cpu_seconds is not None
     assert works.cpu_seconds is not None

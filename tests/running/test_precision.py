@@ -17,6 +17,7 @@ from ctid_cli.inference.precision import AT_LEAST, GROWTH, Replications, Until, 
 from ctid_cli.running import events
 from ctid_cli.running.cell_precision import cell_precisions
 from ctid_cli.running.engine import RunSummary, preview, run_experiment
+from ctid_cli.running.stopping import StopAt
 from ctid_cli.storage.store import read_stored
 from tests.running.fakes import FakePlan
 
@@ -169,7 +170,7 @@ def test_neither_workers_nor_interruptions_change_a_byte(tmp_path: Path, undistu
     def after(count: int) -> Any:
         def listen(event: events.Event) -> None:
             nonlocal seen
-            seen += isinstance(event, events.DataSetDone)
+            seen += isinstance(event, events.EstimatesDone)
             if seen >= count:
                 stop.set()
 
@@ -179,7 +180,7 @@ def test_neither_workers_nor_interruptions_change_a_byte(tmp_path: Path, undistu
     for count in (1, 1, 20):
         stop.clear()
         seen = 0
-        summary = run(plan(), place, jobs=1 + interruptions % 2, stop=stop, on_event=after(count))
+        summary = run(plan(), place, jobs=1 + interruptions % 2, stop=StopAt(stop), on_event=after(count))
         interruptions += summary.exit_code == 5
     assert interruptions > 0
     told: list[events.Event] = []

@@ -234,7 +234,7 @@ from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 
 def tell(event):
-    if isinstance(event, events.DataSetDone):
+    if isinstance(event, events.EstimatesDone):
         print("stored", flush=True)
 
 run_experiment(build_plan(load_spec(Path(sys.argv[1]))), Path(sys.argv[2]), jobs=1, on_event=tell)
