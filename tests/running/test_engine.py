@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import logging
 import os
 import random
 import shutil
@@ -472,14 +471,6 @@ def test_mixing_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 # Storage
-
-
-def test_callbacks_of_a_pool_that_is_gone_print_no_traceback(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    run(FakePlan(runs=1), tmp_path)
-    logger = logging.getLogger("concurrent.futures")
-    logger.error("exception calling callback for <Future>")
-    logger.error("something else")
-    assert [record.getMessage() for record in caplog.records] == ["something else"]
 
 
 def test_a_full_disk_loses_nothing_that_was_reported(tmp_path: Path, undisturbed: bytes) -> None:
