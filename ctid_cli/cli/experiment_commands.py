@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ctid_cli.cli._common import AllowCode, Configs, Fresh, Jobs, Out, Overrides, Runs, guarded
+from ctid_cli.cli._common import AllowCode, AllowMixed, Configs, Fresh, Jobs, Out, Overrides, Runs, guarded
 from ctid_cli.cli._progress import Reporter, json_lines
 from ctid_cli.errors import Problem, SpecError, TooManyFailuresError, UsageError
 from ctid_cli.reporting.layout import count, seconds
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from ctid_cli.running.cells import Plan
     from ctid_cli.running.engine import RunSummary
     from ctid_cli.running.events import Event, PlanReady
+    from ctid_cli.storage.shards import Shard
 
 
 def load_plans(
@@ -69,7 +71,11 @@ def run(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and stop.")] = False,
     out: Out = Path("results"),
     fresh: Fresh = False,
-    allow_mixed: Annotated[bool, typer.Option("--allow-mixed", help="Mix code versions or processors.")] = False,
+    allow_mixed: AllowMixed = False,
+    shard: Annotated[
+        str | None,
+        typer.Option("--shard", metavar="K/N", help="Only the K-th of N equal parts; ctid merge joins them."),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Write one JSON object per line to stdout.")] = False,
 ) -> None:
@@ -78,25 +84,32 @@ def run(
     Finished estimates are stored as they come, so nothing is lost when a run is stopped or killed.
     """
     from ctid_cli.running.engine import preview, run_experiment
+    from ctid_cli.running.shard_plan import shard_plan
+    from ctid_cli.storage.shards import Shard
 
     plans = [plan for _, plan in load_plans(configs, overrides or [], runs, allow_code=allow_code)]
+    folders = [out / plan.experiment for plan in plans]
+    part = None if shard is None else Shard.read(shard)
+    if part is not None:
+        plans, folders = [shard_plan(plan, part) for plan in plans], [out / part.folder(p.experiment) for p in plans]
     if dry_run:
-        for ready in [preview(plan, out / plan.experiment, fresh=fresh, allow_mixed=allow_mixed) for plan in plans]:
+        for plan, folder in zip(plans, folders, strict=True):
+            ready = preview(plan, folder, fresh=fresh, allow_mixed=allow_mixed)
             typer.echo(json_lines(ready)[0] if as_json else _intention(ready))
         return
     hopeless = []
-    for plan in plans:
+    for plan, folder in zip(plans, folders, strict=True):
         with Reporter(plan.experiment) as reporter:
-            tell, folder = partial(_tell, None if quiet else reporter, as_json), out / plan.experiment
+            tell = partial(_tell, None if quiet else reporter, as_json)
             summary = run_experiment(plan, folder, jobs=jobs, on_event=tell, fresh=fresh, allow_mixed=allow_mixed)
         if as_json:
             content = asdict(summary) | {"missing": summary.missing, "exit_code": summary.exit_code}
             typer.echo(json.dumps({"event": "summary", **content}, default=str))
         if not quiet:
-            typer.echo(_conclusion(summary, out), err=as_json)
+            typer.echo(_conclusion(summary, out, part), err=as_json)
         if summary.exit_code:
             raise typer.Exit(summary.exit_code)
-        if summary.failed == summary.planned:
+        if summary.failed == summary.planned > 0:
             hopeless.append(f"{plan.experiment}: all {summary.planned} estimates failed")
     if hopeless:
         raise TooManyFailuresError("\n".join(hopeless))
@@ -117,7 +130,7 @@ def _intention(ready: PlanReady) -> str:
     return text + more if ready.at_most is not None and ready.estimates else text
 
 
-def _conclusion(summary: RunSummary, out: Path) -> str:
+def _conclusion(summary: RunSummary, out: Path, part: Shard | None) -> str:
     from ctid_cli.reporting.precision_words import precision_lines
     from ctid_cli.reporting.results import out_option
     from ctid_cli.reporting.study import tables_of
@@ -134,6 +147,8 @@ def _conclusion(summary: RunSummary, out: Path) -> str:
         lines.append(f"  {summary.failed} failed; to see why: ctid status {summary.experiment}{option}")
     if summary.stopped_by is not None:
         lines.append(f"  stopped by {summary.stopped_by}; run the same command again to compute the rest")
+    if part is not None:
+        return "\n".join([*lines, f"  {part}; when all are done: ctid merge {shlex.quote(str(out))}{option}"])
     name = " ".join(str(number) for number in tables_of(summary.experiment)) or summary.experiment
     return "\n".join([*lines, f"  next: ctid table {name}{option}"])
 

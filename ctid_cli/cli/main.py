@@ -10,6 +10,7 @@ from ctid_cli.cli.check_commands import CheckCommand, check
 from ctid_cli.cli.experiment_commands import run, schema, validate
 from ctid_cli.cli.fit_command import fit
 from ctid_cli.cli.init_command import init
+from ctid_cli.cli.merge_command import merge
 from ctid_cli.cli.result_commands import export, figure, report, show, status, table
 from ctid_cli.cli.study_command import study
 from ctid_cli.cli.track_command import track
@@ -47,7 +48,7 @@ def _root(
 
 
 app.command(cls=CheckCommand)(check)
-for _command in (fit, track, init, run, status, table, figure, report, show, export, validate, schema):
+for _command in (fit, track, init, run, merge, status, table, figure, report, show, export, validate, schema):
     app.command(cls=Command)(_command)
 app.add_typer(study, name="study")
 

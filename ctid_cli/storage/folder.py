@@ -144,13 +144,18 @@ def check_free(folder: Path, manifest: Manifest, origins: Mapping[str, Origin], 
 
 
 def _other_origin(folder: Path, other: Origin, origin: Origin) -> str:
-    then, now = dict(other.packages), dict(origin.packages)
-    pairs: list[tuple[str, str | None, str | None]] = [("code version", other.code_version, origin.code_version)]
-    pairs += [(name, then.get(name), now.get(name)) for name in then | now]
-    pairs += [("numeric platform", repr(other.platform), repr(origin.platform))]
-    differences = "; ".join(f"{name} {old} then, {new} now" for name, old, new in pairs if old != new)
+    differences = "; ".join(f"{name} {old} then, {new} now" for name, old, new in origin_differences(other, origin))
     ways = "use --fresh to move them aside and compute all anew, or --allow-mixed to add to them, which is recorded"
     return f"{folder} holds results of other code or arithmetic ({differences}); {ways}"
+
+
+def origin_differences(one: Origin, other: Origin) -> list[tuple[str, str | None, str | None]]:
+    """What of two origins differs: its name, and what it is of each."""
+    left, right = dict(one.packages), dict(other.packages)
+    pairs: list[tuple[str, str | None, str | None]] = [("code version", one.code_version, other.code_version)]
+    pairs += [(name, left.get(name), right.get(name)) for name in left | right]
+    pairs += [("numeric platform", repr(one.platform), repr(other.platform))]
+    return [pair for pair in pairs if pair[1] != pair[2]]
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from ctid_cli.errors import RefusedError
 from ctid_cli.storage import columns
+from ctid_cli.storage.shards import Shard
 
 Manifest = dict[str, Any]
 
@@ -68,12 +69,24 @@ def refuse_newer(path: Path, written: int, known: int) -> None:
 
 
 def slots(manifest: Manifest) -> Iterator[Slot]:
-    """Every estimate that a plan asks for."""
+    """Every estimate that a plan asks for, or that its shard is to compute."""
+    cells, shard = manifest["data_cells"], shard_of(manifest)
     for estimator in manifest["estimators"]:
-        for cell in manifest["data_cells"]:
+        for number, cell in enumerate(cells):
             for replicate in range(cell["replicates"]):
-                for start in estimator["starts"]:
-                    yield Slot(Key(cell["hash"], replicate, estimator["hash"], start), cell, estimator)
+                if shard is None or shard.has(number, replicate, len(cells)):
+                    for start in estimator["starts"]:
+                        yield Slot(Key(cell["hash"], replicate, estimator["hash"], start), cell, estimator)
+
+
+def shard_of(manifest: Manifest) -> Shard | None:
+    """Which shard of the experiment it is; None for the whole."""
+    return Shard(*manifest["shard"]) if "shard" in manifest else None
+
+
+def whole(manifest: Manifest) -> Manifest:
+    """The plan that a shard was dealt from."""
+    return {name: value for name, value in manifest.items() if name != "shard"}
 
 
 def assemble(

@@ -22,6 +22,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.running.cells import Plan, Task
 from ctid_cli.simulation.dataset import DataSet
 from ctid_cli.storage.manifest import Key
+from ctid_cli.storage.shards import Shard
 
 
 class FakeStatus(Enum):
@@ -226,6 +227,14 @@ class FakePlan:
     def with_replicates(self, replicates: Sequence[int]) -> FakePlan:
         other = copy(self)
         other.replicates = tuple(replicates)
+        return other
+
+    def part(self, number: int, of: int) -> FakePlan:
+        """One of several shards."""
+        other, shard, cells = copy(self), Shard(number, of), len(self.data_cells)
+        tasks = [task for task in self.tasks() if shard.has(task.cell, task.replicate, cells)]
+        other.tasks = lambda: tasks  # type: ignore[method-assign]
+        other.manifest = lambda: self.manifest() | {"shard": [number, of]}  # type: ignore[method-assign]
         return other
 
     def keys(self, task: Task) -> list[tuple[Key, FakeEstimatorCell, FakeStartPoint]]:

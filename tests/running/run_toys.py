@@ -31,10 +31,13 @@ def main() -> int:
     parser.add_argument("--file-size", type=int, help="largest file that may be written, as on a full disk")
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=0.02)
+    parser.add_argument("--shard", help="only a part, as in 2/3")
     options = parser.parse_args()
     if options.file_size:
         resource.setrlimit(resource.RLIMIT_FSIZE, (options.file_size, options.file_size))
     toys = plan(options.seconds, options.runs)
+    if options.shard:
+        toys = toys.part(*map(int, options.shard.split("/")))
     try:
         summary = run_experiment(toys, options.folder, jobs=options.jobs, on_event=report, warm=lambda: 0.0)
     except CtidError as error:

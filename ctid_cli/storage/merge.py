@@ -1,0 +1,268 @@
+"""Merging: what several folders hold of one experiment, as if one run had computed it.
+
+The folders that are merged are only read. Rows go over with their times, and the runs that computed them with all that
+is known of these. The sealed file comes from the rows alone, so that it has the bytes of a single run's.
+"""
+
+import json
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ctid_cli.errors import RefusedError, StorageError, UsageError
+from ctid_cli.storage import folder as place
+from ctid_cli.storage import journal
+from ctid_cli.storage.identity import Origin, are_mixed
+from ctid_cli.storage.manifest import Key, Manifest, Outcome, shard_of, slots, whole
+from ctid_cli.storage.shards import Shard, owner, ranges
+from ctid_cli.storage.store import seal
+
+#: What a session is called, apart from what is known of it.
+_OF_SESSION = ("session", "started", "stopped", "reason")
+_SHARD = re.compile(r"\.shard-\d+-of-\d+$")
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """What one folder holds."""
+
+    folder: Path
+    manifest: Manifest
+    entries: Mapping[Key, journal.Entry]
+    sessions: Sequence[Mapping[str, Any]]
+
+    @property
+    def shard(self) -> Shard | None:
+        """Which shard it is."""
+        return shard_of(self.manifest)
+
+
+@dataclass(frozen=True)
+class Merged:
+    """What a merge has made."""
+
+    experiment: str
+    folder: Path
+    sources: int
+    planned: int
+    stored: int
+    #: Estimates that were not in the folder before.
+    new: int
+    mixed: bool
+    checksum: str
+    #: What is not there, in words.
+    missing: tuple[str, ...]
+
+
+def find_sources(paths: Iterable[Path]) -> list[Path]:
+    """The folders that are meant: of experiments as they are given, of all shards below others."""
+    found: dict[Path, Path] = {}
+    for path in paths:
+        if (path / journal.FILE_NAME).exists():
+            inside = [path]
+        else:
+            inside = [folder for folder in place.experiment_folders(path) if _SHARD.search(folder.name)]
+        if not inside:
+            raise UsageError(f"there are no results of shards in {path}; 'ctid run --shard 1/3' writes the first of 3")
+        found |= {folder.resolve(): folder for folder in inside}
+    return list(found.values())
+
+
+@contextmanager
+def _reading(folder: Path) -> Iterator[journal.Journal]:
+    with place.lock(folder, shared=True), place.reading_journal(folder) as log:
+        if log is None:
+            raise UsageError(f"there is no {journal.FILE_NAME} with results in {folder}, which a merge reads")
+        yield log
+
+
+def read_source(folder: Path) -> Source:
+    """What a folder holds of its latest plan, each row compared with its checksum."""
+    with _reading(folder) as log:
+        log.check()
+        manifest, entries = log.manifest(), log.entries()
+        planned = {slot.key for slot in slots(whole(manifest))}
+        return Source(folder, manifest, {key: entries[key] for key in entries if key in planned}, log.sessions())
+
+
+def merge_all(
+    folders: Iterable[Path], out: Path, *, allow_mixed: bool = False, partial: bool = False
+) -> Iterator[Merged]:
+    """Merge folders, those of each experiment into the one of its name."""
+    experiments: dict[str, list[Path]] = defaultdict(list)
+    for folder in folders:
+        with _reading(folder) as log:
+            experiments[log.experiment()].append(folder)
+    for name, places in experiments.items():
+        # The name comes from the folders, which may come from anybody.
+        if not (out / name).resolve().is_relative_to(out.resolve()):
+            raise RefusedError(f"{places[0]} holds the experiment {name!r}, whose folder would not be in {out}")
+        yield merge(map(read_source, places), out / name, allow_mixed=allow_mixed, partial=partial)
+
+
+def merge(sources: Iterable[Source], target: Path, *, allow_mixed: bool = False, partial: bool = False) -> Merged:
+    """Merge folders of one experiment into another one, which may hold some of its estimates already."""
+    # In the same order whatever the order they are named in.
+    read = sorted(sources, key=lambda source: (source.shard or Shard(0, 0), str(source.folder)))
+    read = [source for source in read if not (target.exists() and source.folder.samefile(target))]
+    if not read:
+        raise UsageError(f"there is nothing to merge into {target} but itself")
+    plan = _common_plan(read)
+    present = _present(target, plan, read, allow_mixed=allow_mixed)
+    if not allow_mixed:
+        _check_origins([*present, *read])
+    new = _new_entries(present, read)
+    planned = {slot.key for slot in slots(plan)}
+    known = {key for source in present for key in source.entries}
+    missing = tuple(_missing(plan, read, planned - known - new.keys()))
+    if missing and not partial:
+        raise RefusedError(f"{plan['experiment']}: {'; '.join(missing)}. --partial merges what there is")
+    with _writing(target):
+        target.mkdir(parents=True, exist_ok=True)
+    with place.lock(target), closing(journal.open_journal(target / journal.FILE_NAME)) as log:
+        if known != planned & log.keys():
+            raise place.InUseError(f"{target} was changed by another process just now; run the command again")
+        with _writing(target):
+            for name in (place.SPEC, place.CANONICAL):
+                place.write_safely(target / name, (read[0].folder / name).read_bytes())
+        log.replan(plan)
+        for source in read:
+            _take_over(source, {key: entry for key, (own, entry) in new.items() if own is source}, plan, log)
+        count, checksum = seal(target, log)
+        mixed = are_mixed(log.origins())
+    return Merged(plan["experiment"], target, len(read), len(planned), count, len(new), mixed, checksum, missing)
+
+
+def _common_plan(read: Sequence[Source]) -> Manifest:
+    """The plan that all folders are of."""
+    first = read[0]
+    plan = whole(first.manifest)
+    for source in read[1:]:
+        other = whole(source.manifest)
+        if other != plan:
+            ours, theirs = first.manifest["spec"], source.manifest["spec"]
+            sections = [name for name in ours | theirs if ours.get(name) != theirs.get(name)]
+            where = f" ({', '.join(sections)} differ)" if sections else ""
+            raise RefusedError(
+                f"{first.folder} and {source.folder} are of different specifications{where}; run their shards again "
+                "with the same specification and options, which computes only what is new"
+            )
+    return plan
+
+
+def _present(target: Path, plan: Manifest, read: Sequence[Source], *, allow_mixed: bool) -> list[Source]:
+    """What the folder that is merged into holds of the plan."""
+    if not target.exists():
+        return []
+    origins = {key.estimator_hash: entry.origin for source in read for key, entry in source.entries.items()}
+    with place.lock(target, shared=True):
+        if origins:
+            place.check_free(target, plan, origins, allow_mixed=allow_mixed)
+        with place.reading_journal(target) as log:
+            if log is None:
+                return []
+            planned, entries = {slot.key for slot in slots(plan)}, log.entries()
+            return [Source(target, plan, {key: entries[key] for key in entries if key in planned}, log.sessions())]
+
+
+def _check_origins(sources: Sequence[Source]) -> None:
+    """Refuse what other code or another processor has computed than the rest."""
+    seen: dict[str, tuple[Origin, Path]] = {}
+    for source in sources:
+        for estimator, origin in sorted({(key.estimator_hash, entry.origin) for key, entry in source.entries.items()}):
+            # All share what makes their data; those of one estimator share what makes the estimates too.
+            other, folder = seen.get(estimator) or next(iter(seen.values()), (origin, source.folder))
+            if other.shared != origin.shared or (estimator in seen and other != origin):
+                pairs = place.origin_differences(other, origin)
+                differences = "; ".join(f"{name} {left} and {right}" for name, left, right in pairs)
+                raise RefusedError(
+                    f"{folder} and {source.folder} were computed by other code or arithmetic ({differences}); run one "
+                    "of them with --fresh where the other was run, or merge with --allow-mixed, which tables will say"
+                )
+            seen.setdefault(estimator, (origin, source.folder))
+
+
+def _new_entries(present: Sequence[Source], read: Sequence[Source]) -> dict[Key, tuple[Source, journal.Entry]]:
+    """What is to be stored, and where it comes from."""
+    found: dict[Key, tuple[Source, journal.Entry]] = {}
+    for source in (*present, *read):
+        for key, entry in source.entries.items():
+            other, stored = found.setdefault(key, (source, entry))
+            if stored.result != entry.result:
+                raise RefusedError(
+                    f"estimate {key.id} is one thing in {other.folder} and another in {source.folder}; 'ctid show "
+                    f"{key.id}' prints each, and --fresh computes one of the folders anew"
+                )
+    ours = set(map(id, present))
+    return {key: value for key, value in found.items() if id(value[0]) not in ours}
+
+
+def _missing(plan: Manifest, read: Sequence[Source], keys: set[Key]) -> Iterator[str]:
+    """What is not there, by shard where all folders are of the same dealing."""
+    dealt = {source.shard.of for source in read if source.shard is not None}
+    if not keys:
+        return
+    if len(dealt) != 1 or any(source.shard is None for source in read):
+        yield f"{len(keys)} estimates are missing"
+        return
+    (of,) = dealt
+    cells = [cell["hash"] for cell in plan["data_cells"]]
+    places = {cell: number for number, cell in enumerate(cells)}
+    lacking = Counter(owner(places[key.data_hash], key.replicate, len(cells), of) for key in keys)
+    given = {source.shard.number for source in read if source.shard is not None}
+    if absent := lacking.keys() - given:
+        number = sum(lacking[shard] for shard in absent)
+        what = "is not among the folders" if len(absent) == 1 else "are not among the folders"
+        yield f"{_shards(absent, of)} {what} ({number} estimates)"
+    if unfinished := lacking.keys() & given:
+        number, one = sum(lacking[shard] for shard in unfinished), len(unfinished) == 1
+        again = f"{'lacks' if one else 'lack'} {number} estimates, which the same 'ctid run' again computes"
+        yield f"{_shards(unfinished, of)} {again}"
+
+
+def _shards(numbers: Iterable[int], of: int) -> str:
+    """Some shards in words, with numbers as a job array takes them."""
+    text = ranges(numbers)
+    return f"{'shard' if text.isdigit() else 'shards'} {text} of {of}"
+
+
+def _take_over(source: Source, entries: Mapping[Key, journal.Entry], plan: Manifest, log: journal.Journal) -> None:
+    """Store estimates of a folder, run by run, with what is known of the runs that computed them."""
+    for run in source.sessions:
+        own = {key: entry for key, entry in entries.items() if entry.session == run["session"]}
+        if own:
+            info = {name: value for name, value in run.items() if name not in _OF_SESSION}
+            number = log.begin(plan, {key.estimator_hash: e.origin for key, e in own.items()}, run["started"], info)
+            log.add([Outcome(key, e.result, e.seconds, e.cpu_seconds) for key, e in own.items()], number)
+            if run["stopped"] is not None:
+                log.end(number, run["stopped"], run["reason"])
+            with _writing(log.path.parent):
+                _copy_provenance(source.folder, run["session"], log.path.parent, number)
+
+
+def _copy_provenance(source: Path, session: int, target: Path, number: int) -> None:
+    """Keep what is known of a run, under its new number."""
+    (target / place.PROVENANCE).mkdir(exist_ok=True)
+    # One that was killed has left nothing but its line in the journal.
+    for file in (source / place.PROVENANCE).glob(f"{session:04d}-*.json"):
+        try:
+            content = json.loads(file.read_text(encoding="utf-8")) | {"session": number}
+        except (ValueError, TypeError) as error:
+            raise StorageError(f"{file} cannot be read or is damaged ({error})") from error
+        name = f"{number:04d}-{file.name.partition('-')[2]}"
+        text = json.dumps(content, indent=2, ensure_ascii=False)
+        place.write_safely(target / place.PROVENANCE / name, f"{text}\n".encode())
+
+
+@contextmanager
+def _writing(target: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(
+            f"{error.filename or target}: {error.strerror or error}; the same merge again goes on"
+        ) from error

@@ -1,0 +1,36 @@
+"""How data sets are dealt to shards."""
+
+from collections import Counter
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctid_cli.errors import UsageError
+from ctid_cli.storage.shards import Shard, owner, ranges
+
+
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 60))
+def test_every_shard_gets_its_share(cells: int, runs: int, of: int) -> None:
+    dealt = Counter(owner(cell, replicate, cells, of) for replicate in range(runs) for cell in range(cells))
+    counts = [dealt[number] for number in range(1, of + 1)]
+    assert sum(counts) == cells * runs
+    assert max(counts) - min(counts) <= 1
+
+
+@given(st.integers(1, 12), st.integers(1, 12))
+def test_no_shard_is_left_with_the_same_cells(cells: int, of: int) -> None:
+    # After as many data sets of each cell as there are shards, each has had one of every cell.
+    for cell in range(cells):
+        assert {owner(cell, replicate, cells, of) for replicate in range(of)} == set(range(1, of + 1))
+
+
+@pytest.mark.parametrize("text", ["0/3", "4/3", "1/0", "1", "a/b", "1/3/5", "-1/3", " 1/3", "1/٣", ""])
+def test_a_wrong_shard_is_told_how_to_write_it(text: str) -> None:
+    with pytest.raises(UsageError, match="write k/n, for example 2/3"):
+        Shard.read(text)
+
+
+def test_numbers_are_written_as_job_arrays_take_them() -> None:
+    assert ranges([7, 1, 3, 2]) == "1-3,7"
+    assert Shard.read("2/3").folder("a/b") == "a/b.shard-2-of-3"
