@@ -4,6 +4,7 @@ import contextlib
 import functools
 import json
 import os
+import re
 import sys
 import tempfile
 import time
@@ -56,6 +57,16 @@ class Command(TyperCommand):
             if option.param_type_name == "option" and not option.multiple and given.count(option) > 1:
                 ctx.fail(f"{max(option.opts, key=len)} is given twice.")
         return super().parse_args(ctx, args)
+
+
+def duration(text: str) -> float:
+    """A time such as ``90s``, ``30m`` or ``1h30m`` in seconds."""
+    found = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+)s)?", text.strip())
+    parts = [float(part or 0) for part in found.groups()] if found else []
+    if not any(parts):
+        raise typer.BadParameter(f"{text!r} is no time; write for example 90s, 30m or 1h30m")
+    hours, minutes, rest = parts
+    return 3600 * hours + 60 * minutes + rest
 
 
 def answer(as_json: bool, content: Callable[[], object], text: Callable[[], str]) -> None:

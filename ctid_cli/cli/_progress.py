@@ -165,6 +165,8 @@ class Reporter(_Progress):
 
     def _plan(self, event: Any) -> None:
         parts = [f"{count(event.estimates, 'estimate')} of {count(event.data_sets, 'data set')} to compute"]
+        if event.again:
+            parts.append(f"{event.again} of them once more")
         if event.reused:
             parts.append(f"{event.reused} already stored")
         if event.left_aside:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 import shlex
+import time
 from collections.abc import Sequence
 from dataclasses import asdict
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ctid_cli.cli._common import AllowCode, AllowMixed, Configs, Fresh, Jobs, Out, Overrides, Runs, guarded
+from ctid_cli.cli._common import AllowCode, AllowMixed, Configs, Fresh, Jobs, Out, Overrides, Runs, duration, guarded
 from ctid_cli.cli._progress import Reporter, json_lines
-from ctid_cli.errors import Problem, SpecError, TooManyFailuresError, UsageError
+from ctid_cli.errors import MachineError, Problem, SpecError, TooManyFailuresError, UsageError
 from ctid_cli.reporting.layout import count, seconds
 
 if TYPE_CHECKING:
@@ -22,6 +24,23 @@ if TYPE_CHECKING:
     from ctid_cli.running.engine import RunSummary
     from ctid_cli.running.events import Event, PlanReady
     from ctid_cli.storage.shards import Shard
+
+
+#: Why a run ended early, in words; signals have their names.
+_STOPPED = {
+    "time budget": "stopped at the end of the time budget",
+    "failures": "stopped because estimates failed, as was asked for",
+    "machine": "stopped because the machine did not let estimates finish",
+}
+
+
+class Failure(StrEnum):
+    """How a stored estimate failed."""
+
+    failed = "failed"
+    timeout = "timeout"
+    crashed = "crashed"
+    memory = "memory"
 
 
 def load_plans(
@@ -68,6 +87,17 @@ def run(
     runs: Runs = None,
     overrides: Overrides = None,
     allow_code: AllowCode = False,
+    retry: Annotated[
+        list[Failure] | None, typer.Option("--retry", help="Compute stored failures of this kind again; repeatable.")
+    ] = None,
+    fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first estimate that fails.")] = False,
+    max_failures: Annotated[
+        int | None, typer.Option("--max-failures", min=1, metavar="N", help="Stop when N estimates have failed.")
+    ] = None,
+    time_budget: Annotated[
+        float | None,
+        typer.Option("--time-budget", metavar="TIME", parser=duration, help="Stop after e.g. 90s, 30m or 1h30m."),
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and stop.")] = False,
     out: Out = Path("results"),
     fresh: Fresh = False,
@@ -81,10 +111,12 @@ def run(
 ) -> None:
     """Run experiments; the same command again resumes.
 
-    Finished estimates are stored as they come, so nothing is lost when a run is stopped or killed.
+    Finished estimates are stored as they come, so nothing is lost when a run is stopped or killed. A section limits of
+    the file, or for example --set limits.wall_seconds=600, ends single estimates that take too much.
     """
     from ctid_cli.running.engine import preview, run_experiment
     from ctid_cli.running.shard_plan import shard_plan
+    from ctid_cli.running.stopping import StopAt
     from ctid_cli.storage.shards import Shard
 
     plans = [plan for _, plan in load_plans(configs, overrides or [], runs, allow_code=allow_code)]
@@ -92,21 +124,26 @@ def run(
     part = None if shard is None else Shard.read(shard)
     if part is not None:
         plans, folders = [shard_plan(plan, part) for plan in plans], [out / part.folder(p.experiment) for p in plans]
+    how: dict[str, Any] = {"fresh": fresh, "allow_mixed": allow_mixed, "retry": [kind.upper() for kind in retry or ()]}
     if dry_run:
         for plan, folder in zip(plans, folders, strict=True):
-            ready = preview(plan, folder, fresh=fresh, allow_mixed=allow_mixed)
+            ready = preview(plan, folder, **how)
             typer.echo(json_lines(ready)[0] if as_json else _intention(ready))
         return
-    hopeless = []
+    hopeless, ends = [], None if time_budget is None else time.monotonic() + time_budget
     for plan, folder in zip(plans, folders, strict=True):
+        left = None if ends is None else max(ends - time.monotonic(), 0.0)
+        stop = StopAt(failures=1 if fail_fast else max_failures, seconds=left)
         with Reporter(plan.experiment) as reporter:
             tell = partial(_tell, None if quiet else reporter, as_json)
-            summary = run_experiment(plan, folder, jobs=jobs, on_event=tell, fresh=fresh, allow_mixed=allow_mixed)
+            summary = run_experiment(plan, folder, jobs=jobs, on_event=tell, stop=stop, **how)
         if as_json:
             content = asdict(summary) | {"missing": summary.missing, "exit_code": summary.exit_code}
             typer.echo(json.dumps({"event": "summary", **content}, default=str))
         if not quiet:
             typer.echo(_conclusion(summary, out, part), err=as_json)
+        if summary.exit_code == MachineError.exit_code:
+            raise summary.machine_error()
         if summary.exit_code:
             raise typer.Exit(summary.exit_code)
         if summary.failed == summary.planned > 0:
@@ -125,6 +162,7 @@ def _tell(reporter: Reporter | None, as_json: bool, event: Event) -> None:
 def _intention(ready: PlanReady) -> str:
     text = f"{ready.experiment}: would compute {count(ready.estimates, 'estimate')} of "
     text += f"{count(ready.data_sets, 'data set')} into {ready.folder}; {ready.reused} are already stored"
+    text += f", {ready.again} failed ones are tried again" if ready.again else ""
     text += f", {ready.left_aside} stored ones set aside" if ready.left_aside else ""
     more = f"; then in blocks until they are enough, {ready.at_most} data sets of a cell at most"
     return text + more if ready.at_most is not None and ready.estimates else text
@@ -146,7 +184,8 @@ def _conclusion(summary: RunSummary, out: Path, part: Shard | None) -> str:
     if summary.failed:
         lines.append(f"  {summary.failed} failed; to see why: ctid status {summary.experiment}{option}")
     if summary.stopped_by is not None:
-        lines.append(f"  stopped by {summary.stopped_by}; run the same command again to compute the rest")
+        why = _STOPPED.get(summary.stopped_by, f"stopped by {summary.stopped_by}")
+        lines.append(f"  {why}; run the same command again to compute the rest")
     if part is not None:
         return "\n".join([*lines, f"  {part}; when all are done: ctid merge {shlex.quote(str(out))}{option}"])
     name = " ".join(str(number) for number in tables_of(summary.experiment)) or summary.experiment

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ctid_cli.errors import MachineError
 from ctid_cli.reporting import surprises as unexpected
 from ctid_cli.reporting.figures.experiment_plot import experiment_drawing
 from ctid_cli.reporting.layout import count
@@ -208,6 +209,8 @@ def run_experiment(
         If the specification has mistakes; all of them are named.
     RefusedError
         If the folder holds another experiment or results of other code, or code may not be run.
+    MachineError
+        If the machine did not let estimates finish (memory, open files, killed processes); what is finished is stored.
 
     Examples
     --------
@@ -220,5 +223,7 @@ def run_experiment(
     for warning in plan.spec.warnings:
         warnings.warn(warning, stacklevel=2)
     folder = Path(out) / plan.experiment
-    engine.run_experiment(plan, folder, jobs=jobs, fresh=fresh, allow_mixed=allow_mixed)
+    summary = engine.run_experiment(plan, folder, jobs=jobs, fresh=fresh, allow_mixed=allow_mixed)
+    if summary.exit_code == MachineError.exit_code:
+        raise summary.machine_error()
     return read_results(folder)

@@ -111,7 +111,9 @@ class Plan:
 
     def manifest(self) -> Manifest:
         """The plan as plain data."""
-        canonical, wanted = self.spec.canonical(), self.keys(Task(0, 0))
+        canonical, wanted = dict(self.spec.canonical()), self.keys(Task(0, 0))
+        # Limits end estimates; they are no part of what the results are of.
+        canonical.pop("limits", None)
         return {
             "experiment": self.experiment,
             "runs": self.runs,

@@ -7,13 +7,14 @@ estimate is reported as done after the journal has it safely.
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,12 +24,14 @@ from ctid_cli.running import events
 from ctid_cli.running.cell_precision import CellPrecision, as_needed, stored_precisions
 from ctid_cli.running.dispatch import Died, GivenUp, Unable, run_jobs
 from ctid_cli.running.executor import Computed, Executor
+from ctid_cli.running.hindrances import advice
 from ctid_cli.running.job import Job
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.origins import current_origins
 from ctid_cli.running.own_check import check_components
 from ctid_cli.running.pool import LokyPool
-from ctid_cli.running.stopping import MACHINE, StopAt, StopRequest
+from ctid_cli.running.retry import Stock, take_stock
+from ctid_cli.running.stopping import MACHINE, TOO_MANY_FAILURES, StopAt, StopRequest
 from ctid_cli.storage import folder as place
 from ctid_cli.storage import journal
 from ctid_cli.storage.columns import FAILURES
@@ -84,6 +87,11 @@ class RunSummary:
         """
         return 0 if self.stopped_by is None else _EXIT_CODES.get(self.stopped_by, STOPPED)
 
+    def machine_error(self) -> MachineError:
+        """What to say where the machine stood in the way."""
+        text = f"{self.experiment}: the machine did not let estimates finish, {self.missing} are missing"
+        return MachineError(f"{text} ({self.hindrance}); {advice(self.hindrance)}. The same command goes on")
+
 
 def run_experiment(
     plan: Plan,
@@ -96,17 +104,19 @@ def run_experiment(
     stop: StopAt | None = None,
     warm: Callable[[], float] | None = None,
     executor: Callable[[Limits], Executor] | None = None,
+    retry: Collection[str] = (),
 ) -> RunSummary:
     """Compute the missing estimates of a plan and seal all of them.
 
-    An executor is made for the limits that it is to watch; by default `jobs` processes on this machine.
+    An executor is made for the limits that it is to watch; by default `jobs` processes on this machine. Stored failures
+    of a status in `retry` are computed again; so are those that exceeded a limit which is higher now.
     """
     begun = time.monotonic()
     origins = current_origins(plan)
     limits = Limits.of(plan.spec.canonical())
     with StopRequest(stop) as stopping, ExitStack() as stack:
-        begun_with, peek = _look(plan, folder, origins, fresh=fresh, allow_mixed=allow_mixed)
-        todo = _jobs(begun_with, peek)
+        begun_with, stock = _look(plan, folder, origins, retry, fresh=fresh, allow_mixed=allow_mixed)
+        todo = _jobs(begun_with, stock.kept)
         if todo:
             on_event(events.KernelsCompiling())
             on_event(events.KernelsCompiled(warm() if warm else _compile_kernels(plan)))
@@ -126,9 +136,10 @@ def run_experiment(
         workers = jobs or usable_processors()
         computing = executor(limits) if executor else LokyPool(workers, limits)
         stack.callback(computing.close)
-        run = _Run(as_needed(plan, log), folder, log, origins, on_event, computing, workers)
+        stock = take_stock(log, retry, limits)
+        run = _Run(as_needed(plan, log), folder, log, stock, origins, on_event, computing)
         stack.callback(run.cleanup)
-        run.start()
+        run.start({"jobs": workers, "limits": asdict(limits)})
         run.compute(stopping)
         while run.needs_more() and not stopping():
             run.compute(stopping)
@@ -150,16 +161,16 @@ class _Run:
         plan: Plan,
         folder: Path,
         log: journal.Journal,
+        stock: Stock,
         origins: Mapping[str, Origin],
         on_event: events.OnEvent,
         executor: Executor,
-        workers: int,
     ) -> None:
         self.plan, self.folder, self.log, self.origins = plan, folder, log, origins
-        self.on_event, self.executor, self.workers = on_event, executor, workers
-        #: Estimates that were stored when the run began.
-        self.stored = log.keys()
-        self.computed = self.done = self.total = self.given_up = 0
+        self.on_event, self.executor = on_event, executor
+        #: What was stored when the run began, and what of it is still to be computed again.
+        self.stock, self.again = stock, set(stock.again)
+        self.computed = self.done = self.total = self.failures = self.given_up = 0
         self.hindrance = ""
         self.precision: tuple[CellPrecision, ...] = ()
         self.started = now()
@@ -171,11 +182,11 @@ class _Run:
         self.slots: dict[Key, list[Slot]] = defaultdict(list)
         for slot in slots(self.manifest):
             self.slots[slot.key].append(slot)
-        self.ready = _ready(self.plan, self.folder, self.stored)
-        self.jobs = _jobs(self.plan, self.log.keys())
+        self.ready = _ready(self.plan, self.folder, self.stock)
+        self.jobs = _jobs(self.plan, self.log.keys() - self.again)
         self.total += len(self.jobs)
 
-    def start(self) -> None:
+    def start(self, circumstances: dict[str, Any]) -> None:
         spec = self.plan.spec
         canonical = json.dumps(spec.canonical(), sort_keys=True, indent=2, allow_nan=False, ensure_ascii=False)
         with _writing(self.folder):
@@ -183,7 +194,7 @@ class _Run:
             _write_if_new(self.folder / place.CANONICAL, f"{canonical}\n".encode())
             (self.folder / place.PROVENANCE).mkdir(exist_ok=True)
         versions = {cell.name: self.origins[cell.hash] for cell in self.plan.estimators}
-        self.info = session_info(spec.text, spec.folder, versions, self.workers)
+        self.info = session_info(spec.text, spec.folder, versions) | circumstances
         self.session = self.log.begin(self.manifest, self.origins, self.started, self.info)
         self._announce()
         self.on_event(self.ready)
@@ -218,6 +229,8 @@ class _Run:
                 if batch and (late or len(batch) >= COMMIT_ESTIMATES):
                     self._commit(batch)
                     batch = []
+                    if self.failures >= (stopping.at.failures or math.inf):
+                        stopping.ask(TOO_MANY_FAILURES)
                 if late:
                     since = time.monotonic()
             if batch:
@@ -241,6 +254,8 @@ class _Run:
 
     def _commit(self, batch: Sequence[Outcome]) -> None:
         self.log.add(batch, self.session)
+        self.again.difference_update(outcome.key for outcome in batch)
+        self.failures += sum(outcome.result["status"] in FAILURES for outcome in batch)
         for data_set, found in groupby(batch, key=lambda outcome: outcome.key[:2]):
             outcomes = list(found)
             self.unfinished[data_set] -= len(outcomes)
@@ -290,33 +305,44 @@ class _Run:
             (self.folder / place.RUNNING).unlink(missing_ok=True)
 
 
-def preview(plan: Plan, folder: Path, *, fresh: bool = False, allow_mixed: bool = False) -> events.PlanReady:
+def preview(
+    plan: Plan, folder: Path, *, fresh: bool = False, allow_mixed: bool = False, retry: Collection[str] = ()
+) -> events.PlanReady:
     """What a run would do, without doing or writing anything."""
-    needed, stored = _look(plan, folder, current_origins(plan), fresh=fresh, allow_mixed=allow_mixed)
-    return _ready(needed, folder, stored)
+    needed, stock = _look(plan, folder, current_origins(plan), retry, fresh=fresh, allow_mixed=allow_mixed)
+    return _ready(needed, folder, stock)
 
 
-def _ready(plan: Plan, folder: Path, stored: set[Key]) -> events.PlanReady:
+def _ready(plan: Plan, folder: Path, stock: Stock) -> events.PlanReady:
     """What there is to do, in numbers."""
     planned = {slot.key for slot in slots(plan.manifest())}
-    reused = len(planned & stored)
-    counts = (len(_jobs(plan, stored)), len(planned) - reused, reused, len(stored - planned))
-    return events.PlanReady(plan.experiment, folder, *counts, at_most=_monte_carlo(plan).get("at_most"))
+    reused = len(planned & stock.kept)
+    counts = (len(_jobs(plan, stock.kept)), len(planned) - reused, reused, len(stock.keys - planned))
+    again, at_most = len(planned & stock.again), _monte_carlo(plan).get("at_most")
+    return events.PlanReady(plan.experiment, folder, *counts, at_most=at_most, again=again)
 
 
 def _look(
-    plan: Plan, folder: Path, origins: Mapping[str, Origin], *, fresh: bool, allow_mixed: bool
-) -> tuple[Plan, set[Key]]:
-    """The plan as far as it is decided, and which estimates are stored in a folder that it may be run into."""
+    plan: Plan,
+    folder: Path,
+    origins: Mapping[str, Origin],
+    retry: Collection[str],
+    *,
+    fresh: bool,
+    allow_mixed: bool,
+) -> tuple[Plan, Stock]:
+    """The plan as far as it is decided, and what is stored in a folder that it may be run into."""
     if fresh or not folder.exists():
-        return plan, set()
+        return plan, Stock()
     with place.lock(folder, shared=True):
         place.check_free(folder, plan.manifest(), origins, allow_mixed=allow_mixed)
         with place.reading_journal(folder) as log:
-            return (plan, set()) if log is None else (as_needed(plan, log), log.keys())
+            if log is None:
+                return plan, Stock()
+            return as_needed(plan, log), take_stock(log, retry, Limits.of(plan.spec.canonical()))
 
 
-def _jobs(plan: Plan, stored: set[Key]) -> list[Job]:
+def _jobs(plan: Plan, stored: Collection[Key]) -> list[Job]:
     """The data sets of which estimates are missing, in the order of the plan."""
     seed = _monte_carlo(plan).get("seed")
     terms = plan.terms

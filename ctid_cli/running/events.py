@@ -23,6 +23,8 @@ class PlanReady:
     left_aside: int
     #: Most data sets of a data cell, where it gets as many as a precision needs.
     at_most: int | None = None
+    #: Estimates among those to compute that are stored as failures, and are to be tried again.
+    again: int = 0
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.canonical import canonical_json, plain
+from ctid_cli.running.limits import Limits
 from ctid_cli.storage.columns import failed, no_result
 from ctid_cli.storage.manifest import Key, Outcome
 
@@ -71,10 +72,24 @@ class Short:
 
     keys: tuple[Key, ...]
     reason: str
+    #: Memory that was asked for in vain [bytes], as far as is known.
+    asked: float = 0.0
 
 
-def run_job(job: Job) -> Iterator[Began | Outcome | Short]:
-    """Compute the wanted estimates of one data set, and say which is begun."""
+def run_job(job: Job, limits: Limits | None = None) -> Iterator[Began | Outcome | Short]:
+    """Compute the wanted estimates of one data set, and say which is begun.
+
+    Whoever runs this watches the limits; here it is only seen who asks for more memory than there may be.
+    """
+    for entry in _estimates(job):
+        if isinstance(entry, Short) and limits is not None and not limits.allows(entry.asked):
+            result = failed(limits.too_much(), "MEMORY")
+            yield from (Outcome(key, result, None) for key in entry.keys)
+        else:
+            yield entry
+
+
+def _estimates(job: Job) -> Iterator[Began | Outcome | Short]:
     yield Began(job.keys)
     try:
         data = job.cell.dataset(job.replicate)
@@ -119,7 +134,7 @@ def _ended(keys: tuple[Key, ...], error: BaseException) -> Iterator[Outcome | Sh
     """What becomes of estimates that an exception ended."""
     short = shortage(error)
     if short:
-        yield Short(keys, short)
+        yield Short(keys, short, float(getattr(error, "_total_size", 0.0)))
         return
     result = failure(error)
     yield from (Outcome(key, result, None) for key in keys)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -24,12 +25,22 @@ class Limits:
     memory_mb: float | None = None
 
     @classmethod
-    def of(cls, canonical: dict[str, Any]) -> Self:
-        """The limits of a specification in its canonical form."""
-        return cls(**(canonical.get("limits") or {}))
+    def of(cls, content: Mapping[str, Any]) -> Self:
+        """The limits in the canonical form of a specification, or in what is known of a run."""
+        return cls(**(content.get("limits") or {}))
 
     def __bool__(self) -> bool:
         return self != Limits()
+
+    def rose_since(self, other: Limits, status: str) -> bool:
+        """Whether an estimate that ended with a status under other limits may take more now."""
+        names = {"TIMEOUT": ("cpu_seconds", "wall_seconds"), "MEMORY": ("memory_mb",)}.get(status, ())
+        pairs = [(getattr(other, name), getattr(self, name)) for name in names]
+        return any(old is not None and (new is None or new > old) for old, new in pairs)
+
+    def allows(self, size: float) -> bool:
+        """Whether so much memory may be asked for [bytes]."""
+        return self.memory_mb is None or size <= self.memory_mb * _MEGABYTE
 
     @property
     def of_processes(self) -> bool:
@@ -42,9 +53,11 @@ class Limits:
             return "time", f"not finished after {self.wall_seconds:g} s (limits.wall_seconds)"
         if self.cpu_seconds is not None and cpu > self.cpu_seconds:
             return "time", f"not finished after {self.cpu_seconds:g} s of processor time (limits.cpu_seconds)"
-        if self.memory_mb is not None and memory > self.memory_mb * _MEGABYTE:
-            return "memory", f"needed more than {self.memory_mb:g} MB (limits.memory_mb)"
-        return None
+        return None if self.allows(memory) else ("memory", self.too_much())
+
+    def too_much(self) -> str:
+        """What is said of an estimate that needs more memory than it may have."""
+        return f"needed more than {self.memory_mb:g} MB (limits.memory_mb)"
 
 
 @dataclass(frozen=True)

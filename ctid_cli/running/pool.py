@@ -64,7 +64,7 @@ class LokyPool:
     def submit(self, job: Job, *, alone: bool = False) -> None:
         """Take a job."""
         try:
-            packed = _packed(job)
+            packed = _packed(job, self._limits)
         except Exception as error:
             self._messages.append(Lost(job, "crash", _in_one_line(error)))
             return

@@ -12,7 +12,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 #: Reasons that are neither signals nor the caller's event.
-TIME_BUDGET, FAILURES, MACHINE = "time budget", "failures", "machine"
+TIME_BUDGET, TOO_MANY_FAILURES, MACHINE = "time budget", "failures", "machine"
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,8 @@ def compute(path: str, packed: bytes) -> None:
     try:
         progress.write(Received(os.getpid()))
         # Code of one's own is imported here.
-        _, job = pickle.loads(packed)
-        for entry in run_job(job):
+        _, job, limits = pickle.loads(packed)
+        for entry in run_job(job, limits):
             progress.write(Mark(entry, usage("self")) if isinstance(entry, Began) else entry)
     finally:
         progress.close()

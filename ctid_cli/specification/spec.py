@@ -20,6 +20,7 @@ from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.signals.recorder import Recorder
 from ctid_cli.simulation.dataset import MeasuredSource, located
 from ctid_cli.specification.fields import LATER, MAX_WHOLE, Positive, Text, matching
+from ctid_cli.specification.limits_section import LimitsSection
 from ctid_cli.specification.loop_section import LoopSection
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.option_sections import EstimatorSection, ExcitationSection, NoiseSection
@@ -176,6 +177,8 @@ class Spec(Section):
         What tables show, such as [bias, rmse, coverage]; by default percentages, or bias and rmse without success
     tracks : mapping, optional
         What is stored of the frequencies of a signal over time; nothing by default
+    limits : mapping, optional
+        Time and memory that one estimate may take; no limits by default
     """
 
     experiment: Annotated[Text, _EXPERIMENT]
@@ -194,6 +197,7 @@ class Spec(Section):
     success: SuccessSection | None = None
     measures: Annotated[list[Text] | None, LATER] = None
     tracks: Annotated[TracksSection | None, LATER] = None
+    limits: Annotated[LimitsSection | None, LATER] = None
 
     _warnings: tuple[str, ...] = PrivateAttr(default=())
     _text: str = PrivateAttr(default="")

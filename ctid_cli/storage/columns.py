@@ -12,7 +12,7 @@ from typing import Any, Literal
 from ctid_cli.simulation.frequency_measures import measure_names
 
 #: Statuses of estimates that have no result because something went wrong.
-FAILURES = ("FAILED", "CRASHED", "TIMEOUT")
+FAILURES = ("FAILED", "CRASHED", "TIMEOUT", "MEMORY")
 
 ByName = Mapping[str, float | None]
 

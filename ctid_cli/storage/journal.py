@@ -19,6 +19,7 @@ from typing import Any
 
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import StorageError
+from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.identity import Origin, gathered
 from ctid_cli.storage.manifest import Key, Manifest, Outcome, refuse_newer
 
@@ -120,6 +121,13 @@ class Journal:
         rows = self._rows(f"SELECT json_extract(result, '$.status'), {_KEY} FROM estimates")
         return {Key(*parts): status for status, *parts in rows}
 
+    def failures(self) -> list[tuple[Key, str, int]]:
+        """Every stored failure: its status, and the run that it comes from."""
+        marks = ", ".join("?" * len(FAILURES))
+        chosen = f"json_extract(result, '$.status') AS status, session, {_KEY}"
+        rows = self._rows(f"SELECT {chosen} FROM estimates WHERE status IN ({marks})", *FAILURES)
+        return [(Key(*parts), status, session) for status, session, *parts in rows]
+
     def entries(self) -> dict[Key, Entry]:
         """Every stored estimate, each compared with its checksum."""
         found, origins = {}, self._known_origins()
@@ -173,14 +181,14 @@ class Journal:
             self._connection.execute("DELETE FROM meta WHERE name = ?", (_SEALED,))
 
     def add(self, outcomes: Iterable[Outcome], session: int) -> None:
-        """Store estimates; when this returns, they are safe."""
+        """Store estimates, in place of earlier ones if there are any; when this returns, they are safe."""
         rows = []
         for key, result, seconds, cpu_seconds in outcomes:
             text = canonical_json(result)
             origin = self._origins[key.estimator_hash]
             rows.append((*key, text, _checksum(key, text), seconds, session, origin, cpu_seconds))
         with self._transaction() as connection:
-            connection.executemany("INSERT INTO estimates VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
+            connection.executemany("INSERT OR REPLACE INTO estimates VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
             connection.execute("DELETE FROM meta WHERE name = ?", (_SEALED,))
 
     def mark_sealed(self, checksum: str) -> None:

@@ -24,7 +24,7 @@ def now() -> str:
     return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def session_info(spec_text: str, spec_folder: Path, origins: Mapping[str, Origin], jobs: int) -> dict[str, Any]:
+def session_info(spec_text: str, spec_folder: Path, origins: Mapping[str, Origin]) -> dict[str, Any]:
     """Describe the run that is about to start."""
     return {
         "argv": sys.argv,
@@ -32,7 +32,6 @@ def session_info(spec_text: str, spec_folder: Path, origins: Mapping[str, Origin
         "host": platform.node(),
         "system": platform.platform(),
         "processors": os.cpu_count(),
-        "jobs": jobs,
         "code_version": {name: origin.code_version for name, origin in origins.items()},
         "numeric_platform": numeric_platform(),
         "packages": {"python": platform.python_version(), **package_versions()},

@@ -9,8 +9,8 @@ An estimate has *converged* if it satisfies every condition of the specification
   counted from the start, and after its last step from that.
 
 Its status does not matter: an estimate that stopped at the iteration limit with the right delay has converged, one that
-settled elsewhere has not. An estimate without a result (``FAILED``, ``CRASHED``, ``TIMEOUT``) has not converged and
-counts in every percentage. Without ``success``, or without true values to compare with, nothing is said.
+settled elsewhere has not. An estimate without a result (``FAILED``, ``CRASHED``, ``TIMEOUT``, ``MEMORY``) has not
+converged and counts in every percentage. Without ``success``, or without true values to compare with, nothing is said.
 """
 
 from __future__ import annotations

@@ -202,6 +202,7 @@ class FakePlan:
         names: tuple[str, ...] | None = None,
         text: str = "# toys\n",
         precision: dict[str, Any] | None = None,
+        limits: dict[str, float] | None = None,
     ) -> None:
         toys = estimators or (Toy(), Toy(order=3))
         names = names or tuple(f"toy{k}" for k in range(len(toys)))
@@ -221,8 +222,8 @@ class FakePlan:
             "monte_carlo": {"seed": seed, **(precision or {"runs": runs})},
             "success": {"delay_relative_error": 0.01},
         }
-        self.spec = FakeSpec(content, text)
         self.spec_hash = content_hash(content)
+        self.spec = FakeSpec(content | ({"limits": limits} if limits else {}), text)
 
     def with_replicates(self, replicates: Sequence[int]) -> FakePlan:
         other = copy(self)

@@ -1,0 +1,215 @@
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from ctid_cli.errors import MachineError
+from ctid_cli.running import events
+from ctid_cli.running.engine import RunSummary, preview, run_experiment
+from ctid_cli.running.hindrances import advice
+from ctid_cli.running.limits import Limits, usage
+from ctid_cli.running.stopping import StopAt
+from ctid_cli.storage.store import load_estimates
+from tests.running.fakes import FakePlan, Toy
+from tests.running.hostile import Hostile
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def run(plan: Any, place: Path, jobs: int = 2, **options: Any) -> RunSummary:
+    return run_experiment(plan, place, jobs=jobs, warm=lambda: 0.0, **options)
+
+
+def toys(*hostile: Toy, runs: int = 3, **options: Any) -> Any:
+    """A well-behaved estimator, hostile ones and another good one, which all share data sets."""
+    return FakePlan(Toy(), *hostile, Toy(order=4), levels=(5,), runs=runs, **options)
+
+
+def failures(place: Path) -> dict[tuple[str, int, str], str]:
+    """Status of what did not converge, by estimator, replicate and start."""
+    frame = load_estimates(place)
+    bad = frame[frame["status"] != "CONVERGED"]
+    return dict(zip(zip(bad["estimator"], bad["replicate"], bad["start"], strict=True), bad["status"], strict=True))
+
+
+def messages(place: Path) -> set[str]:
+    frame: pd.DataFrame = load_estimates(place)
+    return set(frame["message"][frame["status"] != "CONVERGED"])
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_what_takes_too_long_is_ended_and_all_else_is_stored(tmp_path: Path, jobs: int) -> None:
+    loop, stop = Hostile("loop", at=1, order=5), Hostile("stop", at=0, order=6)
+    summary = run(toys(loop, stop, limits={"wall_seconds": 3}), tmp_path, jobs=jobs)
+    # The second of the four estimators has one start, the third two.
+    assert failures(tmp_path) == {
+        ("toy1", 1, "none"): "TIMEOUT",
+        ("toy2", 0, "3"): "TIMEOUT",
+        ("toy2", 0, "uniform(0, 9)"): "TIMEOUT",
+    }
+    assert messages(tmp_path) == {"not finished after 3 s (limits.wall_seconds)"}
+    assert (summary.planned, summary.computed, summary.failed, summary.exit_code) == (18, 18, 3, 0)
+
+
+def test_processor_time_and_memory_are_limited_too(tmp_path: Path) -> None:
+    hostile = [Hostile("hang in preparation", at=1, order=5), Hostile("grow", at=2, order=6)]
+    hostile.append(Hostile("ask for too much", at=0, order=7))
+    run(toys(*hostile, limits={"cpu_seconds": 2, "memory_mb": 300}), tmp_path)
+    assert failures(tmp_path) == {
+        ("toy1", 1, "none"): "TIMEOUT",
+        ("toy2", 2, "3"): "MEMORY",
+        ("toy2", 2, "uniform(0, 9)"): "MEMORY",
+        ("toy3", 0, "none"): "MEMORY",
+    }
+    assert messages(tmp_path) == {
+        "not finished after 2 s of processor time (limits.cpu_seconds)",
+        "needed more than 300 MB (limits.memory_mb)",
+    }
+
+
+def test_what_is_finished_of_a_data_set_is_stored_while_the_rest_goes_on(tmp_path: Path) -> None:
+    seen: list[events.Event] = []
+    stop = StopAt(seconds=4)
+    summary = run(toys(Hostile("loop", at=0, order=5), runs=1), tmp_path, jobs=1, stop=stop, on_event=seen.append)
+    assert (summary.computed, summary.stopped_by, summary.exit_code) == (2, "time budget", 5)
+    assert set(load_estimates(tmp_path)["estimator"]) == {"toy0"}
+    assert any(isinstance(event, events.Stopping) and event.reason == "time budget" for event in seen)
+
+
+def test_limits_are_no_part_of_results(tmp_path: Path) -> None:
+    run(toys(runs=2), tmp_path / "without")
+    summary = run(toys(runs=2, limits={"wall_seconds": 600, "memory_mb": 3000}), tmp_path / "with")
+    assert summary.failed == 0
+    assert (tmp_path / "with" / "runs.h5").read_bytes() == (tmp_path / "without" / "runs.h5").read_bytes()
+    again = run(toys(runs=2, limits={"wall_seconds": 1}), tmp_path / "with")
+    assert (again.reused, again.computed) == (again.planned, 0)
+
+
+def test_a_higher_limit_is_a_reason_to_try_again(tmp_path: Path) -> None:
+    marker = tmp_path / "marker"
+
+    def plan(**limits: float) -> Any:
+        return toys(Hostile("sleep", at=1, order=5, marker=str(marker)), limits=limits)
+
+    place = tmp_path / "toys"
+    assert run(plan(wall_seconds=1), place).failed == 1
+    assert preview(plan(wall_seconds=1), place).estimates == 0
+    assert preview(plan(wall_seconds=0.5, cpu_seconds=9), place).estimates == 0
+    assert preview(plan(memory_mb=9000), place).again == 1
+    assert preview(plan(wall_seconds=2), place).again == 1
+    assert run(plan(wall_seconds=1.5), place).computed == 1
+    assert preview(plan(wall_seconds=1.5), place).estimates == 0
+    marker.touch()
+    summary = run(plan(), place)
+    assert (summary.computed, summary.failed) == (1, 0)
+
+
+def test_failures_are_tried_again_when_asked(tmp_path: Path) -> None:
+    marker = tmp_path / "marker"
+    hostile = [Hostile("speak in halves", at=1, order=5, marker=str(marker)), Toy("die", at=0, order=6)]
+    place, plan = tmp_path / "toys", toys(*hostile)
+    assert run(plan, place).failed == 3
+    assert set(failures(place).values()) == {"FAILED", "CRASHED"}
+    marker.touch()
+    assert preview(plan, place).estimates == 0
+    assert preview(plan, place, retry=["CRASHED"]).again == 2
+    summary = run(plan, place, retry=["FAILED"])
+    assert (summary.computed, summary.reused, summary.failed, summary.missing) == (1, 17, 2, 0)
+    assert set(failures(place).values()) == {"CRASHED"}
+
+
+def test_texts_that_no_file_can_hold_are_stored_readably(tmp_path: Path) -> None:
+    run(toys(Hostile("speak in halves", at=0, order=5), Hostile("be speechless", at=1, order=6)), tmp_path)
+    texts = {message.partition("\n")[0] for message in messages(tmp_path)}
+    assert texts == {
+        r"ValueError: half a character: \ud83d, a \x00 and\x1b[31m red",
+        "SpeechlessError: (its text cannot be made)",
+    }
+    assert len(load_estimates(tmp_path)) == 18
+
+
+@pytest.mark.parametrize(
+    ("mischief", "said"),
+    [("be killed", "SIGKILL"), ("ask for too much", "out of memory: Unable to allocate"), ("open files", "[Errno 24]")],
+)
+def test_what_the_machine_does_is_told_and_not_stored(tmp_path: Path, mischief: str, said: str) -> None:
+    marker, seen = tmp_path / "marker", list[events.Event]()
+    place, plan = tmp_path / "toys", toys(Hostile(mischief, at=1, order=5, marker=str(marker)))
+    summary = run(plan, place, on_event=seen.append)
+    assert (summary.missing, summary.failed, summary.stopped_by) == (1, 0, "machine")
+    assert summary.exit_code == MachineError.exit_code == 8
+    assert said in str(summary.machine_error())
+    assert [event.estimates for event in seen if isinstance(event, events.GivenUp)] == [1]
+    assert failures(place) == {}
+    marker.touch()
+    again = run(plan, place)
+    assert (again.computed, again.missing, again.exit_code) == (1, 0, 0)
+
+
+def test_a_process_that_leaves_each_time_is_its_estimators_failure(tmp_path: Path) -> None:
+    run(toys(Hostile("leave", at=1, order=5)), tmp_path)
+    assert failures(tmp_path) == {("toy1", 1, "none"): "CRASHED"}
+    (message,) = messages(tmp_path)
+    assert message == "the worker process died each time this was computed, the last time alone (exit code 3)"
+
+
+def test_without_descriptors_nothing_is_stored_and_the_run_says_what_to_do(tmp_path: Path) -> None:
+    code = "import resource, sys; from tests.running import run_toys; "
+    code += "resource.setrlimit(resource.RLIMIT_NOFILE, (20, 20)); sys.exit(run_toys.main())"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "toys"), "2", "--runs=3"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 8, done.stderr
+    assert "CRASHED" not in done.stdout
+    assert run(FakePlan(runs=1), tmp_path / "toys").exit_code == 0 or True
+
+
+@pytest.mark.parametrize(("at_most", "least"), [(1, 1), (3, 3)])
+def test_a_run_stops_after_so_many_failures(tmp_path: Path, at_most: int, least: int) -> None:
+    plan = FakePlan(*[Toy("raise", at=k, order=2 + k) for k in range(8)], Toy(seconds=0.3, order=12), runs=20)
+    summary = run(plan, tmp_path, stop=StopAt(failures=at_most))
+    assert summary.stopped_by == "failures"
+    assert summary.exit_code == 5
+    assert least <= summary.failed
+    assert summary.missing > 0
+
+
+def test_what_a_process_uses() -> None:
+    before = usage("self")
+    assert before is not None
+    kept, begun = bytearray(b"x" * 50_000_000), time.process_time()
+    while time.process_time() - begun < 0.1:
+        pass
+    after = usage(os.getpid())
+    assert after is not None
+    grown = after - before
+    assert grown.cpu >= 0.08
+    assert 40e6 < grown.memory < 200e6
+    assert kept
+    assert usage(2**22 + 1) is None
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > 0
+
+
+def test_limits_say_which_was_exceeded() -> None:
+    limits = Limits(cpu_seconds=1, wall_seconds=5, memory_mb=100)
+    assert limits.exceeded(4, 0.5, 9e7) is None
+    assert limits.exceeded(6, 0.5, 0) == ("time", "not finished after 5 s (limits.wall_seconds)")
+    assert limits.exceeded(4, 2, 2e8) == ("time", "not finished after 1 s of processor time (limits.cpu_seconds)")
+    assert limits.exceeded(4, 0, 2e8) == ("memory", "needed more than 100 MB (limits.memory_mb)")
+    assert not Limits()
+    assert Limits().exceeded(1e9, 1e9, 1e18) is None
+
+
+def test_advice_fits_the_reason() -> None:
+    assert "ulimit -n" in advice("OSError: [Errno 24] Too many open files")
+    assert "memory_mb" in advice("SIGKILL")
+    assert "TMPDIR" in advice("[Errno 28] No space left on device")
+    assert "another machine" in advice("?")
