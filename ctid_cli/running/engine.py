@@ -90,7 +90,7 @@ class RunSummary:
     def machine_error(self) -> MachineError:
         """What to say where the machine stood in the way."""
         text = f"{self.experiment}: the machine did not let estimates finish, {self.missing} are missing"
-        return MachineError(f"{text} ({self.hindrance}); {advice(self.hindrance)}. The same command goes on")
+        return MachineError(f"{text}: {self.hindrance}. What helps: {advice(self.hindrance)}. The same command goes on")
 
 
 def run_experiment(

@@ -84,6 +84,8 @@ class FakeCell:
         return content_hash(self.content)
 
     def dataset(self, replicate: int) -> FakeData:
+        while replicate == self.content.get("hangs_at", -1):
+            time.sleep(60)
         rng = np.random.default_rng([self.content["seed"], replicate])
         return FakeData(FakeRecord(rng.standard_normal(50) * self.content["level"], replicate))
 

@@ -29,12 +29,15 @@ def main() -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("jobs", type=int)
     parser.add_argument("--file-size", type=int, help="largest file that may be written, as on a full disk")
+    parser.add_argument("--open-files", type=int, help="most files that may be open")
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=0.02)
     parser.add_argument("--shard", help="only a part, as in 2/3")
     options = parser.parse_args()
     if options.file_size:
         resource.setrlimit(resource.RLIMIT_FSIZE, (options.file_size, options.file_size))
+    if options.open_files:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (options.open_files, options.open_files))
     toys = plan(options.seconds, options.runs)
     if options.shard:
         toys = toys.part(*map(int, options.shard.split("/")))
@@ -43,6 +46,8 @@ def main() -> int:
     except CtidError as error:
         print(error, file=sys.stderr)
         return error.exit_code
+    if summary.given_up or summary.hindrance:
+        print(summary.machine_error(), file=sys.stderr)
     return summary.exit_code
 
 

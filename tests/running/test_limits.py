@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import os
 import resource
 import subprocess
@@ -84,6 +85,17 @@ def test_what_is_finished_of_a_data_set_is_stored_while_the_rest_goes_on(tmp_pat
     assert any(isinstance(event, events.Stopping) and event.reason == "time budget" for event in seen)
 
 
+def test_a_data_set_that_is_never_made_is_a_failure_of_all_its_estimates(tmp_path: Path) -> None:
+    plan = toys(runs=2, limits={"wall_seconds": 1})
+    plan.data_cells = (dataclasses.replace(plan.data_cells[0], content=plan.data_cells[0].content | {"hangs_at": 1}),)
+    run(plan, tmp_path)
+    assert {(name, where): status for (name, where, _), status in failures(tmp_path).items()} == {
+        ("toy0", 1): "TIMEOUT",
+        ("toy1", 1): "TIMEOUT",
+    }
+    assert len(failures(tmp_path)) == 3
+
+
 def test_limits_are_no_part_of_results(tmp_path: Path) -> None:
     run(toys(runs=2), tmp_path / "without")
     summary = run(toys(runs=2, limits={"wall_seconds": 600, "memory_mb": 3000}), tmp_path / "with")
@@ -162,14 +174,15 @@ def test_a_process_that_leaves_each_time_is_its_estimators_failure(tmp_path: Pat
 
 
 def test_without_descriptors_nothing_is_stored_and_the_run_says_what_to_do(tmp_path: Path) -> None:
-    code = "import resource, sys; from tests.running import run_toys; "
-    code += "resource.setrlimit(resource.RLIMIT_NOFILE, (20, 20)); sys.exit(run_toys.main())"
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "toys"), "2", "--runs=3"], cwd=ROOT, capture_output=True, text=True
-    )
+    command = [sys.executable, "-m", "tests.running.run_toys", str(tmp_path / "toys"), "2", "--runs=3"]
+    done = subprocess.run([*command, "--open-files=14"], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 8, done.stderr
-    assert "CRASHED" not in done.stdout
-    assert run(FakePlan(runs=1), tmp_path / "toys").exit_code == 0 or True
+    assert done.stdout == "ready\n"
+    assert "18 are missing" in done.stderr
+    assert "Too many open files). What helps: raise the number of open files ('ulimit -n" in done.stderr
+    assert len(load_estimates(tmp_path / "toys")) == 0
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, len(load_estimates(tmp_path / "toys"))) == (0, 18)
 
 
 @pytest.mark.parametrize(("at_most", "least"), [(1, 1), (3, 3)])
