@@ -51,7 +51,7 @@ class RefusedOptionsError(ValueError):
 class Section(BaseModel):
     """A mapping of the specification."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, validate_default=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, validate_default=True, defer_build=True)
 
     #: Option dataclass that the section describes, if it describes one.
     target: ClassVar[type | None] = None
