@@ -3,6 +3,7 @@
 import difflib
 import textwrap
 from collections.abc import Iterable
+from importlib import import_module
 
 #: Columns of a paragraph.
 WIDTH = 100
@@ -43,3 +44,11 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     """The same as the end of a sentence; empty where no name is near."""
     near = closest(word, known)
     return f"; did you mean {near!r}?" if near else ""
+
+
+class ShownAsTable:
+    """A result that a notebook shows as its summary."""
+
+    def _repr_html_(self) -> str:
+        # By name: results know nothing of the floor that says what is found.
+        return str(import_module("ctid_cli.reporting.result_views").html(self))

@@ -42,7 +42,7 @@ def fit(
     from ctid_cli.estimation.common import LEAST_DRAWS
     from ctid_cli.estimators.delay_profile import DelayProfile
     from ctid_cli.estimators.identification import identify
-    from ctid_cli.reporting.identification_plot import identification_svg
+    from ctid_cli.reporting.identification_plot import identification_drawing
     from ctid_cli.reporting.identification_report import common_units, identification_object, identification_text
     from ctid_cli.signals.measurement import read_measurement
 
@@ -72,7 +72,7 @@ def fit(
         noise: Any = ("auto",) if bootstrap is None else ("bootstrap", bootstrap, progress)
         result = identify(options, [item.record for item in measurements], validation, *noise)
     text = json.dumps(identification_object(result, measurements, units, other), allow_nan=False)
-    figure = identification_svg(result, measurements, units)
+    figure = identification_drawing(result, measurements, units).saved()
     write_files({out / "fit.json": text.encode() + b"\n", out / "fit.svg": figure})
     if as_json:
         typer.echo(text)

@@ -49,7 +49,7 @@ def track(
     """
     from ctid_cli.frequency.automatic import choose_settings
     from ctid_cli.frequency.record_track import track_record
-    from ctid_cli.reporting.track_plot import track_svg
+    from ctid_cli.reporting.track_plot import track_drawing
     from ctid_cli.reporting.track_report import track_bytes, track_object, track_table, track_text
     from ctid_cli.signals.sampled_signal import read_sampled_signal
 
@@ -71,7 +71,7 @@ def track(
             found = track_record(record.samples, record.interval, settings, every=every, on_progress=tell)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    drawn = track_svg(found, record.start, record.unit, f"{file.name}: {settings.estimator.kind}")
+    drawn = track_drawing(found, record.start, record.unit, f"{file.name}: {settings.estimator.kind}").saved()
     write_files({data: track_bytes(track_table(found, record.start), style, record.unit), figure: drawn})
     answer(
         as_json,

@@ -27,6 +27,7 @@ from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty
 from ctid_cli.signals.record import Record
+from ctid_cli.text import ShownAsTable
 
 #: Confidence level of intervals and tests.
 LEVEL = 0.95
@@ -49,7 +50,7 @@ class Validation:
 
 
 @dataclass(frozen=True, eq=False)
-class Identification:
+class Identification(ShownAsTable):
     """A fit, its uncertainty, and its diagnostics.
 
     Parameters

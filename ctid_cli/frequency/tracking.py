@@ -18,6 +18,7 @@ from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES, series_of
 from ctid_cli.frequency.prefilter import convolve, fast_convolve
 from ctid_cli.signals.checks import require_integer, require_positive
+from ctid_cli.text import ShownAsTable
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,7 @@ class FrequencyEstimate:
 
 
 @dataclass(frozen=True, eq=False)
-class FrequencyTrack:
+class FrequencyTrack(ShownAsTable):
     """Frequencies over time.
 
     Parameters

@@ -8,7 +8,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.inference.status import Status
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.text import wrapped
+from ctid_cli.text import ShownAsTable, wrapped
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class IterationRecord:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fit:
+class Fit(ShownAsTable):
     """An estimated model, its accuracy, and how it was reached.
 
     Parameters

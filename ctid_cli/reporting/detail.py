@@ -78,7 +78,7 @@ def _parameters(found: FoundEstimate) -> list[UncertainValue]:
 def _fitted(found: FoundEstimate) -> list[list[str]]:
     """Parameters of a model, and how well it fits."""
     row, shown = found.row, _parameters(found)
-    table = [parameter_table(shown), *_conventions(shown)] if shown else []
+    table = [parameter_table(shown).draw(), *_conventions(shown)] if shown else []
     if row.get("true_delay") is not None:
         table.append(f"True delay: {number(row['true_delay'])} s.")
     facts = [("fit", f"{number(row['fit_percent'])} % of the data it was estimated from")]

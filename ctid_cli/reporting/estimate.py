@@ -117,15 +117,15 @@ def parameter_object(item: UncertainValue) -> dict[str, Any]:
     return dict(plain({name: getattr(item, name) for name in names}))
 
 
-def parameter_table(found: Iterable[UncertainValue]) -> str:
-    """Parameters as an aligned table."""
+def parameter_table(found: Iterable[UncertainValue]) -> Table:
+    """Parameters as a table."""
     header = ["parameter", "estimate", "standard error", "relative %", "95 % low", "95 % high", "unit", "status"]
     digits = {"estimate": 6, "standard_error": 3, "relative_percent": 2, "low": 5, "high": 5}
     rows = [
         [item.name, *(number(getattr(item, name), size) for name, size in digits.items()), item.unit, item.status]
         for item in found
     ]
-    return Table(header, rows, "lrrrrrll").draw()
+    return Table(header, rows, "lrrrrrll")
 
 
 def as_object(estimate: Mapping[str, Any]) -> dict[str, Any]:

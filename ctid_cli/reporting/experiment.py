@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 from ctid_cli.errors import MachineError
 from ctid_cli.reporting import surprises as unexpected
 from ctid_cli.reporting.figures.experiment_plot import experiment_drawing
-from ctid_cli.reporting.layout import count
+from ctid_cli.reporting.figures.style import Picture
+from ctid_cli.reporting.layout import Report, count
 from ctid_cli.reporting.measures import default_measures, measure_rows
 from ctid_cli.reporting.paired_table import compare_estimators
-from ctid_cli.reporting.result_views import Picture
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.tables import experiment_report, notes_of
 from ctid_cli.running import engine
@@ -49,8 +49,12 @@ class ExperimentResults(Results):
         return f"{head}\n  in {count(len(self.manifest['data_cells']), 'data cell')}, {self.folder}"
 
     def _repr_html_(self) -> str:
-        report = experiment_report(self, [*notes_of(self, self.out), *self.surprises])
-        return report.draw("html")
+        return self.report.draw("html")
+
+    @property
+    def report(self) -> Report:
+        """What ``ctid table`` prints, to draw as text or HTML."""
+        return experiment_report(self, [*notes_of(self, self.out), *self.surprises])
 
     @property
     def out(self) -> Path:
@@ -136,7 +140,7 @@ class ExperimentResults(Results):
         UsageError
             If the experiment has nothing to draw in this way.
         """
-        return Picture(experiment_drawing(self, kind, measure, parameters).saved())
+        return experiment_drawing(self, kind, measure, parameters).picture()
 
 
 def read_results(folder: str | os.PathLike[str]) -> ExperimentResults:

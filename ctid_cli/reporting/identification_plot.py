@@ -3,64 +3,97 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, STRIPES, outline, svg
+from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, STRIPES, Drawing, outline
 from ctid_cli.signals.measurement import Measurement
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+#: The figure of ``ctid fit``, and its parts.
+Kind = Literal["all", "overlay", "residuals", "correlation", "profile"]
 #: Experiments that are drawn; the others would leave no room.
 MOST_DRAWN = 3
 
 
-def identification_svg(result: Identification, measurements: Sequence[Measurement], units: Units) -> bytes:
-    """Figure of a fit; the same fit always gives the same bytes."""
+def identification_drawing(
+    result: Identification, measurements: Sequence[Measurement], units: Units, kind: Kind | None = None
+) -> Drawing:
+    """The figure of a fit, or one part of it."""
     drawn = measurements[:MOST_DRAWN]
 
     def draw(figure: Figure) -> None:
-        grid = figure.add_gridspec(2 * len(drawn) + 1, 2, height_ratios=[2, 1.2] * len(drawn) + [2])
-        for k, measurement in enumerate(drawn):
-            output = figure.add_subplot(grid[2 * k, :])
-            error = figure.add_subplot(grid[2 * k + 1, :], sharex=output)
-            _draw_record(output, error, result, measurement, k, units)
-            if len(measurements) > 1:
-                output.set_title(f"experiment {k + 1} of {len(measurements)}", loc="left")
-        _draw_correlation(figure.add_subplot(grid[-1, 0]), result, measurements)
-        _draw_profile(figure.add_subplot(grid[-1, 1]), result, units)
+        if kind in ("overlay", "residuals"):
+            part = _draw_output if kind == "overlay" else _draw_residuals
+            for k, measurement in enumerate(drawn):
+                axes = figure.add_subplot(len(drawn), 1, k + 1)
+                part(axes, result, measurement, k, units)
+                axes.margins(x=0.0)
+                _name_panels(axes, axes, measurement, k, len(measurements), units)
+        elif kind in ("correlation", "profile"):
+            axes = figure.add_subplot()
+            if kind == "correlation":
+                _draw_correlation(axes, result, measurements)
+            else:
+                _draw_profile(axes, result, units)
+        else:
+            _draw_all(figure, result, measurements, units)
 
-    return svg(8.0, 3.4 * len(drawn) + 2.8, draw)
+    if kind in ("correlation", "profile"):
+        return Drawing(5.5, 3.4, draw)
+    return Drawing(8.0, 2.8 * len(drawn) if kind in ("overlay", "residuals") else 3.4 * len(drawn) + 2.8, draw)
 
 
-def _draw_record(
-    output: Any, error: Any, result: Identification, measurement: Measurement, k: int, units: Units
-) -> None:
+def _draw_all(figure: Figure, result: Identification, measurements: Sequence[Measurement], units: Units) -> None:
+    drawn = measurements[:MOST_DRAWN]
+    grid = figure.add_gridspec(2 * len(drawn) + 1, 2, height_ratios=[2, 1.2] * len(drawn) + [2])
+    for k, measurement in enumerate(drawn):
+        output = figure.add_subplot(grid[2 * k, :])
+        error = figure.add_subplot(grid[2 * k + 1, :], sharex=output)
+        _draw_output(output, result, measurement, k, units)
+        output.tick_params(labelbottom=False)
+        output.margins(x=0.0)
+        _draw_residuals(error, result, measurement, k, units)
+        _name_panels(output, error, measurement, k, len(measurements), units)
+    _draw_correlation(figure.add_subplot(grid[-1, 0]), result, measurements)
+    _draw_profile(figure.add_subplot(grid[-1, 1]), result, units)
+
+
+def _draw_output(axes: Any, result: Identification, measurement: Measurement, k: int, units: Units) -> None:
     record, use = measurement.record, result.fit.used[k]
-    residuals = result.fit.residuals[k]
-    simulated = outline(*_with_gaps(record.t, use, record.y[use] - residuals))
-    output.plot(*outline(record.t, record.y), color=LIGHT, linewidth=2.2, label="measured")
-    output.plot(*simulated, color=DARK, linewidth=0.9, label="simulated")
+    simulated = outline(*_with_gaps(record.t, use, record.y[use] - result.fit.residuals[k]))
+    axes.plot(*outline(record.t, record.y), color=LIGHT, linewidth=2.2, label="measured")
+    axes.plot(*simulated, color=DARK, linewidth=0.9, label="simulated")
     weighting = result.fit.weighting
     if weighting is not None and weighting.outliers[k].any():
         little = np.flatnonzero(use)[weighting.outliers[k]]
-        output.plot(record.t[little], record.y[little], "x", color="black", markersize=4, label="counts for little")
-    output.set_ylabel(f"{measurement.output} [{units.output}]")
-    output.legend(loc="lower right", ncols=3, fontsize=8)
-    output.tick_params(labelbottom=False)
-    output.margins(x=0.0)
-    low, high = output.get_ylim()
-    output.set_ylim(low - 0.18 * (high - low), high)  # room for the legend below the curves
-    error.plot(*outline(*_with_gaps(record.t, use, residuals)), color=DARK, linewidth=0.7)
-    error.axhline(0.0, color="black", linewidth=0.6)
-    error.set_ylabel(f"residual [{units.output}]")
-    thinned = f"; the least and the greatest of each {record.t.size // STRIPES} samples are drawn"
-    error.set_xlabel(f"{measurement.time} [{units.time}]{thinned * (simulated[0].size < record.t.size)}")
+        axes.plot(record.t[little], record.y[little], "x", color="black", markersize=4, label="counts for little")
+    axes.set_ylabel(f"{measurement.output} [{units.output}]")
+    axes.legend(loc="lower right", ncols=3, fontsize=8)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low - 0.18 * (high - low), high)  # room for the legend below the curves
+
+
+def _draw_residuals(axes: Any, result: Identification, measurement: Measurement, k: int, units: Units) -> None:
+    t = measurement.record.t
+    axes.plot(*outline(*_with_gaps(t, result.fit.used[k], result.fit.residuals[k])), color=DARK, linewidth=0.7)
+    axes.axhline(0.0, color="black", linewidth=0.6)
+    axes.set_ylabel(f"residual [{units.output}]")
+
+
+def _name_panels(upper: Any, lower: Any, measurement: Measurement, k: int, n: int, units: Units) -> None:
+    """Name the axis of time below the lower panel, and above the upper one which of n experiments it is."""
+    t = measurement.record.t
+    thinned = f"; the least and the greatest of each {t.size // STRIPES} samples are drawn"
+    lower.set_xlabel(f"{measurement.time} [{units.time}]{thinned * (outline(t, t)[0].size < t.size)}")
+    if n > 1:
+        upper.set_title(f"experiment {k + 1} of {n}", loc="left")
 
 
 def _with_gaps(t: Array, use: BoolArray, values: Array) -> tuple[Array, Array]:

@@ -13,7 +13,7 @@ from ctid_cli.estimators.identification import Identification, Validation
 from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
-from ctid_cli.reporting.layout import Table, count, number, picked
+from ctid_cli.reporting.layout import Report, Table, count, number, picked
 from ctid_cli.reporting.loss_report import loss_object, loss_text
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import warning_lines, wrapped
@@ -136,8 +136,8 @@ def identification_text(result: Identification, measurements: Sequence[Measureme
     lines.append("")
     for label, text in _asked_for(result, measurements, units):
         row(label, text)
-    lines += ["", parameter_table(parameters_of(result, units)), wrapped(_covariance_line(result)), ""]
-    lines += [derived_table(derived_of(result, units)), ""]
+    lines += ["", parameter_table(parameters_of(result, units)).draw(), wrapped(_covariance_line(result)), ""]
+    lines += [Report([derived_block(derived_of(result, units))]).draw(), ""]
     row("fit", f"{number(fit.fit_percent, 5)} % = {FIT_DEFINITION}")
     row("R2", f"{number(fit.r2, 6)} = {R2_DEFINITION}")
     row("", "y measured, x simulated, over the samples used")
@@ -232,15 +232,14 @@ def _covariance_line(result: Identification) -> str:
     return text + ". Monic denominator, descending powers."
 
 
-def derived_table(rows: Sequence[UncertainValue]) -> str:
-    """Derived quantities as an aligned table."""
+def derived_block(rows: Sequence[UncertainValue]) -> list[str | Table]:
+    """Derived quantities as a table, and why some have no error."""
     header = ["derived", "estimate", "standard error", "95 % low", "95 % high", "unit"]
     cells = [
         [row.name, number(row.estimate), number(row.standard_error, 3), number(row.low), number(row.high), row.unit]
         for row in rows
     ]
-    reasons = dict.fromkeys(row.reason for row in rows if row.reason)
-    return "\n".join([Table(header, cells, "lrrrrl").draw(), *map(wrapped, reasons)])
+    return [Table(header, cells, "lrrrrl"), *dict.fromkeys(row.reason for row in rows if row.reason)]
 
 
 def _modes(result: Identification, units: Units) -> list[dict[str, float | None]]:

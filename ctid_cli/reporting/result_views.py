@@ -1,40 +1,49 @@
-"""Results of fits and tracks as text, as tables of pandas and as figures."""
+"""Results as text, as tables of pandas and as figures, whichever kind of result it is."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, get_args
 
+from ctid_cli.errors import UsageError
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.frequency.record_track import RecordTrack
 from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.reporting import identification_plot, track_plot
 from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
-from ctid_cli.reporting.identification_plot import identification_svg
-from ctid_cli.reporting.identification_report import derived_of, derived_table, parameters_of
-from ctid_cli.reporting.layout import number
+from ctid_cli.reporting.figures.style import Picture, require_kind
+from ctid_cli.reporting.identification_report import derived_block, derived_of, parameters_of
+from ctid_cli.reporting.layout import Report, Table, number
 from ctid_cli.reporting.measures import parameter_unit
-from ctid_cli.reporting.track_plot import track_svg
-from ctid_cli.reporting.track_report import track_table
+from ctid_cli.reporting.track_report import invalid_rows, tones_block, track_table
 from ctid_cli.signals.measurement import Measurement
-from ctid_cli.text import warning_lines, wrapped
+from ctid_cli.text import warning_lines
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from ctid_cli.reporting.experiment import ExperimentResults
 
-def summary(result: Fit | Identification) -> str:
-    """A fit for people: parameters with their standard errors and 95 % intervals, and what to know of them.
+
+def summary(result: Fit | Identification | FrequencyTrack | ExperimentResults) -> str:
+    """A result for people: parameters or tones with their uncertainty, or the table of an experiment.
 
     Parameters
     ----------
-    result : Fit or Identification
-        What an estimator, or :func:`~ctid_cli.estimators.identification.identify`, found.
+    result : Fit, Identification, FrequencyTrack or ExperimentResults
+        What an estimator, :func:`~ctid_cli.estimators.identification.identify`, a tracker or an experiment found.
 
     Returns
     -------
     str
-        The tables of ``ctid fit``, within 100 columns; of an identification with derived quantities and warnings.
+        The tables of ``ctid fit``, ``ctid track`` or ``ctid table``, within 100 columns where they fit; of an
+        identification with derived quantities, and with warnings. A notebook shows the same without being asked.
+
+    Raises
+    ------
+    UsageError
+        If it is no result.
 
     Examples
     --------
@@ -46,62 +55,108 @@ def summary(result: Fit | Identification) -> str:
     >>> print(summary(Svf(poles=1, zeros=0, svf_cutoff=2.0).fit(Record(t, y, u), None)).splitlines()[0])
     parameter  estimate  standard error  relative %  95 % low  95 % high  unit      status
     """
-    fit = result.fit if isinstance(result, Identification) else result
-    parts = [parameter_table(_parameters(result))]
-    if isinstance(result, Identification):
-        parts.append(derived_table(derived_of(result, Units())))
-    parts.append(wrapped(f"fit {number(fit.fit_percent, 5)} % of {fit.count} samples: {fit.status.value}"))
-    if isinstance(result, Identification) and result.warnings:
-        parts.append("\n".join(warning_lines(result.warnings)))
-    return "\n\n".join(parts)
+    return _report(result).draw()
 
 
-def to_frame(result: Fit | Identification | FrequencyTrack) -> pd.DataFrame:
+def html(result: Any) -> str:
+    """The same as tables of a notebook."""
+    return _report(result).draw("html")
+
+
+def to_frame(result: Fit | Identification | FrequencyTrack | ExperimentResults) -> pd.DataFrame:
     """A result as a table.
 
     Parameters
     ----------
-    result : Fit, Identification or FrequencyTrack
+    result : Fit, Identification, FrequencyTrack or ExperimentResults
         What was found.
 
     Returns
     -------
     pandas.DataFrame
         Of a fit one row for each parameter: ``estimate``, ``standard_error``, ``relative_percent``, ``low``, ``high``,
-        ``unit``, ``status``; of a track one row for each instant, with the columns of ``track.csv``.
+        ``unit``, ``status``; of a track one row for each instant, with the columns of ``track.csv``; of an experiment
+        one row for each estimate, what ``ctid export`` writes.
+
+    Raises
+    ------
+    UsageError
+        If it is no result.
     """
     import pandas as pd
 
     if isinstance(result, FrequencyTrack):
         return pd.DataFrame(track_table(result, 0.0)).set_index("t")
-    return pd.DataFrame([parameter_object(item) for item in _parameters(result)]).set_index("name")
+    if isinstance(result, Fit | Identification):
+        return pd.DataFrame([parameter_object(item) for item in _parameters(result)]).set_index("name")
+    return _of_experiment(result).estimates
 
 
-class Picture(bytes):
-    """An SVG file, which a notebook shows."""
-
-    def _repr_svg_(self) -> str:
-        return self.decode()
-
-
-def plot(result: Identification | RecordTrack) -> Picture:
-    """The figure of a result, as ``ctid fit`` and ``ctid track`` draw it.
+def plot(result: Identification | FrequencyTrack | ExperimentResults, kind: str | None = None) -> Picture:
+    """A figure of a result, as ``ctid fit``, ``ctid track`` and ``ctid figure`` draw it.
 
     Parameters
     ----------
-    result : Identification or RecordTrack
+    result : Identification, FrequencyTrack or ExperimentResults
         What was found; a single fit does not hold the record that it would be drawn with,
         :func:`~ctid_cli.estimators.identification.identify` does.
+    kind : str, optional
+        Which figure. Of an identification ``"all"`` (the default) or one part of it: ``"overlay"`` of the measured and
+        the simulated output, ``"residuals"``, their ``"correlation"``, ``"profile"`` of the cost over the delay. Of a
+        track ``"tones"`` (the default): ``"frequencies"`` and, where it has them, ``"amplitudes"``. Of an experiment
+        ``"measure"``, ``"box"``, ``"errors"``, ``"delays"`` or ``"convergence"``, by default what tells most;
+        its method ``figure`` has more options.
 
     Returns
     -------
     Picture
         The bytes of an SVG file, such as for ``Path("fit.svg").write_bytes``; a notebook shows it.
+
+    Raises
+    ------
+    UsageError
+        If the result has no figure of this kind.
     """
-    if isinstance(result, RecordTrack):
-        return Picture(track_svg(result, 0.0, None, "frequencies"))
-    measured = [Measurement(record, None, None, None, "t", "u", "y") for record in result.records]
-    return Picture(identification_svg(result, measured, Units()))
+    if isinstance(result, Identification):
+        require_kind(kind, get_args(identification_plot.Kind))
+        measured = [Measurement(record, None, None, None, "t", "u", "y") for record in result.records]
+        shown: Any = kind
+        return identification_plot.identification_drawing(result, measured, Units(), shown).picture()
+    if isinstance(result, FrequencyTrack):
+        known = get_args(track_plot.Kind)
+        require_kind(kind, known if isinstance(result, RecordTrack) else known[:2])
+        shown = kind
+        return track_plot.track_drawing(result, 0.0, None, "frequencies", shown).picture()
+    if isinstance(result, Fit):
+        what = f"a single {type(result).__name__} does not hold the record that it would be drawn with"
+        raise UsageError(f"{what}; plot(identify(DelayProfile(...), [record])) does")
+    return _of_experiment(result).figure(kind)
+
+
+def _report(result: Any) -> Report:
+    """What is said of a result."""
+    if isinstance(result, FrequencyTrack):
+        found = [warning for part in invalid_rows(result) for warning in part]
+        return Report([tones_block(result, None), warning_lines(found)[1:]])
+    if not isinstance(result, Fit | Identification):
+        return _of_experiment(result).report
+    fit = result.fit if isinstance(result, Identification) else result
+    blocks: list[list[str | Table]] = [[parameter_table(_parameters(result))]]
+    if isinstance(result, Identification):
+        blocks.append(derived_block(derived_of(result, Units())))
+    blocks.append([f"fit {number(fit.fit_percent, 5)} % of {fit.count} samples: {fit.status.value}"])
+    if isinstance(result, Identification):
+        blocks.append([*warning_lines(result.warnings)[1:]])
+    return Report(blocks)
+
+
+def _of_experiment(result: Any) -> ExperimentResults:
+    from ctid_cli.reporting.experiment import ExperimentResults
+
+    if not isinstance(result, ExperimentResults):
+        results = "a fit, an identification, a track of frequencies or the results of an experiment"
+        raise UsageError(f"{type(result).__name__!r} is no result; what can be shown is {results}")
+    return result
 
 
 def _parameters(result: Fit | Identification) -> list[UncertainValue]:

@@ -1,19 +1,22 @@
-"""The figure of ``ctid track``: frequencies over time, and amplitudes below."""
+"""The figures of a track: frequencies over time, and amplitudes below."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.frequency.record_track import RecordTrack
-from ctid_cli.reporting.figures.style import BAND, ramp, spread, svg
+from ctid_cli.frequency.tracking import FrequencyTrack
+from ctid_cli.reporting.figures.style import BAND, Drawing, ramp, spread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+#: The figure of ``ctid track``, and its halves.
+Kind = Literal["tones", "frequencies", "amplitudes"]
 #: Up to so many tones get a panel each, which shows how far they move; more share one.
 MOST_PANELS = 5
 #: The axis of a panel shows the central part of the valid rows, and so much more on both sides.
@@ -23,23 +26,40 @@ MARGIN = 0.35
 LOGARITHMIC = 10.0
 
 
-def track_svg(track: RecordTrack, start: float, unit: str | None, title: str) -> bytes:
-    """Figure of a track; the same track always gives the same bytes."""
-    tones = track.omega.shape[1]
-    panels = tones if tones <= MOST_PANELS else 1
-    height = 1.1 + (1.15 * panels if panels > 1 else 2.6) + 1.7
+def track_drawing(
+    track: FrequencyTrack, start: float, unit: str | None, title: str, kind: Kind | None = None
+) -> Drawing:
+    """A figure of a track: of all that it holds where no kind is given."""
+    t, styles = start + track.t, ramp(track.omega.shape[1])
+    panels = track.omega.shape[1] if track.omega.shape[1] <= MOST_PANELS else 1
+    upper = 1.15 * panels if panels > 1 else 2.6
 
     def draw(figure: Figure) -> None:
-        _draw(figure, track, start, unit, title, panels)
+        if not isinstance(track, RecordTrack) or kind == "frequencies":
+            _draw_all_frequencies(figure, figure.add_gridspec(panels, 1), track, t, styles)
+            figure.axes[-1].tick_params(labelbottom=True)
+            figure.axes[-1].set_xlabel("t [s]")
+            figure.axes[-1].margins(x=0.0)
+        elif kind == "amplitudes":
+            _draw_amplitudes(figure.add_subplot(), track, t, unit, styles)
+        else:
+            ratios = [1.0] * panels + [1.5] if panels > 1 else [2.2, 1.4]
+            grid = figure.add_gridspec(panels + 1, 1, height_ratios=ratios)
+            first = _draw_all_frequencies(figure, grid, track, t, styles)
+            _draw_amplitudes(figure.add_subplot(grid[-1], sharex=first), track, t, unit, styles)
+        figure.axes[0].set_title(title, loc="left")
 
-    return svg(7.2, height, draw)
+    heights = {"frequencies": 1.1 + upper, "amplitudes": 3.2}
+    alone = "frequencies" if not isinstance(track, RecordTrack) else kind
+    return Drawing(7.2, heights.get(alone or "tones", 2.8 + upper), draw)
 
 
-def _draw(figure: Figure, track: RecordTrack, start: float, unit: str | None, title: str, panels: int) -> None:
-    tones, t = track.omega.shape[1], start + track.t
-    ratios = [1.0] * panels + [1.5] if panels > 1 else [2.2, 1.4]
-    grid = figure.add_gridspec(panels + 1, 1, height_ratios=ratios)
-    styles = ramp(tones)
+def _draw_all_frequencies(
+    figure: Figure, grid: Any, track: FrequencyTrack, t: Array, styles: list[dict[str, Any]]
+) -> Any:
+    """Draw the tones into the first places of a grid, and return the first panel."""
+    tones = len(styles)
+    panels = tones if tones <= MOST_PANELS else 1
     first: Any = None
     for row in range(panels):
         # The highest tone on top, as on a sheet of music.
@@ -51,15 +71,14 @@ def _draw(figure: Figure, track: RecordTrack, start: float, unit: str | None, ti
             place: dict[str, Any] = {"xycoords": "axes fraction", "ha": "right", "va": "top", "fontsize": 8}
             axes.annotate(f"tone {tones - row}", (0.995, 0.92), **place)
         _shade(axes, t, track.valid)
-    figure.axes[0].set_title(title, loc="left")
     if panels > 1:
         figure.supylabel("frequency [Hz]", fontsize=9)
     else:
         first.set_ylabel("frequency [Hz]")
-    _draw_amplitudes(figure.add_subplot(grid[-1], sharex=first), track, t, unit, styles)
+    return first
 
 
-def _draw_frequencies(axes: Any, track: RecordTrack, t: Array, lines: list[tuple[int, dict[str, Any]]]) -> None:
+def _draw_frequencies(axes: Any, track: FrequencyTrack, t: Array, lines: list[tuple[int, dict[str, Any]]]) -> None:
     frequencies, valid = track.omega / (2.0 * np.pi), track.valid
     for k, style in lines:
         axes.plot(t, np.where(valid, np.nan, frequencies[:, k]), color=style["color"], linewidth=0.4, alpha=0.6)

@@ -14,27 +14,27 @@ from ctid_cli.frequency.automatic import Settings
 from ctid_cli.frequency.flags import MEANINGS, Flag
 from ctid_cli.frequency.record_track import RecordTrack
 from ctid_cli.frequency.tracking import FrequencyTrack
-from ctid_cli.reporting.layout import Table, count, number
+from ctid_cli.reporting.layout import Report, Table, count, number
 from ctid_cli.signals.sampled_signal import SampledSignal
 from ctid_cli.text import warning_lines, wrapped
 
 _UNITS = {"t": "s", "omega": "rad/s", "frequency": "Hz"}
 #: A smaller share of valid time is worth a warning.
 MOSTLY_VALID = 0.9
+_NONE_VALID = "No row is valid: there are no frequencies to report."
 #: Most frequent reasons for invalid rows that are named.
 MOST_REASONS = 3
 
 
-def summarise(track: RecordTrack) -> list[dict[str, Any]]:
+def summarise(track: FrequencyTrack) -> list[dict[str, Any]]:
     """Each tone over the valid rows of a track; None where there are none.
 
     ``frequency_hz`` [Hz] and ``omega`` [rad/s] are medians, ``spread_hz`` is half the width of the central 68 %,
     ``amplitude`` a median [signal unit], ``valid_percent`` the share of the rows that are valid.
     """
     found = []
-    for k, (omega, amplitudes) in enumerate(
-        zip(track.omega[track.valid].T, track.amplitudes[track.valid].T, strict=True)
-    ):
+    heights = track.amplitudes if isinstance(track, RecordTrack) else np.full(track.omega.shape, np.nan)
+    for k, (omega, amplitudes) in enumerate(zip(track.omega[track.valid].T, heights[track.valid].T, strict=True)):
         amplitudes = amplitudes[np.isfinite(amplitudes)]
         tone: dict[str, Any] = {"tone": k + 1, **dict.fromkeys(("frequency_hz", "omega", "spread_hz", "amplitude"))}
         if omega.size:
@@ -47,24 +47,27 @@ def summarise(track: RecordTrack) -> list[dict[str, Any]]:
     return found
 
 
-def _valid_share(track: RecordTrack) -> float:
+def _valid_share(track: FrequencyTrack) -> float:
     return float(track.valid.mean()) if track.valid.size else 0.0
 
 
 def track_warnings(track: RecordTrack, settings: Settings) -> list[str]:
     """What a reader must know before believing the numbers."""
-    found, share = list(settings.warnings), _valid_share(track)
+    share, reasons = invalid_rows(track)
+    if settings.estimator.online and not track.valid.any():
+        share.append("A record is easier for the methods that take it window by window: try --method automatic.")
+    return [*settings.warnings, *share, *reasons]
+
+
+def invalid_rows(track: FrequencyTrack) -> tuple[list[str], list[str]]:
+    """How many rows are not valid, and why; nothing where nearly all are."""
+    share = _valid_share(track)
     if share >= MOSTLY_VALID:
-        return found
-    if share > 0:
-        found.append(f"{100 * (1 - share):.3g} % of the rows are not valid.")
-    else:
-        found.append("No row is valid: there are no frequencies to report.")
-    if share == 0 and settings.estimator.online:
-        found.append("A record is easier for the methods that take it window by window: try --method automatic.")
+        return [], []
+    found = [f"{100 * (1 - share):.3g} % of the rows are not valid." if share > 0 else _NONE_VALID]
     shares = {flag: float(np.mean((track.flags & int(flag)) != 0)) for flag in Flag}
     reasons = sorted((flag for flag in Flag if shares[flag] > 0), key=lambda flag: -shares[flag])
-    return [*found, *(f"{100 * shares[flag]:.3g} %: {MEANINGS[flag]}" for flag in reasons[:MOST_REASONS])]
+    return found, [f"{100 * shares[flag]:.3g} %: {MEANINGS[flag]}" for flag in reasons[:MOST_REASONS]]
 
 
 def track_object(signal: SampledSignal, settings: Settings, track: RecordTrack, files: list[Path]) -> dict[str, Any]:
@@ -104,7 +107,12 @@ def track_text(signal: SampledSignal, settings: Settings, track: RecordTrack) ->
     head += f"{end:.6g} s, every {signal.interval:.6g} s ({1.0 / signal.interval:.6g} Hz){gaps}"
     lines = [wrapped(head), *(wrapped(note, "  ") for note in signal.notes)]
     lines += [wrapped(f"- {reason}", hanging="  ") for reason in settings.reasons]
-    unit = f"amplitude [{signal.unit}]" if signal.unit else "amplitude"
+    lines += ["", Report([tones_block(track, signal.unit)]).draw()]
+    return "\n".join([*lines, *warning_lines(track_warnings(track, settings))])
+
+
+def tones_block(track: FrequencyTrack, unit: str | None) -> list[str | Table]:
+    """A table of the tones, and what its numbers are."""
     cells = [
         [
             *(str(tone["tone"]), _to_spread(tone["frequency_hz"], tone["spread_hz"])),
@@ -113,11 +121,15 @@ def track_text(signal: SampledSignal, settings: Settings, track: RecordTrack) ->
         ]
         for tone in summarise(track)
     ]
-    header = ["tone", "frequency [Hz]", "spread [Hz]", "[rad/s]", unit, "valid"]
-    rows = f"{count(track.t.size, 'row')}, one every {track.every:.4g} s"
+    amplitude = f"amplitude [{unit}]" if unit else "amplitude"
+    header = ["tone", "frequency [Hz]", "spread [Hz]", "[rad/s]", amplitude, "valid"]
+    rows = count(track.t.size, "row")
+    if isinstance(track, RecordTrack):
+        rows += f", one every {track.every:.4g} s"
+    else:
+        header, cells = [*header[:4], *header[5:]], [[*row[:4], *row[5:]] for row in cells]
     foot = f"Medians over the valid ones of {rows}; the spread is half the width of the central 68 %."
-    lines += ["", Table(header, cells, "rrrrrr").draw(), wrapped(foot)]
-    return "\n".join([*lines, *warning_lines(track_warnings(track, settings))])
+    return [Table(header, cells, "r" * len(header)), foot]
 
 
 def flag_words(flags: int) -> str:

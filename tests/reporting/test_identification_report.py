@@ -16,7 +16,7 @@ from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.status import Status
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.identification_plot import identification_svg
+from ctid_cli.reporting.identification_plot import identification_drawing
 from ctid_cli.reporting.identification_report import (
     common_units,
     derived_of,
@@ -160,8 +160,8 @@ def test_units_of_several_files():
 
 def test_the_figure_is_the_same_every_time_and_names_its_axes(fitted):
     result, measurements, _ = fitted
-    figure = identification_svg(result, measurements, UNITS)
-    assert figure == identification_svg(result, measurements, UNITS)
+    figure = identification_drawing(result, measurements, UNITS).saved()
+    assert figure == identification_drawing(result, measurements, UNITS).saved()
     root = ElementTree.fromstring(figure)
     assert root.tag.endswith("svg")
     # Text is drawn as outlines; what it says stands in comments beside them.
@@ -172,7 +172,7 @@ def test_the_figure_is_the_same_every_time_and_names_its_axes(fitted):
 def test_the_figure_of_several_experiments_and_a_known_delay():
     files = [measurement(seed) for seed in range(4)]
     result = identify(DelayProfile(2, 0, (0.73, 0.73)), [item.record for item in files])
-    figure = identification_svg(result, files, UNITS)
+    figure = identification_drawing(result, files, UNITS).saved()
     assert b"<!-- experiment 3 of 4 -->" in figure
     assert b"experiment 4" not in figure
     assert b"known delay 0.73 ms" in figure
@@ -190,7 +190,7 @@ def test_a_loss_names_the_samples_that_count_for_little():
     text = " ".join(identification_text(result, files, UNITS).split())
     assert "2 of 300 samples have no weight, at 3, 20 ms; fit 8" in text
     assert f"fit {loss['fit_percent']:.5g} % without them" in text
-    assert b"counts for little" in identification_svg(result, files, UNITS)
+    assert b"counts for little" in identification_drawing(result, files, UNITS).saved()
     squares = identification_object(identify(DelayProfile(2, 0, (0.73, 0.73)), [one.record]), files, UNITS)["loss"]
     assert squares == {"kind": "squares", "scales": None, "outliers": [[]], "fit_percent": None}
 

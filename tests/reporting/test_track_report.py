@@ -11,7 +11,7 @@ import pytest
 from ctid_cli.frequency.automatic import choose_settings
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.record_track import RecordTrack
-from ctid_cli.reporting.track_plot import track_svg
+from ctid_cli.reporting.track_plot import track_drawing
 from ctid_cli.reporting.track_report import (
     flag_words,
     summarise,
@@ -121,15 +121,15 @@ def test_figure(tones):
     flags = some_invalid()
     omega = 2 * np.pi * np.outer(1.0 + 0.01 * np.sin(np.arange(ROWS)), 10.0 * np.arange(1, tones + 1))
     track = RecordTrack(0.1 * np.arange(ROWS), omega, flags, omega, 1.0 / omega, 0.1)
-    one, two = (track_svg(track, 0.0, "Pa", "title") for _ in range(2))
+    one, two = (track_drawing(track, 0.0, "Pa", "title").saved() for _ in range(2))
     assert one == two
     assert one.startswith(b"<?xml")
     assert b"#e4e4e4" in one  # the shade of what is not valid
     plain = RecordTrack(track.t, omega, np.zeros(ROWS, np.uint16), omega, 1.0 / omega, 0.1)
-    assert b"#e4e4e4" not in track_svg(plain, 0.0, None, "title")
+    assert b"#e4e4e4" not in track_drawing(plain, 0.0, None, "title").saved()
 
 
 def test_figure_without_anything_valid():
     nothing = np.full((3, 2), np.nan)
     track = RecordTrack(np.arange(3.0), nothing, np.full(3, 2, np.uint16), nothing, nothing, 1.0)
-    assert track_svg(track, 0.0, None, "title").startswith(b"<?xml")
+    assert track_drawing(track, 0.0, None, "title").saved().startswith(b"<?xml")

@@ -6,12 +6,11 @@ from typing import Literal, get_args
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.figures.estimate_plot import box_drawing, delays_drawing, errors_drawing
 from ctid_cli.reporting.figures.measure_plot import convergence_drawing, measure_drawing
-from ctid_cli.reporting.figures.style import Drawing
+from ctid_cli.reporting.figures.style import Drawing, require_kind
 from ctid_cli.reporting.measures import default_measures
 from ctid_cli.reporting.parameter_errors import estimates_by_group
 from ctid_cli.reporting.results import Results
 from ctid_cli.storage.manifest import true_values
-from ctid_cli.text import did_you_mean
 
 Kind = Literal["measure", "errors", "delays", "box", "convergence"]
 
@@ -48,9 +47,7 @@ def chosen_kind(results: Results, kind: str | None = None, measure: str | None =
     known = kinds_of(results)
     if kind is None:
         return "measure" if measure is not None else known[0]
-    if kind not in get_args(Kind):
-        hint = did_you_mean(kind, get_args(Kind)) or ";"
-        raise UsageError(f"there is no kind of figure {kind!r}{hint} there are {', '.join(get_args(Kind))}")
+    require_kind(kind, get_args(Kind))
     if kind not in known:
         raise UsageError(f"{results.experiment} has nothing to draw as {kind}; it has {', '.join(known)}")
     return kind

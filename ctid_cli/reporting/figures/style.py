@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
+from ctid_cli.errors import UsageError
+from ctid_cli.text import did_you_mean
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,6 +55,16 @@ Format = Literal["svg", "png", "pdf"]
 _METADATA: dict[Format, Any] = {"svg": {"Date": None}, "png": {"Software": None}, "pdf": {"CreationDate": None}}
 
 
+class Picture(bytes):
+    """An SVG file, which a notebook shows."""
+
+    def __repr__(self) -> str:
+        return f"Picture: an SVG file of {len(self)} bytes"
+
+    def _repr_svg_(self) -> str:
+        return self.decode()
+
+
 class Drawing(NamedTuple):
     """A figure that is still to be drawn."""
 
@@ -69,6 +81,10 @@ class Drawing(NamedTuple):
             self.draw(figure)
         return figure
 
+    def picture(self) -> Picture:
+        """Draw it for a notebook."""
+        return Picture(self.saved())
+
     def saved(self, style: Format = "svg") -> bytes:
         """Draw it as a file; the same drawing always gives the same bytes."""
         file, figure = io.BytesIO(), self.figure()
@@ -82,6 +98,13 @@ def _style() -> Any:
     import matplotlib.style
 
     return matplotlib.style.context(["default", _STYLE])
+
+
+def require_kind(kind: str | None, known: Sequence[str]) -> None:
+    """Refuse a kind of figure that there is not."""
+    if kind is not None and kind not in known:
+        hint = did_you_mean(kind, known) or ";"
+        raise UsageError(f"there is no kind of figure {kind!r}{hint} there are {', '.join(known)}")
 
 
 def plain(text: str) -> str:
