@@ -1,6 +1,7 @@
 """The Python surface gives what the commands print."""
 
 import io
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ import ctid_cli
 from ctid_cli import (
     CtidError,
     DelayProfile,
+    Flag,
+    FrequencyTrack,
     HeldSignal,
     Record,
     SpecError,
@@ -25,6 +28,7 @@ from ctid_cli import (
     summary,
     to_frame,
 )
+from ctid_cli.frequency.record_track import RecordTrack
 
 SPEC = {
     "experiment": "group/study",
@@ -62,6 +66,12 @@ def test_results_are_those_of_the_commands(out, ctid):
     assert results.surprises == []
     drawn = ctid("figure", "group/study", "--kind", "box", "--out", out, "--file", out / "box.svg")
     assert (out / "box.svg").read_bytes() == results.figure("box"), drawn.stderr
+    assert plot(results, "box") == results.figure("box")
+    with pytest.raises(CtidError, match=r"there is no kind of figure 'boxes'; did you mean 'box'\? there are meas"):
+        plot(results, "boxes")
+    pd.testing.assert_frame_equal(to_frame(results), results.estimates)
+    printed = ctid("table", "group/study", "--out", out).stdout
+    assert summary(results).strip() == printed.strip()
     assert repr(results).startswith("group/study: 12 of 12 estimates by one, other, 0 failed\n  in 1 data cell")
     assert "<td" in results._repr_html_()
 
@@ -95,6 +105,12 @@ def test_a_fit_as_text_and_as_a_table():
     assert list(frame["unit"]) == ["1/s", "out/in/s"]
     assert f"{fit.parameters['a1']:.6g}" in summary(fit)
     assert f"fit {fit.fit_percent:.5g} % of 300 samples" in summary(fit)
+    assert fit._repr_html_().count("<tr>") == 3
+    with pytest.raises(CtidError, match=r"a single Fit does not hold the record .* plot\(identify"):
+        plot(fit)
+    for view in (summary, to_frame, plot):
+        with pytest.raises(CtidError, match="'TransferFunction' is no result; what can be shown is a fit, an identi"):
+            view(fit.model)
 
 
 def test_an_identification_is_shown_as_by_the_command(tmp_path, ctid):
@@ -108,8 +124,39 @@ def test_an_identification_is_shown_as_by_the_command(tmp_path, ctid):
     # The file names no units either.
     tables = summary(found).split("\n\n")[:2]
     assert all(table.splitlines()[2].split()[:3] == shown for table, shown in zip(tables, rows(printed), strict=True))
+    written = (tmp_path / "fit.svg").read_bytes()
+    assert len(plot(found)) == len(plot(found, "all"))
     assert plot(found).startswith(b"<?xml")
-    assert plot(found)._repr_svg_().count("measured") >= 1
+    parts = {kind: plot(found, kind)._repr_svg_() for kind in ("overlay", "residuals", "correlation", "profile")}
+    words = {"overlay": "simulated", "residuals": "residual [", "correlation": "lag [samples]", "profile": "delay ["}
+    for kind, word in words.items():
+        assert [other for other, svg in parts.items() if f"<!-- {word}" in svg] == [kind]
+        assert f"<!-- {word}".encode() in written
+    with pytest.raises(CtidError, match=r"there is no kind of figure 'profil'; did you mean 'profile'\? there are all"):
+        plot(found, "profil")
+    assert found._repr_html_().count("<table>") == 2
+    assert repr(plot(found, "profile")).startswith("Picture: an SVG file of ")
+
+
+def test_a_track_as_text_as_a_table_and_as_a_figure():
+    flags = np.zeros(40, np.uint16)
+    flags[:10] = int(Flag.GAP)
+    omega = 2 * np.pi * np.column_stack((np.linspace(9.0, 11.0, 40), np.full(40, 30.0)))
+    online = FrequencyTrack(0.1 * np.arange(40), omega, flags, 0.1 * omega)
+    recorded = RecordTrack(online.t, omega, flags, 0.1 * omega, np.full((40, 2), [2.0, 0.5]), 0.1)
+    assert "tone  frequency [Hz]" in summary(online)
+    assert "amplitude" not in summary(online)
+    assert "\nWarnings:\n- 25 % of the rows are not valid.\n" in summary(recorded)
+    assert summary(recorded).splitlines()[3].split() == ["2", "30.0000", "0", "188.49556", "0.5", "75", "%"]
+    assert to_frame(online).shape == (40, 6)
+    assert recorded._repr_html_().count("<tr>") == 3
+    drawn = {kind: plot(recorded, kind).decode() for kind in (None, "tones", "frequencies", "amplitudes")}
+    assert drawn[None] == drawn["tones"]
+    assert ["<!-- amplitude -->" in drawn[kind] for kind in drawn] == [True, True, False, True]
+    assert ["<!-- frequency [Hz] -->" in drawn[kind] for kind in drawn] == [True, True, True, False]
+    assert plot(online) == plot(recorded, "frequencies")
+    with pytest.raises(CtidError, match=r"there is no kind of figure 'amplitudes'; there are tones, frequencies$"):
+        plot(online, "amplitudes")
 
 
 def rows(printed):
@@ -118,7 +165,10 @@ def rows(printed):
     return [lines[k + 2].split()[:3] for k in heads]
 
 
-def test_completion_knows_the_public_names():
+def test_completion_knows_the_public_names_and_no_others():
     stub = Path(ctid_cli.__file__).with_suffix(".pyi").read_text(encoding="utf-8")
-    assert {"run_experiment", "read_results", "summary", "to_frame", "plot"} <= set(dir(ctid_cli))
-    assert all(f"as {name}" in stub for name in dir(ctid_cli) if name[0] != "_" and name.islower())
+    names = [name for line in re.findall(r"^from .*", stub, re.MULTILINE) for name in re.findall(r" as (\w+)", line)]
+    assert set(names) == set(ctid_cli.__all__) == {name for name in dir(ctid_cli) if name[0] != "_"}
+    assert len(names) == len(set(names))
+    for name in names:
+        assert getattr(ctid_cli, name).__name__ == name

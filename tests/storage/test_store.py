@@ -1,7 +1,11 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
+import subprocess
+import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +78,17 @@ def test_the_sealed_file_explains_itself_to_other_programs(place: Path) -> None:
         texts = [file[name] for name in everything if getattr(file[name], "dtype", np.dtype("f8")).kind in "SO"]
         assert len(texts) > 5
         assert all(h5py.check_string_dtype(text.dtype).encoding == "utf-8" for text in texts)
+
+
+def test_the_documented_lines_read_it_with_h5py_and_pandas_alone(place: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "machine-readable.md").read_text(encoding="utf-8")
+    (lines,) = re.findall(r"^    import json\n(?:    .*\n|\n)+", page, re.MULTILINE)
+    code = textwrap.dedent(lines).replace("results/quickstart/runs.h5", "runs.h5")
+    told = "import sys; print(experiment, len(spec['estimators']), units['delay'], len(estimates))\n"
+    told += "print(*sorted(estimates['status'].unique()), [name for name in sys.modules if name.startswith('ctid')])"
+    done = subprocess.run([sys.executable, "-c", code + told], capture_output=True, text=True, cwd=place, check=True)
+    rows = read_sealed(place / "runs.h5").results
+    assert done.stdout.splitlines() == [f"toys 2 s {len(rows)}", "CONVERGED FAILED []"]
 
 
 def test_rows_are_sorted_as_the_specification_is_written(place: Path) -> None:
