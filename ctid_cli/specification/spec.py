@@ -119,7 +119,7 @@ class SuccessSection(Section):
     fit_percent : float, optional
         Least fit of the simulated output [%]
     parameter_relative_error : float, optional
-        Largest error of a parameter of the submodels, as a fraction of the true value [-]
+        Largest error of any parameter but the delay, as a fraction of the true value [-]
     band : float, optional
         Largest error of a settled frequency of a signal [rad/s]
     by : float, optional

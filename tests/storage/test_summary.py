@@ -66,6 +66,14 @@ def test_success_rule_of_parameters(found: Any, status: str, expected: bool) -> 
     assert is_converged(estimate, success, {"delay": 0.0}) is None
 
 
+def test_success_rule_of_the_coefficients_of_a_transfer_function() -> None:
+    success = {"parameter_relative_error": 0.1}
+    found = row("CONVERGED") | {"numerator": [2.1], "denominator": [1.0, 2.9, 4.0]}
+    assert is_converged(found, success, {"b0": 2.0, "a1": 3.0, "a2": 4.0, "delay": 1.0}) is True
+    assert is_converged(found, success, {"b0": 2.0, "a1": 3.5, "a2": 4.0, "delay": 1.0}) is False
+    assert is_converged(found, success, {"b0": 2.0, "a1": 3.0, "delay": 1.0}) is False, "another number of poles"
+
+
 def frame() -> pd.DataFrame:
     return pd.DataFrame(
         {
