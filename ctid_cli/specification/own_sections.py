@@ -12,6 +12,7 @@ from pydantic import PlainValidator, WithJsonSchema
 from ctid_cli.errors import CtidError
 from ctid_cli.kinds import KINDS
 from ctid_cli.own_code import OwnCodeError, find_class, find_entry_point, reason
+from ctid_cli.simulation.own_clocked_noise import OwnClockedNoise
 from ctid_cli.simulation.own_components import OwnEstimation, OwnExcitation, OwnNoise, OwnSampling, OwnSystem
 from ctid_cli.specification.fields import ByShape, Number, Text
 from ctid_cli.specification.messages import Complaint, several_wrong
@@ -19,13 +20,16 @@ from ctid_cli.specification.sections import RefusedOptionsError, Section, sectio
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.text import did_you_mean
 
-#: What stands for a component of one's own, the method that it needs, and what the method is given.
-CONTRACTS: dict[str, tuple[type, str, tuple[str, ...]]] = {
-    "estimator": (OwnEstimation, "fit", ("record", "start")),
-    "excitation": (OwnExcitation, "generate", ("times", "rng")),
-    "noise": (OwnNoise, "generate", ("output", "rng")),
-    "sampling": (OwnSampling, "times", ("rng",)),
-    "system": (OwnSystem, "simulate", ("input", "times")),
+#: What stands for a component of one's own, the method that it needs, and what the method is given: one way or more.
+CONTRACTS: dict[str, tuple[tuple[type, str, tuple[str, ...]], ...]] = {
+    "estimator": ((OwnEstimation, "fit", ("record", "start")),),
+    "excitation": ((OwnExcitation, "generate", ("times", "rng")),),
+    "noise": (
+        (OwnNoise, "generate", ("output", "rng")),
+        (OwnClockedNoise, "generate", ("output", "times", "rng")),
+    ),
+    "sampling": ((OwnSampling, "times", ("rng",)),),
+    "system": ((OwnSystem, "simulate", ("input", "times")),),
 }
 
 
@@ -90,17 +94,15 @@ def _own_kind(section: str, name: str, folder: Path) -> OwnKind | None:
 
 @cache
 def _section_of(target: type[Any], section: str, kind: str) -> type[Section]:
-    name, (stand_in, method, given) = target.__name__, CONTRACTS[section]
-    call = getattr(target, method, None)
-    wanted = f"{method}(self, {', '.join(given)})"
-    if not callable(call):
+    name, method = target.__name__, CONTRACTS[section][0][1]
+    wanted = " or ".join(f"{method}(self, {', '.join(given)})" for _, _, given in CONTRACTS[section])
+    if not callable(getattr(target, method, None)):
         raise OwnCodeError(f"{name} has no method {method}; this kind needs {wanted}")
     if not is_dataclass(target):
         raise OwnCodeError(f"{name} is no dataclass; write @dataclass(frozen=True) above it")
-    try:
-        inspect.signature(call).bind(None, *given)
-    except (TypeError, ValueError):
-        raise OwnCodeError(f"{name}.{method} cannot be called so; this kind needs {wanted}") from None
+    fitting = [stand_in for stand_in, _, given in CONTRACTS[section] if _takes(getattr(target, method), given)]
+    if not fitting:
+        raise OwnCodeError(f"{name}.{method} cannot be called so; this kind needs {wanted}")
     start_from = getattr(target, "start_from", None)
     if section == "estimator" and start_from not in (None, "delay", "parameters"):
         raise OwnCodeError(f"{name}.start_from must be None, 'delay' or 'parameters', not {start_from!r}")
@@ -113,8 +115,17 @@ def _section_of(target: type[Any], section: str, kind: str) -> type[Section]:
     # Whatever is wrong with the annotations of a class that somebody wrote.
     except Exception as error:
         raise OwnCodeError(f"the options of {name} cannot be read: {reason(error)}") from None
-    found.stand_in = stand_in  # type: ignore[attr-defined]
+    found.stand_in = fitting[0]  # type: ignore[attr-defined]
     return found
+
+
+def _takes(call: Any, given: tuple[str, ...]) -> bool:
+    """Whether a method can be called with so many values besides its object."""
+    try:
+        inspect.signature(call).bind(None, *given)
+    except (TypeError, ValueError):
+        return False
+    return True
 
 
 class OwnSection(Section):

@@ -4,11 +4,13 @@ import random
 import re
 import sys
 
+import numpy as np
 import pytest
 
 from ctid_cli.errors import CtidError, RefusedError, SpecError
 from ctid_cli.own_code import find_class
 from ctid_cli.running.plan import build_plan
+from ctid_cli.signals.drifts import noise_at
 from ctid_cli.specification import own_sections
 from ctid_cli.specification.load import load_spec, spec_from_canonical
 
@@ -163,6 +165,16 @@ def test_installed_packages_offer_kinds_without_permission(folder, monkeypatch):
     plan = build_plan(load_spec(folder / "spec.yaml"))
     assert plan.data_cells[0].source.noise.options == target(0.1)
     assert plan.data_cells[0].content["noise"]["kind"] == "hum"
+
+
+def test_a_noise_may_ask_for_the_instants(folder):
+    edited(folder, "parts.py", "generate(self, output, rng)", "generate(self, output, times, rng)")
+    edited(folder, "parts.py", "return GAIN * self.deviation * rng", "return times + 0 * GAIN * rng")
+    noise = build_plan(load(folder)).data_cells[0].source.noise
+    times = np.array([0.0, 0.1, 0.3])
+    np.testing.assert_array_equal(noise_at(noise, times, np.zeros(3), np.random.default_rng(0)), times)
+    edited(folder, "parts.py", "output, times, rng", "output")
+    assert "needs generate(self, output, rng) or generate(self, output, times, rng)" in str(problem(folder))
 
 
 WRONG = {
