@@ -22,7 +22,7 @@ from importlib.abc import MetaPathFinder, SourceLoader
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Self
 
 #: Part of a specification to the group of entry points that offers kinds for it.
 GROUPS = {name: f"ctid.{name}s" for name in ("estimator", "excitation", "noise", "sampling", "system")}
@@ -39,6 +39,21 @@ class Source:
 
     path: str
     content: bytes
+    #: SHA-256 of each data file that it names in FILES, by name.
+    data: tuple[tuple[str, str], ...] = ()
+
+    @classmethod
+    def read(cls, file: Path) -> Self:
+        """A module's file, and what the data files that it names hold now."""
+        content = file.read_bytes()
+        data = []
+        for name in _data_files(content, file.name):
+            try:
+                data.append((name, hashlib.sha256((file.parent / name).read_bytes()).hexdigest()))
+            except OSError as error:
+                text = f"{name}, which FILES in {file.name} names, cannot be read: {error.strerror}"
+                raise OwnCodeError(text) from None
+        return cls(str(file), content, tuple(data))
 
     @property
     def is_package(self) -> bool:
@@ -169,9 +184,12 @@ def _serve_file(path: Path, place: str) -> str:
         sources = _with_neighbours(path)
     except FileNotFoundError:
         raise OwnCodeError(f"there is no file {place}; names start at the folder of the specification") from None
+    except OwnCodeError:
+        raise
     except (OSError, ValueError) as error:
         raise OwnCodeError(f"{place} cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    digest = hashlib.sha256(repr([(name, source.content) for name, source in sorted(sources.items())]).encode())
+    contents = [(name, source.content, source.data) for name, source in sorted(sources.items())]
+    digest = hashlib.sha256(repr(contents).encode())
     # Named by content, so that a changed file is another module.
     main = f"own_{re.sub(r'[^0-9A-Za-z_]', '_', path.stem)}_{digest.hexdigest()[:12]}"
     _serve({f"{main}.{name}" if name else main: source for name, source in sources.items()})
@@ -180,13 +198,13 @@ def _serve_file(path: Path, place: str) -> str:
 
 def _with_neighbours(path: Path) -> dict[str, Source]:
     """A file, under no name, and the modules in its folder that it imports, directly or not."""
-    found, waiting = {"": Source(str(path), path.read_bytes())}, [""]
+    found, waiting = {"": Source.read(path)}, [""]
     while waiting:
         name = waiting.pop()
         for other in imports_of(found[name], name):
             file = None if other in found or _is_installed(other) else _beside(path.parent, other)
             if file is not None:
-                found[other] = Source(str(file), file.read_bytes())
+                found[other] = Source.read(file)
                 waiting.append(other)
     return found
 
@@ -217,7 +235,7 @@ def source_of(name: str) -> Source | None:
     with suppress(BaseException):
         spec = importlib.util.find_spec(name)
         if spec is not None and is_own_file(spec.origin):
-            return Source(str(spec.origin), Path(str(spec.origin)).read_bytes())
+            return Source.read(Path(str(spec.origin)))
     return None
 
 
@@ -235,6 +253,22 @@ def imports_of(source: Source, name: str) -> set[str]:
     found = _named(source.content, name if source.is_package else name.rpartition(".")[0])
     neighbours = {other: f"{name.partition('.')[0]}.{other}" for other in found}
     return {private if private in _SERVED else other for other, private in neighbours.items()} - {name}
+
+
+def _data_files(content: bytes, place: str) -> tuple[str, ...]:
+    """What a module assigns to FILES: names of data files, seen from its folder."""
+    try:
+        body = ast.parse(content).body
+    except (SyntaxError, ValueError):
+        return ()
+    for node in body:
+        if isinstance(node, ast.Assign) and any(isinstance(at, ast.Name) and at.id == "FILES" for at in node.targets):
+            with suppress(ValueError):
+                names = ast.literal_eval(node.value)
+                if isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names):
+                    return tuple(names)
+            raise OwnCodeError(f'FILES in {place} must be a list of names that stands there: FILES = ["table.csv"]')
+    return ()
 
 
 @cache

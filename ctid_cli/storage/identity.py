@@ -137,6 +137,8 @@ def _own_tree(source: own_code.Source, name: str, root: Path) -> tuple[str, list
         digest = hashlib.sha256(ast.dump(_Reduced().visit(ast.parse(source.content))).encode()).hexdigest()
     except (SyntaxError, ValueError):
         return hashlib.sha256(source.content).hexdigest(), []
+    if source.data:
+        digest = content_hash([digest, source.data])
     imports = []
     for other in sorted(own_code.imports_of(source, name)):
         package, _, attribute = other.rpartition(".")

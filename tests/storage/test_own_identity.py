@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from ctid_cli.own_code import find_class
+from ctid_cli.own_code import OwnCodeError, find_class
 from ctid_cli.simulation.own_components import OwnNoise
 from ctid_cli.storage.identity import modules_behind, modules_of
 
@@ -60,6 +60,20 @@ def test_the_folder_and_the_words_do_not_matter(tmp_path: Path) -> None:
 )
 def test_every_module_on_the_way_matters(module: str, text: str, tmp_path: Path) -> None:
     assert behind(tmp_path) != behind(tmp_path, **{module: text})
+
+
+def test_data_files_that_a_module_names_matter(tmp_path: Path) -> None:
+    def with_data(value: str, names: str = '["rates.csv"]') -> dict[str, str]:
+        (tmp_path / "rates.csv").write_text(value)
+        return behind(tmp_path, levels=f"LEVEL = 2.0\nFILES = {names}\n")
+
+    first = with_data("1,2")
+    assert with_data("1,2") == first
+    assert with_data("1,3") != first
+    with pytest.raises(OwnCodeError, match=r"no\.csv, which FILES in levels\.py names, cannot be read: No such file"):
+        with_data("1", '["no.csv"]')
+    with pytest.raises(OwnCodeError, match=r"FILES in levels\.py must be a list of names"):
+        with_data("1", "[name for name in ()]")
 
 
 def test_a_module_that_python_imports_itself_counts_as_far_as_it_is_not_installed(
