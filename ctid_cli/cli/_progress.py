@@ -150,6 +150,8 @@ class Reporter(_Progress):
             case events.KernelsCompiled():
                 if event.seconds > QUICK:
                     self._say(f"kernels ready after {seconds(event.seconds)}")
+            case events.Warned():
+                self._say(f"warning: {event.text}")
             case events.EstimatesDone():
                 self._advance(event)
             case events.BlockDone():

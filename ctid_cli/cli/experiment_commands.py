@@ -201,7 +201,7 @@ def validate(configs: Configs, overrides: Overrides = None, allow_code: AllowCod
     from ctid_cli.running.own_check import check_components
 
     for config, plan in load_plans(configs, overrides or [], allow_code=allow_code):
-        check_components(plan)
+        check_components(plan, warn=lambda warning: typer.echo(f"warning: {warning}", err=True))
         typer.echo(f"{config}: ok, {plan.experiment}: {_workload(plan)}")
 
 

@@ -120,7 +120,7 @@ def run_experiment(
         if todo:
             on_event(events.KernelsCompiling())
             on_event(events.KernelsCompiled(warm() if warm else _compile_kernels(plan)))
-            if not check_components(plan, limits, stopping):
+            if not check_components(plan, limits, stopping, lambda text: on_event(events.Warned(text))):
                 _check_first_records(todo)
         moved = place.move_aside(folder) if fresh else None
         with _writing(folder):

@@ -41,6 +41,13 @@ class KernelsCompiled:
 
 
 @dataclass(frozen=True)
+class Warned:
+    """Something about components of one's own that is to be known, and that does not stop the run."""
+
+    text: str
+
+
+@dataclass(frozen=True)
 class EstimatesDone:
     """Estimates of one data set are safely stored: some of them, or the last ones."""
 
@@ -94,6 +101,7 @@ Event = (
     PlanReady
     | KernelsCompiling
     | KernelsCompiled
+    | Warned
     | EstimatesDone
     | BlockDone
     | WorkerDied

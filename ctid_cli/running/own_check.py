@@ -3,7 +3,8 @@
 import random
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ from ctid_cli.simulation.own_components import (
     OwnSampling,
     OwnSystem,
 )
+from ctid_cli.storage.columns import FAILURES
+from ctid_cli.storage.manifest import found_values, true_values
 
 STAND_INS = (OwnSampling, OwnExcitation, OwnSystem, OwnNoise)
 #: Key path, and what is wrong there.
@@ -36,11 +39,27 @@ MISTAKES = (NameError, AttributeError, TypeError, ImportError)
 GLOBAL = "depends on the global random state, so that no run could be repeated; draw from"
 
 
-def check_components(plan: Plan, limits: Limits | None = None, stopping: Callable[[], bool] = lambda: False) -> bool:
+@dataclass(frozen=True)
+class Look:
+    """What components of one's own do wrong on a data set, and what is odd about it."""
+
+    wrong: list[Complaint] = field(default_factory=list)
+    odd: list[Complaint] = field(default_factory=list)
+    #: Estimates as they would be stored, by estimator.
+    returned: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+def check_components(
+    plan: Plan,
+    limits: Limits | None = None,
+    stopping: Callable[[], bool] = lambda: False,
+    warn: Callable[[str], None] = lambda text: None,
+) -> bool:
     """Refuse components that fail on the first data set, or come out otherwise the second time.
 
-    A component that ends the process, or takes too long, is left to the run, which stores that for every estimate. Says
-    whether data are made by a component of one's own, so that no other process but a worker should make them.
+    A component that ends the process, or takes too long, is left to the run, which stores that for every estimate; what
+    other data sets may mend is a warning. Says whether data are made by a component of one's own, so that no other
+    process but a worker should make them.
     """
     task = Task(0, 0)
     cell = plan.data_cells[task.cell]
@@ -50,17 +69,42 @@ def check_components(plan: Plan, limits: Limits | None = None, stopping: Callabl
         return False
     seed = (plan.spec.canonical().get("monte_carlo") or {}).get("seed")
     job = Job(cell, task.replicate, seed, tuple(wanted), plan.terms)
-    found: list[Complaint] = in_worker(look, job, limits=limits or Limits(), stopping=stopping) or []
-    if found:
-        raise SpecError([plan.spec.problem(path, message) for path, message in found])
+    found: Look = in_worker(look, job, limits=limits or Limits(), stopping=stopping) or Look()
+    if found.wrong:
+        raise SpecError([plan.spec.problem(path, message) for path, message in found.wrong])
+    success = plan.spec.canonical().get("success") or {}
+    for path, message in (*found.odd, *_uncounted(found.returned, true_values({"content": cell.content}), success)):
+        warn(str(plan.spec.problem(path, message)))
     return makes_data
 
 
-def look(job: Job) -> list[Complaint]:
-    """What components of one's own do wrong on a data set."""
+def look(job: Job) -> Look:
+    """What is seen of components of one's own on a data set."""
+    found = Look()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return list(_of_data(job)) or list(_of_estimators(job))
+        found.wrong.extend(_of_data(job))
+        if not found.wrong:
+            _of_estimators(job, found)
+    return found
+
+
+def _uncounted(
+    returned: Mapping[str, Mapping[str, Any]], truth: Mapping[str, float], success: Mapping[str, Any]
+) -> Iterator[Complaint]:
+    """Say which estimators return nothing that a true value, or the rule of success, can be compared with."""
+    others = [name for name in truth if name != "delay"]
+    asked = {"delay_relative_error": ["delay"] if "delay" in truth else [], "parameter_relative_error": others}
+    for name, row in returned.items():
+        found = found_values(row, truth)[0]
+        path = ("estimators", name, "kind")
+        if truth and all(value is None for value in found.values()):
+            names = ", ".join(row["parameters"] or {}) or "a model with another number of poles"
+            yield path, f"returns {names}; true values are known of {', '.join(truth)} only"
+        for rule, wanted in asked.items():
+            lacking = [each for each in wanted if found[each] is None]
+            if lacking and success.get(rule) is not None:
+                yield path, f"returns no {', '.join(lacking)}, so that it never meets success.{rule}"
 
 
 def _parts(source: Any) -> dict[str, Any]:
@@ -105,7 +149,7 @@ def _of_data(job: Job) -> Iterator[Complaint]:
                 return
 
 
-def _of_estimators(job: Job) -> Iterator[Complaint]:
+def _of_estimators(job: Job, found: Look) -> None:
     try:
         data = job.cell.dataset(job.replicate)
     except Exception:
@@ -116,26 +160,32 @@ def _of_estimators(job: Job) -> Iterator[Complaint]:
         if key.estimator_hash not in seen:
             seen.add(key.estimator_hash)
             drawn = start.draw(job.seed, job.replicate, data.true_model)
-            message = _of_estimator(cell.estimator, data, drawn, job.terms)
-            if message:
-                yield ("estimators", cell.name, "kind"), message
+            path = ("estimators", cell.name, "kind")
+            try:
+                returned = _of_estimator(cell.estimator, data, drawn, job.terms)
+            except ContractError as error:
+                found.wrong.append((path, str(error)))
+            except MISTAKES as error:
+                found.wrong.append((path, f"fails on the first data set: {reason(error)}"))
+            except BaseException as error:
+                # Of another kind of failure others may be free.
+                text = f"fails on the first data set: {reason(error)}; such estimates are stored as FAILED"
+                found.odd.append((path, text))
+            else:
+                if returned["status"] not in FAILURES:
+                    found.returned[cell.name] = returned
 
 
-def _of_estimator(estimator: Any, data: Any, start: Any, terms: Sequence[Any] | None) -> str:
-    results = []
+def _of_estimator(estimator: Any, data: Any, start: Any, terms: Sequence[Any] | None) -> dict[str, Any]:
+    """What comes out of an estimator, twice the same."""
+    results: list[dict[str, Any]] = []
     for seed in (0, 1):
         begun = time.perf_counter()
         _set_global(seed)
-        try:
-            fit = estimator.prepare(data.record).fit(start)
-            results.append(canonical_json(plain(data.result_of(fit, start, terms))))
-        except ContractError as error:
-            return str(error)
-        except MISTAKES as error:
-            return f"fails on the first data set: {reason(error)}"
-        except BaseException:
-            # Of another kind of failure others may be free.
-            return ""
+        fit = estimator.prepare(data.record).fit(start)
+        results.append(plain(data.result_of(fit, start, terms)))
         if time.perf_counter() - begun > SLOW:
-            return ""
-    return "" if results[0] == results[1] else f"{GLOBAL} numpy.random.default_rng(seed), with seed among its options"
+            break
+    if canonical_json(results[0]) != canonical_json(results[-1]):
+        raise ContractError(f"{GLOBAL} numpy.random.default_rng(seed), with seed among its options")
+    return results[0]

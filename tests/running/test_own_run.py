@@ -23,11 +23,13 @@ from level import LEVEL
 
 @dataclass(frozen=True)
 class Mean:
-    mischief: Literal["none", "raise", "die", "nan", "always", "global", "mistake"] = "none"
+    mischief: Literal["none", "raise", "die", "nan", "always", "global", "mistake", "fail"] = "none"
     def fit(self, record, start):
         print("a word that must not get into the answer")
         if self.mischief == "global":
             return {"parameters": {"mean": random.random()}}
+        if self.mischief == "fail":
+            raise LookupError("never")
         if self.mischief == "mistake":
             return {"parameters": {"mean": recrod.y.mean()}}
         if record.y[0] > 0.0 or self.mischief == "always":
@@ -137,6 +139,34 @@ def test_what_shows_on_the_first_data_set_is_said_before_the_run(changes, place,
         check_components(plan)
     assert f"spec.yaml:{place}" in str(caught.value)
     assert words in str(caught.value)
+
+
+BAD = '  bad:       {kind: "./parts.py:Mean", mischief: [raise, die, nan]}\n'
+RULE = ("seed: 5}", "seed: 5}\nsuccess: {delay_relative_error: 0.1}")
+
+
+@pytest.mark.parametrize(
+    ("changes", "at", "words"),
+    [
+        (((BAD, ""),), "7:21: estimators.good.kind", ["returns mean; true values are known of a1, b0, delay only"]),
+        (
+            ((BAD, ""), RULE, ("[1, 2]}", "[1, 2], delay: 0.1}")),
+            "7:21: estimators.good.kind",
+            ["true values", "returns no delay, so that it never meets success.delay_relative_error"],
+        ),
+        (
+            (("[raise, die, nan]", "fail"),),
+            "estimators.",
+            ["fails on the first data set: LookupError: never (", "true"],
+        ),
+    ],
+)
+def test_what_is_odd_on_the_first_data_set_is_a_warning(changes, at, words, folder):
+    heard = []
+    assert check_components(planned(folder, *changes), warn=heard.append)
+    for text, expected in zip(heard, words, strict=True):
+        assert at in text
+        assert expected in text
 
 
 def test_a_component_that_ends_the_process_is_left_to_the_run(folder):
