@@ -149,7 +149,13 @@ def with_error(value: float, error: float) -> str:
     digits = 2
     if abs(value) > error:
         digits += math.floor(math.log10(abs(value))) - math.floor(math.log10(error))
-    return f"{value:#.{digits}g} ± {error:#.2g}"
+    return f"{_to_digits(value, digits)} ± {_to_digits(error, 2)}"
+
+
+def _to_digits(value: float, digits: int) -> str:
+    """A number with its trailing zeros: 0.0400, 2.0, 26, 130; as 1.3e+07 where it has many digits that say nothing."""
+    text = f"{value:#.{digits}g}".removesuffix(".")
+    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
 
 
 def count(n: int, noun: str) -> str:
