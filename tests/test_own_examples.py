@@ -66,6 +66,20 @@ def test_permission(command, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_walk_through_shows_the_files_and_they_run(tmp_path):
+    page = (EXAMPLES.parent / "own-study.md").read_text(encoding="utf-8")
+    for language, name in (("py", "projection.py"), ("yaml", "projection.yaml")):
+        assert f"```{language}\n{(EXAMPLES / name).read_text(encoding='utf-8')}```\n" in page
+    smaller = ["--runs", "1", "--set", "sampling.samples=100", "--set", "noise.snr_db=20", "--jobs", "1"]
+    ctid("run", EXAMPLES / "projection.yaml", "--allow-code", "--quiet", *smaller, "--out", tmp_path)
+    mine, ours = json.loads(ctid("export", "projection", "--format", "json", "--out", tmp_path).stdout)
+    assert (mine["estimator"], ours["estimator"]) == ("mine", "search")
+    # Both minimise the output error.
+    assert mine["cost"] == pytest.approx(ours["cost"], rel=1e-4)
+    assert mine["delay"] == pytest.approx(ours["delay"], abs=1e-3)
+    assert mine["converged"] is not None
+
+
 def test_the_documentation_names_what_there_is():
     text = (EXAMPLES.parent / "own-components.md").read_text(encoding="utf-8")
     names = set(re.findall(r"`(\w+\.(?:py|yaml))`", text))

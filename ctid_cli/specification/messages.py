@@ -84,7 +84,9 @@ def _told(
 ) -> tuple[KeyPath, str, Any, dict[str, Any]]:
     """What is to be told of an error, where pydantic's own type, or place, says too little."""
     if kind == "no_kind" and not isinstance(value, Mapping):
-        return path, "no_form", value, {"allowed": f"a mapping with a 'kind' (one of {context['allowed']})"}
+        text = f"a mapping with a 'kind' (one of {context['allowed']})"
+        each = "; several kinds are several experiments, each with a file" if isinstance(value, list) else ""
+        return path, "no_form", value, {"allowed": f"{text}{each}"}
     if kind == "no_kind":
         return (*path, "kind"), "no_kind" if "kind" in value else "kind_missing", value.get("kind"), context
     if kind == "float_type" and type(value) is int:
