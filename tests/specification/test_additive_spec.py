@@ -459,9 +459,9 @@ def test_success_of_the_parameters_of_a_transfer_function(tmp_path):
     rest = ("starts=null", "estimators={one: {kind: srivc, poles: 2, zeros: 0}}")
     spec = load(tmp_path, CLOSED, "system={numerator: [1], denominator: [1, 2, 3]}", *rest)
     assert spec.canonical()["success"]["parameter_relative_error"] == 0.1
-    (problem,) = problems(tmp_path, CLOSED, "system={numerator: [1], denominator: [1, 0, 3]}", *rest)
+    (problem,) = problems(tmp_path, CLOSED, "system={numerator: [1, 0], denominator: [1, 2, 3]}", *rest)
     assert problem.key == "success.parameter_relative_error"
-    assert "a1 is zero" in problem.message
+    assert "b1 is zero" in problem.message
 
 
 def test_coloured_noise(tmp_path):
