@@ -4,6 +4,7 @@
 #                 goes on where it was; with RUNS=20 fewer data sets, which are checked and not published
 # make reproduce-small
 #                 the first data sets of every study, compared with the committed estimates: what CI does after make test
+# make faults     20,000 inputs that nobody meant to write; FROM=20000 goes on with others
 # make bench      speed, measured against other tools
 # make clean      remove what the other targets built (never results)
 
@@ -16,7 +17,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test reproduce reproduce-small bench clean
+.PHONY: demo test faults reproduce reproduce-small bench clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -29,6 +30,9 @@ test: $(VENV)/.test-installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest -q -n logical --dist loadfile
+
+faults: $(VENV)/.test-installed
+	CTID_FAULTS=20000 CTID_FAULTS_FROM=$(or $(FROM),0) $(BIN)/python -m pytest -q tests/faults
 
 reproduce: $(VENV)/.installed
 	$(BIN)/ctid study run $(if $(RUNS),--runs $(RUNS)) --jobs $(JOBS) --out "$(OUT)"

@@ -3,6 +3,9 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+#: Problems of a specification that a message lists.
+MAX_SHOWN = 100
+
 
 class CtidError(Exception):
     """Base of every error that ctid raises on purpose; its text is meant for the user."""
@@ -71,7 +74,9 @@ class SpecError(UsageError):
 
     def __init__(self, problems: Iterable[Problem]) -> None:
         self.problems = tuple(problems)
-        super().__init__("\n".join(str(problem) for problem in self.problems))
+        lines = [str(problem) for problem in self.problems[:MAX_SHOWN]]
+        more = len(self.problems) - len(lines)
+        super().__init__("\n".join([*lines, *([f"and {more} more problems like these"] if more else [])]))
 
 
 class RefusedError(CtidError):

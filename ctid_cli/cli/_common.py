@@ -31,6 +31,12 @@ AllowCode = Annotated[
     bool,
     typer.Option("--allow-code", envvar="CTID_ALLOW_CODE", help="Run the code that the file names as kind; trust it."),
 ]
+AllowOutside = Annotated[
+    bool,
+    typer.Option(
+        "--allow-outside", envvar="CTID_ALLOW_OUTSIDE", help="Read data files outside the folder of the file."
+    ),
+]
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Worker processes; all processors by default.")]
 Runs = Annotated[int | None, typer.Option("--runs", min=1, help="Data sets per setting, not the file's own number.")]
 AllowMixed = Annotated[bool, typer.Option("--allow-mixed", help="Mix code versions or processors.")]

@@ -7,6 +7,7 @@ import typer
 
 from ctid_cli.cli._common import (
     AllowCode,
+    AllowOutside,
     Command,
     Config,
     From,
@@ -93,6 +94,7 @@ def check_accuracy(
     overrides: Overrides = None,
     out: Out = Path("results"),
     allow_code: AllowCode = False,
+    allow_outside: AllowOutside = False,
     as_json: Json = False,
 ) -> None:
     """Say how accurate the estimates of an experiment can be, before any data are taken.
@@ -105,7 +107,7 @@ def check_accuracy(
     from ctid_cli.reporting.accuracy_report import accuracy_object, accuracy_text
     from ctid_cli.reporting.results import find_results
 
-    ((_, plan),) = load_plans([config], overrides or [], allow_code=allow_code)
+    ((_, plan),) = load_plans([config], overrides or [], allow_code=allow_code, allow_outside=allow_outside)
     content = accuracy_object(plan, find_results(out, plan.experiment))
     answer(as_json, lambda: content, lambda: accuracy_text(content))
 

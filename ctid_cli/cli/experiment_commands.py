@@ -14,7 +14,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ctid_cli.cli._common import AllowCode, AllowMixed, Configs, Fresh, Jobs, Out, Overrides, Runs, duration, guarded
+from ctid_cli.cli._common import (
+    AllowCode,
+    AllowMixed,
+    AllowOutside,
+    Configs,
+    Fresh,
+    Jobs,
+    Out,
+    Overrides,
+    Runs,
+    duration,
+    guarded,
+)
 from ctid_cli.cli._progress import Reporter, json_lines
 from ctid_cli.errors import MachineError, Problem, SpecError, TooManyFailuresError, UsageError
 from ctid_cli.reporting.layout import count, seconds
@@ -44,7 +56,12 @@ class Failure(StrEnum):
 
 
 def load_plans(
-    configs: Sequence[Path], overrides: Sequence[str], runs: int | None = None, *, allow_code: bool = False
+    configs: Sequence[Path],
+    overrides: Sequence[str],
+    runs: int | None = None,
+    *,
+    allow_code: bool = False,
+    allow_outside: bool = False,
 ) -> list[tuple[Path, Plan]]:
     """Read and check experiment files; warnings go to stderr."""
     from ctid_cli.running.plan import build_plan
@@ -54,7 +71,8 @@ def load_plans(
     plans: list[tuple[Path, Plan]] = []
     for config in configs:
         try:
-            plans.append((config, build_plan(load_spec(config, overrides, allow_code=allow_code), runs)))
+            spec = load_spec(config, overrides, allow_code=allow_code, allow_outside=allow_outside)
+            plans.append((config, build_plan(spec, runs)))
         except SpecError as error:
             problems += error.problems
     if problems:
@@ -72,10 +90,8 @@ def load_plans(
 
 def _workload(plan: Plan) -> str:
     """How much work a plan asks for."""
-    tasks = plan.tasks()
-    estimates = sum(len(plan.keys(task)) for task in tasks)
-    sets, cells = count(len(tasks), "data set"), count(len(plan.data_cells), "data cell")
-    text = f"{sets} ({cells}), {count(estimates, 'estimate')}"
+    sets, cells = count(plan.data_sets, "data set"), count(len(plan.data_cells), "data cell")
+    text = f"{sets} ({cells}), {count(plan.data_sets * plan.estimates_each, 'estimate')}"
     section = plan.spec.monte_carlo
     return text if section is None or section.until is None else f"{text}; at most {section.most} data sets of a cell"
 
@@ -87,6 +103,7 @@ def run(
     runs: Runs = None,
     overrides: Overrides = None,
     allow_code: AllowCode = False,
+    allow_outside: AllowOutside = False,
     retry: Annotated[
         list[Failure] | None, typer.Option("--retry", help="Compute stored failures of this kind again; repeatable.")
     ] = None,
@@ -119,7 +136,8 @@ def run(
     from ctid_cli.running.stopping import StopAt
     from ctid_cli.storage.shards import Shard
 
-    plans = [plan for _, plan in load_plans(configs, overrides or [], runs, allow_code=allow_code)]
+    allowed = {"allow_code": allow_code, "allow_outside": allow_outside}
+    plans = [plan for _, plan in load_plans(configs, overrides or [], runs, **allowed)]
     folders = [out / plan.experiment for plan in plans]
     part = None if shard is None else Shard.read(shard)
     if part is not None:
@@ -193,14 +211,19 @@ def _conclusion(summary: RunSummary, out: Path, part: Shard | None) -> str:
 
 
 @guarded
-def validate(configs: Configs, overrides: Overrides = None, allow_code: AllowCode = False) -> None:
+def validate(
+    configs: Configs,
+    overrides: Overrides = None,
+    allow_code: AllowCode = False,
+    allow_outside: AllowOutside = False,
+) -> None:
     """Check experiment files without running them.
 
     Prints every mistake with its place in the file, or how much work the experiment asks for.
     """
     from ctid_cli.running.own_check import check_components
 
-    for config, plan in load_plans(configs, overrides or [], allow_code=allow_code):
+    for config, plan in load_plans(configs, overrides or [], allow_code=allow_code, allow_outside=allow_outside):
         check_components(plan, warn=lambda warning: typer.echo(f"warning: {warning}", err=True))
         typer.echo(f"{config}: ok, {plan.experiment}: {_workload(plan)}")
 

@@ -81,6 +81,21 @@ class Plan:
             if replicate < own
         ]
 
+    @property
+    def data_sets(self) -> int:
+        """Number of data sets."""
+        return sum(self.replicates)
+
+    @property
+    def estimates_each(self) -> int:
+        """Number of estimates of every data set."""
+        return len(self.keys(Task(0, 0)))
+
+    @property
+    def distinct_each(self) -> int:
+        """The same, where two names of the same estimator share their estimates."""
+        return len({key for key, _, _ in self.keys(Task(0, 0))})
+
     def with_replicates(self, replicates: Sequence[int]) -> Plan:
         """The plan with other numbers of data sets."""
         return replace(self, replicates=tuple(replicates))

@@ -310,7 +310,11 @@ def preview(
 ) -> events.PlanReady:
     """What a run would do, without doing or writing anything."""
     needed, stock = _look(plan, folder, current_origins(plan), retry, fresh=fresh, allow_mixed=allow_mixed)
-    return _ready(needed, folder, stock)
+    if stock.keys:
+        return _ready(needed, folder, stock)
+    # Of a million data sets, counting is quicker than naming.
+    counts = (needed.data_sets, needed.data_sets * needed.distinct_each, 0, 0)
+    return events.PlanReady(plan.experiment, folder, *counts, at_most=_monte_carlo(plan).get("at_most"))
 
 
 def _ready(plan: Plan, folder: Path, stock: Stock) -> events.PlanReady:

@@ -21,6 +21,11 @@ class ShardPlan(Plan):
         cells = len(self.data_cells)
         return [task for task in super().tasks() if self.shard.has(task.cell, task.replicate, cells)]
 
+    @property
+    def data_sets(self) -> int:
+        """Number of data sets of this shard."""
+        return len(self.tasks())
+
     def manifest(self) -> Manifest:
         """The plan as plain data."""
         return super().manifest() | {"shard": [self.shard.number, self.shard.of]}

@@ -11,6 +11,27 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 
+#: Largest magnitude of a signal, and one over the least that it may reach: squares of squares still are numbers.
+LARGEST = 1e60
+#: The same of times and the steps between them [s]: so are high powers of poles.
+LONGEST = 1e24
+
+
+def require_scale(what: str, values: Array, largest: float = LARGEST) -> None:
+    """Refuse a signal in a unit so small or so large that nothing can be computed with it; zeros are allowed."""
+    finite = np.abs(values[np.isfinite(values)])
+    found = float(finite.max(initial=0.0))
+    if found > largest or 0.0 < found < 1.0 / largest:
+        side = f"reaches {found:.3g}" if found > largest else f"is at most {found:.3g}"
+        raise DataError(f"{what} {side}; give it in a unit in which it is between {1 / largest:g} and {largest:g}")
+
+
+def require_steps(what: str, t: Array) -> None:
+    """Refuse a clock that is too fast to compute with."""
+    least = float(np.diff(t).min(initial=np.inf))
+    if least < 1.0 / LONGEST:
+        raise DataError(f"{what} advances by {least:.3g}; give it in a unit in which it is at least {1 / LONGEST:g}")
+
 
 def require_positive(name: str, value: float, unit: str, label: str = "") -> None:
     """Refuse anything but a positive finite number."""

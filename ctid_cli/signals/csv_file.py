@@ -4,7 +4,6 @@ import os
 import re
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn, get_args
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from ctid_cli.arrays import Array, IntArray
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import require_choice
+from ctid_cli.signals.files import quoted, require_file
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.table import Table
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 Offset = Literal["none", "remove"]
 
+#: Columns of the widest file, and letters of its first line.
+MAX_COLUMNS, MAX_HEADER = 10_000, 1_000_000
 #: What stands for a missing sample (upper and lower case alike).
 MISSING = ("", "nan", "na")
 
@@ -83,7 +85,8 @@ def read_held_signal(
 
 def read_csv_table(path: str | os.PathLike[str]) -> Table:
     """Columns of a comma-separated file."""
-    file = require_file(path)
+    file = require_file(path, "1: the file is empty; its first line must name the columns")
+    _require_header(path, file)
     # Columns of numbers become numbers as they are read: as text they would take twenty times the memory.
     frame = _parsed(path, file, na_values=[*MISSING, "NaN", "NAN", "NA"])
     names = tuple(str(column).strip() for column in frame.columns)
@@ -98,7 +101,7 @@ def read_csv_table(path: str | os.PathLike[str]) -> Table:
         if column.dtype.kind in "iuf":
             return column.to_numpy(dtype=float)
         text = _parsed(path, file, dtype=str).iloc[kept, names.index(name)].str.strip()
-        return _numbers(text, lambda k: f"{file}:{lines[k]}: column {name!r} holds {text.iloc[k]!r}")
+        return _numbers(text, lambda k: f"{file}:{lines[k]}: column {name!r} holds {quoted(text.iloc[k])}")
 
     return Table(file, names, convert, lines)
 
@@ -126,6 +129,21 @@ def _parsed(path: str | os.PathLike[str], file: str, **options: Any) -> "DataFra
         raise DataError(f"{file}: cannot be read: {error.strerror}") from None
 
 
+def _require_header(path: str | os.PathLike[str], file: str) -> None:
+    """Refuse a first line that cannot name columns, which pandas would take minutes or all memory for."""
+    try:
+        with open(path, "rb") as content:
+            header = content.readline(MAX_HEADER)
+    except OSError as error:
+        raise DataError(f"{file}: cannot be read: {error.strerror}") from None
+    if b"\0" in header:
+        raise DataError(f"{file}: this is not a text file in UTF-8; export it as comma-separated UTF-8 text")
+    columns = header.count(b",") + 1
+    if columns > MAX_COLUMNS or len(header) == MAX_HEADER:
+        many = f"{columns} columns" if columns > MAX_COLUMNS else f"more than {MAX_HEADER} characters"
+        raise DataError(f"{file}:1: the first line has {many}; it must name the columns, at most {MAX_COLUMNS}")
+
+
 def _blank_rows(path: str | os.PathLike[str], empty: IntArray) -> list[int]:
     """Those of the rows without a value that do not even say so."""
     if not empty.size:
@@ -144,15 +162,6 @@ def _numbers(text: "Series[str]", place: Callable[[int], str]) -> Array:
     if wrong.any():
         raise DataError(f"{place(int(np.argmax(wrong)))}, which is not a number")
     return numbers
-
-
-def require_file(path: str | os.PathLike[str]) -> str:
-    """Refuse a path that names no file."""
-    file = os.fspath(path)
-    if not Path(path).is_file():
-        kind = "is not a file" if Path(path).exists() else "does not exist"
-        raise DataError(f"{file}: {kind}; relative names start at {Path(path).absolute().parent}")
-    return file
 
 
 def _refuse_ragged(file: str, message: str) -> NoReturn:

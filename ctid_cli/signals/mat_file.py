@@ -1,5 +1,6 @@
 """Columns from MATLAB files that hold plain arrays."""
 
+import math
 import os
 import warnings
 from collections.abc import Iterator, Mapping
@@ -10,9 +11,12 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.signals.csv_file import require_file
+from ctid_cli.signals.files import require_file, require_values
+from ctid_cli.signals.hdf5 import MAX_DEPTH, PLAIN, members, require_plain
 from ctid_cli.signals.table import Table
 
+#: Variables of one file.
+MAX_NAMES_READ = 10_000
 #: What MATLAB calls arrays of real numbers.
 NUMERIC = ("double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 
@@ -24,15 +28,17 @@ def read_mat_table(path: str | os.PathLike[str]) -> Table:
     """
     import scipy.io
 
-    file = require_file(path)
-    if Path(path).stat().st_size == 0:
-        raise DataError(f"{file}: the file is empty; {_how_to_save(path)}")
+    file = require_file(path, f" the file is empty; {_how_to_save(path)}")
     try:
         with warnings.catch_warnings():
             # Two objects in one file share a placeholder name, which is no concern of the arrays beside them.
             warnings.simplefilter("ignore")
+            for name, shape in _shapes(path).items():
+                require_values(file, name, math.prod(shape))
             content = scipy.io.loadmat(path)
         arrays, objects = _flat(content)
+    except DataError:
+        raise
     except NotImplementedError:
         arrays, objects = _read_hdf5(path, file)
     except OSError as error:
@@ -47,6 +53,18 @@ def read_mat_table(path: str | os.PathLike[str]) -> Table:
         return _vector(file, name, arrays[name])
 
     return Table(file, tuple(arrays), convert, lines=None, noun="variable", hint=hint)
+
+
+def _shapes(path: str | os.PathLike[str]) -> dict[str, tuple[int, ...]]:
+    """What the headers of a file claim; nothing where objects are in it, which have no such headers."""
+    import scipy.io
+
+    try:
+        return {name: tuple(shape) for name, shape, _ in scipy.io.whosmat(path)}
+    except NotImplementedError:
+        raise
+    except Exception:  # the reader itself says what is wrong
+        return {}
 
 
 def _flat(content: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
@@ -79,8 +97,10 @@ def _read_hdf5(path: str | os.PathLike[str], file: str) -> tuple[dict[str, Any],
     arrays: dict[str, Any] = {}
     objects: dict[str, str] = {}
 
-    def members(group: Any, prefix: str) -> Iterator[tuple[str, Any]]:
-        for name, item in group.items():
+    def parts(group: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+        if prefix.count(".") > MAX_DEPTH or len(arrays) > MAX_NAMES_READ:
+            raise DataError("it holds too many structs")
+        for name, item in members(group):
             if not name.startswith("#"):  # MATLAB's own store of what objects and cells refer to
                 yield prefix + name, item
 
@@ -89,24 +109,29 @@ def _read_hdf5(path: str | os.PathLike[str], file: str) -> tuple[dict[str, Any],
         if "MATLAB_object_decode" in item.attrs:
             objects[name] = kind
         elif isinstance(item, h5py.Group):
-            for field, part in members(item, f"{name}."):
+            for field, part in parts(item, f"{name}."):
                 visit(field, part)
         elif "MATLAB_empty" in item.attrs:
             arrays[name] = np.empty((0, 0))
         else:
-            arrays[name] = item[()] if kind in NUMERIC else np.array(kind, dtype=object)
+            require_plain(name, item)
+            numeric = kind in NUMERIC and item.dtype.kind in PLAIN
+            arrays[name] = item[()] if numeric else np.array("text", dtype=object)
 
     try:
         with h5py.File(path, "r") as store:
-            for name, item in members(store, ""):
+            for name, item in parts(store, ""):
                 visit(name, item)
-    except OSError:
+    except DataError as error:
+        raise DataError(f"{file}: {error}") from None
+    # HDF5 reports damage as whatever exception the damaged part happens to cause.
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, UnicodeError, MemoryError):
         raise DataError(f"{file}: this is not a MATLAB file, or a damaged one; {_how_to_save(path)}") from None
     return arrays, objects
 
 
 def _vector(file: str, name: str, value: Any) -> Array:
-    array = value.toarray() if hasattr(value, "toarray") else np.asarray(value)  # a matrix may be sparse
+    array = _full(file, name, value)
     if array.dtype.kind not in "biufc":
         raise DataError(f"{file}: variable {name!r} does not hold numbers")
     if array.size == 0:
@@ -121,6 +146,17 @@ def _vector(file: str, name: str, value: Any) -> Array:
             raise DataError(f"{file}: variable {name!r} holds complex numbers")
         array = array.real
     return np.array(array, dtype=float).reshape(-1)
+
+
+def _full(file: str, name: str, value: Any) -> Any:
+    """A matrix as an array; if it is sparse, its indices are looked at before anything is written to where they say."""
+    if not hasattr(value, "toarray"):
+        return np.asarray(value)
+    try:
+        value.tocsc().check_format(full_check=True)
+        return value.toarray()
+    except (ValueError, MemoryError):
+        raise DataError(f"{file}: variable {name!r} is a damaged sparse matrix") from None
 
 
 def _how_to_save(path: str | os.PathLike[str]) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
-from ctid_cli.signals.checks import freeze, require_choice, require_increasing
+from ctid_cli.signals.checks import LONGEST, freeze, require_choice, require_increasing, require_scale, require_steps
 from ctid_cli.signals.held import HeldSignal, Hold
 
 #: A clock counts as regular when no instant is further than this fraction of the interval from its place.
@@ -115,12 +115,16 @@ class Record:
             raise DataError(f"{where}the record is empty")
         if not np.isfinite(t).all():
             raise DataError(f"{where}time of sample {int(np.argmin(np.isfinite(t)))} is not a finite number")
+        require_scale(f"{where}the times", t, LONGEST)
         require_increasing(f"{where}times", t)
         if np.isinf(y).any():
             k = int(np.argmax(np.isinf(y)))
             raise DataError(f"{where}output of sample {k} is infinite; mark missing samples as NaN")
         if not np.isfinite(y).any():
             raise DataError(f"{where}no output sample is a finite number")
+        require_steps(f"{where}the clock", t)
+        require_scale(f"{where}the output", y)
+        require_scale(f"{where}the input", self.input.values)
         freeze(self, t=t, y=y)
         if self.loop is not None:
             self._require_loop(self.loop, where)

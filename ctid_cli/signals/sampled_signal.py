@@ -11,8 +11,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.signals.checks import require_positive
-from ctid_cli.signals.csv_file import require_file
+from ctid_cli.signals.checks import LONGEST, require_positive, require_scale, require_steps
+from ctid_cli.signals.files import require_file
 from ctid_cli.signals.measurement import USUAL_NAMES, no_sample, read_table
 from ctid_cli.signals.table import Table, listing, refuse_nameless, refuse_one_column, split_header
 
@@ -101,10 +101,13 @@ def read_sampled_signal(
             notes.append(f"The times {times!r} are not used, since the sampling interval was given.")
             times = None
     assert interval is not None  # every way above has set it
+    require_steps(f"{table.file}: the clock", np.array([0.0, interval]))
+    require_scale(f"{table.file}: the clock", np.array([interval]), LONGEST)
     low, high = _window(table, first, interval, values.size, start, stop, time_unit or "s")
     values = values[low:high]
     if not np.isfinite(values).any():
         raise DataError(f"{table.file}: no sample of {column!r} is a finite number")
+    require_scale(f"{table.file}: the signal {column!r}", values)
     begin = first + low * interval
     return SampledSignal(values, interval, begin, table.file, name, times, time_unit, unit, tuple(notes))
 

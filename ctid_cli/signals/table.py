@@ -9,6 +9,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IntArray
 from ctid_cli.errors import DataError
+from ctid_cli.signals.checks import LONGEST, require_scale, require_steps
+from ctid_cli.signals.files import MAX_NAMES, quoted
 from ctid_cli.text import closest
 
 
@@ -59,6 +61,7 @@ class Table:
         """The one number that stands for all times."""
         if not (np.isfinite(value) and value > 0):
             raise DataError(f"{self.file}: {name!r} is {value:g}; a sampling interval must be a positive number")
+        require_steps(f"{self.file}: the sampling interval {name!r}", np.array([0.0, value]))
         return value
 
     def require_as_many(self, name: str, values: Array, other: str, others: Array) -> None:
@@ -77,16 +80,20 @@ class Table:
         self._refuse(
             ~np.isfinite(t), f"time {name!r} is missing or not finite; every {every} needs its instant [{unit}]"
         )
+        label = f"{self.file}: the time {name!r}"
+        require_scale(label, t, LONGEST)
         steps = np.diff(t, prepend=-np.inf)
         k = int(np.argmax(steps <= 0))
         how = "repeats" if steps[k] == 0 else "goes back to"
         found = f"{t[k]:.12g} {unit} after {t[k - 1]:.12g} {unit} on {self.row(k - 1)}"
         self._refuse(steps <= 0, f"time {name!r} {how} {found}; times must increase strictly")
+        require_steps(label, t)
         return t
 
     def check_input(self, name: str, u: Array, first: int = 0) -> Array:
         """Refuse an input with gaps: the system answers to its input whether or not that was recorded."""
         self._refuse(~np.isfinite(u), f"input {name!r} is missing or not finite; only the output may have gaps", first)
+        require_scale(f"{self.file}: the input {name!r}", u)
         return u
 
     def check_output(self, name: str, y: Array, first: int = 0) -> Array:
@@ -96,6 +103,7 @@ class Table:
         )
         if not np.isfinite(y).any():
             raise DataError(f"{self.place(first)}: no sample of the output {name!r} is a finite number")
+        require_scale(f"{self.file}: the output {name!r}", y)
         return y
 
     def _refuse(self, wrong: BoolArray, message: str, first: int = 0) -> None:
@@ -145,7 +153,10 @@ def refuse_one_column(table: Table) -> None:
 
 def listing(table: Table) -> str:
     """The columns of a file."""
-    return f"the file has {', '.join(map(repr, table.names)) or f'no {table.noun} of numbers'}"
+    if not table.names:
+        return f"the file has no {table.noun} of numbers"
+    more = f" and {len(table.names) - MAX_NAMES} more" if len(table.names) > MAX_NAMES else ""
+    return f"the file has {', '.join(map(quoted, table.names[:MAX_NAMES]))}{more}"
 
 
 def _is_number(text: str) -> bool:

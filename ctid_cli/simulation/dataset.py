@@ -21,6 +21,7 @@ from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.csv_file import Offset, read_held_signal, read_record
 from ctid_cli.signals.drifts import ContinuousNoise, noise_at
 from ctid_cli.signals.excitation import Excitation, InputFile
+from ctid_cli.signals.files import require_file
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.noise import Noise
 from ctid_cli.signals.record import Enters, Loop, Record, regular_interval
@@ -290,10 +291,12 @@ def located(options: Any, folder: Path) -> Any:
 
 def file_sha256(path: str) -> str:
     """Content hash of a file."""
+    if not Path(path).exists():
+        raise DataError(f"{path}: there is no such file; names start at the folder of the specification")
+    require_file(path)
     try:
-        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
-    except FileNotFoundError:
-        raise DataError(f"{path}: there is no such file; names start at the folder of the specification") from None
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise DataError(f"{path}: the file cannot be read: {error.strerror or error}") from None
 

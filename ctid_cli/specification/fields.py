@@ -88,9 +88,13 @@ def _different(values: list[Any]) -> list[Any]:
 
 def without_copies(values: list[Any], called: Callable[[Any], str] = lambda item: "this start") -> list[Any]:
     """The values, if none is there twice."""
+    seen: set[str] = set()
     for k, item in enumerate(values):
-        if item in values[:k]:
+        # Lists and sections have no hash; what is equal reads alike.
+        text = repr(item + 0.0 if type(item) in (int, float) else item)
+        if text in seen:
             raise several_wrong("list", [((k,), f"{called(item)} is in this list twice; keep one of them", False)])
+        seen.add(text)
     return values
 
 

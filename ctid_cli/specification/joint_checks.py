@@ -18,7 +18,7 @@ from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.dataset import LoopOptions, located
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.sections import Section, Variant, over, variants
+from ctid_cli.specification.sections import MAX_COMBINATIONS, Section, Variant, case_count, over, variants
 from ctid_cli.specification.signal_checks import signal_complaints, world_complaints
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.start_points import additive_form
@@ -27,6 +27,8 @@ from ctid_cli.specification.yaml_source import KeyPath
 
 #: Samples, or clock periods of the input, of the longest record; ten times this would not fit in memory.
 MAX_SAMPLES = 10_000_000
+#: Data cells times estimators with each of their settings that an experiment may have.
+MAX_SETTINGS = 100_000
 #: Combinations that are tried when a specification is checked, of sections whose faults show only together.
 MAX_TRIALS = 64
 
@@ -51,6 +53,19 @@ class Extent:
         if self.times is not None:
             return int(np.count_nonzero(self.times >= delay))
         return max(self.samples - math.ceil(delay / self.interval), 0)
+
+
+def too_many_cases(spec: Spec) -> str:
+    """Why not even the combinations of a specification can be looked at; empty if they can."""
+    parts = (spec.system, spec.excitation, spec.loop, spec.sampling, spec.noise, spec.recorder, spec.signal)
+    cells = math.prod(map(case_count, (*parts, spec.disturbance)))
+    estimators = sum(map(case_count, spec.estimators.values()))
+    if cells > MAX_COMBINATIONS:
+        return f"the lists combine to {cells} data cells, which are too many; at most {MAX_COMBINATIONS} are allowed"
+    if cells * estimators > MAX_SETTINGS:
+        product = f"{cells} data cells and {estimators} estimators with their settings combine to {cells * estimators}"
+        return f"{product} cases, which are too many; at most {MAX_SETTINGS} are allowed"
+    return ""
 
 
 def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool) -> Iterator[Complaint]:

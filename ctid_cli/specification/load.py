@@ -8,8 +8,9 @@ from pydantic import ValidationError, create_model
 
 from ctid_cli.errors import DataError, Problem, RefusedError, SpecError
 from ctid_cli.signals.csv_file import read_held_signal
+from ctid_cli.signals.files import is_inside
 from ctid_cli.simulation.dataset import file_sha256, joined, located
-from ctid_cli.specification.joint_checks import joint_complaints
+from ctid_cli.specification.joint_checks import joint_complaints, too_many_cases
 from ctid_cli.specification.joint_warnings import joint_warnings
 from ctid_cli.specification.messages import Complaint, Located, explained, shown
 from ctid_cli.specification.option_sections import EstimatorSection
@@ -41,8 +42,17 @@ _Remainder = create_model(
 )
 
 
-def load_spec(given: Path | Mapping[str, Any], overrides: Sequence[str] = (), *, allow_code: bool = False) -> Spec:
-    """Read and check a specification, of a file or as a mapping; code that it names is run only if that is allowed.
+def load_spec(
+    given: Path | Mapping[str, Any],
+    overrides: Sequence[str] = (),
+    *,
+    allow_code: bool = False,
+    allow_outside: bool = False,
+) -> Spec:
+    """Read and check a specification, of a file or as a mapping.
+
+    Code that it names is run, and data files outside its folder are read, only if that is allowed; whoever gives a
+    mapping names the files himself.
 
     Sampling is called slow, which is a warning and no error, if its (mean) interval exceeds pi / max |p| over the
     poles p [rad/s] of the system: its rate is then below twice the frequency of the fastest pole.
@@ -52,7 +62,7 @@ def load_spec(given: Path | Mapping[str, Any], overrides: Sequence[str] = (), *,
         source = parse_yaml(text, "(specification)")
     else:
         folder, source = given.parent, read_yaml(given)
-        text = given.read_text(encoding="utf-8-sig")
+        text = source.text
     apply_overrides(source, overrides)
     tree = source.tree
     if not isinstance(tree, dict):
@@ -61,7 +71,9 @@ def load_spec(given: Path | Mapping[str, Any], overrides: Sequence[str] = (), *,
     _require_allowed(tree, source.problem, allow_code)
     spec, complaints = _validated(with_own_kinds(tree, folder))
     spec._folder, spec._source = folder, source
-    spec, about_files = _with_files(spec)
+    if too_many := too_many_cases(spec):
+        raise SpecError([source.problem((), too_many)])
+    spec, about_files = _with_files(spec, anywhere=allow_outside or isinstance(given, Mapping))
     broken = frozenset(str(where[0]) for where, _, _ in complaints if where)
     joint = joint_complaints(spec, broken, files_are_good=not about_files)
     complaints += [(where, message, False) for where, message in (*about_files, *joint)]
@@ -121,7 +133,7 @@ def _validated(tree: dict[str, Any]) -> tuple[Spec, list[Located]]:
     return _Remainder.model_validate(good), complaints
 
 
-def _with_files(spec: Spec) -> tuple[Spec, list[Complaint]]:
+def _with_files(spec: Spec, *, anywhere: bool) -> tuple[Spec, list[Complaint]]:
     """The specification with the content hash of its file filled in, and what is wrong with the file."""
     place: tuple[str, ...]
     section: Any
@@ -129,6 +141,9 @@ def _with_files(spec: Spec) -> tuple[Spec, list[Complaint]]:
     if not hasattr(section, "sha256") or section.own:
         return spec, []
     file = joined(spec.folder, section.file)
+    if not (anywhere or is_inside(file, spec.folder)):
+        ask = "if you trust the specification, repeat the command with --allow-outside (or CTID_ALLOW_OUTSIDE=1)"
+        return spec, [((*place, "file"), f"lies outside the folder of the specification and is not read; {ask}")]
     try:
         content = file_sha256(file)
         if section.sha256 not in (None, content):

@@ -316,6 +316,11 @@ def variants(section: Section | None) -> list[Variant]:
     return [Variant(one.model_dump(mode="json"), swept, one.options()) for swept, one in _combinations(section)]
 
 
+def case_count(section: Any) -> int:
+    """Number of combinations of a section's swept values, before any of them is made."""
+    return math.prod(len(values) for _, values in _axes(section)) if isinstance(section, Section) else 1
+
+
 def _axes(section: Section, prefix: KeyPath = ()) -> Iterator[tuple[KeyPath, list[Any]]]:
     for name, info in type(section).model_fields.items():
         value = getattr(section, name)

@@ -27,14 +27,17 @@ import yaml
 
 from ctid_cli.canonical import plain
 from ctid_cli.errors import Problem, SpecError, UsageError
+from ctid_cli.signals.files import require_file
 from ctid_cli.text import did_you_mean
 
 #: Keys and list indices that lead from the top of a file to a value.
 KeyPath = tuple[str | int, ...]
 
 #: A specification is written by hand; anything larger is some other file, or an alias that multiplies itself.
-MAX_BYTES = 1_000_000
+MAX_BYTES = 250_000
 MAX_VALUES = 100_000
+#: Letters of a key that a message repeats.
+MAX_KEY = 60
 
 #: What stands for the name of the file in problems with a ``--set`` option.
 OVERRIDE_FILE = "--set"
@@ -84,6 +87,8 @@ class YamlSource:
     keys: dict[KeyPath, Place] = field(default_factory=dict)
     values: dict[KeyPath, Place] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
+    #: The text itself, where it came from a file.
+    text: str = ""
 
     def place(self, path: KeyPath, *, key: bool = False) -> Place:
         """Where a problem with a key path is to be reported."""
@@ -148,7 +153,9 @@ class YamlSource:
                 message = "merge keys (<<) are not supported; write the keys out, or use an alias for a whole value"
                 self.problems.append(place.problem(here, message))
             elif key in mapping:
-                message = f"the key {key!r} is given twice, first on line {self.keys[here].line}; keep one"
+                message = (
+                    f"the key {path_text((key,))!r} is given twice, first on line {self.keys[here].line}; keep one"
+                )
                 self.problems.append(place.problem(here, message))
             else:
                 self.keys[here] = place
@@ -181,7 +188,8 @@ def path_text(path: KeyPath) -> str:
     """A key path as users write it."""
     text = ""
     for part in path:
-        text += f"[{part}]" if isinstance(part, int) else f"{'.' if text else ''}{part}"
+        word = part if isinstance(part, int) or len(part) <= MAX_KEY else part[: MAX_KEY - 1] + "…"
+        text += f"[{part}]" if isinstance(part, int) else f"{'.' if text else ''}{word}"
     return text
 
 
@@ -189,19 +197,23 @@ def read_yaml(path: Path) -> YamlSource:
     """Read a YAML file."""
     if path.is_dir():
         raise UsageError(f"{path}: this is a folder; name the YAML file in it")
+    if path.is_file() and path.stat().st_size == 0:
+        raise SpecError([Place(str(path), 1, 1).problem((), "the file is empty")])
     try:
-        data = path.read_bytes()
+        require_file(path)
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise UsageError(f"{path}: the file cannot be read: {error.strerror or error}") from None
     if len(data) > MAX_BYTES:
-        raise UsageError(f"{path}: {len(data)} bytes are too many for a specification (at most {MAX_BYTES})")
+        raise UsageError(f"{path}: the file has too many bytes for a specification (at most {MAX_BYTES})")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         before = data[: error.start]
         place = Place(str(path), before.count(b"\n") + 1, error.start - before.rfind(b"\n"))
         raise SpecError([place.problem((), "the file is not UTF-8 text; save it as UTF-8")]) from None
-    return parse_yaml(text, str(path))
+    return replace(parse_yaml(text, str(path)), text=text)
 
 
 def written(tree: Mapping[str, Any]) -> str:

@@ -20,6 +20,7 @@ from typing import Any
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import StorageError
 from ctid_cli.storage.columns import FAILURES
+from ctid_cli.storage.foreign import read_json, require_manifest
 from ctid_cli.storage.identity import Origin, gathered
 from ctid_cli.storage.manifest import Key, Manifest, Outcome, refuse_newer
 
@@ -83,8 +84,7 @@ class Journal:
     def manifest(self) -> Manifest:
         """The plan of the latest run."""
         with self._guard("read"):
-            manifest: Manifest = json.loads(self._meta("manifest") or "")
-        return manifest
+            return require_manifest(read_json(self._meta("manifest") or ""))
 
     def sealed(self) -> str | None:
         """Checksum of the sealed file, or None if estimates came after it."""

@@ -16,10 +16,13 @@ import h5py
 import numpy as np
 
 from ctid_cli.canonical import canonical_json
-from ctid_cli.errors import StorageError
+from ctid_cli.errors import DataError, StorageError
 from ctid_cli.frequency.flags import Flag
+from ctid_cli.signals.files import require_file
+from ctid_cli.signals.hdf5 import require_plain_tree
 from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, unpack_track
 from ctid_cli.storage import columns
+from ctid_cli.storage.foreign import read_json, require_manifest
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import Key, Manifest, assemble, refuse_newer, row_columns, slots, swept_names
 
@@ -84,8 +87,8 @@ def read_sealed(path: Path) -> SealedRuns:
     """Read a sealed file and compare it with its checksum."""
     with _checked(path) as (file, checksum):
         # A text; once it was an array of bytes.
-        manifest = json.loads(bytes(file["manifest"][()]))
-        origins = tuple(Origin.of(**entry) for entry in json.loads(str(file.attrs["origins"])))
+        manifest = require_manifest(read_json(bytes(file["manifest"][()]).decode("utf-8")))
+        origins = tuple(Origin.of(**entry) for entry in read_json(str(file.attrs["origins"])))
         return SealedRuns(manifest, origins, _results(file["estimates"]), checksum)
 
 
@@ -109,18 +112,23 @@ def _checked(path: Path) -> Iterator[tuple[h5py.File, str]]:
         with _open(path) as file:
             if file.attrs.get("format") != KIND:
                 raise StorageError(f"{path} is an HDF5 file, but not one that 'ctid run' has written")
+            require_plain_tree(file)
             refuse_newer(path, int(file.attrs["format_version"]), FORMAT)
             checksum = str(file.attrs["checksum"])
             if _content_checksum(file) != checksum:
                 raise StorageError(f"{path} is damaged: its content does not agree with its checksum")
             yield file, checksum
+    except DataError as error:
+        raise StorageError(f"{path} cannot be read: {error}") from error
     # HDF5 reports damage as whatever exception the damaged part happens to cause.
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, UnicodeError) as error:
-        raise StorageError(f"{path} cannot be read ({error})") from error
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, UnicodeError, MemoryError) as error:
+        raise StorageError(f"{path} cannot be read ({str(error)[:200]})") from error
 
 
 def _require_intact(path: Path) -> None:
     """Refuse a damaged file before HDF5 sees it, which may go round in circles in there."""
+    if path.exists():
+        require_file(path)
     with path.open("rb") as file:
         head = file.read(USER_BLOCK)
         if not head.startswith(_SIGNATURE) and head != _head(hashlib.file_digest(file, "sha256").hexdigest()):
@@ -215,7 +223,7 @@ def _write_named(group: h5py.Group, name: str, parts: list[str], rows: Sequence[
 
 
 def _results(group: h5py.Group) -> dict[Key, dict[str, Any]]:
-    keys = (_decode(group["cell"]), group["replicate"][()].tolist(), _decode(group["estimator_hash"]))
+    keys = (_decode(group["cell"]), _whole(group["replicate"]), _decode(group["estimator_hash"]))
     found: list[dict[str, Any]] = [columns.no_result() for _ in keys[0]]
     for column in columns.COLUMNS:
         # A column that is younger than the file is missing.
@@ -226,7 +234,11 @@ def _results(group: h5py.Group) -> dict[Key, dict[str, Any]]:
         # An estimate with a model has a table of errors, if an empty one.
         if result["denominator"] is not None:
             result["standard_errors"] = result["standard_errors"] or {}
-    return dict(zip(map(Key, *keys, _decode(group["start"])), found, strict=True))
+    starts = _decode(group["start"])
+    rows = dict(zip(map(Key, *keys, starts), found, strict=True))
+    if {len(found), len(rows)} != {len(part) for part in (*keys, starts)} | {len(rows)}:
+        raise ValueError("its columns differ in length, or an estimate is in it twice")
+    return rows
 
 
 def _read_column(group: h5py.Group, column: columns.Column) -> list[Any]:
@@ -234,15 +246,21 @@ def _read_column(group: h5py.Group, column: columns.Column) -> list[Any]:
     if column.type == "str":
         return _decode(group[name])
     values = _plain(group[name])
+    if column.type in ("float64", "boolean") and group[name].ndim != 1:
+        raise ValueError(f"{name} is no column")
     match column.type:
         case "int64" | "Int64":
-            return [None if value == _MISSING else value for value in values]
+            return [None if value == _MISSING else value for value in _whole(group[name])]
         case "coefficients":
-            lengths = _plain(group[f"{name}_length"])
+            lengths, width = _whole(group[f"{name}_length"]), group[name].shape[1]
+            if not all(n == _MISSING or 0 <= n <= width for n in lengths):
+                raise ValueError(f"{name} has lengths that it cannot have")
             return [None if n == _MISSING else row[:n] for row, n in zip(values, lengths, strict=True)]
         case "by name":
             names = _decode(group[f"{name.removesuffix('s')}_names"])
             masks = _plain(group[f"{name}_present"])
+            if len(set(names)) != len(names):
+                raise ValueError(f"{name} has a name twice")
             return [
                 {part: value for part, value, there in zip(names, row, mask, strict=True) if there} or None
                 for row, mask in zip(values, masks, strict=True)
@@ -277,6 +295,8 @@ def _encode(texts: Sequence[str]) -> np.ndarray[Any, Any]:
 
 
 def _decode(dataset: h5py.Dataset) -> list[str]:
+    if dataset.dtype.kind != "S" or dataset.ndim != 1:
+        raise ValueError(f"{dataset.name} holds no texts")
     return [value.decode("utf-8") for value in dataset[()].tolist()]
 
 
@@ -284,8 +304,18 @@ def _floats(values: Sequence[Any]) -> np.ndarray[Any, Any]:
     return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
 
 
+def _whole(dataset: h5py.Dataset) -> list[int]:
+    """Whole numbers."""
+    if dataset.dtype.kind not in "iu" or dataset.ndim != 1:
+        raise ValueError(f"{dataset.name} holds no whole numbers")
+    numbers: list[int] = dataset[()].tolist()
+    return numbers
+
+
 def _plain(dataset: h5py.Dataset) -> list[Any]:
     """Numbers, None where there is none."""
+    if dataset.dtype.kind not in "biuf" or dataset.ndim not in (1, 2):
+        raise ValueError(f"{dataset.name} holds no numbers")
     values = dataset[()]
     found = values.astype(object)
     found[values != values] = None

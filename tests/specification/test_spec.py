@@ -207,7 +207,7 @@ def test_a_precision_needs_something_that_it_is_the_precision_of(tmp_path):
 
 
 def test_missing_file_and_folder(tmp_path):
-    with pytest.raises(UsageError, match="No such file"):
+    with pytest.raises(UsageError, match="does not exist"):
         load_spec(tmp_path / "none.yaml")
     with pytest.raises(UsageError, match="folder"):
         load_spec(tmp_path)

@@ -116,7 +116,7 @@ def test_aliases_that_multiply_are_stopped():
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(UsageError, match="No such file"):
+    with pytest.raises(UsageError, match="does not exist"):
         read_yaml(tmp_path / "missing.yaml")
     with pytest.raises(UsageError, match="this is a folder"):
         read_yaml(tmp_path)

@@ -1,0 +1,64 @@
+"""Files that somebody else may have made: ordinary ones only, of bounded size, and where they may lie."""
+
+import os
+import stat
+from pathlib import Path
+
+from ctid_cli.errors import DataError
+
+#: Bytes of the largest data file; ten million samples with all their digits need less.
+MAX_FILE_BYTES = 2_000_000_000
+#: Numbers of the largest array in a file, whatever its header says of them.
+MAX_VALUES = 100_000_000
+#: Letters of a file that a message repeats, and names that it lists.
+MAX_LETTERS, MAX_NAMES = 24, 20
+
+_KINDS = {
+    stat.S_ISDIR: "a folder",
+    stat.S_ISFIFO: "a pipe",
+    stat.S_ISSOCK: "a socket",
+    stat.S_ISCHR: "a device",
+    stat.S_ISBLK: "a device",
+}
+
+
+def require_file(path: str | os.PathLike[str], empty: str = " the file is empty") -> str:
+    """Refuse what is no ordinary file, before it is opened: a pipe waits for ever, a device never ends.
+
+    The system's own files on processes and devices say that they are empty, so that they are never read.
+    """
+    file = os.fspath(path)
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
+        reason = getattr(error, "strerror", None) if isinstance(error, PermissionError) else None
+        missing = reason or "does not exist"
+        raise DataError(f"{file}: {missing}; relative names start at {Path.cwd()}") from None
+    if not stat.S_ISREG(found.st_mode):
+        kind = next((kind for is_one, kind in _KINDS.items() if is_one(found.st_mode)), "something else")
+        raise DataError(f"{file}: is not a file but {kind}; relative names start at {Path.cwd()}")
+    if found.st_size == 0:
+        raise DataError(f"{file}:{empty}")
+    if found.st_size > MAX_FILE_BYTES:
+        size = f"{found.st_size} bytes are too many; at most {MAX_FILE_BYTES} are read"
+        raise DataError(f"{file}: {size}; cut the record, or save every second sample")
+    return file
+
+
+def require_values(file: str, name: str, count: int) -> None:
+    """Refuse an array whose header asks for more memory than any record needs."""
+    if count > MAX_VALUES:
+        raise DataError(f"{file}: {name!r} claims to hold {count} values; at most {MAX_VALUES} are read")
+
+
+def is_inside(path: str | os.PathLike[str], folder: Path) -> bool:
+    """Whether a file lies in a folder or below it, links followed."""
+    try:
+        return Path(path).resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):  # links that go round in circles, a zero byte
+        return False
+
+
+def quoted(text: str) -> str:
+    """What a file holds, as a message may repeat it: short, on one line."""
+    return repr(text) if len(text) <= MAX_LETTERS else f"a text of {len(text)} characters"
