@@ -22,7 +22,7 @@ from pathlib import Path
 import _timing  # noqa: F401
 
 from ctid_cli.running.engine import run_experiment, usable_processors
-from ctid_cli.running.pool import kill_workers
+from ctid_cli.running.pool import end_idle_workers
 from tests.running.fakes import FakePlan, Toy
 
 TASK = 0.05
@@ -53,7 +53,7 @@ def main() -> None:
         for busy in (False, True):
             for jobs in all_jobs:
                 ideal = data_sets * TASK / jobs
-                kill_workers()
+                end_idle_workers()
                 for started in ("started", "there"):
                     name = f"{busy}-{jobs}-{started}"
                     total = measure(data_sets, jobs, busy, Path(scratch) / name)

@@ -159,7 +159,10 @@ class Reporter(_Progress):
                 self._update(self.done, total=event.total)
             case events.WorkerDied():
                 what = count(event.estimates, "estimate")
-                self._say(f"a worker process died ({event.reason}); computing {what} once more, alone")
+                self._say(f"a worker process died ({event.reason}); computing {what} once more")
+            case events.Slow():
+                what = f"{event.estimator} on replicate {event.replicate} has been at work for {seconds(event.seconds)}"
+                self._say(f"{what}; limits.wall_seconds would end what takes longer than it says")
             case events.GivenUp():
                 self._say(f"{count(event.estimates, 'estimate')} given up, not stored: {event.reason}")
             case events.Stopping():

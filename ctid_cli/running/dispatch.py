@@ -23,8 +23,12 @@ from ctid_cli.storage.manifest import Key, Outcome
 TICK = 0.05
 #: How long running jobs may go on after a request to stop [s].
 DRAIN = 1.0
-#: After so many misfortunes without a single finished estimate in between, the machine is not fit to go on.
+#: After so many misfortunes for each job at work, without a single finished estimate in between, the machine is not
+#: fit to go on; with nothing at work, the next attempt waits the longer the more there were [s].
 PATIENCE = 4
+PAUSE = 0.2
+#: An estimate that takes so long is mentioned, and again after twice the time [s].
+SLOW = 600.0
 
 
 @dataclass(frozen=True)
@@ -44,18 +48,44 @@ class GivenUp:
 
 
 @dataclass(frozen=True)
+class Slow:
+    """An estimate that has been at work for long."""
+
+    key: Key
+    seconds: float
+
+
+@dataclass(frozen=True)
 class Unable:
     """Nothing can be computed here any more."""
 
     reason: str
 
 
-Event = Computed | Died | GivenUp | Unable | None
+Event = Computed | Died | GivenUp | Slow | Unable | None
 
 
 def run_jobs(jobs: Sequence[Job], executor: Executor, stopping: Callable[[], bool]) -> Iterator[Event]:
     """Run jobs; None comes now and then."""
     return _Dispatch(jobs, executor, stopping).run()
+
+
+@dataclass
+class _Work:
+    """A job in work."""
+
+    job: Job
+    #: Its estimates that are still to come, in their order.
+    left: list[Key]
+    #: Since when the first of them has been expected [s], and how often that was mentioned.
+    since: float
+    mentioned: int = 0
+
+    def take_off(self, keys: Iterable[Key]) -> None:
+        """Note that estimates need not be waited for any more."""
+        gone = set(keys)
+        self.left = [key for key in self.left if key not in gone]
+        self.since, self.mentioned = time.monotonic(), 0
 
 
 class _Dispatch:
@@ -66,21 +96,24 @@ class _Dispatch:
         self._again: deque[Job] = deque()
         self._alone: deque[Job] = deque()
         self._last: deque[Job] = deque()
-        #: Jobs in work, with those of their estimates that are still to come.
-        self._running: dict[int, tuple[Job, set[Key]]] = {}
+        self._running: dict[int, _Work] = {}
+        self._most = 1
         self._suspected: set[Key] = set()
         self._hindered: set[Key] = set()
         self._misfortunes = 0
 
     def run(self) -> Iterator[Event]:
-        while not self._stopping() and self._misfortunes < PATIENCE:
+        while not self._stopping() and self._misfortunes < PATIENCE * self._most:
+            if not self._running:
+                time.sleep(PAUSE * self._misfortunes)
             self._submit()
             if not self._running:
                 return
             yield None
             for message in self._executor.collect(TICK):
                 yield from self._take(message)
-        if self._misfortunes >= PATIENCE:
+            yield from self._slow()
+        if self._misfortunes >= PATIENCE * self._most:
             yield Unable(self._reason)
         deadline = time.monotonic() + DRAIN
         while self._running and time.monotonic() < deadline:
@@ -103,32 +136,42 @@ class _Dispatch:
                 job = self._last.popleft()
             else:
                 return
-            self._running[id(job)] = (job, set(job.keys))
+            self._running[id(job)] = _Work(job, list(job.keys), time.monotonic())
+            self._most = max(self._most, len(self._running))
             self._executor.submit(job, alone=alone)
 
+    def _slow(self) -> Iterator[Slow]:
+        now = time.monotonic()
+        for work in self._running.values():
+            if work.left and now - work.since > SLOW * 2**work.mentioned:
+                work.mentioned += 1
+                yield Slow(work.left[0], now - work.since)
+
     def _take(self, message: Message) -> Iterator[Event]:
-        job, left = self._running[id(message.job)]
+        work = self._running[id(message.job)]
+        job = work.job
         match message:
             case Computed():
                 self._misfortunes = 0
-                left.difference_update(outcome.key for outcome in message.outcomes)
+                work.take_off(outcome.key for outcome in message.outcomes)
                 self._waiting.learn(message.outcomes)
                 yield message
             case Hindered():
-                left.difference_update(message.keys)
+                work.take_off(message.keys)
                 yield from self._hinder(job, message.keys, message.reason)
             case Done():
                 del self._running[id(job)]
             case Lost():
                 del self._running[id(job)]
-                blamed = [key for key in message.keys if key in left] or list(left)
-                others = [key for key in left if key not in blamed]
+                blamed = [key for key in message.keys if key in work.left] or work.left
+                others = [key for key in work.left if key not in blamed]
                 yield from self._lose(job, message, blamed, others)
 
     def _lose(self, job: Job, lost: Lost, blamed: Sequence[Key], others: Sequence[Key]) -> Iterator[Event]:
         if lost.cause == "chance":
             others = [*others, *blamed]
         elif lost.cause == "machine":
+            yield Died(len(blamed), lost.reason)
             yield from self._hinder(job, blamed, lost.reason)
         elif lost.cause == "crash":
             yield from self._suspect(job, blamed, lost.reason)

@@ -19,14 +19,14 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ctid_cli.errors import DataError, MachineError, StorageError
+from ctid_cli.errors import DataError, MachineError, StorageError, UsageError
 from ctid_cli.running import events
 from ctid_cli.running.cell_precision import CellPrecision, as_needed, stored_precisions
-from ctid_cli.running.dispatch import Died, GivenUp, Unable, run_jobs
+from ctid_cli.running.dispatch import Died, GivenUp, Slow, Unable, run_jobs
 from ctid_cli.running.executor import Computed, Executor
 from ctid_cli.running.hindrances import advice
 from ctid_cli.running.job import Job
-from ctid_cli.running.limits import Limits
+from ctid_cli.running.limits import WATCHES_PROCESSES, Limits
 from ctid_cli.running.origins import current_origins
 from ctid_cli.running.own_check import check_components
 from ctid_cli.running.pool import LokyPool
@@ -114,6 +114,8 @@ def run_experiment(
     begun = time.monotonic()
     origins = current_origins(plan)
     limits = Limits.of(plan.spec.canonical())
+    if limits.of_processes and not WATCHES_PROCESSES:
+        raise UsageError("limits.cpu_seconds and limits.memory_mb need Linux; use wall_seconds, which works everywhere")
     with StopRequest(stop) as stopping, ExitStack() as stack:
         begun_with, stock = _look(plan, folder, origins, retry, fresh=fresh, allow_mixed=allow_mixed)
         todo = _jobs(begun_with, stock.kept)
@@ -239,7 +241,7 @@ class _Run:
             self.executor.stop()
             raise
 
-    def _note(self, item: Died | GivenUp | Unable, stopping: StopRequest) -> None:
+    def _note(self, item: Died | GivenUp | Slow | Unable, stopping: StopRequest) -> None:
         """Take note of what is not a result."""
         match item:
             case Died():
@@ -248,6 +250,9 @@ class _Run:
                 self.given_up += len(item.keys)
                 self.hindrance = item.reason
                 self.on_event(events.GivenUp(len(item.keys), item.reason))
+            case Slow():
+                name = self.slots[item.key][0].estimator["name"]
+                self.on_event(events.Slow(item.key.id, name, item.key.replicate, item.seconds))
             case Unable():
                 self.hindrance = item.reason
                 stopping.ask(MACHINE)

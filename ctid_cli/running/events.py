@@ -67,7 +67,7 @@ class BlockDone:
 
 @dataclass(frozen=True)
 class WorkerDied:
-    """A worker process died; the estimates that it was at are computed once more, each in a process of its own."""
+    """A worker process died; the estimates that it was at are computed once more, one by one."""
 
     estimates: int
     reason: str
@@ -79,6 +79,17 @@ class GivenUp:
 
     estimates: int
     reason: str
+
+
+@dataclass(frozen=True)
+class Slow:
+    """An estimate has been at work for long."""
+
+    id: str
+    estimator: str
+    replicate: int
+    #: So far [s].
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -106,6 +117,7 @@ Event = (
     | BlockDone
     | WorkerDied
     | GivenUp
+    | Slow
     | Stopping
     | Sealed
 )

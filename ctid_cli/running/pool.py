@@ -45,14 +45,15 @@ class LokyPool:
 
     def __init__(self, workers: int, limits: Limits | None = None) -> None:
         self._limits = limits or Limits()
+        _make_room(64 + 8 * workers)
         self._workers = [_idle.pop() if _idle else _Worker() for _ in range(workers)]
         end_idle_workers()
         self._folder = tempfile.TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True)
         self._numbers = itertools.count()
-        self._over: queue.SimpleQueue[tuple[_Worker, Any]] = queue.SimpleQueue()
+        self._over: queue.SimpleQueue[tuple[_Worker, bool, Any]] = queue.SimpleQueue()
         self._messages: list[Message] = []
-        #: Jobs for which no process could be started while others were at work.
-        self._held: list[Job] = []
+        #: Jobs for which no process could be started while others were at work, and whether they are to be alone.
+        self._held: list[tuple[Job, bool]] = []
         #: Time that was watched [s].
         self._clock, self._looked = 0.0, time.monotonic()
 
@@ -77,21 +78,21 @@ class LokyPool:
         try:
             future = worker.start(compute, str(worker.reader.path), packed)
         except Exception as error:
-            self._not_begun(worker, job, _in_one_line(error))
+            self._not_begun(worker, job, alone, _in_one_line(error))
             return
-        future.add_done_callback(lambda future: self._over.put((worker, future)))
+        future.add_done_callback(lambda future: self._over.put((worker, alone, future)))
 
-    def _not_begun(self, worker: _Worker, job: Job, reason: str) -> None:
+    def _not_begun(self, worker: _Worker, job: Job, alone: bool, reason: str) -> None:
         """A process could not be started, or ended before it had its job: there may be room for fewer."""
         was_used = worker.used
         worker.end()
         worker.leave()
         if was_used:
             # It ended while it was idle.
-            self._held.append(job)
+            self._held.append((job, alone))
         elif any(other.job is not None for other in self._workers):
             self._workers.remove(worker)
-            self._held.append(job)
+            self._held.append((job, alone))
         else:
             self._messages.append(Lost(job, "machine", f"no worker process could be started ({reason})"))
 
@@ -106,11 +107,12 @@ class LokyPool:
         if time.monotonic() - self._looked >= TICK:
             self._look()
         while self._held and any(worker.job is None for worker in self._workers):
-            self.submit(self._held.pop())
+            job, alone = self._held.pop()
+            self.submit(job, alone=alone)
         messages, self._messages = self._messages, []
         return messages
 
-    def _finish(self, worker: _Worker, future: Any) -> None:
+    def _finish(self, worker: _Worker, alone: bool, future: Any) -> None:
         """A worker is through with its job, or its process has died."""
         job = worker.job
         if job is None or future is not worker.future:
@@ -118,7 +120,7 @@ class LokyPool:
         error = future.exception()
         self._read(worker, job)
         if isinstance(error, BrokenExecutor) and not worker.process:
-            self._not_begun(worker, job, _ending(error)[1])
+            self._not_begun(worker, job, alone, _ending(error)[1])
             return
         if error is None:
             worker.used = True
@@ -226,6 +228,10 @@ class _Worker:
         self.future = self._executor.submit(function, path, packed)
         return self.future
 
+    def usage(self) -> Usage | None:
+        """What the process uses."""
+        return next((usage(number) for number in list(self._executor._processes)), None)
+
     def end(self) -> threading.Thread | None:
         """End the process, and what it has started; the thread that sees to it is over when they are gone."""
         executor, self._executor, self.used = self._executor, None, False
@@ -271,8 +277,11 @@ def in_worker(
     worker = _idle.pop() if _idle else _Worker()
     try:
         future = worker.start(call, "", _packed(function, given))
-        begun = time.monotonic()
-        while not stopping() and limits.exceeded(time.monotonic() - begun, 0.0, 0.0) is None:
+        begun, before = time.monotonic(), worker.usage()
+        while not stopping():
+            took, now = time.monotonic() - begun, worker.usage()
+            if limits.exceeded(took, took, 0.0 if now is None or before is None else (now - before).memory):
+                break
             with suppress(TimeoutError):
                 answer = future.result(timeout=TICK)
                 worker.used = True
@@ -284,6 +293,17 @@ def in_worker(
         if worker not in _idle:
             _end([worker])
     return None
+
+
+def _make_room(files: int) -> None:
+    """Allow this process so many open files, as far as it may."""
+    with suppress(ImportError, ValueError, OSError):
+        import resource
+
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        if soft < files and soft != resource.RLIM_INFINITY:
+            most = files if hard == resource.RLIM_INFINITY else min(files, hard)
+            resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 def _packed(*content: Any) -> bytes:

@@ -20,8 +20,9 @@ import numpy as np
 
 from ctid_cli.errors import DataError
 from ctid_cli.running.cells import Plan, Task
+from ctid_cli.running.job import Job, run_job
 from ctid_cli.simulation.dataset import DataSet
-from ctid_cli.storage.manifest import Key
+from ctid_cli.storage.manifest import Key, Outcome
 from ctid_cli.storage.shards import Shard
 
 
@@ -247,6 +248,11 @@ class FakePlan:
             for cell in self.estimators
             for label in cell.starts
         ]
+
+
+def outcomes_of(job: Job) -> list[Outcome]:
+    """What comes of a job in this process."""
+    return [entry for entry in run_job(job) if isinstance(entry, Outcome)]
 
 
 def blas_threads() -> int:

@@ -12,7 +12,7 @@ from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.running.job import Job, Short, failure, run_job
 from ctid_cli.storage.columns import no_result
-from ctid_cli.storage.manifest import Key, Outcome
+from ctid_cli.storage.manifest import Key
 from tests.running.fakes import (
     STARTS,
     FakeCell,
@@ -23,6 +23,7 @@ from tests.running.fakes import (
     FakeStart,
     Prepared,
     Toy,
+    outcomes_of,
 )
 
 
@@ -41,10 +42,6 @@ PREPARED: list[int] = []
 class Broken(FakeCell):
     def dataset(self, replicate: int) -> Any:
         raise self.swept["error"]
-
-
-def outcomes_of(wanted: Job) -> list[Outcome]:
-    return [entry for entry in run_job(wanted) if isinstance(entry, Outcome)]
 
 
 def job(*toys: Toy, cell: FakeCell | None = None, replicate: int = 2) -> Job:

@@ -8,11 +8,12 @@ import pytest
 
 from ctid_cli.errors import RefusedError, SpecError
 from ctid_cli.running.engine import run_experiment
-from ctid_cli.running.job import Job, run_job
+from ctid_cli.running.job import Job
 from ctid_cli.running.own_check import check_components
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.store import read_stored
+from tests.running.fakes import outcomes_of
 
 CODE = """\
 import os, random, signal
@@ -100,7 +101,7 @@ def test_workers_run_it_failures_stay_alone_and_changed_code_is_not_mixed_in(fol
     assert 0 < len(bad) < 4
     for k in range(4):
         job = jobs(plan)[k]
-        here = run_job(replace(job, wanted=job.wanted[:1]))[0].result
+        here = outcomes_of(replace(job, wanted=job.wanted[:1]))[0].result
         assert results["good", None, k] == here
         for mischief, status in (("raise", "FAILED"), ("die", "CRASHED"), ("nan", "FAILED")):
             found = results["bad", mischief, k]

@@ -15,7 +15,7 @@ from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.running.engine import run_experiment
-from ctid_cli.running.job import Job, run_job
+from ctid_cli.running.job import Job
 from ctid_cli.running.plan import build_plan
 from ctid_cli.signals.sinusoids import Piece, SumOfSinusoids, Tone
 from ctid_cli.simulation.frequency_measures import (
@@ -29,6 +29,7 @@ from ctid_cli.simulation.frequency_measures import (
 from ctid_cli.specification.load import load_spec, spec_from_canonical
 from ctid_cli.storage.store import load_estimates, read_stored, read_tracks
 from ctid_cli.storage.summary import export_rows
+from tests.running.fakes import outcomes_of
 
 SPEC = """\
 experiment: frequencies
@@ -200,7 +201,7 @@ def test_results_are_sealed_and_read_back(tmp_path):
     stored = read_stored(folder)
     (cell,) = plan.data_cells
     wanted = tuple(plan.keys(plan.tasks()[0]))
-    outcomes = run_job(Job(cell, 0, 1, wanted))
+    outcomes = outcomes_of(Job(cell, 0, 1, wanted))
     assert {outcome.key for outcome in outcomes} < stored.results.keys()
     for outcome in outcomes:
         assert stored.results[outcome.key]["measures"] == outcome.result["measures"]
