@@ -83,7 +83,6 @@ def table(
     Without a name: all tables of the useful-redundancy study. Cells that were not run say so; where the folder results
     holds nothing of a table, as in a fresh clone, the committed results are printed.
     """
-    from ctid_cli.reporting.comparison import check_tables, mismatch_sentence, write_comparison
     from ctid_cli.reporting.layout import write_reports
     from ctid_cli.reporting.paired_table import compare_estimators
     from ctid_cli.reporting.tables import build_tables, experiments
@@ -95,10 +94,7 @@ def table(
     if not out.is_dir():
         typer.echo(f"ctid: there is no folder {out}, so nothing was run yet (--out names the results folder)", err=True)
     if check:
-        comparison = check_tables(names or [], out, reference)
-        typer.echo(write_comparison(comparison, style))
-        if comparison.mismatches:
-            raise MismatchError(mismatch_sentence(comparison))
+        _check(names or [], out, reference, style)
         return
     if compare is not None:
         tables = [compare_estimators(results, compare, out) for results in experiments(names or [], out, "--compare")]
@@ -109,6 +105,15 @@ def table(
     # Text and Markdown hold their notes themselves.
     for note in (note for report in tables for note in report.notes if style in ("csv", "json")):
         typer.echo(f"ctid: {note}", err=True)
+
+
+def _check(names: list[str], out: Path, reference: Path | None, style: str) -> None:
+    from ctid_cli.reporting.comparison import check_tables, mismatch_sentence, write_comparison
+
+    comparison = check_tables(names, out, reference)
+    typer.echo(write_comparison(comparison, style))
+    if comparison.mismatches:
+        raise MismatchError(mismatch_sentence(comparison))
 
 
 @guarded

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.models.transfer_function import TransferFunction
@@ -91,27 +91,16 @@ def answer_test(
     outputs = [_Output.of(record, use, periodic, rng) for record, use in zip(records, used, strict=True)]
     longest = max((output.t[:, 0] for output in outputs), key=len)
     shares, testable = np.zeros((2, SERIES + 1)), False
-    if longest.size < FEWEST_SAMPLES:
-        return AnswerTest(float("nan"), float("nan"), float("nan"))
-    for pole in _poles(float(np.median(np.diff(longest))), float(np.ptp(longest))):
+    poles = _poles(float(np.median(np.diff(longest))), float(np.ptp(longest))) if longest.size >= FEWEST_SAMPLES else ()
+    for pole in poles:
         count = int(np.clip(abs(pole) * np.ptp(delays) + 1, FEWEST_DELAYS, MOST_DELAYS))
         grid = np.unique(np.linspace(*delays, count))
-        parts = [output.beside_own(pole, grid, free_response) for output in outputs]
-        for k, kind in enumerate(zip(*parts, strict=True)):
-            products = sum(part.responses.T @ part.series for part in kind)
-            power = sum(np.sum(part.responses**2, axis=0) for part in kind)
-            useful = power > NOTHING_LEFT * sum(part.whole for part in kind)
-            testable |= bool(useful.any())
-            slopes = np.divide(products, power[:, None], out=np.zeros_like(products), where=useful[:, None])
-            best = np.argmax(slopes * products, axis=0)
-            fitted, total = np.max(slopes * products, axis=0), sum(part.total for part in kind)
-            share = np.divide(fitted, total, out=np.zeros_like(total), where=total > 0.0)
-            better = np.flatnonzero(share > shares[k])
-            shares[k, better], best = share[better], best[better]
-            if k == 0:
-                for output, part in zip(outputs, kind, strict=True):
-                    answer = part.responses[:, best] * slopes[best, better]
-                    output.residual[:, better] = part.without_own(part.series[:, better]) - answer
+        as_they_are, new = zip(*(output.beside_own(pole, grid, free_response) for output in outputs), strict=True)
+        best = _better(as_they_are, shares[0])
+        for output, part in zip(outputs, as_they_are, strict=True):
+            answer = part.responses[:, best.response] * best.slope
+            output.residual[:, best.series] = part.without_own(part.series[:, best.series]) - answer
+        testable |= best.useful | _better(new, shares[1]).useful
     if not testable:
         return AnswerTest(float("nan"), float("nan"), float("nan"))
     statistics = zip((*shares, sum(output.likelihood_gain for output in outputs)), WEIGHTS, strict=True)
@@ -119,6 +108,30 @@ def answer_test(
     smallest = np.min([_p_values(statistic) / weight for statistic, weight in statistics], axis=0)
     by_chance = float(np.quantile(shares[0, 1:], 1.0 - LEVEL * WEIGHTS[0]))
     return AnswerTest(float(shares[0, 0]), by_chance, float(np.mean(smallest <= smallest[0])))
+
+
+class _Better(NamedTuple):
+    """Series of which a response explains more than any before; which response, and its slope."""
+
+    series: IndexArray
+    response: IndexArray
+    slope: Array
+    #: Whether any response can be told from offset and free response.
+    useful: bool
+
+
+def _better(parts: Sequence["_BesideOwn"], shares: Array) -> _Better:
+    """The best responses of one pole in all records together; shares that they raise are raised in place."""
+    products = sum(part.responses.T @ part.series for part in parts)
+    power = sum(np.sum(part.responses**2, axis=0) for part in parts)
+    useful = power > NOTHING_LEFT * sum(part.whole for part in parts)
+    slopes = np.divide(products, power[:, None], out=np.zeros_like(products), where=useful[:, None])
+    best = np.argmax(slopes * products, axis=0)
+    fitted, total = np.max(slopes * products, axis=0), sum(part.total for part in parts)
+    share = np.divide(fitted, total, out=np.zeros_like(total), where=total > 0.0)
+    better = np.flatnonzero(share > shares)
+    shares[better] = share[better]
+    return _Better(better, best[better], slopes[best[better], better], bool(useful.any()))
 
 
 class _BesideOwn(NamedTuple):

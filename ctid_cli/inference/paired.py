@@ -81,7 +81,7 @@ def bootstrap_difference(statistic: Callable[[Array], Array], first: Array, seco
     rng, n = np.random.default_rng(SEED), first.size
 
     def difference(picked: IntArray) -> Array:
-        return statistic(first[picked]) - statistic(second[picked])
+        return statistic(first.take(picked)) - statistic(second.take(picked))
 
     value = float(difference(np.arange(n)))
     drawn = np.concatenate([difference(rng.integers(n, size=(BLOCK, n))) for _ in range(DRAWS // BLOCK)])

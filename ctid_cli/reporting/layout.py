@@ -3,14 +3,17 @@
 import csv
 import html
 import io
+import itertools
 import json
 import math
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from ctid_cli.text import wrapped
+
+Lines = Sequence[Sequence[str]]
 
 
 @dataclass(frozen=True)
@@ -22,27 +25,8 @@ class Table:
     align: str
 
     def draw(self, style: str = "text") -> str:
-        """Columns padded with blanks and a rule under the header, or Markdown (``md``), or ``latex`` with booktabs."""
-        lines = [self.header, *self.rows]
-        if style == "html":
-            sides = ["left" if side == "l" else "right" for side in self.align]
-            found = ("".join(map(_html_cell, cells, sides)) for cells in lines)
-            return "<table>" + "\n".join(f"<tr>{cells}</tr>" for cells in found) + "</table>"
-        if style == "latex":
-            header, *body = (" & ".join(map(latex, cells)) + r" \\" for cells in lines)
-            rules = [f"\\begin{{tabular}}{{{self.align}}}", r"\toprule", header, r"\midrule"]
-            return "\n".join([*rules, *body, r"\bottomrule", r"\end{tabular}"])
-        if style == "md":
-            drawn = ["| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |" for cells in lines]
-            rule = "|" + "|".join(":--" if side == "l" else "--:" for side in self.align) + "|"
-        else:
-            widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-            columns = list(zip(self.align, widths, strict=True))
-            pad = {"l": str.ljust, "r": str.rjust}
-            padded = ((pad[side](cell, n) for cell, (side, n) in zip(cells, columns, strict=True)) for cells in lines)
-            drawn = ["  ".join(cells).rstrip() for cells in padded]
-            rule = "-" * (sum(widths) + 2 * (len(widths) - 1))
-        return "\n".join([drawn[0], rule, *drawn[1:]])
+        """Columns padded with blanks and a rule under the header, or ``md``, ``html``, or ``latex`` with booktabs."""
+        return _TABLES[style]([self.header, *self.rows], self.align)
 
 
 @dataclass(frozen=True)
@@ -58,29 +42,47 @@ class Report:
     def draw(self, style: str = "text") -> str:
         """The report for people, as text, as Markdown (``md``), or its tables in LaTeX with the rest as comments."""
         notes = [f"Note: {note}" for note in self.notes]
-        if style == "html":
-            items = [*(item for block in self.blocks for item in block), *notes]
-            return "\n".join(
-                item.draw("html") if isinstance(item, Table) else f"<p>{html.escape(item.removeprefix('### '))}</p>"
-                for item in items
-            )
-        if style == "latex":
-            items = [*(item for block in self.blocks for item in block), *notes]
-            return "\n\n".join(
-                item.draw("latex") if isinstance(item, Table) else textwrap.indent(item.removeprefix("### "), "% ")
-                for item in items
-            )
-        if style == "md":
-            items = [item for block in self.blocks for item in block]
-            return "\n\n".join([*(item.draw("md") if isinstance(item, Table) else item for item in items), *notes])
-        blocks = ["\n".join(map(_drawn, block)) for block in self.blocks if block]
-        return "\n\n".join([*blocks, "\n".join(notes)] if notes else blocks)
+        if style == "text":
+            blocks = ["\n".join(map(_drawn, block)) for block in self.blocks if block]
+            return "\n\n".join([*blocks, "\n".join(notes)] if notes else blocks)
+        items, paragraph = [*itertools.chain(*self.blocks), *notes], _PARAGRAPHS[style]
+        return "\n\n".join(item.draw(style) if isinstance(item, Table) else paragraph(item) for item in items)
+
+
+def _text_table(lines: Lines, align: str) -> str:
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    sides = [f"{'<' if side == 'l' else '>'}{width}" for side, width in zip(align, widths, strict=True)]
+    header, *body = ("  ".join(map(format, cells, sides)).rstrip() for cells in lines)
+    return "\n".join([header, "-" * (sum(widths) + 2 * (len(widths) - 1)), *body])
+
+
+def _markdown_table(lines: Lines, align: str) -> str:
+    header, *body = ("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |" for cells in lines)
+    return "\n".join([header, "|" + "|".join(":--" if side == "l" else "--:" for side in align) + "|", *body])
+
+
+def _html_table(lines: Lines, align: str) -> str:
+    sides = ["left" if side == "l" else "right" for side in align]
+    return "<table>" + "\n".join(f"<tr>{''.join(map(_html_cell, cells, sides))}</tr>" for cells in lines) + "</table>"
 
 
 def _html_cell(text: str, side: str) -> str:
     return f'<td style="text-align: {side}">{html.escape(text)}</td>'
 
 
+def _latex_table(lines: Lines, align: str) -> str:
+    header, *body = (" & ".join(map(latex, cells)) + r" \\" for cells in lines)
+    rules = [f"\\begin{{tabular}}{{{align}}}", r"\toprule", header, r"\midrule"]
+    return "\n".join([*rules, *body, r"\bottomrule", r"\end{tabular}"])
+
+
+#: How a table is drawn in each style, and a paragraph in those that are not plain text.
+_TABLES = {"text": _text_table, "md": _markdown_table, "html": _html_table, "latex": _latex_table}
+_PARAGRAPHS: Mapping[str, Callable[[str], str]] = {
+    "md": str,
+    "html": lambda text: f"<p>{html.escape(text.removeprefix('### '))}</p>",
+    "latex": lambda text: textwrap.indent(text.removeprefix("### "), "% "),
+}
 #: What LaTeX would read as something else.
 _LATEX = str.maketrans(
     {

@@ -40,8 +40,11 @@ DEFAULT = ("bias", "rmse")
 Found = tuple[str | None, Measured, str, int]
 
 
-def measure_rows(results: Results, names: Sequence[str]) -> list[Row]:
-    """Measures by name, of every combination of swept fields, estimator and start that was planned."""
+def measure_rows(results: Results, names: Sequence[str], first: int | None = None) -> list[Row]:
+    """Measures by name, of every combination of swept fields, estimator and start that was planned.
+
+    ``first``: from so many data sets of each only.
+    """
     for name in names:
         _require_measurable(name, results)
     groups = results.groups()
@@ -52,7 +55,7 @@ def measure_rows(results: Results, names: Sequence[str]) -> list[Row]:
     cells = {cell["hash"]: cell for cell in results.manifest["data_cells"]}
     rows = []
     for group, labels in labelled_groups(results):
-        members = groups.get(group, [])
+        members = [row for row in groups.get(group, ()) if first is None or row["replicate"] < first]
         counts = {"n": len(members), "failed": sum(row["status"] in FAILURES for row in members)}
         for name in dict.fromkeys(names):
             measure, argument = requested(name), name.partition(":")[2]
@@ -64,7 +67,7 @@ def measure_rows(results: Results, names: Sequence[str]) -> list[Row]:
                 far = distances(system, members, distance_of(name.partition(":")[0], argument))
                 found = [(None, measure.compute(far), measure.unit, int(np.isinf(far).sum()))]
             elif measure.source == "errors":
-                own = estimates[group]
+                own = estimates[group] if first is None else estimates[group].first(first)
                 if argument == "poles":
                     own = pole_estimates(own, system_of(cells[group.cell], name), members)
                 found = _of_errors(measure, own, argument, bounds.get(group, {}))

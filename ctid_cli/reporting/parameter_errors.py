@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import CtidError, DataError, UsageError
 from ctid_cli.inference import monte_carlo
 from ctid_cli.inference.monte_carlo import Sample
@@ -61,8 +61,9 @@ class ParameterEstimates:
     values: Array
     #: Standard errors; NaN where there is none, shape (R, p).
     standard_errors: Array
-    failed: int
-    not_converged: int
+    #: Whether each estimate failed, and whether one that did not fail did not converge either, shape (R,).
+    failures: BoolArray
+    unconverged: BoolArray
     replicates: tuple[int, ...]
     #: N times the variance that theory predicts for long records; None where there is no theory, shape (p,).
     theory: Array | None = None
@@ -87,6 +88,23 @@ class ParameterEstimates:
     def runs(self) -> int:
         """Data sets that were computed, R."""
         return len(self.replicates)
+
+    @property
+    def failed(self) -> int:
+        """How many failed."""
+        return int(self.failures.sum())
+
+    @property
+    def not_converged(self) -> int:
+        """How many ended without convergence, but did not fail."""
+        return int(self.unconverged.sum())
+
+    def first(self, n: int) -> "ParameterEstimates":
+        """Those of the first data sets only."""
+        kept = np.array(self.replicates) < n
+        arrays = ("values", "standard_errors", "failures", "unconverged")
+        replicates = tuple(replicate for replicate in self.replicates if replicate < n)
+        return replace(self, replicates=replicates, **{name: getattr(self, name)[kept] for name in arrays})
 
 
 @dataclass(frozen=True)
@@ -224,7 +242,7 @@ def _estimates(
         np.array([[side[name] for name in true] for side in sides], dtype=float) for sides in zip(*pairs, strict=True)
     )
     values[~monte_carlo.complete(values)] = np.nan
-    failed = sum(row["status"] in FAILURES for row in rows)
+    failures = np.array([row["status"] in FAILURES for row in rows])
     options = dict(zip(results.swept("estimators"), group.options, strict=True))
     swept = {name: value for name, value in cell["swept"].items() if name != "samples"}
     return ParameterEstimates(
@@ -236,8 +254,8 @@ def _estimates(
         truth=np.array([*true.values()]),
         values=values,
         standard_errors=errors,
-        failed=failed,
-        not_converged=sum(row["status"] != "CONVERGED" for row in rows) - failed,
+        failures=failures,
+        unconverged=np.array([row["status"] != "CONVERGED" for row in rows]) & ~failures,
         replicates=tuple(row["replicate"] for row in rows),
     )
 

@@ -3,7 +3,7 @@
 import json
 import shlex
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, reduce
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -82,14 +82,6 @@ class Results:
             group = Group(row["cell"], row["estimator"], tuple(row.get(name) for name in across), row["start"])
             found.setdefault(group, []).append(row)
         return found
-
-    def first(self, n: int) -> "Results":
-        """The results of the first data sets of every cell."""
-        kept = {key: value for key, value in self.stored.results.items() if key.replicate < n}
-        part = replace(self, stored=replace(self.stored, results=kept))
-        # What the cached property would make once more.
-        part.__dict__["rows"] = [row for row in self.rows if row["replicate"] < n]
-        return part
 
     def summaries(self, by: Sequence[str]) -> list[dict[str, Any]]:
         """Counts and percentages in groups, as plain Python."""

@@ -131,29 +131,31 @@ class _Reasons:
         warned = [] if self.plan is None else joint_warnings(self.plan.spec)
         self.input_is_late = any(path[:2] == ("sampling", "input_record") for path, _ in warned)
 
-    def of(self, finding: Finding) -> Iterator[str]:
+    def of(self, finding: Finding) -> list[str]:
         """Clauses, what matters most first."""
         k, j = place_of(self.results, finding.group)
         cell, part = self.results.manifest["data_cells"][k]["content"], self.results.manifest["estimators"][j]
         source = None if self.plan is None else self.plan.data_cells[k].source
         if self.plan is None or not isinstance(source, SimulatedSource):
-            return
-        if why := why_biased(source, self.plan.estimators[j].estimator):
-            yield why
-        if self.input_is_late and lookup(cell, "sampling.input_record") == "sampled":
-            yield "the input is known only at its samples (sampling.input_record: sampled)"
+            return []
+        late = self.input_is_late and lookup(cell, "sampling.input_record") == "sampled"
         white = part["content"].get("covariance", "white") == "white"
         coloured = source.noise is not None and getattr(source.noise, "coloured", True)
-        if finding.kind in ("width", "coverage") and white and coloured:
-            kind = cell["noise"]["kind"]
-            yield f"the noise is coloured (noise.kind: {kind}), and these standard errors are for white noise"
-        if finding.group.estimator in self.far and finding.group.start != "none":
-            yield "the search for the delay can end at another minimum of the cost (starts.initial_delay)"
-        if source.recorder.resolution:
-            yield "outputs are rounded, which theory does not count (recorder.resolution)"
-        treated = [key for key in ("initial_state", "offset") if part["content"].get(key) == "estimate"]
-        if finding.kind == "rmse" and treated:
-            yield f"theory does not count what else is estimated (estimators.{part['name']}.{treated[0]}: estimate)"
+        treated = next((key for key in ("initial_state", "offset") if part["content"].get(key) == "estimate"), "")
+        noise, option = lookup(cell, "noise.kind"), f"estimators.{part['name']}.{treated}: estimate"
+        clauses = {
+            why_biased(source, self.plan.estimators[j].estimator): True,
+            "the input is known only at its samples (sampling.input_record: sampled)": late,
+            f"the noise is coloured (noise.kind: {noise}), and these standard errors are for white noise": (
+                finding.kind in ("width", "coverage") and white and coloured
+            ),
+            "the search for the delay can end at another minimum of the cost (starts.initial_delay)": (
+                finding.group.estimator in self.far and finding.group.start != "none"
+            ),
+            "outputs are rounded, which theory does not count (recorder.resolution)": source.recorder.resolution,
+            f"theory does not count what else is estimated ({option})": finding.kind == "rmse" and treated,
+        }
+        return [clause for clause, holds in clauses.items() if clause and holds]
 
 
 # --- words ----------------------------------------------------------------------------------------------------------

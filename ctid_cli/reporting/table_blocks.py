@@ -1,5 +1,6 @@
 """Tables as blocks of a report: published ones with our percentages in them, and those of an experiment."""
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -287,15 +288,19 @@ def record_blocks(results: Results) -> Blocks:
 
 
 def _record_table(block: Sequence[Row], bounds: Mapping[str, Any], fits: Mapping[str, str]) -> Table:
-    found = [{item.name: item for item in parameters(row, bounds.get(row["estimator"]))} for row in block]
-    units = {name: item.unit for one in reversed(found) for name, item in one.items()}
     body = [[key, "", *(str(row[key]) for row in block)] for key in ("id", "status")]
-    for name in dict.fromkeys(name for one in found for name in one):
-        body.append([name, units[name], *(_with_error(one.get(name)) for one in found)])
+    body += _parameter_lines([parameters(row, bounds.get(row["estimator"])) for row in block])
     body += [[title, "%", *(number(row.get(key), 4) for row in block)] for title, key in fits.items()]
     body.append(["time", "", *(seconds(row.get("cpu_seconds") or row.get("seconds")) for row in block)])
     header = ["", "unit", *(f"{row['estimator']}, start {_start(row['start'])}" for row in block)]
     return Table(header, body, "ll" + "r" * len(block))
+
+
+def _parameter_lines(block: Sequence[Sequence[UncertainValue]]) -> list[list[str]]:
+    found = [{item.name: item for item in one} for one in block]
+    first = {name: item for one in reversed(found) for name, item in one.items()}
+    names = dict.fromkeys(itertools.chain(*found))
+    return [[name, first[name].unit, *(_with_error(one.get(name)) for one in found)] for name in names]
 
 
 def _with_error(item: UncertainValue | None) -> str:

@@ -136,7 +136,8 @@ def _draw_clouds(
         small = {"linestyle": "none", "markersize": 2.2, "markeredgewidth": 0.5, "alpha": 0.55}
         axes.plot(*points[:, :size][:, inside[:size]], **style | small)
     if (high > low).all():
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        edge = 0.04 * (high - low)
+        axes.set(xlim=(low[0] - edge[0], high[0] + edge[0]), ylim=(low[1] - edge[1], high[1] + edge[1]))
     if outside:
         axes.annotate(f"{outside} outside", (0.98, 0.03), xycoords="axes fraction", ha="right", fontsize=7)
 
@@ -245,6 +246,8 @@ def box_drawing(results: Results, asked: Sequence[str] = ()) -> Drawing:
                 found = [settings.row_at(point, own) for point in settings.points]
                 _draw_boxes(axes, found, name, k, len(settings.methods))
             axes.axhline(0.0, color=MIDDLE, linewidth=0.7, zorder=0.5)
+            # The lowest box keeps its distance from the edge.
+            axes.use_sticky_edges = False
             axes.set_ylabel(_labelled(name, rows))
             scale.apply(axes)
             axes.grid(False, axis="x")

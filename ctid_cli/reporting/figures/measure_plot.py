@@ -17,7 +17,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.inference.monte_carlo import MEASURES
 from ctid_cli.reporting.figures.settings import Scale, Settings, part_of, scale_of, settings_in, value_text
 from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, panels_of, plain, size_for
-from ctid_cli.reporting.layout import count
+from ctid_cli.reporting.layout import count, number
 from ctid_cli.reporting.measures import measure_rows
 from ctid_cli.reporting.percentages import Row
 from ctid_cli.reporting.results import Results
@@ -122,6 +122,8 @@ def _label(axes: Axes, rows: Sequence[Row], measure: str) -> None:
         axes.set_ylim(max(low, -3.0), min(high, 103.0))
     elif values and base not in ("bias", "median_bias") and min(values) > 0 and max(values) > SPAN * min(values):
         axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(lambda value, _: number(value, 3))
+        axes.yaxis.set_minor_formatter(lambda value, _: number(value, 3) if f"{value:.0e}"[0] in "25" else "")
 
 
 def _draw_stairs(axes: Axes, settings: Settings) -> None:
@@ -191,7 +193,7 @@ def _title(results: Results, measure: str, rows: Sequence[Row]) -> str:
 
 def convergence_drawing(results: Results, measure: str) -> Drawing:
     """A measure over the number of data sets that it is computed from: one panel for each combination of settings."""
-    by_size = {n: [row for row in measure_rows(results.first(n), [measure]) if row["n"]] for n in _sizes(results)}
+    by_size = {n: [row for row in measure_rows(results, [measure], n) if row["n"]] for n in _sizes(results)}
     last = list(by_size.values())[-1]
     settings = settings_in(last, results)
     names = list(dict.fromkeys(row["parameter"] for row in last))

@@ -14,15 +14,26 @@ from ctid_cli.reporting.layout import delay_label, number
 from ctid_cli.reporting.percentages import Row, settings_of
 from ctid_cli.reporting.results import Results
 from ctid_cli.signals.recorder import Recorder
+from ctid_cli.signals.sinusoids import SumOfSinusoids
+from ctid_cli.simulation.dataset import MeasuredSource
 from ctid_cli.specification.loop_section import LoopSection
 from ctid_cli.specification.option_docs import option_docs
+from ctid_cli.specification.signal_sections import RegularDurationSection, TracksSection
 from ctid_cli.specification.start_sections import StartsSection
 from ctid_cli.specification.system_sections import AdditiveSystemSection, SystemSection
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_SECTIONS = {"system": SystemSection, "starts": StartsSection, "loop": LoopSection, "recorder": Recorder}
+_SECTIONS = {
+    "system": SystemSection,
+    "starts": StartsSection,
+    "loop": LoopSection,
+    "recorder": Recorder,
+    "signal": SumOfSinusoids,
+    "data": MeasuredSource,
+    "tracks": TracksSection,
+}
 #: Values of the settings that vary, in the order of their names.
 Point = tuple[Any, ...]
 
@@ -88,12 +99,16 @@ def documentation(section: str, content: Mapping[str, Any]) -> tuple[str, dict[s
     """What a section of a specification is, and the text about each of its keys; nothing of what is not our own."""
     kind = content.get("kind")
     if kind in KINDS.get(section, {}):
-        target: type | None = resolve(section, kind)
+        target: type | None = RegularDurationSection if _has_duration(section, content) else resolve(section, kind)
     else:
         target = AdditiveSystemSection if "additive" in content else _SECTIONS.get(section) if kind is None else None
     if target is None:
         return "", {}
     return (target.__doc__ or "").strip().splitlines()[0].replace("``", ""), option_docs(target)
+
+
+def _has_duration(section: str, content: Mapping[str, Any]) -> bool:
+    return section == "sampling" and content["kind"] == "regular" and "duration" in content
 
 
 def unit_in(text: str) -> str:

@@ -92,6 +92,15 @@ class Drawing(NamedTuple):
             figure.savefig(file, format=style, metadata=_METADATA[style], dpi=200)
         return file.getvalue()
 
+    def laid_out_once(self) -> bytes:
+        """Draw it as SVG in half the time: places are found once, and may differ from those of ``saved`` by a hair."""
+        file, figure = io.BytesIO(), self.figure()
+        with _style():
+            figure.draw_without_rendering()
+            figure.set_layout_engine("none")
+            figure.savefig(file, format="svg", metadata=_METADATA["svg"])
+        return file.getvalue()
+
 
 def _style() -> Any:
     """Not the user's own defaults: a published figure looks the same everywhere."""

@@ -58,7 +58,7 @@ def experiment_page(results: Results, out: Path) -> str:
         seed=results.manifest["seed"],
         success=success_sentence(settings) if settings.get("success") else "",
         reports=_tables(results),
-        figures=list(_figures(results)),
+        figures=list(_figures(results, out)),
         comparisons=list(_comparisons(results, out)),
         outcomes=_outcomes(rows, out),
         notes=notes_of(results, out),
@@ -78,8 +78,9 @@ def _counts(results: Results) -> str:
     methods = len({part["name"] for part in manifest["estimators"]})
     sets = sum(cell["replicates"] for cell in manifest["data_cells"])
     cells = f" in {count(len(manifest['data_cells']), 'setting')}" if len(manifest["data_cells"]) > 1 else ""
+    estimates = count(len(results.rows), "estimate")
     failed = f", {results.failed} of them failed" if results.failed else ", none of them failed"
-    return f"{count(methods, 'estimator')} on {count(sets, 'data set')}{cells}: {len(results.rows)} estimates{failed}"
+    return f"{count(methods, 'estimator')} on {count(sets, 'data set')}{cells}: {estimates}{failed}"
 
 
 def _tables(results: Results) -> list[Report]:
@@ -96,7 +97,7 @@ def _untitled(block: Any) -> list[str | Table]:
     return [item for item in block if not (isinstance(item, str) and item.startswith("### "))]
 
 
-def _figures(results: Results) -> Iterator[dict[str, Any]]:
+def _figures(results: Results, out: Path) -> Iterator[dict[str, Any]]:
     try:
         kinds = kinds_of(results)
     except UsageError:
@@ -108,8 +109,8 @@ def _figures(results: Results) -> Iterator[dict[str, Any]]:
         except UsageError:
             continue
         caption = f"{name.capitalize()} {CAPTIONS[kind]}" if kind == "measure" else CAPTIONS[kind]
-        command = f"ctid figure {results.experiment} --kind {kind}"
-        yield {"svg": inline(drawing.saved(), kind), "caption": caption, "command": command}
+        command = f"ctid figure {results.experiment} --kind {kind}{out_option(out)}"
+        yield {"svg": inline(drawing.laid_out_once(), kind), "caption": caption, "command": command}
 
 
 def _comparisons(results: Results, out: Path) -> Iterator[Report]:

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 #: Rows of a table that a page shows; the tables of ``ctid table`` have all of them.
 ROWS = 200
+#: A drawing as wide as a page of paper, 7.5 inch, has 52 rem on the screen.
+REM_PER_POINT = 52.0 / (7.5 * 72.0)
 
 
 def written(template: str, **content: Any) -> str:
@@ -29,8 +31,16 @@ def _environment() -> "Environment":
         loader=folder, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.tests["table"] = lambda item: isinstance(item, Table)
+    environment.filters["marked"] = _marked
     environment.globals["row_limit"] = ROWS
     return environment
+
+
+def _marked(text: str) -> "Markup":
+    """A text in which backquotes mark names."""
+    from markupsafe import Markup, escape
+
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def inline(svg: bytes, name: str) -> "Markup":
@@ -43,7 +53,10 @@ def inline(svg: bytes, name: str) -> "Markup":
     drawn = re.sub(r'href="#', f'href="#{name}-', drawn).replace("url(#", f"url(#{name}-")
     # The drawing's own description holds nothing but addresses of vocabularies.
     drawn = re.sub(r"<metadata>.*?</metadata>", "", drawn, flags=re.DOTALL)
-    return Markup(drawn.replace("<svg ", '<svg role="img" ', 1))
+    # All drawings at one scale, so that their letters have one size.
+    width = re.search(r'<svg [^>]*?width="([\d.]+)pt"', drawn)
+    scale = f' style="max-width: {float(width[1]) * REM_PER_POINT:.4g}rem"' if width else ""
+    return Markup(drawn.replace("<svg ", f'<svg role="img"{scale} ', 1))
 
 
 def report_of(markdown: str) -> Report:

@@ -1,7 +1,6 @@
 """What an experiment asks, in words: the system, what drives it, when it is sampled, who estimates, what counts."""
 
 import inspect
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -80,15 +79,16 @@ def _part(title: str, section: str, content: Mapping[str, Any]) -> Part:
 
 def _unit_and_meaning(text: str) -> tuple[str, str]:
     unit = unit_in(text)
-    return unit, text.replace(f" [{unit}]", "", 1) if unit else text
+    meaning = text.replace(f" [{unit or '-'}]", "", 1)
+    return unit, meaning if not meaning or meaning.endswith(".") else f"{meaning}."
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, list) and not any(isinstance(item, Mapping | list) for item in value):
-        return ", ".join(map(_text, value))
-    if isinstance(value, Mapping | list | bool):
-        return json.dumps(value, ensure_ascii=False)
-    return number(value, 15)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name.replace('_', ' ')} {_text(item)}" for name, item in value.items() if item is not None)
+    if isinstance(value, list):
+        return ("; " if any(isinstance(item, Mapping | list) for item in value) else ", ").join(map(_text, value))
+    return str(value).lower() if isinstance(value, bool) else number(value, 15)
 
 
 def equation(settings: Mapping[str, Any]) -> tuple[list[Fraction], bool] | None:
