@@ -174,7 +174,7 @@ def scaled(group, estimator, factor, shift=0.0):
 
 def stopped(group, estimator, least, count):
     there = group.estimator == estimator and group.samples >= least
-    return replace(group, not_converged=count) if there else group
+    return replace(group, unconverged=np.arange(group.runs) < count) if there else group
 
 
 def wide(group):
@@ -203,7 +203,8 @@ def test_each_claim_sees_what_it_is_for(changed, name, change, claim):
 
 def test_a_few_estimates_that_did_not_converge_may_be_forgiven(changed):
     def some(group):
-        return replace(group, not_converged=3 if group.samples < 7000 or group.estimator != "additive" else 0)
+        count = 3 if group.samples < 7000 or group.estimator != "additive" else 0
+        return replace(group, unconverged=np.arange(group.runs) < count)
 
     assert failures(changed("closed-loop", some)) == []
     wrong = failures(changed("open-loop", some))
