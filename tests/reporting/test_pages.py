@@ -62,7 +62,7 @@ def page(results):
 def test_a_page_says_all_that_it_should(page, results):
     titles = ["Question", "Tables", "Figures", "What went wrong", "Provenance", "How to cite"]
     assert all(title in page.text for title in titles)
-    assert page.tags["svg"] == 5
+    assert page.tags["svg"] == 4
     assert "2 estimators on 8 data sets in 2 settings: 16 estimates, 1 of them failed." in page.text
     assert "percent of the data sets whose delay estimate lies within 1 % of the true delay" in page.text
     failed = next(row["id"] for row in results.rows if row["status"] == "FAILED")

@@ -5,7 +5,7 @@ from typing import Literal, get_args
 
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.figures.estimate_plot import box_drawing, delays_drawing, errors_drawing
-from ctid_cli.reporting.figures.measure_plot import FEWEST, convergence_drawing, measure_drawing
+from ctid_cli.reporting.figures.measure_plot import convergence_drawing, measure_drawing
 from ctid_cli.reporting.figures.style import Drawing, require_kind
 from ctid_cli.reporting.measures import default_measures
 from ctid_cli.reporting.parameter_errors import estimates_by_group
@@ -28,7 +28,7 @@ def kinds_of(results: Results) -> list[Kind]:
         kinds += ["box"]
         kinds += ["errors"] if any(len(own) > 1 for own in names) else []
         kinds += ["delays"] if any("delay" in own for own in names) else []
-    kinds += ["convergence"] if max(cell["replicates"] for cell in results.manifest["data_cells"]) > FEWEST else []
+    kinds += ["convergence"]
     alone = len(results.groups()) == 1 and "box" in kinds
     return sorted(kinds, key=lambda kind: kind != "box") if alone else kinds
 

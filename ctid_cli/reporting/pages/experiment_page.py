@@ -9,6 +9,7 @@ from typing import Any
 import ctid_cli
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.figures.experiment_plot import Kind, experiment_drawing, kinds_of, main_measure
+from ctid_cli.reporting.figures.measure_plot import FEWEST
 from ctid_cli.reporting.layout import Report, Table, count
 from ctid_cli.reporting.measure_tables import measure_report
 from ctid_cli.reporting.measures import SUCCESSES, default_measures
@@ -103,7 +104,11 @@ def _figures(results: Results, out: Path) -> Iterator[dict[str, Any]]:
     except UsageError:
         return
     name = main_measure(results)
+    # From so few data sets it is one point.
+    few = max(cell["replicates"] for cell in results.manifest["data_cells"]) <= FEWEST
     for kind in kinds:
+        if kind == "convergence" and few:
+            continue
         try:
             drawing = experiment_drawing(results, kind, name if kind in ("measure", "convergence") else None)
         except UsageError:
