@@ -92,7 +92,7 @@ def test_long_tables_are_cut_and_say_so(results, monkeypatch):
 
     table = Table(["a"], [[str(k)] for k in range(ROWS + 5)], "r")
     monkeypatch.setattr(module, "_tables", lambda results: [Report([[table]])])
-    monkeypatch.setattr(module, "_figures", lambda results: [])
+    monkeypatch.setattr(module, "_figures", lambda results, out: [])
     text = Page(experiment_page(results, Path("results"))).text
     assert f"The first {ROWS} of {ROWS + 5} rows" in text
     assert f"{ROWS - 1}" in text
