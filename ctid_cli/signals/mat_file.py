@@ -1,9 +1,11 @@
 """Columns from MATLAB files that hold plain arrays."""
 
+import json
 import math
 import os
 import warnings
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,13 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
+from ctid_cli.signals.apart import done_apart
 from ctid_cli.signals.files import require_file, require_values
 from ctid_cli.signals.hdf5 import MAX_DEPTH, PLAIN, members, require_plain
 from ctid_cli.signals.table import Table
 
+#: Seconds that reading may take, and bytes a second of the slowest disk.
+LEAST_PATIENCE, SLOWEST = 50.0, 5e6
 #: Variables of one file.
 MAX_NAMES_READ = 10_000
 #: What MATLAB calls arrays of real numbers.
@@ -22,37 +27,72 @@ NUMERIC = ("double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", 
 
 
 def read_mat_table(path: str | os.PathLike[str]) -> Table:
-    """Variables of a MATLAB file.
+    """Variables of a MATLAB file, read in a process of its own: some damaged files crash their readers."""
+    file = require_file(path, f" the file is empty; {_how_to_save(path)}")
+    patience = LEAST_PATIENCE + Path(path).stat().st_size / SLOWEST
+    vectors: dict[str, Array] = {}
+    with done_apart(partial(_write_answer, path, file), patience) as folder:
+        if folder is None:
+            raise DataError(f"{file}: this is not a MATLAB file, or a damaged one; {_how_to_save(path)}")
+        answer = json.loads((folder / "answer.json").read_text(encoding="utf-8"))
+        for k, name in enumerate(answer.get("names", ())):
+            if name not in answer["wrong"]:
+                vectors[name] = np.load(folder / f"{k}.npy", allow_pickle=False)
+    if "refused" in answer:
+        raise DataError(answer["refused"])
+    names, objects = tuple(answer["names"]), answer["objects"]
+    hint = " ".join(_how_to_export(path, name, kind) for name, kind in objects.items())
+    if not names:
+        raise DataError(f"{file}: {hint}" if hint else f"{file}: the file holds no arrays; {_how_to_save(path)}")
+
+    def convert(name: str) -> Array:
+        if name not in vectors:
+            raise DataError(answer["wrong"][name])
+        return vectors[name]
+
+    return Table(file, names, convert, lines=None, noun="variable", hint=hint)
+
+
+def _write_answer(path: str | os.PathLike[str], file: str, folder: Path) -> None:
+    """Write the vectors of a file to a folder, and why other variables are none."""
+    answer: dict[str, Any]
+    try:
+        arrays, objects = _content(path, file)
+        answer = {"names": list(arrays), "objects": objects, "wrong": {}}
+        for k, (name, value) in enumerate(arrays.items()):
+            try:
+                np.save(folder / f"{k}.npy", _vector(file, name, value), allow_pickle=False)
+            except DataError as error:
+                answer["wrong"][name] = str(error)
+    except DataError as error:
+        answer = {"refused": str(error)}
+    except Exception:  # a reader in C meets damage in its own way, memory included; the caller says so
+        raise SystemExit(1) from None
+    (folder / "answer.json").write_text(json.dumps(answer), encoding="utf-8")
+
+
+def _content(path: str | os.PathLike[str], file: str) -> tuple[dict[str, Any], dict[str, str]]:
+    """Arrays by name, and the classes of objects by name.
 
     MATLAB writes version 7.3 as HDF5, where strings, structs and objects are told apart by attributes.
     """
     import scipy.io
 
-    file = require_file(path, f" the file is empty; {_how_to_save(path)}")
     try:
         with warnings.catch_warnings():
             # Two objects in one file share a placeholder name, which is no concern of the arrays beside them.
             warnings.simplefilter("ignore")
             for name, shape in _shapes(path).items():
                 require_values(file, name, math.prod(shape))
-            content = scipy.io.loadmat(path)
-        arrays, objects = _flat(content)
+            return _flat(scipy.io.loadmat(path))
     except DataError:
         raise
     except NotImplementedError:
-        arrays, objects = _read_hdf5(path, file)
+        return _read_hdf5(path, file)
     except OSError as error:
         raise DataError(f"{file}: cannot be read: {error.strerror or error}") from None
     except Exception:  # the reader meets damaged files with whatever its parser stumbles over
         raise DataError(f"{file}: this is not a MATLAB file, or a damaged one; {_how_to_save(path)}") from None
-    hint = " ".join(_how_to_export(path, name, kind) for name, kind in objects.items())
-    if not arrays:
-        raise DataError(f"{file}: {hint}" if hint else f"{file}: the file holds no arrays; {_how_to_save(path)}")
-
-    def convert(name: str) -> Array:
-        return _vector(file, name, arrays[name])
-
-    return Table(file, tuple(arrays), convert, lines=None, noun="variable", hint=hint)
 
 
 def _shapes(path: str | os.PathLike[str]) -> dict[str, tuple[int, ...]]:

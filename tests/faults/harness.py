@@ -158,7 +158,7 @@ def faults(fuzzer: Fuzzer, kind: str, numbers: Iterable[int]) -> dict[int, str]:
     context = multiprocessing.get_context("fork")
     while left:
         ours, theirs = context.Pipe(duplex=False)
-        worker = context.Process(target=_work, args=(fuzzer, kind, left, theirs), daemon=True)
+        worker = context.Process(target=_work, args=(fuzzer, kind, left, theirs))
         worker.start()
         theirs.close()
         try:

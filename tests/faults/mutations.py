@@ -161,7 +161,7 @@ def mat_file(rng: random.Random) -> bytes:
     _, rows = record(rng)
     columns = {name: np.array([float(row[k]) for row in rows]) for k, name in enumerate("tuy")}
     odd = (
-        np.array([1 + 2j]), np.zeros((0, 3)), np.array("text"), np.eye(2), np.array([None, {}], dtype=object),
+        np.array([1 + 2j]), np.zeros((0, 3)), np.array("text"), np.eye(2), np.array(["a", 1.0], dtype=object),
         np.array([True]), np.arange(3, dtype=np.uint8), {"t": columns["t"]}, np.array([np.nan]),
     )  # fmt: skip
     values = dict(columns)
@@ -184,7 +184,7 @@ def mat_file(rng: random.Random) -> bytes:
         data = head.ljust(512, b"\0") + stream.getvalue()[512:]
     else:
         scipy.io.savemat(stream, values, do_compression=rng.random() < 0.5)
-        data = stream.getvalue()
+        data = b"MATLAB 5.0 MAT-file".ljust(116) + stream.getvalue()[116:]  # without the time of day
     return mutated_bytes(rng, data) if rng.random() < 0.6 else data
 
 

@@ -1,0 +1,23 @@
+"""Work that may crash or never end, in a process of its own: libraries in C do not survive every damaged file."""
+
+import multiprocessing
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def done_apart(work: Callable[[Path], None], patience: float) -> Iterator[Path | None]:
+    """The folder that the work has written its answer to; None if it crashed, or took longer than this [s]."""
+    with tempfile.TemporaryDirectory(prefix="ctid-") as folder, warnings.catch_warnings():
+        # The process does nothing but this, so that threads of others do not matter.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        process = multiprocessing.get_context("fork").Process(target=work, args=(Path(folder),))
+        process.start()
+        process.join(patience)
+        if process.is_alive():
+            process.kill()
+            process.join()
+        yield Path(folder) if process.exitcode == 0 else None
