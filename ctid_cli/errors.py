@@ -97,6 +97,10 @@ class StorageError(CtidError):
     exit_code = 6
 
 
+class DamageError(StorageError):
+    """A stored file is not what was written."""
+
+
 class MismatchError(CtidError):
     """A comparison or verification found a difference."""
 

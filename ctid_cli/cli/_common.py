@@ -1,6 +1,7 @@
 """What all commands share: the results option, and how errors reach the user."""
 
 import contextlib
+import errno
 import functools
 import json
 import os
@@ -11,12 +12,13 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, NoReturn, TypeVar, cast
 
 import typer
 from typer.core import TyperCommand
 
 from ctid_cli.errors import CtidError, SpecError, StorageError
+from ctid_cli.files import write_file
 from ctid_cli.signals.treatment import Hold
 
 Function = TypeVar("Function", bound=Callable[..., None])
@@ -51,6 +53,8 @@ From = Annotated[float | None, typer.Option("--from", metavar="TIME", help="Firs
 To = Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")]
 
 INTERRUPTED = 130
+#: Errors that are the disk's: full, over quota, read-only, or failing.
+_OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
 
 
 class Command(TyperCommand):
@@ -85,7 +89,7 @@ def write_files(files: Mapping[Path, bytes]) -> None:
     for path, content in files.items():
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
+            write_file(path, content)
         except OSError as error:
             raise StorageError(f"{error.filename or path} cannot be written: {error.strerror or error}") from error
 
@@ -105,13 +109,23 @@ def guarded(command: Function) -> Function:
             raise typer.Exit(INTERRUPTED) from None
         except (typer.Exit, typer.Abort, BrokenPipeError):
             raise
+        except OSError as error:
+            if error.errno not in _OF_THE_DISK and "temporary directory" not in str(error):
+                _report(error, kwargs.get("out"))
+            where = f"{error.filename}: " if error.filename else ""
+            typer.echo(f"ctid: {where}{error.strerror or error}; what was reported as done is safe", err=True)
+            raise typer.Exit(StorageError.exit_code) from None
         except Exception as error:
-            file = _write_traceback(kwargs.get("out"))
-            kind = type(error).__name__
-            typer.echo(f"ctid: unexpected error ({kind}: {_one_line(error)}); please report it with {file}", err=True)
-            raise typer.Exit(1) from None
+            _report(error, kwargs.get("out"))
 
     return cast(Function, wrapper)
+
+
+def _report(error: Exception, out: Path | None) -> NoReturn:
+    """Say that an error was not foreseen, and where its details are."""
+    file, kind = _write_traceback(out), type(error).__name__
+    typer.echo(f"ctid: unexpected error ({kind}: {_one_line(error)}); please report it with {file}", err=True)
+    raise typer.Exit(1) from None
 
 
 def _one_line(error: Exception) -> str:
@@ -122,10 +136,10 @@ def _one_line(error: Exception) -> str:
 def _write_traceback(out: Path | None) -> Path:
     name = f"ctid-error-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}.txt"
     text = f"arguments: {sys.argv}\n\n{traceback.format_exc()}"
-    results = [out] if out is not None and out.is_dir() else []
-    for folder in [*results, Path(tempfile.gettempdir())]:
+    for folder in (out if out is not None and out.is_dir() else None, None):
         with contextlib.suppress(OSError):
-            (folder / name).write_text(text, encoding="utf-8")
-            return folder / name
+            place = Path(tempfile.gettempdir()) if folder is None else folder
+            write_file(place / name, text.encode())
+            return place / name
     typer.echo(text, err=True)
     return Path("the text above")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import typer
 
-from ctid_cli.reporting.layout import count, seconds
+from ctid_cli.reporting.layout import count, rate, seconds
 from ctid_cli.reporting.precision_words import block_sentence
 
 if TYPE_CHECKING:
@@ -192,11 +192,10 @@ class Reporter(_Progress):
         self.done = event.done
         self.failed += sum(row["status"] in FAILURES for row in event.rows)
         speed = event.done / max(self._clock() - self._began, 1e-9)
-        rate = f"{speed:.2g}/s" if speed >= 0.1 else f"{60 * speed:.2g}/min"
-        self._update(event.done, rate=rate, failed=self.failed)
+        self._update(event.done, rate=rate(speed), failed=self.failed)
         if self._is_time() or (self._bar is None and event.done == event.total):
             left = f", ETA {seconds((event.total - event.done) / speed)}" if 0 < event.done < event.total else ""
-            self._say(f"{event.done}/{event.total} data sets, {rate}, {self.failed} failed{left}")
+            self._say(f"{event.done}/{event.total} data sets, {rate(speed)}, {self.failed} failed{left}")
 
 
 def json_lines(event: Event) -> list[str]:

@@ -12,6 +12,7 @@ from ctid_cli.cli.fit_command import fit
 from ctid_cli.cli.init_command import init
 from ctid_cli.cli.merge_command import merge
 from ctid_cli.cli.result_commands import export, figure, report, show, status, table
+from ctid_cli.cli.storage_commands import repair, verify
 from ctid_cli.cli.study_command import study
 from ctid_cli.cli.track_command import track
 
@@ -48,7 +49,8 @@ def _root(
 
 
 app.command(cls=CheckCommand)(check)
-for _command in (fit, track, init, run, merge, status, table, figure, report, show, export, validate, schema):
+_RESULTS = (status, table, figure, report, show, export, verify, repair)
+for _command in (fit, track, init, run, merge, *_RESULTS, validate, schema):
     app.command(cls=Command)(_command)
 app.add_typer(study, name="study")
 

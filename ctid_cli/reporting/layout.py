@@ -165,6 +165,11 @@ def count(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
+def rate(speed: float) -> str:
+    """How many there are in a second, or in a minute where these are few."""
+    return f"{speed:.2g}/s" if speed >= 0.1 else f"{60 * speed:.2g}/min"
+
+
 def percent(value: float | None, n: int) -> str:
     """A percentage out of ``n``; one decimal where ``n`` can resolve it."""
     if value is None or not math.isfinite(value):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ctid_cli.reporting.estimate import as_object
-from ctid_cli.reporting.layout import Table, number, picked
+from ctid_cli.reporting.layout import Table, number, picked, rate
 from ctid_cli.reporting.precision_words import precision_table
 from ctid_cli.reporting.results import out_option
 from ctid_cli.running.cell_precision import CellPrecision
@@ -91,12 +91,24 @@ def sentence_of(row: Mapping[str, Any]) -> str:
     return str(row.get("message") or "").split("\n", 1)[0]
 
 
+def _running(progress: Mapping[str, Any]) -> str:
+    """Who runs, since when, how far it is, and when it will have ended."""
+    if progress["pid"] is None:
+        return "running now"
+    words = [f"running now: process {progress['pid']} on {progress['host']}"]
+    if "started" in progress:
+        words.append(f"since {progress['started']}")
+    if "total" in progress:
+        words.append(f"{progress['done']} of {progress['total']} data sets")
+    if progress["data_sets_per_second"] is not None:
+        words += [rate(progress["data_sets_per_second"]), f"to end about {progress['expected_end']}"]
+    return ", ".join(words)
+
+
 def _remark(status: ExperimentStatus) -> str:
     remarks = []
     if status.running is not None:
-        progress = status.running
-        counts = f", {progress['done']} of {progress['total']} data sets" if "total" in progress else ""
-        remarks.append(f"running now: process {progress.get('pid')} on {progress.get('host')}{counts}")
+        remarks.append(_running(status.running))
     elif status.todo:
         remarks.append("unfinished")
     if status.mixed:

@@ -121,12 +121,17 @@ def find_results(out: Path, experiment: str) -> Results | None:
 
 def read_results(out: Path, experiment: str) -> Results:
     """Results of one experiment."""
-    found = find_results(out, experiment)
-    if found is None:
-        known = experiments_in(out)
+    folder = stored_folder(out, experiment)
+    return Results(folder, read_stored(folder))
+
+
+def stored_folder(out: Path, experiment: str) -> Path:
+    """The folder with the results of one experiment."""
+    known = experiments_in(out)
+    if experiment not in known:
         hint, there = did_you_mean(experiment, known) or ".", ", ".join(known) or "none"
         raise UsageError(f"there are no results of {experiment!r} in {out}{hint} Experiments there: {there}")
-    return found
+    return out / experiment
 
 
 def differences(settings: Mapping[str, Any], reference: Mapping[str, Any], shown: Collection[str]) -> list[str]:

@@ -13,7 +13,7 @@ import time
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
@@ -37,7 +37,7 @@ from ctid_cli.storage import journal
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.identity import Origin, are_mixed
 from ctid_cli.storage.manifest import Key, Outcome, Slot, assemble, slots
-from ctid_cli.storage.provenance import now, session_info
+from ctid_cli.storage.provenance import canonical_text, now, session_info
 from ctid_cli.storage.store import seal
 
 if TYPE_CHECKING:
@@ -130,10 +130,8 @@ def run_experiment(
         stack.enter_context(place.lock(folder))
         # Another run may have come between.
         place.check_free(folder, plan.manifest(), origins, allow_mixed=allow_mixed)
-        try:
+        with place.saying_what_is_safe(folder):
             log = journal.open_journal(folder / journal.FILE_NAME)
-        except StorageError as error:
-            raise StorageError(f"{error}. {place.what_is_safe(folder)}") from error
         stack.callback(log.close)
         workers = jobs or usable_processors()
         computing = executor(limits) if executor else LokyPool(workers, limits)
@@ -190,10 +188,10 @@ class _Run:
 
     def start(self, circumstances: dict[str, Any]) -> None:
         spec = self.plan.spec
-        canonical = json.dumps(spec.canonical(), sort_keys=True, indent=2, allow_nan=False, ensure_ascii=False)
+        canonical = canonical_text(spec.canonical())
         with _writing(self.folder):
-            _write_if_new(self.folder / place.SPEC, spec.text.encode())
-            _write_if_new(self.folder / place.CANONICAL, f"{canonical}\n".encode())
+            for name, text in ((place.SPEC, spec.text), (place.CANONICAL, canonical)):
+                self.log.write_beside(name, text.encode())
             (self.folder / place.PROVENANCE).mkdir(exist_ok=True)
         versions = {cell.name: self.origins[cell.hash] for cell in self.plan.estimators}
         self.info = session_info(spec.text, spec.folder, versions) | circumstances
@@ -287,10 +285,10 @@ class _Run:
         self.log.end(self.session, stopped, ended)
         counts = {"planned": len(self.slots), "reused": self.ready.reused, "computed": self.computed, "failed": failed}
         about = {"session": self.session, "started": self.started, "stopped": stopped, "reason": ended, **counts}
-        text = json.dumps(about | self.info, indent=2, ensure_ascii=False)
-        name = f"{self.session:04d}-{self.started.replace(':', '').replace('-', '')}.json"
+        text = json.dumps(about | self.info, indent=2, ensure_ascii=False) + "\n"
+        name = f"{place.PROVENANCE}/{self.session:04d}-{self.started.replace(':', '').replace('-', '')}.json"
         with _writing(self.folder):
-            place.write_safely(self.folder / place.PROVENANCE / name, f"{text}\n".encode())
+            self.log.write_beside(name, text.encode())
         return RunSummary(
             experiment=self.plan.experiment,
             folder=self.folder,
@@ -306,8 +304,7 @@ class _Run:
         )
 
     def cleanup(self) -> None:
-        with suppress(OSError):
-            (self.folder / place.RUNNING).unlink(missing_ok=True)
+        place.retract(self.folder)
 
 
 def preview(
@@ -406,11 +403,6 @@ def _compile_kernels(plan: Plan) -> float:
         if isinstance(cell.estimator, FrequencyEstimation):
             cell.estimator.compile(source.sampling.interval)
     return time.perf_counter() - begun
-
-
-def _write_if_new(path: Path, data: bytes) -> None:
-    if not path.exists() or path.read_bytes() != data:
-        place.write_safely(path, data)
 
 
 @contextmanager

@@ -9,11 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, PrivateAttr
+from pydantic import AfterValidator, Field, PrivateAttr
 from pydantic_core import ErrorDetails
 
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import Problem, UsageError
+from ctid_cli.files import why_unusable
 from ctid_cli.inference.monte_carlo import requested
 from ctid_cli.inference.precision import AT_LEAST, block_ends
 from ctid_cli.kinds import KINDS, resolve
@@ -22,7 +23,7 @@ from ctid_cli.simulation.dataset import MeasuredSource, located
 from ctid_cli.specification.fields import LATER, MAX_WHOLE, Positive, Text, matching
 from ctid_cli.specification.limits_section import LimitsSection
 from ctid_cli.specification.loop_section import LoopSection
-from ctid_cli.specification.messages import Complaint
+from ctid_cli.specification.messages import Complaint, wrong
 from ctid_cli.specification.option_sections import EstimatorSection, ExcitationSection, NoiseSection
 from ctid_cli.specification.sections import Options, Section, variants
 from ctid_cli.specification.signal_sections import AnySamplingSection, DisturbanceOrNone, SignalSection, TracksSection
@@ -35,9 +36,18 @@ _EXPERIMENT = matching(
     "use letters, digits, '-', '_' and '.', with '/' between parts, no '..', 200 characters at most",
 )
 _NAME = matching("[A-Za-z0-9_-]{1,60}", "a name has letters, digits, '-' and '_', at most 60 of them")
+
 _SIMULATED = ("system", "excitation", "sampling")
 #: Sections that belong to the identification of systems.
 _OF_SYSTEMS = ("system", "excitation", "loop", "noise", "recorder", "data", "starts")
+
+
+def _usable(name: str) -> str:
+    """Refuse the name of an experiment under which its results could not be found again."""
+    why = why_unusable(name)
+    if why:
+        raise wrong(f"{name!r} cannot be used here: {why}; choose another name")
+    return name
 
 
 #: A measured record in place of a simulated one.
@@ -181,7 +191,7 @@ class Spec(Section):
         Time and memory that one estimate may take; no limits by default
     """
 
-    experiment: Annotated[Text, _EXPERIMENT]
+    experiment: Annotated[Text, _EXPERIMENT, AfterValidator(_usable)]
     system: AnySystemSection | None = None
     excitation: ExcitationSection | None = None
     loop: Annotated[LoopSection | None, LATER] = None

@@ -11,12 +11,12 @@ import platform
 import re
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ctid_cli.errors import RefusedError, StorageError
+from ctid_cli.errors import DamageError, RefusedError, StorageError
 from ctid_cli.storage import journal
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import Manifest
@@ -76,6 +76,14 @@ def _is_open(folder: Path, descriptor: int) -> bool:
         return False
 
 
+def retract(folder: Path) -> None:
+    """Take back what was announced, unless another process announced it."""
+    running = who_runs(folder)
+    if running is not None and (running["pid"], running["host"]) == (os.getpid(), platform.node()):
+        with suppress(OSError):
+            (folder / RUNNING).unlink(missing_ok=True)
+
+
 def _owner(folder: Path) -> str:
     running = who_runs(folder)
     return f"process {running['pid']} on {running['host']}" if running else "another process"
@@ -101,30 +109,10 @@ def announce(folder: Path, experiment: str, started: str, done: int, total: int)
         temporary.replace(folder / RUNNING)
 
 
-def write_safely(path: Path, data: bytes) -> None:
-    """Replace a file in one go: readers, and a crash at any moment, find the old or the new content."""
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise
-    descriptor = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def check_free(folder: Path, manifest: Manifest, origins: Mapping[str, Origin], *, allow_mixed: bool) -> None:
-    """Refuse a folder whose results this run must not add to."""
+    """Refuse a folder, whose lock this process holds, if this run must not add to its results."""
     experiment = manifest["experiment"]
-    with reading_journal(folder) as log:
+    with saying_what_is_safe(folder), journal.read_journal(folder / journal.FILE_NAME) as log:
         if log is None:
             if (folder / SEALED).exists():
                 why = f"{SEALED} without the {journal.FILE_NAME} it was made from, so nothing can be added to it"
@@ -160,19 +148,60 @@ def origin_differences(one: Origin, other: Origin) -> list[tuple[str, str | None
 
 @contextmanager
 def reading_journal(folder: Path) -> Iterator[journal.Journal | None]:
-    """Read the folder's journal; if it is damaged, say what is safe."""
+    """Read the folder's journal, while a run writes to it or not; if it is damaged, say what is safe."""
+    with saying_what_is_safe(folder), ExitStack() as stack:
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            try:
+                yield stack.enter_context(_open_to_read(folder))
+                return
+            except _NotYetError:
+                # A run is just opening the journal, or closing it.
+                if time.monotonic() > deadline:
+                    raise InUseError(f"{folder} is in use by {_owner(folder)}; wait until it ends") from None
+                time.sleep(0.05)
+
+
+class _NotYetError(Exception):
+    """A journal that another process is opening or closing at this moment."""
+
+
+@contextmanager
+def _open_to_read(folder: Path) -> Iterator[journal.Journal | None]:
+    path = folder / journal.FILE_NAME
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(lock(folder, shared=True, patience=0.0))
+            live = False
+        except InUseError:
+            live = True
+        try:
+            log = stack.enter_context(journal.read_journal(path, live=live))
+        except DamageError:
+            raise
+        except StorageError as error:
+            if live:
+                raise _NotYetError from error
+            raise
+        if live and log is None:
+            raise _NotYetError
+        yield log
+
+
+@contextmanager
+def saying_what_is_safe(folder: Path) -> Iterator[None]:
+    """Add to a report of damage what is safe."""
     try:
-        with journal.read_journal(folder / journal.FILE_NAME) as log:
-            yield log
-    except StorageError as error:
-        raise StorageError(f"{error}. {what_is_safe(folder)}") from error
+        yield
+    except DamageError as error:
+        raise DamageError(f"{error}. {what_is_safe(folder)}") from error
 
 
 def what_is_safe(folder: Path) -> str:
     """A sentence about the results that can still be read although the journal cannot."""
     from ctid_cli.storage.sealed import read_sealed
 
-    advice = "Move the folder away or use --fresh to compute anew."
+    advice = "'ctid verify' says what else can be read, 'ctid repair' saves it into a new folder."
     try:
         results = read_sealed(folder / SEALED)
     except (StorageError, RefusedError):
@@ -207,7 +236,8 @@ def experiment_folders(results: Path) -> list[Path]:
     """Folders of experiments, in a results folder or anywhere below."""
     found = []
     for path, folders, files in os.walk(results):
-        folders[:] = sorted(name for name in folders if not _ASIDE.search(name) and name != PROVENANCE)
+        folders[:] = sorted(name for name in folders if not _ASIDE.search(name))
         if journal.FILE_NAME in files or SEALED in files:
+            folders[:] = [name for name in folders if name != PROVENANCE]
             found.append(Path(path))
     return sorted(found)

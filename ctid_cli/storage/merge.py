@@ -128,7 +128,7 @@ def merge(sources: Iterable[Source], target: Path, *, allow_mixed: bool = False,
             raise place.InUseError(f"{target} was changed by another process just now; run the command again")
         with _writing(target):
             for name in (place.SPEC, place.CANONICAL):
-                place.write_safely(target / name, (read[0].folder / name).read_bytes())
+                log.write_beside(name, (read[0].folder / name).read_bytes())
         log.replan(plan)
         for source in read:
             _take_over(source, {key: entry for key, (own, entry) in new.items() if own is source}, plan, log)
@@ -241,12 +241,12 @@ def _take_over(source: Source, entries: Mapping[Key, journal.Entry], plan: Manif
             if run["stopped"] is not None:
                 log.end(number, run["stopped"], run["reason"])
             with _writing(log.path.parent):
-                _copy_provenance(source.folder, run["session"], log.path.parent, number)
+                _copy_provenance(source.folder, run["session"], log, number)
 
 
-def _copy_provenance(source: Path, session: int, target: Path, number: int) -> None:
+def _copy_provenance(source: Path, session: int, log: journal.Journal, number: int) -> None:
     """Keep what is known of a run, under its new number."""
-    (target / place.PROVENANCE).mkdir(exist_ok=True)
+    (log.path.parent / place.PROVENANCE).mkdir(exist_ok=True)
     # One that was killed has left nothing but its line in the journal.
     for file in (source / place.PROVENANCE).glob(f"{session:04d}-*.json"):
         try:
@@ -255,7 +255,7 @@ def _copy_provenance(source: Path, session: int, target: Path, number: int) -> N
             raise StorageError(f"{file} cannot be read or is damaged ({error})") from error
         name = f"{number:04d}-{file.name.partition('-')[2]}"
         text = json.dumps(content, indent=2, ensure_ascii=False)
-        place.write_safely(target / place.PROVENANCE / name, f"{text}\n".encode())
+        log.write_beside(f"{place.PROVENANCE}/{name}", f"{text}\n".encode())
 
 
 @contextmanager

@@ -21,7 +21,12 @@ PUBLIC = (
 
 def now() -> str:
     """The present time in UTC, for example ``2026-11-21T04:00:00Z``."""
-    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    return as_text(datetime.now(UTC))
+
+
+def as_text(moment: datetime) -> str:
+    """A time in UTC, as it is stored."""
+    return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def session_info(spec_text: str, spec_folder: Path, origins: Mapping[str, Origin]) -> dict[str, Any]:
@@ -39,6 +44,11 @@ def session_info(spec_text: str, spec_folder: Path, origins: Mapping[str, Origin
         "spec_folder": str(spec_folder.resolve()),
         "spec": spec_text,
     }
+
+
+def canonical_text(spec: Mapping[str, Any]) -> str:
+    """A canonical specification as its file holds it."""
+    return json.dumps(spec, sort_keys=True, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def public_sessions(folder: Path) -> list[dict[str, Any]]:

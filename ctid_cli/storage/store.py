@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.errors import StorageError, UsageError
+from ctid_cli.files import write_file
 from ctid_cli.storage import columns, journal
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.folder import SEALED, TIMINGS, InUseError
@@ -28,10 +31,13 @@ from ctid_cli.storage.manifest import (
     swept_names,
     true_values,
 )
+from ctid_cli.storage.provenance import as_text
 from ctid_cli.storage.summary import is_converged
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from ctid_cli.storage.sealed import SealedRuns
 
 
 #: Columns of the table of times.
@@ -135,16 +141,13 @@ def seal(folder: Path, log: journal.Journal) -> tuple[int, str]:
     manifest, entries = log.manifest(), log.entries()
     stored = _planned(manifest, entries)
     image, checksum, count = seal_image(manifest, stored.origins, stored.results)
-    times = io.StringIO()
-    table = csv.writer(times, lineterminator="\n")
-    table.writerow(("id", "seconds", "cpu_seconds", "session"))
-    for key in stored.results:
-        table.writerow((key.id, entries[key].seconds, entries[key].cpu_seconds, entries[key].session))
+    times = _times_table({key: entries[key] for key in stored.results})
     target, safe = folder / SEALED, f"all {len(entries)} estimates are safe in {log.path}"
     try:
-        place.write_safely(folder / TIMINGS, times.getvalue().encode())
-        place.write_safely(target, image)
+        log.write_beside(TIMINGS, times)
+        write_file(target, image)
     except OSError as error:
+        log.require_in_place()
         reason = f"{target} could not be written ({error.strerror or error})"
         raise StorageError(f"{reason}; {safe}. Make room and run the same command again") from error
     if verify_sealed(target) != checksum:
@@ -156,26 +159,24 @@ def seal(folder: Path, log: journal.Journal) -> tuple[int, str]:
 def read_stored(folder: Path) -> Stored:
     """The estimates of the latest plan of an experiment."""
     with _reading(folder) as log:
-        if log is not None and (log.sealed() is None or not (folder / SEALED).exists()):
-            return _planned(log.manifest(), log.entries())
-    return _read_sealed(folder)
+        if log is None:
+            return read_sealed_alone(folder)
+        if log.sealed() is not None and (folder / SEALED).exists():
+            stored, checksum = _read_sealed_beside(folder, log)
+            # Another file, however intact, is not what this journal was sealed to.
+            if checksum == log.sealed():
+                return stored
+        return _planned(log.manifest(), log.entries())
 
 
 @contextmanager
 def _reading(folder: Path) -> Iterator[journal.Journal | None]:
-    """The journal of an experiment; None where there is only the sealed file to read, for instance during a run."""
-    sealed = (folder / SEALED).exists()
-    with ExitStack() as stack:
-        log = None
-        if (folder / journal.FILE_NAME).exists():
-            try:
-                stack.enter_context(place.lock(folder, shared=True, patience=0.2))
-                log = stack.enter_context(place.reading_journal(folder))
-            except InUseError:
-                if not sealed:
-                    raise
+    """The journal of an experiment, checked, also during a run; None where there is the sealed file only."""
+    with place.reading_journal(folder) as log:
         # There is a journal without a plan where the run was killed before it had planned anything.
-        if log is None and not sealed:
+        if log is not None:
+            log.check()
+        elif not (folder / SEALED).exists():
             raise UsageError(f"there are no results in {folder}; 'ctid run' writes them")
         yield log
 
@@ -204,28 +205,57 @@ def read_tracks(folder: Path) -> dict[str, dict[str, Any]]:
     return read_sealed_tracks(folder / SEALED) if (folder / SEALED).exists() else {}
 
 
-def _read_sealed(folder: Path) -> Stored:
+def read_sealed_alone(folder: Path) -> Stored:
+    """The estimates in the sealed file, whatever else there is."""
+    from ctid_cli.storage.sealed import read_sealed
+
+    return _with_times(read_sealed(folder / SEALED), _times_of(folder))
+
+
+def _read_sealed_beside(folder: Path, log: journal.Journal) -> tuple[Stored, str]:
+    """The sealed file of a journal, with its times if they are what was written, and its checksum."""
     from ctid_cli.storage.sealed import read_sealed
 
     try:
         runs = read_sealed(folder / SEALED)
     except StorageError as error:
-        if (folder / journal.FILE_NAME).exists():
-            advice = f"{journal.FILE_NAME} holds all estimates: 'ctid run' with the same specification seals them again"
-            raise StorageError(f"{error}; {advice}") from error
-        raise
-    times = _read_times(folder / TIMINGS)
+        advice = f"{journal.FILE_NAME} holds all estimates: 'ctid run' with the same specification seals them again"
+        raise StorageError(f"{error}; {advice}") from error
+    times, noted = _times_of(folder), log.files().get(TIMINGS)
+    if noted is not None and hashlib.sha256(times).hexdigest() not in noted:
+        entries = log.entries()
+        times = _times_table({key: entries[key] for key in runs.results})
+    return _with_times(runs, times), runs.checksum
+
+
+def _times_of(folder: Path) -> bytes:
+    # Times are extra: results without them, copied from elsewhere, are complete.
+    try:
+        return (folder / TIMINGS).read_bytes()
+    except OSError:
+        return b""
+
+
+def _with_times(runs: SealedRuns, table: bytes) -> Stored:
+    times = _read_times(table)
     columns_of_times = ({key: times.get((key.id, name)) for key in runs.results} for name in CLOCKS)
     return Stored(runs.manifest, runs.origins, runs.results, *columns_of_times)
 
 
-def _read_times(path: Path) -> dict[tuple[str, str], float]:
-    # Times are extra: results without them, copied from elsewhere, are complete.
+def _times_table(entries: Mapping[Key, journal.Entry]) -> bytes:
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(("id", *CLOCKS, "session"))
+    for key, entry in entries.items():
+        table.writerow((key.id, entry.seconds, entry.cpu_seconds, entry.session))
+    return text.getvalue().encode()
+
+
+def _read_times(table: bytes) -> dict[tuple[str, str], float]:
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-            return {(row["id"], name): float(row[name]) for row in rows for name in CLOCKS if row.get(name)}
-    except (OSError, ValueError, KeyError):
+        rows = list(csv.DictReader(io.StringIO(table.decode())))
+        return {(row["id"], name): float(row[name]) for row in rows for name in CLOCKS if row.get(name)}
+    except (ValueError, KeyError, csv.Error):
         return {}
 
 
@@ -275,9 +305,9 @@ def find_estimate(results: Path, prefix: str) -> FoundEstimate:
 
 def spec_folder(folder: Path) -> Path | None:
     """Folder of the specification that an experiment was last run with."""
-    with place.lock(folder, shared=True), place.reading_journal(folder) as log:
+    with place.reading_journal(folder) as log:
         sessions = [] if log is None else log.sessions()
-    return Path(sessions[-1]["spec_folder"]) if sessions else None
+    return next((Path(entry["spec_folder"]) for entry in reversed(sessions) if "spec_folder" in entry), None)
 
 
 def experiment_status(folder: Path) -> ExperimentStatus:
@@ -287,19 +317,32 @@ def experiment_status(folder: Path) -> ExperimentStatus:
             if log is not None:
                 statuses, manifest = log.statuses(), log.manifest()
                 left_aside = len(statuses.keys() - {slot.key for slot in slots(manifest)})
-                return _status(folder, manifest, statuses, left_aside, are_mixed(log.origins()), None)
+                running = _running(folder) if log.live else None
+                return _status(folder, manifest, statuses, left_aside, are_mixed(log.origins()), running)
     except InUseError:
-        # The first run has nothing to read yet.
-        running = place.who_runs(folder) or _SOMEONE
+        # A run that is just beginning has nothing to read yet.
+        running = _running(folder)
         name = str(running.get("experiment") or folder.name)
         return ExperimentStatus(0, 0, 0, name, folder, None, False, running, ())
-    stored = _read_sealed(folder)
+    stored = read_sealed_alone(folder)
     statuses = {key: str(result["status"]) for key, result in stored.results.items()}
-    in_use = place.who_runs(folder) or _SOMEONE if (folder / journal.FILE_NAME).exists() else None
-    return _status(folder, stored.manifest, statuses, None, stored.mixed, in_use)
+    return _status(folder, stored.manifest, statuses, None, stored.mixed, None)
 
 
-_SOMEONE = {"pid": None, "host": None}
+def _running(folder: Path) -> dict[str, Any]:
+    """Who runs, how far it is, how fast, and when it will have ended at that speed."""
+    running = place.who_runs(folder)
+    if running is None:
+        return {"pid": None, "host": None}
+    about: dict[str, Any] = {"data_sets_per_second": None, "expected_end": None}
+    with suppress(KeyError, TypeError, ValueError, OverflowError):
+        present = datetime.now(UTC)
+        elapsed = (present - datetime.fromisoformat(running["started"])).total_seconds()
+        if running["done"] > 0 and elapsed > 0:
+            speed = running["done"] / elapsed
+            left = timedelta(seconds=(running["total"] - running["done"]) / speed)
+            about = {"data_sets_per_second": speed, "expected_end": as_text(present + left)}
+    return running | about
 
 
 def _status(

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from ctid_cli.files import write_file
 from ctid_cli.reporting.results import read_results
 from ctid_cli.running.cells import Plan
 from ctid_cli.running.engine import run_experiment
@@ -72,7 +73,7 @@ def read_first(study: StudyFolder) -> Estimates:
 def write_first(study: StudyFolder, found: Estimates) -> None:
     """Commit to these estimates: one line for each, so that a change can be read."""
     lines = [f"{json.dumps(name)}: {json.dumps(found[name])}" for name in found]
-    (study.folder / FILE).write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+    write_file(study.folder / FILE, ("{\n" + ",\n".join(lines) + "\n}\n").encode())
 
 
 def differences(found: Estimates, committed: Estimates) -> list[str]:

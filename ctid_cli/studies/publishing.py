@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ctid_cli.errors import RefusedError, UsageError
+from ctid_cli.files import write_file
 from ctid_cli.reporting.layout import csv_text
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.origins import current_versions
@@ -95,7 +96,7 @@ def publish(found: StudyResults, claims: Sequence[Claim], target: Path) -> None:
         old.unlink()
     for name, content in files.items():
         (target / name).parent.mkdir(parents=True, exist_ok=True)
-        (target / name).write_bytes(content)
+        write_file(target / name, content)
 
 
 def _sessions(found: StudyResults) -> dict[str, list[dict[str, object]]]:

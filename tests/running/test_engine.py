@@ -423,8 +423,11 @@ def test_a_second_run_is_refused_and_told_who_runs(tmp_path: Path) -> None:
     status = experiment_status(place)
     assert status.running is not None
     assert status.running["pid"] == process.pid
-    with pytest.raises(RefusedError, match="in use"):
-        load_estimates(place)
+    # Others see what is stored, and more of it a little later.
+    first = len(load_estimates(place))
+    read_ids(process, 3)
+    assert first < len(load_estimates(place)) < 3000
+    assert 0 < status.done < status.planned == 3000
     os.killpg(process.pid, signal.SIGKILL)
     finish(process)
 
@@ -497,12 +500,39 @@ def test_a_full_disk_while_sealing_keeps_the_old_file(tmp_path: Path, monkeypatc
             raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(folder.os, "fsync", full)
+        patch.setattr(os, "fsync", full)
         with pytest.raises(StorageError, match="all 18 estimates are safe"):
             run(FakePlan(runs=3), tmp_path)
     assert sealed(tmp_path) == before
     assert not list(tmp_path.glob("*.tmp"))
     assert len(load_estimates(tmp_path)) == 18
+
+
+@pytest.mark.parametrize("change", ["rename", "delete", "replace"])
+def test_a_folder_that_is_gone_ends_the_run_before_anything_is_reported(tmp_path: Path, change: str) -> None:
+    place, elsewhere = tmp_path / "toys", tmp_path / "elsewhere"
+    reported: list[str] = []
+    gone: list[int] = []
+
+    def lose_it(event: events.Event) -> None:
+        if isinstance(event, events.EstimatesDone):
+            reported.extend(row["id"] for row in event.rows)
+            if len(reported) > 10 and not gone:
+                gone.append(len(reported))
+                shutil.rmtree(place) if change == "delete" else place.rename(elsewhere)
+                if change == "replace":
+                    run(FakePlan(runs=1), place)
+
+    with pytest.raises(StorageError, match="while a run wrote to it"):
+        run(FakePlan(Toy(seconds=0.02), runs=20), place, on_event=lose_it)
+    # What came with the same commit was stored before.
+    assert len(reported) < 70
+    if change == "replace":
+        assert len(load_estimates(place)) == 6
+    if change != "delete":
+        assert set(reported) <= stored_ids(elsewhere)
+    else:
+        assert not place.exists()
 
 
 def test_a_damaged_journal_is_reported_and_not_touched(tmp_path: Path) -> None:

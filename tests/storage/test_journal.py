@@ -1,19 +1,24 @@
 from __future__ import annotations
 
 import hashlib
+import random
+import shutil
 import sqlite3
+import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from ctid_cli.errors import RefusedError, StorageError
+from ctid_cli.errors import DamageError, RefusedError, StorageError
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.journal import Journal, open_journal, read_journal
 from ctid_cli.storage.manifest import Key, Outcome
+from tests.running.fakes import FakePlan
 
 ORIGIN = Origin("c0de", "a platform", (("python", "3.11.7"), ("numpy", "2.4")))
 ORIGINS = {"estimator": ORIGIN}
-MANIFEST = {"experiment": "toys", "data_cells": [], "estimators": [], "starts": {}}
+MANIFEST = FakePlan(runs=1).manifest()  # type: ignore[arg-type]
 
 
 def outcome(replicate: int, delay: float = 8.0) -> Outcome:
@@ -25,6 +30,18 @@ def filled(path: Path, count: int = 3) -> Journal:
     session = log.begin(MANIFEST, ORIGINS, "2026-11-21T04:00:00Z", {"host": "here"})
     log.add([outcome(k, 8.0 + k / 3) for k in range(count)], session)
     return log
+
+
+def before_format_4(log: Journal) -> None:
+    """Take away what older formats did not have."""
+    for table in ("meta", "origins", "sessions"):
+        log._connection.execute(f"ALTER TABLE {table} DROP COLUMN checksum")
+    for row in list(log.unchecked_rows()):
+        text = "\n".join([*map(str, row.key), row.result])
+        values = (hashlib.sha256(text.encode()).hexdigest()[:32], row.key.replicate)
+        log._connection.execute("UPDATE estimates SET checksum = ? WHERE replicate = ?", values)
+    for statement in ("DROP TABLE files", "DELETE FROM meta WHERE name = 'tally'", "PRAGMA user_version=3"):
+        log._connection.execute(statement)
 
 
 def files(folder: Path) -> dict[str, str]:
@@ -63,9 +80,72 @@ def test_what_was_added_is_read_back_exactly(tmp_path: Path) -> None:
 def test_settings_that_make_commits_durable(tmp_path: Path) -> None:
     log = filled(tmp_path / "journal.sqlite")
     pragmas = ("journal_mode", "synchronous", "locking_mode")
-    assert [log._connection.execute(f"PRAGMA {name}").fetchone()[0] for name in pragmas] == ["wal", 2, "exclusive"]
-    with pytest.raises(StorageError, match="locked"):
-        open_journal(log.path)
+    assert [log._connection.execute(f"PRAGMA {name}").fetchone()[0] for name in pragmas] == ["wal", 2, "normal"]
+    log.close()
+
+
+def test_a_file_system_without_shared_memory_gives_the_same_guarantee(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    connect = sqlite3.connect
+
+    def without(path: Path, **options: Any) -> sqlite3.Connection:
+        # SQLite's "unix-none" has no shared memory, as some network file systems.
+        return connect(f"{Path(path).as_uri()}?vfs=unix-none", uri=True, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sqlite3, "connect", without)
+        log = filled(tmp_path / "journal.sqlite")
+        pragmas = ("journal_mode", "synchronous", "locking_mode")
+        assert [log._connection.execute(f"PRAGMA {name}").fetchone()[0] for name in pragmas] == ["wal", 2, "exclusive"]
+        log.close()
+    with read_journal(tmp_path / "journal.sqlite") as read:
+        assert read is not None
+        assert len(read.entries()) == 3
+
+
+def test_others_read_while_a_run_writes_each_as_it_was_when_they_began(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "mkdtemp", None)  # nothing is copied
+    log = filled(tmp_path / "journal.sqlite")
+    before = files(tmp_path)
+    with read_journal(log.path, live=True) as early:
+        assert early is not None
+        assert len(early.statuses()) == 3
+        # The index in memory is shared with the writer, which is in the same process here.
+        assert {**files(tmp_path), "journal.sqlite-shm": ""} == {**before, "journal.sqlite-shm": ""}
+        log.add([outcome(3), outcome(4)], 1)
+        with read_journal(log.path, live=True) as late:
+            assert late is not None
+            assert (len(early.entries()), len(late.entries())) == (3, 5)
+    log.add([outcome(k) for k in range(5, 500)], 1)  # more than SQLite keeps in its log
+    assert len(log.entries()) == 500
+    log.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["journal.sqlite"]
+
+
+@pytest.mark.parametrize("change", ["rename", "delete", "replace", "other journal", "other log"])
+def test_nothing_is_acknowledged_in_a_folder_that_is_gone(tmp_path: Path, change: str) -> None:
+    place, elsewhere = tmp_path / "toys", tmp_path / "old"
+    place.mkdir()
+    log = filled(place / "journal.sqlite")
+    log.add([outcome(3)], 1)
+    match change:
+        case "rename":
+            place.rename(elsewhere)
+        case "delete":
+            shutil.rmtree(place)
+        case "replace":
+            place.rename(elsewhere)
+            shutil.copytree(elsewhere, place)
+        case _:
+            name = "journal.sqlite" if change == "other journal" else "journal.sqlite-wal"
+            (place / name).rename(place / "kept")
+            shutil.copyfile(place / "kept", place / name)
+    words = {"rename": f"renamed .* it is {elsewhere} now", "delete": "toys was deleted", "replace": f"{elsewhere} now"}
+    with pytest.raises(StorageError, match=words.get(change, "was deleted or replaced")):
+        log.add([outcome(4)], 1)
     log.close()
 
 
@@ -87,10 +167,22 @@ def test_reading_after_a_kill_finds_everything_and_changes_nothing(tmp_path: Pat
     again.close()
 
 
-def test_adding_an_estimate_twice_is_an_error_that_stores_nothing(tmp_path: Path) -> None:
+def test_an_estimate_that_is_added_again_takes_the_place_of_the_first(tmp_path: Path) -> None:
+    log = filled(tmp_path / "journal.sqlite", count=2)
+    log.add([outcome(1, 5.0), outcome(2)], 1)
+    log.close()
+    with read_journal(log.path) as read:
+        assert read is not None
+        assert [entry.result["delay"] for entry in read.entries().values()] == [8.0, 5.0, 8.0]
+
+
+def test_what_cannot_be_stored_as_a_whole_is_not_stored(tmp_path: Path) -> None:
     log = filled(tmp_path / "journal.sqlite", count=1)
+    log._connection.execute(
+        "CREATE TRIGGER full BEFORE INSERT ON estimates WHEN new.replicate = 2 BEGIN SELECT raise(FAIL, 'full'); END"
+    )
     with pytest.raises(StorageError, match="could not be written"):
-        log.add([outcome(1), outcome(0)], 1)
+        log.add([outcome(1), outcome(2)], 1)
     assert log.keys() == {outcome(0).key}
     log.close()
 
@@ -104,7 +196,7 @@ def test_the_seal_is_broken_by_new_estimates_and_by_a_new_plan(tmp_path: Path) -
     log.add([outcome(7)], 2)
     assert log.sealed() is None
     log.mark_sealed("def")
-    log.begin({**MANIFEST, "starts": {"3": 3.0}}, ORIGINS, "later", {})
+    log.begin({**MANIFEST, "runs": 7}, ORIGINS, "later", {})
     assert log.sealed() is None
     log.close()
 
@@ -120,6 +212,39 @@ def test_a_changed_estimate_is_found_by_its_checksum(tmp_path: Path) -> None:
         read.check()
         with pytest.raises(StorageError, match=f"estimate {outcome(0).key.id} has changed"):
             read.entries()
+
+
+def test_no_flipped_bit_changes_what_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "journal.sqlite"
+    log = filled(path, count=40)
+    expected = log.entries(), log.manifest(), log.sessions(), log.origins(), log.keys()
+    log.close()
+    intact, rng, found = path.read_bytes(), random.Random(4), 0
+    used = [k for k, byte in enumerate(intact) if byte]
+    for position in rng.sample(used, 250):
+        path.write_bytes(intact[:position] + bytes([intact[position] ^ 1 << rng.randrange(8)]) + intact[position + 1 :])
+        try:
+            with read_journal(path) as read:
+                assert read is not None
+                assert (read.entries(), read.manifest(), read.sessions(), read.origins(), read.keys()) == expected
+        except (StorageError, RefusedError):
+            found += 1
+    assert found > 200
+
+
+def test_an_estimate_that_is_missing_or_doubled_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "journal.sqlite"
+    log = filled(path, count=5)
+    log._connection.execute("DELETE FROM estimates WHERE replicate = 3")
+    log.close()
+    with read_journal(path) as read:
+        assert read is not None
+        read.check()
+        for reading in (read.keys, read.statuses, read.entries):
+            with pytest.raises(DamageError, match="5 estimates were written, 4 are there"):
+                reading()
+    with pytest.raises(DamageError, match="5 estimates were written, 4 are there"):
+        open_journal(path)
 
 
 def test_every_damaged_page_is_reported_as_damage(tmp_path: Path) -> None:
@@ -165,9 +290,9 @@ def test_another_programs_database_is_refused(tmp_path: Path) -> None:
 def test_a_newer_format_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "journal.sqlite"
     log = filled(path)
-    log._connection.execute("PRAGMA user_version=4")
+    log._connection.execute("PRAGMA user_version=5")
     log.close()
-    with pytest.raises(RefusedError, match="format 4; this ctid reads formats up to 3"), read_journal(path):
+    with pytest.raises(RefusedError, match="format 5; this ctid reads formats up to 4"), read_journal(path):
         pass
 
 
@@ -186,6 +311,7 @@ def test_no_journal_and_an_empty_one_are_the_same(tmp_path: Path) -> None:
 def test_a_journal_without_processor_times_is_read_and_goes_on(tmp_path: Path) -> None:
     path = tmp_path / "journal.sqlite"
     log = filled(path, count=2)
+    before_format_4(log)
     log._connection.execute("ALTER TABLE estimates DROP COLUMN cpu_seconds")
     log._connection.execute("PRAGMA user_version=2")
     log.close()

@@ -1,0 +1,69 @@
+"""Files as ctid writes them, and the names that they may have."""
+
+import itertools
+import os
+import re
+import stat
+from contextlib import suppress
+from pathlib import Path
+
+#: What else lies in the folder of an experiment; experiments lie in folders too, and must not be called like this.
+TAKEN = (
+    *("journal.sqlite", "journal.sqlite-wal", "journal.sqlite-shm", "journal.sqlite-journal", "runs.h5", "spec.yaml"),
+    *("spec.canonical.json", "timings.csv", "provenance", "running.json", "figures", "report.html"),
+)
+#: Names of devices on Windows, with any ending.
+_DEVICES = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)", re.IGNORECASE)
+_SHARD = re.compile(r"\.shard-\d+-of-\d+$")
+_TEMPORARY = ".tmp"
+_numbers = itertools.count(1)
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Replace a file in one go: readers, and a crash or a full disk at any moment, find the old or the new content."""
+    # A link stays one, and what is no file, such as /dev/stdout, is written to.
+    path = Path(os.path.realpath(path))
+    before = path.stat().st_mode if path.exists() else None
+    if before is not None and not stat.S_ISREG(before):
+        path.write_bytes(data)
+        return
+    temporary = path.with_name(f".{path.name[:40]}-{os.getpid()}-{next(_numbers)}{_TEMPORARY}")
+    try:
+        with temporary.open("xb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        if before is not None:
+            temporary.chmod(stat.S_IMODE(before))
+        temporary.replace(path)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+    descriptor = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def is_leftover(name: str) -> bool:
+    """Whether a file is what a process that was killed has left behind."""
+    return name.endswith(_TEMPORARY)
+
+
+def why_unusable(name: str) -> str | None:
+    """Why no experiment may have a name, as the end of a sentence; None if it may."""
+    for part in name.split("/"):
+        low = part.lower()
+        if low in TAKEN or is_leftover(low):
+            return f"{part!r} is the name of a file or folder that lies beside results"
+        if ".aside-" in low:
+            return "'.aside-' marks older results that --fresh has moved aside"
+        if _SHARD.search(low):
+            return f"{part!r} is how the results of a shard are called"
+        if _DEVICES.match(part):
+            return f"{part!r} is the name of a device on Windows"
+        if part.endswith("."):
+            return f"{part!r} ends with a dot, which Windows drops"
+    return None
