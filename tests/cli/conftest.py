@@ -3,6 +3,11 @@
 import pytest
 from typer.testing import CliRunner
 
+from ctid_cli.running import engine
+from ctid_cli.running.executor import Computed, Done
+from ctid_cli.running.job import run_job
+from ctid_cli.storage.manifest import Outcome
+
 TINY = """\
 experiment: tiny
 system:      {numerator: [2], denominator: [1, 2], delay: 0.35}
@@ -33,6 +38,37 @@ def record_text(samples=300):
         lines.append(f"{0.1 * k:.1f},{u:g},{x + 1.0:.9f}")
         x = 0.8187307530779818 * x + 0.18126924692201818 * u
     return "\n".join(lines) + "\n"
+
+
+class Here:
+    """An executor that computes in this process: for tests of what is computed, not of how processes are treated."""
+
+    def __init__(self, workers, limits):
+        self.messages = []
+
+    @property
+    def room(self):
+        return 0 if self.messages else 1
+
+    def submit(self, job, *, alone=False):
+        self.messages = [Computed(job, [found]) for found in run_job(job) if isinstance(found, Outcome)] + [Done(job)]
+
+    def collect(self, seconds):
+        told, self.messages = self.messages, []
+        return told
+
+    def stop(self):
+        pass
+
+    close = stop
+
+
+@pytest.fixture(scope="module")
+def without_workers():
+    """Runs compute in the process of the test."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(engine, "LokyPool", Here)
+        yield
 
 
 @pytest.fixture

@@ -42,6 +42,7 @@ def test_nothing_is_overwritten_without_force(ctid, here):
     assert (here / "modes.yaml").read_text().startswith("# A sum of submodels")
 
 
+@pytest.mark.usefixtures("without_workers")
 def test_the_templates_are_valid_and_run(ctid, here):
     ctid("init")
     files = [names[0] for _, names in TEMPLATES.values()]
@@ -51,7 +52,7 @@ def test_the_templates_are_valid_and_run(ctid, here):
     for file in files:
         # What is unwise in them is there on purpose.
         assert all("ignores_the_loop: ignores the loop" in warning for warning in load_spec(here / file).warnings)
-    ctid("run", *files, "--runs", 2, "--jobs", 1, "--quiet")
+    ctid("run", *files, "--runs", 1, "--quiet")
     for kind in TEMPLATES:
         assert ctid("table", kind).stdout.startswith(kind)
         assert '"FAILED"' not in ctid("export", kind, "--format", "json").stdout

@@ -71,7 +71,7 @@ def specifications():
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory):
+def results(tmp_path_factory, without_workers):
     """Results folder of all experiments, run once."""
     from ctid_cli.cli.main import app
 
@@ -81,7 +81,7 @@ def results(tmp_path_factory):
     for name, sections in specifications():
         files.append(folder / f"{name}.yaml")
         files[-1].write_text(json.dumps(specification(name, **sections)))
-    arguments = ["run", *map(str, files), "--jobs", "1", "--quiet", "--out", str(folder / "results")]
+    arguments = ["run", *map(str, files), "--quiet", "--out", str(folder / "results")]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     return folder / "results"
