@@ -37,7 +37,7 @@ class Mean:
             if self.mischief == "raise":
                 raise LookupError("no mean")
             if self.mischief in ("die", "always"):
-                os.kill(os.getpid(), signal.SIGKILL)
+                os.kill(os.getpid(), signal.SIGSEGV)
             if self.mischief == "nan":
                 return {"parameters": {"mean": float("nan")}}
         return {"parameters": {"mean": record.y.mean()}, "standard_errors": {"mean": 0.1}}
