@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import shlex
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from ctid_cli.running.cells import Plan
     from ctid_cli.running.engine import RunSummary
     from ctid_cli.running.events import Event, PlanReady
+    from ctid_cli.running.executor import Executor
+    from ctid_cli.running.limits import Limits
     from ctid_cli.storage.shards import Shard
 
 
@@ -123,6 +125,13 @@ def run(
         str | None,
         typer.Option("--shard", metavar="K/N", help="Only the K-th of N equal parts; ctid merge joins them."),
     ] = None,
+    backend: Annotated[
+        Literal["loky", "dask"], typer.Option("--backend", help="Processes of this machine, or workers of dask.")
+    ] = "loky",
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help="With --backend dask: tcp://host:port of yours."),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Write one JSON object per line to stdout.")] = False,
 ) -> None:
@@ -136,6 +145,8 @@ def run(
     from ctid_cli.running.stopping import StopAt
     from ctid_cli.storage.shards import Shard
 
+    if scheduler is not None and backend != "dask":
+        raise UsageError("--scheduler goes with --backend dask")
     allowed = {"allow_code": allow_code, "allow_outside": allow_outside}
     plans = [plan for _, plan in load_plans(configs, overrides or [], runs, **allowed)]
     folders = [out / plan.experiment for plan in plans]
@@ -154,7 +165,8 @@ def run(
         stop = StopAt(failures=1 if fail_fast else max_failures, seconds=left)
         with Reporter(plan.experiment) as reporter:
             tell = partial(_tell, None if quiet else reporter, as_json)
-            summary = run_experiment(plan, folder, jobs=jobs, on_event=tell, stop=stop, **how)
+            executor = None if backend == "loky" else _on_dask(plan, scheduler, jobs)
+            summary = run_experiment(plan, folder, jobs=jobs, on_event=tell, stop=stop, executor=executor, **how)
         if as_json:
             content = asdict(summary) | {"missing": summary.missing, "exit_code": summary.exit_code}
             typer.echo(json.dumps({"event": "summary", **content}, default=str))
@@ -168,6 +180,17 @@ def run(
             hopeless.append(f"{plan.experiment}: all {summary.planned} estimates failed")
     if hopeless:
         raise TooManyFailuresError("\n".join(hopeless))
+
+
+def _on_dask(plan: Plan, scheduler: str | None, jobs: int | None) -> Callable[[Limits], Executor]:
+    """What makes an executor of workers of dask."""
+    from ctid_cli.running.dask_executor import DaskExecutor
+    from ctid_cli.running.engine import usable_processors
+
+    def say(text: str) -> None:
+        typer.echo(f"{plan.experiment}: {text}", err=True)
+
+    return lambda limits: DaskExecutor(plan, limits, scheduler, jobs or usable_processors(), say)
 
 
 def _tell(reporter: Reporter | None, as_json: bool, event: Event) -> None:

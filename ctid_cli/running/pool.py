@@ -65,7 +65,7 @@ class LokyPool:
     def submit(self, job: Job, *, alone: bool = False) -> None:
         """Take a job."""
         try:
-            packed = _packed(job, self._limits)
+            content = packed(job, self._limits)
         except Exception as error:
             self._messages.append(Lost(job, "crash", _in_one_line(error)))
             return
@@ -76,7 +76,7 @@ class LokyPool:
             worker.end()
         worker.take(job, Path(self._folder.name) / str(next(self._numbers)))
         try:
-            future = worker.start(compute, str(worker.reader.path), packed)
+            future = worker.start(compute, str(worker.reader.path), content)
         except Exception as error:
             self._not_begun(worker, job, alone, _in_one_line(error))
             return
@@ -126,7 +126,7 @@ class LokyPool:
             worker.used = True
             self._messages.append(Done(job))
         else:
-            self._messages.append(Lost(job, *_cause(error), worker.keys))
+            self._messages.append(Lost(job, *cause_of(error), worker.keys))
             worker.end()
         worker.leave()
 
@@ -276,7 +276,7 @@ def in_worker(
     """What a function answers in a worker process; None if the process died of it, or took more than is allowed."""
     worker = _idle.pop() if _idle else _Worker()
     try:
-        future = worker.start(call, "", _packed(function, given))
+        future = worker.start(call, "", packed(function, given))
         begun, before = time.monotonic(), worker.usage()
         while not stopping():
             took, now = time.monotonic() - begun, worker.usage()
@@ -306,7 +306,7 @@ def _make_room(files: int) -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
-def _packed(*content: Any) -> bytes:
+def packed(*content: Any) -> bytes:
     """Content for a worker, after the code of one's own that it needs to read it."""
     from joblib.externals.loky.backend.reduction import dumps
 
@@ -318,7 +318,7 @@ def _in_one_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {first}"
 
 
-def _cause(error: BaseException) -> tuple[Cause, str]:
+def cause_of(error: BaseException) -> tuple[Cause, str]:
     """Why a job was lost."""
     if isinstance(error, BrokenExecutor):
         return _ending(error)
