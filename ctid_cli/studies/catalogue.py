@@ -2,7 +2,7 @@
 
 import importlib
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -138,11 +138,20 @@ class StudyFigure:
         """Names of the experiments whose results it shows."""
         return [self.study.experiment(short) for short in self.study.figures[self.number]]
 
+    @property
+    def caption(self) -> str:
+        """What it shows."""
+        return (self._draw.__doc__ or "").partition("\n")[0].rstrip(".")
+
+    @property
+    def _draw(self) -> Callable[..., bytes]:
+        found: Callable[..., bytes] = getattr(self.study.module("figures"), f"figure_{self.number}")
+        return found
+
     def svg(self, out: Path) -> bytes:
         """Draw it."""
         require_results([self], out)
-        draw = getattr(self.study.module("figures"), f"figure_{self.number}")
-        return bytes(draw(*(read_results(out, name) for name in self.experiments)))
+        return bytes(self._draw(*(read_results(out, name) for name in self.experiments)))
 
 
 def sorted_names(names: Sequence[str], out: Path) -> tuple[list[str], list[str]]:

@@ -72,9 +72,11 @@ def _figures(study: StudyFolder, out: Path, published: Path, *, own: bool) -> It
         file = published / "figures" / f"figure_{number}.svg"
         drawn = own and bool(needed)
         if drawn or file.is_file():
-            svg = StudyFigure(study, number).svg(out) if drawn else file.read_bytes()
-            command = f"ctid figure {study.name}/{number}"
-            yield {"svg": inline(svg, f"figure-{number}"), "caption": f"Figure {number}", "command": command}
+            figure = StudyFigure(study, number)
+            svg = figure.svg(out) if drawn else file.read_bytes()
+            caption = f"Figure {number}. {figure.caption}" if number.isdigit() else figure.caption
+            command = f"ctid figure {study.name}/{number}{out_option(out)}"
+            yield {"svg": inline(svg, f"figure-{number}"), "caption": caption, "command": command}
 
 
 def _published_origin(published: Path, study: str) -> Iterator[str]:
