@@ -94,6 +94,11 @@ def write_files(files: Mapping[Path, bytes]) -> None:
             raise StorageError(f"{error.filename or path} cannot be written: {error.strerror or error}") from error
 
 
+def printable(text: str) -> str:
+    """A message without characters that would steer a terminal: what it quotes may come from anywhere."""
+    return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
+
+
 def guarded(command: Function) -> Function:
     """Turn the exceptions of a command into one message and an exit code."""
 
@@ -103,7 +108,7 @@ def guarded(command: Function) -> Function:
             command(*args, **kwargs)
         except CtidError as error:
             # Problems of a specification begin with file:line:column, which editors turn into links.
-            typer.echo(str(error) if isinstance(error, SpecError) else f"ctid: {error}", err=True)
+            typer.echo(printable(str(error) if isinstance(error, SpecError) else f"ctid: {error}"), err=True)
             raise typer.Exit(error.exit_code) from None
         except KeyboardInterrupt:
             raise typer.Exit(INTERRUPTED) from None
@@ -129,7 +134,7 @@ def _report(error: Exception, out: Path | None) -> NoReturn:
 
 
 def _one_line(error: Exception) -> str:
-    text = " ".join(str(error).split())
+    text = printable(" ".join(str(error).split()))
     return text if len(text) <= 200 else text[:200] + "..."
 
 

@@ -26,6 +26,7 @@ from ctid_cli.cli._common import (
     Runs,
     duration,
     guarded,
+    printable,
 )
 from ctid_cli.cli._progress import Reporter, json_lines
 from ctid_cli.errors import MachineError, Problem, SpecError, TooManyFailuresError, UsageError
@@ -86,7 +87,7 @@ def load_plans(
             raise UsageError(f"{both}; run them one at a time, or give one of them another name")
         seen[plan.experiment] = config
         for warning in plan.spec.warnings:
-            typer.echo(f"warning: {warning}", err=True)
+            typer.echo(printable(f"warning: {warning}"), err=True)
     return plans
 
 
@@ -247,7 +248,7 @@ def validate(
     from ctid_cli.running.own_check import check_components
 
     for config, plan in load_plans(configs, overrides or [], allow_code=allow_code, allow_outside=allow_outside):
-        check_components(plan, warn=lambda warning: typer.echo(f"warning: {warning}", err=True))
+        check_components(plan, warn=lambda warning: typer.echo(printable(f"warning: {warning}"), err=True))
         typer.echo(f"{config}: ok, {plan.experiment}: {_workload(plan)}")
 
 

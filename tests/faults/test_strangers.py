@@ -7,7 +7,9 @@ import os
 import h5py
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from ctid_cli.cli.main import app
 from ctid_cli.errors import DataError, SpecError, StorageError, UsageError
 from ctid_cli.signals.csv_file import read_csv_table
 from ctid_cli.signals.mat_file import read_mat_table
@@ -89,6 +91,16 @@ def test_messages_repeat_little_of_a_file(inside):
     with pytest.raises(DataError, match=r"record.csv:2: column 'y' holds a text of 49 characters") as refused:
         read_measurement(inside / "record.csv")
     assert secret not in str(refused.value)
+
+
+def test_messages_do_not_steer_the_terminal(inside):
+    file = specification(inside, "none.csv")
+    file.write_text(file.read_text() + '"\\e[2J": 1\n"\\u202e": 2\n')
+    done = CliRunner().invoke(app, ["validate", str(file)])
+    assert done.exit_code == 2
+    assert "\x1b" not in done.output
+    assert "\u202e" not in done.output
+    assert "\\x1b[2J" in done.stderr
 
 
 @pytest.mark.parametrize("header", ["," * 20_000, "x" * 2_000_000, "t\0,u,y"])
