@@ -18,8 +18,8 @@ import typer
 from typer.core import TyperCommand
 
 from ctid_cli.errors import CtidError, SpecError, StorageError
-from ctid_cli.files import write_file
 from ctid_cli.signals.treatment import Hold
+from ctid_cli.written_files import write_file
 
 Function = TypeVar("Function", bound=Callable[..., None])
 

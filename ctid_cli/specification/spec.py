@@ -14,7 +14,6 @@ from pydantic_core import ErrorDetails
 
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import Problem, UsageError
-from ctid_cli.files import why_unusable
 from ctid_cli.inference.monte_carlo import requested
 from ctid_cli.inference.precision import AT_LEAST, block_ends
 from ctid_cli.kinds import KINDS, resolve
@@ -30,6 +29,7 @@ from ctid_cli.specification.signal_sections import AnySamplingSection, Disturban
 from ctid_cli.specification.start_sections import StartsSection
 from ctid_cli.specification.system_sections import AnySystemSection
 from ctid_cli.specification.yaml_source import KeyPath, YamlSource, path_text
+from ctid_cli.written_files import why_unusable
 
 _EXPERIMENT = matching(
     r"(?!.*\.\.)(?=.{1,200}\Z)[A-Za-z0-9][A-Za-z0-9._-]*(?:/[A-Za-z0-9][A-Za-z0-9._-]*)*",

@@ -24,12 +24,12 @@ from typing import Any, NamedTuple, NoReturn
 
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import DamageError, StorageError
-from ctid_cli.files import write_file
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.foreign import read_json, require_manifest
 from ctid_cli.storage.identity import Origin, gathered
 from ctid_cli.storage.manifest import Key, Manifest, Outcome, refuse_newer
 from ctid_cli.storage.whereabouts import Whereabouts
+from ctid_cli.written_files import write_file
 
 FILE_NAME = "journal.sqlite"
 #: Raised by one whenever an older ctid could misread the file.

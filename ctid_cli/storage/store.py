@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.errors import StorageError, UsageError
-from ctid_cli.files import write_file
 from ctid_cli.storage import columns, journal
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.folder import SEALED, TIMINGS, InUseError
@@ -33,6 +32,7 @@ from ctid_cli.storage.manifest import (
 )
 from ctid_cli.storage.provenance import as_text
 from ctid_cli.storage.summary import is_converged
+from ctid_cli.written_files import write_file
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Literal
 
 from ctid_cli.errors import CtidError, DamageError
-from ctid_cli.files import is_leftover
 from ctid_cli.storage import folder as place
 from ctid_cli.storage import journal
 from ctid_cli.storage.folder import CANONICAL, PROVENANCE, RUNNING, SEALED, SPEC, TIMINGS
 from ctid_cli.storage.manifest import slots
 from ctid_cli.storage.repair import salvage
 from ctid_cli.storage.sealed import read_sealed
+from ctid_cli.written_files import is_leftover
 
 State = Literal["intact", "damaged", "missing", "stale", "unchecked", "left over"]
 #: What is wrong; all else is in order, or cannot be known.

@@ -10,11 +10,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from ctid_cli.files import write_file
 from ctid_cli.reporting.results import read_results
 from ctid_cli.running.cells import Plan
 from ctid_cli.running.engine import run_experiment
 from ctid_cli.studies.catalogue import StudyFolder
+from ctid_cli.written_files import write_file
 
 #: Largest relative difference of a number.
 TOLERANCE = 1e-6

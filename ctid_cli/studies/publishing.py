@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from ctid_cli.errors import RefusedError, UsageError
-from ctid_cli.files import write_file
 from ctid_cli.reporting.layout import csv_text
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.origins import current_versions
@@ -18,6 +17,7 @@ from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.provenance import public_sessions
 from ctid_cli.studies.catalogue import StudyFigure, StudyFolder, StudyResults, last_part
 from ctid_cli.studies.claim import COLUMNS, Claim, claims_table
+from ctid_cli.written_files import write_file
 
 
 def published_folder(study: StudyFolder) -> Path:

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from ctid_cli.cli._common import guarded
 from ctid_cli.errors import StorageError
-from ctid_cli.files import TAKEN, why_unusable, write_file
 from ctid_cli.running.engine import run_experiment
+from ctid_cli.written_files import TAKEN, why_unusable, write_file
 from tests.running.fakes import FakePlan
 
 ROOT = Path(__file__).resolve().parents[2]

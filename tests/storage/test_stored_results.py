@@ -15,7 +15,7 @@ from ctid_cli.errors import RefusedError
 from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
-from ctid_cli.storage import columns
+from ctid_cli.storage import columns, manifest
 from ctid_cli.storage.journal import open_journal, read_journal
 from ctid_cli.storage.sealed import read_sealed, seal_image
 from ctid_cli.storage.store import load_estimates, read_stored, read_tracks
@@ -43,6 +43,7 @@ def out(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 def added(monkeypatch: pytest.MonkeyPatch) -> None:
     """New columns, in the middle and at the end."""
     before = list(columns.COLUMNS)
+    monkeypatch.setattr(manifest, "_row_columns", manifest._row_columns.__wrapped__)
     monkeypatch.setattr(columns, "COLUMNS", (*before[:10], *ADDED[:2], *before[10:-2], *ADDED[2:], *before[-2:]))
 
 
