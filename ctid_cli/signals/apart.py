@@ -1,5 +1,6 @@
 """Work that may crash or never end, in a process of its own: libraries in C do not survive every damaged file."""
 
+import faulthandler
 import multiprocessing
 import tempfile
 import warnings
@@ -14,10 +15,16 @@ def done_apart(work: Callable[[Path], None], patience: float) -> Iterator[Path |
     with tempfile.TemporaryDirectory(prefix="ctid-") as folder, warnings.catch_warnings():
         # The process does nothing but this, so that threads of others do not matter.
         warnings.simplefilter("ignore", DeprecationWarning)
-        process = multiprocessing.get_context("fork").Process(target=work, args=(Path(folder),))
+        process = multiprocessing.get_context("fork").Process(target=_quietly, args=(work, Path(folder)))
         process.start()
         process.join(patience)
         if process.is_alive():
             process.kill()
             process.join()
         yield Path(folder) if process.exitcode == 0 else None
+
+
+def _quietly(work: Callable[[Path], None], folder: Path) -> None:
+    # That it crashes is expected, and nothing to tell.
+    faulthandler.disable()
+    work(folder)
