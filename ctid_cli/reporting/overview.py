@@ -100,7 +100,7 @@ def _running(progress: Mapping[str, Any]) -> str:
         words.append(f"since {progress['started']}")
     if "total" in progress:
         words.append(f"{progress['done']} of {progress['total']} data sets")
-    if progress["data_sets_per_second"] is not None:
+    if progress.get("data_sets_per_second") is not None:
         words += [rate(progress["data_sets_per_second"]), f"to end about {progress['expected_end']}"]
     return ", ".join(words)
 

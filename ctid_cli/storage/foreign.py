@@ -28,7 +28,7 @@ def require_manifest(found: Any) -> Manifest:
     plan = _mapping(found, "the plan")
     name = _text(plan, "experiment")
     if not re.fullmatch(r"[\w.-]+(?:/[\w.-]+)*", name) or ".." in name or len(name) > MAX_NAME:
-        raise ValueError("the name of the experiment is none")
+        raise ValueError("its experiment has a name that none may have")
     _count(plan, "runs")
     if plan.get("seed") is not None:
         _count(plan, "seed")

@@ -141,7 +141,9 @@ def clean(monkeypatch):
     """A checkout without changes, whose code computed the results."""
     answers = {"status": "", "rev-parse": "1234abcd"}
     monkeypatch.setattr(publishing, "_git", lambda *arguments: answers[arguments[0]])
-    monkeypatch.setattr(publishing, "_present", lambda results: {"c"})
+    monkeypatch.setattr(publishing, "spec_from_canonical", lambda content: content)
+    monkeypatch.setattr(publishing, "build_plan", lambda spec: spec)
+    monkeypatch.setattr(publishing, "current_versions", lambda plan: {"c"})
     return answers
 
 
@@ -170,7 +172,7 @@ def test_changed_files_are_not_published(small, out, tmp_path, clean):
 
 
 def test_results_of_other_code_are_not_published(small, out, tmp_path, clean, monkeypatch):
-    monkeypatch.setattr(publishing, "_present", lambda results: {"d"})
+    monkeypatch.setattr(publishing, "current_versions", lambda plan: {"d"})
     with pytest.raises(RefusedError, match="was not computed by the code that is checked out"):
         publishing.publish(read_study(small, out), [], tmp_path)
 

@@ -119,7 +119,7 @@ def test_missing_samples_are_flagged(ctid, tmp_path):
         (T, signal(), ("--to", -1e308), "no sample lies"),
         (T, signal(), ("--window", 1e308), "window must be from"),
         (T, signal(), ("--rate", 1e-320), "--rate must be a positive number"),
-        (T, 1e200 * signal(), (), "another unit"),
+        (T, 1e200 * signal(), (), "give it in a unit in which it is between"),
         (T, np.where(np.random.default_rng(1).random(T.size) < 0.1, signal(), np.nan), (), "fewer gaps"),
     ],
 )

@@ -193,7 +193,7 @@ class FakePlan:
     """Same surface as the real plan: cells of several noise levels, estimators, starts, runs."""
 
     terms = None
-    manifest, runs, tasks = Plan.manifest, Plan.runs, Plan.tasks
+    manifest, runs, tasks, distinct_each = Plan.manifest, Plan.runs, Plan.tasks, Plan.distinct_each
 
     def __init__(
         self,
@@ -227,6 +227,10 @@ class FakePlan:
         }
         self.spec_hash = content_hash(content)
         self.spec = FakeSpec(content | ({"limits": limits} if limits else {}), text)
+
+    @property
+    def data_sets(self) -> int:
+        return len(self.tasks())
 
     def with_replicates(self, replicates: Sequence[int]) -> FakePlan:
         other = copy(self)
