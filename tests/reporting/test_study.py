@@ -78,7 +78,9 @@ def test_the_whole_study_is_the_default(tmp_path):
 def test_in_a_fresh_clone_the_committed_tables_stand_in(tmp_path):
     (table,) = build_tables(["3"], tmp_path, committed=True)
     assert {row["table"] for row in table.records} == {3}
-    assert all(row["n"] and row["percent"] is not None for row in table.records)
+    # The printed method was run from two of the delays only, as it takes so long.
+    ours = [row for row in table.records if row["method"] != "as_printed"]
+    assert all(row["n"] == 100 and row["percent"] is not None for row in ours)
     assert "committed results of " in table.notes[0]
     assert "not run" not in Report(table.blocks).draw()
     assert json.loads(write_reports([table], "json"))[0]["table"] == 3
