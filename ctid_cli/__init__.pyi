@@ -45,6 +45,10 @@ from .inference.finite_record import cramer_rao_bound as cramer_rao_bound
 # Results as text, as tables of pandas and as figures
 from .reporting.result_views import plot as plot, summary as summary, to_frame as to_frame
 
+# Fits as files
+from .storage.fit_file import load_fit as load_fit
+from .reporting.saved_fit import save_fit as save_fit
+
 # Experiments: what ctid run, table and export do
 from .reporting.experiment import ExperimentResults as ExperimentResults
 from .reporting.experiment import read_results as read_results, run_experiment as run_experiment

@@ -1,7 +1,6 @@
 """``ctid fit``."""
 
 import contextlib
-import json
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -45,6 +44,7 @@ def fit(
     from ctid_cli.reporting.identification_plot import identification_drawing
     from ctid_cli.reporting.identification_report import common_units, identification_object, identification_text
     from ctid_cli.signals.measurement import read_measurement
+    from ctid_cli.storage.fit_file import fit_text
 
     if poles is None:
         raise UsageError(f"--poles is missing; to see what the record allows and a first fit: ctid check {files[0]}")
@@ -71,7 +71,8 @@ def fit(
     with FitProgress(sum(item.record.n_samples for item in measurements)) as progress:
         noise: Any = ("auto",) if bootstrap is None else ("bootstrap", bootstrap, progress)
         result = identify(options, [item.record for item in measurements], validation, *noise)
-    text = json.dumps(identification_object(result, measurements, units, other), allow_nan=False)
+    content = identification_object(result, measurements, units, other)
+    text = fit_text(result, content, measurements, other, out)
     figure = identification_drawing(result, measurements, units).saved()
     write_files({out / "fit.json": text.encode() + b"\n", out / "fit.svg": figure})
     if as_json:

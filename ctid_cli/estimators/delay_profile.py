@@ -19,11 +19,13 @@ from ctid_cli.estimation.profile_search import Profile, search_delay
 from ctid_cli.estimation.robust_fit import RobustFit, robust_fit
 from ctid_cli.inference.bootstrap import Progress
 from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.loss import Weighting, weighted
+from ctid_cli.inference.later import FilledLater
+from ctid_cli.inference.loss import Loss, Weighting, weighted
 from ctid_cli.inference.robust import nearly_regular
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty, estimate_uncertainty
+from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import InitialState, LossKind, Offset
@@ -37,7 +39,7 @@ class Starts(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MeasuredFit(Fit):
+class MeasuredFit(FilledLater, Fit):
     """A fit with what belongs to the records.
 
     Parameters
@@ -96,14 +98,16 @@ class MeasuredFit(Fit):
         Whether lags counted in samples are lags in time, up to jitter.
     """
 
+    later: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used")
+
     theta: Array = field(default_factory=lambda: np.zeros(0))
     initial_states: tuple[Array, ...] = ()
     offsets: tuple[float, ...] = ()
     input_offsets: tuple[float, ...] = ()
     profile: Profile | None = None
-    residuals: tuple[Array, ...] = ()
-    sensitivities: tuple[Array, ...] = ()
-    used: tuple[BoolArray, ...] = ()
+    residuals: tuple[Array, ...] = field(default_factory=tuple)
+    sensitivities: tuple[Array, ...] = field(default_factory=tuple)
+    used: tuple[BoolArray, ...] = field(default_factory=tuple)
     starts: Starts | None = None
     poles_at_infinity: int = 0
     box: Box | None = None
@@ -265,10 +269,9 @@ def _fit(refinement: Refinement, found: Optimum, profile: Profile | None, robust
     """The result, but for its covariance."""
     measured = refinement.measured
     layout, theta = refinement.parameters(found)
-    parts = sensitivities(refinement.problem, layout, theta, found.model.delay)
-    residuals = [eps for _, eps in parts] if robust is None else robust.errors
-    weighting = None if robust is None else weighted(robust.losses, residuals, layout.size)
-    law = _linear(weighting, residuals, [psi for psi, _ in parts], measured.used())
+    samples = samples_at(refinement, found.model, theta, None if robust is None else robust.losses)
+    residuals = samples.residuals
+    law = _linear(samples.weighting, residuals, samples.sensitivities, samples.used)
     hessian = np.sum([psi.T @ psi for psi in law.sensitivities], axis=0)
     each = zip(law.sensitivities, law.residuals, strict=True)
     gradient = np.sum([psi.T @ eps for psi, eps in each], axis=0)
@@ -290,18 +293,42 @@ def _fit(refinement: Refinement, found: Optimum, profile: Profile | None, robust
         offsets=offsets,
         input_offsets=tuple(measured.input_offsets),
         profile=profile,
-        residuals=tuple(residuals),
-        sensitivities=tuple(psi for psi, _ in parts),
-        used=measured.used(),
+        residuals=residuals,
+        sensitivities=samples.sensitivities,
+        used=samples.used,
         starts=Starts(found.tried, found.agree),
         poles_at_infinity=found.poles_at_infinity,
         box=found.box,
-        weighting=weighting,
+        weighting=samples.weighting,
         held_poles=tuple(found.held_poles.tolist()),
         tangent=_tangent(layout, found),
         regular=all(nearly_regular(data.t) for data in refinement.problem.records),
         **values,
     )
+
+
+class FittedSamples(NamedTuple):
+    """What a fit says of each used sample of each record."""
+
+    residuals: tuple[Array, ...]
+    sensitivities: tuple[Array, ...]
+    used: tuple[BoolArray, ...]
+    weighting: Weighting | None
+
+
+def samples_at(
+    refinement: Refinement, model: TransferFunction, theta: Array, losses: Sequence[Loss] | None
+) -> FittedSamples:
+    """The samples of the records at an estimate, whose losses are those of squares where none are given."""
+    layout = refinement.layout_of(model.order, refinement.structure.delay)
+    psi, errors = zip(*sensitivities(refinement.problem, layout, theta, model.delay), strict=True)
+    used = refinement.measured.used()
+    if losses is None:
+        return FittedSamples(errors, psi, used, None)
+    # Outliers are bridged where sensitivities are computed; here they are what was measured.
+    each = zip(refinement.measured.outputs, refinement.problem.records, errors, strict=True)
+    errors = tuple(y - (data.y_used - eps) for y, data, eps in each)
+    return FittedSamples(errors, psi, used, weighted(losses, errors, layout.size))
 
 
 class LinearLaw(NamedTuple):

@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from ctid_cli.inference.covariance import condition_number
 from ctid_cli.inference.delay_interval import CostOfDelay, DelayInterval
 from ctid_cli.inference.derived import derived_parameters
 from ctid_cli.inference.diagnostics import fit_percent, r_squared
+from ctid_cli.inference.later import FilledLater
 from ctid_cli.inference.residuals import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertain_value import UncertainValue
@@ -37,10 +39,13 @@ DECISIVE = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class Validation:
+class Validation(FilledLater):
     """The model on a record that it was not estimated from."""
 
+    later: ClassVar[tuple[str, ...]] = ("record", "applied")
+
     name: str
+    record: Record = field(repr=False)
     applied: AppliedModel = field(repr=False)
     #: ``100 (1 - ||y - x|| / ||y - mean y||)`` [%].
     fit_percent: float
@@ -50,7 +55,7 @@ class Validation:
 
 
 @dataclass(frozen=True, eq=False)
-class Identification(ShownAsTable):
+class Identification(FilledLater, ShownAsTable):
     """A fit, its uncertainty, and its diagnostics.
 
     Parameters
@@ -83,6 +88,8 @@ class Identification(ShownAsTable):
         What it was estimated from.
     """
 
+    later: ClassVar[tuple[str, ...]] = ("records",)
+
     options: DelayProfile
     fit: MeasuredFit
     answer: AnswerTest
@@ -96,7 +103,7 @@ class Identification(ShownAsTable):
     r_t_squared: float
     warnings: tuple[str, ...]
     validation: Validation | None = None
-    records: tuple[Record, ...] = ()
+    records: tuple[Record, ...] = field(default_factory=tuple)
 
     def __repr__(self) -> str:
         return f"Identification: {self.uncertainty.kind} covariance, {len(self.warnings)} warnings\n{self.fit!r}"
@@ -148,7 +155,7 @@ def identify(
     against noise of the outputs' colour, the search over poles and delays included.
     """
     # Before the fit takes its time.
-    checked = None if validation is None else _laid_out(options, validation)
+    checked = None if validation is None else laid_out_validation(options, validation)
     prepared = options.prepare(records)
     fit = prepared.fit()
     # What the estimate is by least squares near it: pseudo-errors where the loss is another.
@@ -199,7 +206,8 @@ def identify(
     return replace(found, warnings=tuple(_warnings(found, look, hessian, _gains(options, refinement, linear))))
 
 
-def _laid_out(options: DelayProfile, validation: Record) -> Refinement:
+def laid_out_validation(options: DelayProfile, validation: Record) -> Refinement:
+    """Another record as those of the estimate are laid out."""
     try:
         return options.prepare(validation).laid_out
     except DataError as error:
@@ -333,4 +341,4 @@ def _validate(refinement: Refinement, fit: MeasuredFit, record: Record) -> Valid
     applied = refinement.errors_of(fit.model)
     y = record.y[applied.used[0]]
     simulated = y - applied.residuals[0]
-    return Validation(record.name, applied, fit_percent(y, simulated), r_squared(y, simulated), y.size)
+    return Validation(record.name, record, applied, fit_percent(y, simulated), r_squared(y, simulated), y.size)

@@ -10,11 +10,12 @@ P. J. Huber and E. M. Ronchetti, *Robust Statistics*, 2nd ed. (Wiley 2009), chap
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.inference.later import FilledLater
 from ctid_cli.inference.quantile import robust_deviation
 
 #: The losses that are not squares.
@@ -59,8 +60,10 @@ class Loss:
 
 
 @dataclass(frozen=True, eq=False)
-class Weighting:
+class Weighting(FilledLater):
     """How a loss counts the output errors of several records."""
+
+    later: ClassVar[tuple[str, ...]] = ("weights", "pseudo_errors")
 
     losses: tuple[Loss, ...]
     #: Weights of the used samples of each record, 0 to 1 [-].

@@ -119,7 +119,7 @@ def plot(result: Identification | FrequencyTrack | ExperimentResults, kind: str 
     """
     if isinstance(result, Identification):
         require_kind(kind, get_args(identification_plot.Kind))
-        measured = [Measurement(record, None, None, None, "t", "u", "y") for record in result.records]
+        measured = [Measurement.of(record) for record in result.records]
         shown: Any = kind
         return identification_plot.identification_drawing(result, measured, Units(), shown).picture()
     if isinstance(result, FrequencyTrack):

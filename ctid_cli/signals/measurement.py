@@ -48,6 +48,13 @@ class Measurement:
     start: float | None = None
     stop: float | None = None
     notes: tuple[str, ...] = ()
+    #: Its file; None for a record that comes from none.
+    path: Path | None = None
+
+    @classmethod
+    def of(cls, record: Record) -> "Measurement":
+        """A record of which nothing else is known."""
+        return cls(record, None, None, None, "t", "u", "y")
 
 
 def read_measurement(
@@ -89,7 +96,9 @@ def read_measurement(
     y = table.check_output(columns["output"], y[first:last], first)
     record = Record(t, y, HeldSignal(t, u, hold), name=table.file)
     named = (columns["time"], columns["input"], columns["output"])
-    return Measurement(record, unit["time"], unit["input"], unit["output"], *named, start, stop, tuple(notes))
+    return Measurement(
+        record, unit["time"], unit["input"], unit["output"], *named, start, stop, tuple(notes), Path(path)
+    )
 
 
 def read_table(path: str | os.PathLike[str], otherwise: str) -> Table:

@@ -69,7 +69,7 @@ def test_json_is_what_is_written(ctid, record, tmp_path):
     content = json.loads(done.stdout)
     assert keys <= content.keys()
     assert {"name", "estimate", "standard_error", "low", "high", "unit", "status"} <= content["parameters"][0].keys()
-    again = ctid("fit", record, "--poles", 2, "--delay", "0:3", "--json", "--out", tmp_path / "again")
+    again = ctid("fit", record, "--poles", 2, "--delay", "0:3", "--json", "--out", tmp_path)
     assert again.stdout == done.stdout
 
 

@@ -1,0 +1,278 @@
+"""``fit.json``: a fit without loss, where its records lie, and how it is read again.
+
+The file has the numbers that people and programs read, as ``ctid fit --json`` prints them; beside them ``result``, the
+fit as it is in Python. What belongs to single samples is left out: it is computed from the records when it is asked
+for.
+"""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NoReturn
+
+import ctid_cli
+from ctid_cli.canonical import content_hash
+from ctid_cli.errors import DataError, UsageError
+from ctid_cli.estimators.delay_profile import samples_at
+from ctid_cli.estimators.identification import Identification, laid_out_validation
+from ctid_cli.inference.loss import Weighting
+from ctid_cli.signals.files import require_file
+from ctid_cli.signals.measurement import Measurement, read_measurement
+from ctid_cli.signals.record import Record
+from ctid_cli.simulation.dataset import file_sha256
+from ctid_cli.storage.exact import decoded, encoded
+
+KIND, FORMAT = "ctid fit", 1
+#: Bytes of the largest file that is read; ten thousand draws of a bootstrap need less.
+MAX_BYTES = 200_000_000
+#: A path, as the caller gives it.
+AnyPath = str | os.PathLike[str]
+
+
+# --- writing ---------------------------------------------------------------------------------------
+
+
+def fit_text(
+    result: Identification,
+    content: Mapping[str, Any],
+    measurements: Sequence[Measurement],
+    validation: Measurement | None,
+    folder: Path,
+) -> str:
+    """The file's text: what is said of a fit, the fit itself, and its records, seen from the folder that it lies in."""
+    whole = {"kind": KIND, "format": FORMAT, "ctid": ctid_cli.__version__, **content}
+    whole["records"] = [
+        {**said, **_source(item, folder)} for said, item in zip(content["records"], measurements, strict=True)
+    ]
+    if validation is not None:
+        whole["validation"] = {**content["validation"], **_source(validation, folder)}
+    whole["result"] = encoded(result)
+    whole["checksum"] = content_hash(json.loads(json.dumps(whole, allow_nan=False)))
+    return json.dumps(whole, allow_nan=False)
+
+
+def _source(measurement: Measurement, folder: Path) -> dict[str, Any]:
+    """Where a record lies and how it was read; of one that is no file its samples."""
+    if measurement.path is None:
+        return {"path": None, "series": encoded(measurement.record)}
+    path, home = Path(os.path.abspath(measurement.path)), Path(os.path.abspath(folder))
+    below = path.is_relative_to(home)
+    return {
+        "path": path.relative_to(home).as_posix() if below else str(path),
+        "sha256": file_sha256(str(path)),
+        "columns": {"time": measurement.time, "input": measurement.input, "output": measurement.output},
+        "hold": measurement.record.input.hold,
+        "from": measurement.start,
+        "to": measurement.stop,
+    }
+
+
+# --- reading ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RecordSource:
+    """A record as ``fit.json`` names it."""
+
+    #: The file that names it, and the record's own as it was called then.
+    owner: str
+    name: str
+    content: Mapping[str, Any]
+    #: Where it is now, if it moved.
+    moved: str | None = None
+
+    @property
+    def place(self) -> str:
+        """Where the record is looked for."""
+        return self.moved or str(Path(os.path.abspath(self.owner)).parent / str(self.content["path"]))
+
+    def read(self) -> Measurement:
+        """The record, as it was read for the fit."""
+        content = self.content
+        if content["path"] is None:
+            record = decoded(content["series"], Record, "series")
+            return Measurement.of(record)
+        self.require_same()
+        columns = {role: content["columns"][role] for role in ("time", "input", "output")}
+        window = {"start": content["from"], "stop": content["to"]}
+        found = read_measurement(self.place, **columns, hold=content["hold"], **window)
+        return replace(found, record=replace(found.record, name=self.name))
+
+    def require_same(self) -> None:
+        """Refuse another file than the fit is of."""
+        if self.moved is None and not Path(self.place).exists():
+            cure = "say where it is now: --record FILE"
+            raise DataError(f"{self.owner}: its record {self.place} does not exist; {cure}")
+        if file_sha256(self.place) != self.content["sha256"]:
+            what = f"{self.place} is not the file that the fit is of (its SHA-256 is another)"
+            raise DataError(f"{self.owner}: {what}; name that one with --record FILE, or fit again")
+
+
+@dataclass(frozen=True, eq=False)
+class StoredFit:
+    """A ``fit.json``, with the records that it names."""
+
+    path: Path
+    #: What the file says, as in the documentation of machine-readable output.
+    content: Mapping[str, Any]
+    result: Identification
+    sources: tuple[RecordSource, ...]
+    validation_source: RecordSource | None
+
+    @cached_property
+    def measurements(self) -> tuple[Measurement, ...]:
+        """The records that the fit was estimated from."""
+        return tuple(source.read() for source in self.sources)
+
+    @cached_property
+    def validation(self) -> Measurement | None:
+        """The record that it was judged on."""
+        return None if self.validation_source is None else self.validation_source.read()
+
+    # What is filled in later: methods, since these can be pickled with what they belong to.
+
+    def _records(self) -> dict[str, Any]:
+        return {"records": tuple(item.record for item in self.measurements)}
+
+    def _samples(self) -> dict[str, Any]:
+        fit = self.result.fit
+        refinement = self.result.options.prepare(self.result.records).laid_out
+        losses = None if fit.weighting is None else fit.weighting.losses
+        return samples_at(refinement, fit.model, fit.theta, losses)._asdict()
+
+    def _weights(self) -> dict[str, Any]:
+        weighting = self._samples()["weighting"]
+        return {name: getattr(weighting, name) for name in Weighting.later}
+
+    def _applied(self) -> dict[str, Any]:
+        assert self.validation is not None
+        refinement = laid_out_validation(self.result.options, self.validation.record)
+        return {"record": self.validation.record, "applied": refinement.errors_of(self.result.fit.model)}
+
+
+def load_fit(
+    path: AnyPath, record: AnyPath | Sequence[AnyPath] | None = None, validation: AnyPath | None = None
+) -> Identification:
+    """Read a fit that ``ctid fit`` or :func:`~ctid_cli.reporting.saved_fit.save_fit` wrote.
+
+    Parameters
+    ----------
+    path : path
+        The file, such as ``fit.json``.
+    record : path or sequence of path, optional
+        Where the records of the fit are now, in their order, if they moved.
+    validation : path, optional
+        The same of the validation record.
+
+    Returns
+    -------
+    Identification
+        What :func:`~ctid_cli.estimators.identification.identify` returned, equal in all numbers. Residuals,
+        sensitivities and records are read and computed anew when they are first asked for.
+
+    Raises
+    ------
+    DataError
+        If the file is damaged, of a newer ctid, or no fit; or, where the records are needed, if they are not there or
+        are not those of the fit.
+
+    Examples
+    --------
+    >>> import numpy as np, tempfile
+    >>> from ctid_cli import DelayProfile, Record, identify, load_fit, save_fit
+    >>> t = 0.1 * np.arange(200)
+    >>> record = Record.from_arrays(t, np.sign(np.sin(t)), np.sin(t) + 0.1 * np.cos(9 * t))
+    >>> fit = identify(DelayProfile(poles=1, zeros=0, delay_bounds=(0, 2)), [record])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     save_fit(fit, f"{folder}/fit.json")
+    ...     again = load_fit(f"{folder}/fit.json")
+    >>> again.fit.theta.tolist() == fit.fit.theta.tolist()
+    True
+    """
+    return read_fit(path, record, validation).result
+
+
+def read_fit(
+    path: AnyPath, record: AnyPath | Sequence[AnyPath] | None = None, validation: AnyPath | None = None
+) -> StoredFit:
+    """The file with everything in it; :func:`load_fit` says the rest."""
+    file = os.fspath(path)
+    content = _content(file)
+    moved = [] if record is None else [record] if isinstance(record, str | os.PathLike) else list(record)
+    try:
+        result = decoded(content["result"], Identification)
+        listed = content["records"]
+        if moved and len(moved) != len(listed):
+            raise UsageError(f"{file} is of {len(listed)} records; --record names {len(moved)}")
+        places: list[str | None] = [os.fspath(each) for each in moved]
+        places = places or [None] * len(listed)
+        sources = tuple(
+            RecordSource(file, str(each["file"]), each, place) for each, place in zip(listed, places, strict=True)
+        )
+        judged = content["validation"]
+        other = judged and RecordSource(
+            file, str(judged["file"]), judged, None if validation is None else os.fspath(validation)
+        )
+    except (KeyError, TypeError, IndexError, AttributeError, ValueError, DataError, OverflowError) as error:
+        _refuse(file, f"is damaged ({str(error)[:200]})")
+    if validation is not None and other is None:
+        raise UsageError(f"{file} has no validation record, so that none can be elsewhere")
+    for source in (*sources, *([other] if other else [])):
+        if source.moved is not None:
+            source.require_same()
+    stored = StoredFit(Path(file), content, result, sources, other)
+    result.leave_out(stored._records)
+    result.fit.leave_out(stored._samples)
+    if result.fit.weighting is not None:
+        result.fit.weighting.leave_out(stored._weights)
+    if result.validation is not None:
+        result.validation.leave_out(stored._applied)
+    return stored
+
+
+def is_fit(path: Path) -> bool:
+    """Whether a name is meant as that of a fit rather than of an experiment."""
+    return path.suffix.lower() == ".json" or path.is_file()
+
+
+def _content(file: str) -> dict[str, Any]:
+    """What the file says, if it is a fit as it was written."""
+    require_file(file)
+    if (size := os.stat(file).st_size) > MAX_BYTES:
+        raise DataError(f"{file}: {size} bytes are too many for a fit; at most {MAX_BYTES} are read")
+    try:
+        content = json.loads(Path(file).read_text(encoding="utf-8"), parse_constant=_no_constant)
+    except OSError as error:
+        raise DataError(f"{file}: the file cannot be read: {error.strerror or error}") from None
+    except (ValueError, RecursionError) as error:
+        _refuse(file, f"is no JSON, or damaged ({str(error)[:200]})")
+    if not isinstance(content, dict) or content.get("kind") != KIND:
+        _refuse(file, _what_else(content))
+    if not isinstance(content.get("format"), int) or content["format"] > FORMAT:
+        written = f"was written by a newer ctid ({str(content.get('ctid'))[:20]}): its format is "
+        _refuse(file, f"{written}{str(content.get('format'))[:20]}, and this one reads up to {FORMAT}")
+    if content.pop("checksum", None) != content_hash(content):
+        _refuse(file, "is damaged, or was changed after it was written: its checksum is that of other content")
+    return content
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no JSON number")
+
+
+def _what_else(content: Any) -> str:
+    """What a file is that is no fit."""
+    if not isinstance(content, dict):
+        return "is no fit"
+    if isinstance(content.get("kind"), str):
+        return f"is no fit but of kind {content['kind'][:40]!r}"
+    if "parameters" in content and "residual_tests" in content:
+        return "is a fit of an older ctid, which cannot be read back"
+    return "is another kind of result than a fit"
+
+
+def _refuse(file: str, what: str) -> NoReturn:
+    raise DataError(f"{file} {what}; ctid fit writes such a file")
