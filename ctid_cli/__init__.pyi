@@ -40,6 +40,8 @@ from .estimators.delay_profile import MeasuredFit as MeasuredFit
 from .estimators.useful_redundancy import RedundantFit as RedundantFit
 from .inference.status import Status as Status
 from .inference.diagnostics import fit_percent as fit_percent
+from .inference.frequency_response import FrequencyResponse as FrequencyResponse
+from .inference.frequency_response import estimate_frequency_response as estimate_frequency_response
 from .inference.finite_record import cramer_rao_bound as cramer_rao_bound
 
 # Results as text, as tables of pandas and as figures

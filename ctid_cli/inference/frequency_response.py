@@ -1,0 +1,384 @@
+"""The frequency response that a record shows without any model, and how far it can be trusted."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.errors import DataError
+from ctid_cli.filtering.spectra import record_spectra
+from ctid_cli.inference.answer import analyse_answer
+from ctid_cli.inference.input_moves import input_moves
+from ctid_cli.inference.local_polynomial import local_polynomial
+from ctid_cli.inference.periodic_response import find_period, from_periods
+from ctid_cli.inference.response_lines import ResponseLines, hold_factor, images
+from ctid_cli.inference.welch_response import welch
+from ctid_cli.signals.checks import require_choice, require_integer
+from ctid_cli.signals.record import REGULARITY, Record
+
+ResponseMethod = Literal["auto", "periodic", "local-polynomial", "welch"]
+
+#: Up to this share of missing outputs is bridged by straight lines.
+MOST_MISSING = 0.05
+#: A change of the input belongs to a sample that is no further away than this fraction of the interval.
+ON_GRID = 1e-5
+#: The images of a hold are worth a word where they may exceed this share of the response.
+IMAGES_MATTER = 0.05
+#: Places at which a response is estimated, unless another number is asked for.
+POINTS = 400
+#: Fewer frequencies than these are no response over frequency.
+FEWEST = 3
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyResponse:
+    """A frequency response estimated without a model.
+
+    Parameters
+    ----------
+    frequencies : ndarray, shape (K,)
+        Frequencies [rad/s], rising.
+    response : ndarray, shape (K,)
+        Complex response ``G(jw)`` [output unit/input unit], with what the hold does to the input taken out.
+    variance : ndarray, shape (K,)
+        Variance ``E |error|^2`` of the response by the noise [(output unit/input unit)^2]; of several realisations by
+        noise and nonlinear distortions.
+    freedom : ndarray, shape (K,)
+        Degrees of freedom of the complex residuals that the variance is from [-].
+    coherence : ndarray, shape (K,)
+        Share of the output's power at that frequency that follows the input linearly [-].
+    distortion : ndarray or None, shape (K,)
+        Variance that nonlinear distortions give the response to one realisation of the input [(output unit/input
+        unit)^2]; None where the record does not tell.
+    bias : ndarray, shape (K,)
+        Bound of what the images of a sampled input add [output unit/input unit], for a gain that falls like 1/w or
+        faster beyond the highest frequencies.
+    method : {"periodic", "local-polynomial", "welch"}
+        How it was estimated.
+    hold : {"zoh", "foh", "band-limited"}
+        What the input was taken to do between its samples.
+    notes : tuple of str
+        What was chosen, and what to know before believing the numbers.
+    """
+
+    frequencies: Array
+    response: ComplexArray
+    variance: Array
+    freedom: Array
+    coherence: Array
+    distortion: Array | None
+    bias: Array
+    method: Literal["periodic", "local-polynomial", "welch"]
+    hold: str
+    notes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        low, high = self.frequencies[[0, -1]]
+        return f"FrequencyResponse({self.frequencies.size} frequencies from {low:g} to {high:g} rad/s, {self.method})"
+
+    @property
+    def standard_error(self) -> Array:
+        """Square root of the variance [output unit/input unit]."""
+        return np.asarray(np.sqrt(self.variance))
+
+    def radius(self, level: float = 0.95) -> Array:
+        """Radius of the circles in the complex plane that hold the true values, each with that probability.
+
+        Parameters
+        ----------
+        level : float, default 0.95
+            Probability [-].
+
+        Returns
+        -------
+        ndarray, shape (K,)
+            Radii [output unit/input unit]: with d degrees of freedom ``|error|^2`` over its variance has the
+            F-distribution of 2 and 2 d degrees of freedom.
+        """
+        return np.asarray(np.sqrt(self.variance * self.freedom * ((1.0 - level) ** (-1.0 / self.freedom) - 1.0)))
+
+    def gain_band(self, level: float = 0.95) -> tuple[Array, Array]:
+        """Pointwise interval of the gain; its lower end is zero where the noise exceeds the response.
+
+        Parameters
+        ----------
+        level : float, default 0.95
+            Probability [-].
+
+        Returns
+        -------
+        low, high : ndarray, shape (K,)
+            Ends [output unit/input unit].
+        """
+        half = self._half_width(level)
+        return np.maximum(np.abs(self.response) - half, 0.0), np.abs(self.response) + half
+
+    def phase_band(self, level: float = 0.95) -> Array:
+        """Half the width of the pointwise interval of the phase.
+
+        Parameters
+        ----------
+        level : float, default 0.95
+            Probability [-].
+
+        Returns
+        -------
+        ndarray, shape (K,)
+            Half-widths [rad]; pi where the noise exceeds the response.
+        """
+        gain, half = np.abs(self.response), self._half_width(level)
+        return np.where(half < gain, np.arcsin(np.minimum(half / np.maximum(gain, 1e-300), 1.0)), np.pi)
+
+    def _half_width(self, level: float) -> Array:
+        """Half the width of an interval of one part of the response."""
+        from scipy.special import stdtrit
+
+        quantile = stdtrit(2 * self.freedom, 0.5 + level / 2)
+        return np.asarray(quantile * np.sqrt(0.5 * self.variance))
+
+
+def estimate_frequency_response(
+    records: Record | Sequence[Record],
+    *,
+    method: ResponseMethod = "auto",
+    period: int | None = None,
+    half_width: int | None = None,
+    segment: int | None = None,
+    points: int = POINTS,
+) -> FrequencyResponse:
+    r"""Frequency response of what lies between input and output, without a model.
+
+    Parameters
+    ----------
+    records : Record or sequence of Record
+        A record; or several of one periodic experiment, each with another realisation of the input.
+    method : {"auto", "periodic", "local-polynomial", "welch"}, default "auto"
+        "periodic" from whole periods of a steady state, which "auto" takes where the input repeats itself;
+        "local-polynomial" from any other record; "welch" by averages over segments, which "auto" takes where the input
+        excites too few lines for the local polynomial.
+    period : int, optional
+        Period of the input [samples]; by default the first after which it repeats itself.
+    half_width : int, optional
+        Half-width of the local polynomial, 4 or more [lines of the record's own spectrum]; by default chosen for each
+        frequency where the lines around it are best foretold by their neighbours.
+    segment : int, optional
+        Length of Welch's segments [samples]; by default an eighth of the record.
+    points : int, default 400
+        Frequencies at which a local polynomial estimates the response, at most [-].
+
+    Returns
+    -------
+    FrequencyResponse
+        Response, variance, coherence, level of nonlinear distortions.
+
+    Raises
+    ------
+    DataError
+        If the record is too short, its input excites nothing, or its clock is irregular and the method is not by local
+        polynomials.
+    ValueError
+        If an option cannot be.
+
+    Notes
+    -----
+    Spectra of samples add up the true spectra of all frequencies that look alike. What a hold does to the frequency
+    itself is taken out; its images stay, ``sum_m G(j(w + m w_s)) H(w + m w_s)/H(w)`` with m ≠ 0, and are bounded in
+    ``bias``. Without a hold (band-limited signals) there are none.
+
+    The estimate by local polynomials has a variance from their residuals, which also hold what the polynomials cannot
+    follow. Neighbouring estimates share lines. On an irregular clock, with an input that moves between the samples, or
+    with many samples missing, it takes the exact spectrum of the held input and that of straight lines through the
+    output; what these miss is noise-like and in the variance.
+
+    References
+    ----------
+    R. Pintelon and J. Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed., Wiley, 2012,
+    doi:10.1002/9781118287422.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli import Record, TransferFunction, simulate
+    >>> t = 0.1 * np.arange(4000)
+    >>> u = np.random.default_rng(0).standard_normal(t.size)
+    >>> record = Record.from_arrays(t, u, np.zeros(t.size))
+    >>> y = simulate(TransferFunction([2.0], [1.0, 1.0]), record.input, t)
+    >>> found = estimate_frequency_response(Record(t, y, record.input))
+    >>> float(abs(np.interp(1.0, found.frequencies, abs(found.response)) - 2 / np.sqrt(2)).round(2))
+    0.0
+    """
+    require_choice("method", method, get_args(ResponseMethod))
+    for name, value, least in (("period", period, 2), ("half_width", half_width, 4), ("points", points, FEWEST)):
+        if value is not None:
+            require_integer(name, value, least)
+    every = [records] if isinstance(records, Record) else list(records)
+    if not every:
+        raise DataError("there is no record to estimate a frequency response from")
+    for record in every:
+        if input_moves(record).kind == "constant":
+            raise DataError(f"{_named(record)}the input is constant: it excites no frequency")
+    first, hold = every[0], every[0].input.hold
+    odd = next((sentence for record in every if (sentence := _not_on_one_clock(record))), None)
+    if odd is not None:
+        return _on_any_clock(every, odd, method, points, half_width)
+    signals = [(record.input.at(record.t), record.bridged_y) for record in every]
+    interval = float(first.interval or 0.0)
+    if method in ("auto", "periodic"):
+        period = period or _common_period([u for u, _ in signals])
+    if method == "periodic" and period is None:
+        raise DataError("the input does not repeat itself; give its period in samples, or take another method")
+    if len(every) > 1:
+        _require_alike(every, period)
+    if period is not None and method in ("auto", "periodic"):
+        return _finished(from_periods(signals, period, interval), "periodic", hold, interval, first)
+    u, y = signals[0]
+    if method != "welch":
+        lines = _by_polynomials(first, u, y, points, half_width)
+        if lines.frequencies.size >= FEWEST or method == "local-polynomial":
+            return _finished(lines, "local-polynomial", hold, interval, first)
+    return _finished(welch(u, y, interval, segment), "welch", hold, interval, first)
+
+
+def _by_polynomials(record: Record, u: Array, y: Array, points: int, half_width: int | None) -> ResponseLines:
+    """Local polynomials, with the output advanced to where it begins to answer: a long delay turns the phase fast."""
+    interval = float(record.interval or 0.0)
+    shift = min(int(_begins(record) / interval), u.size // 2)
+    u, y = u[: u.size - shift], y[shift:]
+    inputs, outputs = (np.fft.rfft(x - x.mean())[1 : (x.size + 1) // 2] / x.size for x in (u, y))
+    found = local_polynomial(inputs, outputs, 2 * np.pi / (u.size * interval), points, half_width)
+    return _later(found, shift * interval)
+
+
+def _on_any_clock(
+    records: list[Record], reason: str, method: ResponseMethod, points: int, half_width: int | None
+) -> FrequencyResponse:
+    """The same from the exact spectrum of the held input and from straight lines between the samples of the output."""
+    (record, *more) = records
+    if method not in ("auto", "local-polynomial") or more:
+        wanted = "several records are taken as realisations" if more else f"--method {method}"
+        raise DataError(
+            f"{_named(record)}{wanted} on one regular clock, but {reason}; use --method local-polynomial, one record "
+            "at a time"
+        )
+    late = min(_begins(record), 0.5 * record.duration)
+    spectra = record_spectra(record, late, np.inf, late, keep_mean=False)
+    base = 2 * np.pi / spectra.duration
+    found = _later(local_polynomial(spectra.inputs(late), spectra.outputs, base, points, half_width), late)
+    note = (
+        f"Since {reason}, the spectrum of the output is that of straight lines between its samples, corrected for what "
+        f"they damp; towards {np.pi / float(np.median(np.diff(record.t))):.3g} rad/s that is rough."
+    )
+    notes = (*found.notes, note, *_of_record(record))
+    bias = np.zeros(found.frequencies.size)
+    _require_some(found, record)
+    return FrequencyResponse(*found[:6], bias, "local-polynomial", record.input.hold, notes)
+
+
+def _begins(record: Record) -> float:
+    """Time before which the output does not answer [s]."""
+    hint = analyse_answer(record).delay
+    return hint.early if hint is not None else 0.0
+
+
+def _later(lines: ResponseLines, delay: float) -> ResponseLines:
+    return lines._replace(response=lines.response * np.exp(-1j * lines.frequencies * delay))
+
+
+def _require_some(lines: ResponseLines, record: Record) -> None:
+    if lines.frequencies.size < FEWEST:
+        raise DataError(
+            f"{_named(record)}the input excites too few frequencies for a response over frequency; record an input that"
+            " switches often, a multisine or a chirp"
+        )
+
+
+def _finished(
+    lines: ResponseLines,
+    method: Literal["periodic", "local-polynomial", "welch"],
+    hold: str,
+    interval: float,
+    record: Record,
+) -> FrequencyResponse:
+    """The response to the input as it was between its samples."""
+    _require_some(lines, record)
+    factor = hold_factor(hold, lines.frequencies, interval)
+    power = np.abs(factor) ** 2
+    response, variance = lines.response / factor, lines.variance / power
+    bias = images(hold, lines.frequencies, response, variance, interval)
+    notes = [*lines.notes, _of_hold(hold, lines.frequencies, bias, np.abs(response)), *_of_record(record)]
+    distortion = None if lines.distortion is None else lines.distortion / power
+    return FrequencyResponse(
+        lines.frequencies,
+        response,
+        variance,
+        lines.freedom,
+        lines.coherence,
+        distortion,
+        bias,
+        method,
+        hold,
+        tuple(notes),
+    )
+
+
+def _of_hold(hold: str, frequencies: Array, bias: Array, gain: Array) -> str:
+    """What the hold means for the estimate."""
+    if hold == "band-limited":
+        return (
+            "Input and output are taken to have no power above half the sampling frequency (--hold band-limited): then "
+            "nothing between the samples biases the estimate."
+        )
+    shape = "constant" if hold == "zoh" else "straight lines"
+    text = f"The input is taken as {shape} between its samples (--hold {hold}); what that does to it is divided out."
+    # From where on nearly all frequencies are concerned: noise makes some gains small.
+    large = bias > IMAGES_MATTER * gain
+    onward = np.cumsum(large[::-1])[::-1] >= 0.8 * np.arange(large.size, 0, -1)
+    if (large & onward).any():
+        where = f"from {frequencies[np.argmax(large & onward)]:.3g} rad/s on"
+        text += f" Its images may bias the estimate by more than {100 * IMAGES_MATTER:g} % {where}."
+    return text + " With another hold the phase differs by up to half a sampling interval of delay." * (hold == "zoh")
+
+
+def _of_record(record: Record) -> list[str]:
+    missing = int(np.count_nonzero(~record.valid))
+    if not missing:
+        return []
+    return [f"{missing} missing output samples are bridged by straight lines."]
+
+
+def _not_on_one_clock(record: Record) -> str | None:
+    """Why samples of input and output do not tell all that was recorded."""
+    signal = record.input
+    if record.interval is None:
+        return "the clock is irregular"
+    if record.valid.mean() < 1.0 - MOST_MISSING:
+        return f"{100 * (1 - record.valid.mean()):.3g} % of the output samples are missing"
+    inside = signal.t[(signal.t > record.t[0]) & (signal.t <= record.t[-1])]
+    places = (inside - record.t[0]) / record.interval
+    moves = bool(np.abs(places - np.round(places)).max(initial=0.0) > ON_GRID)
+    return "the input moves between the instants of the output" if moves else None
+
+
+def _common_period(inputs: list[Array]) -> int | None:
+    found = {find_period(u) for u in inputs}
+    return found.pop() if len(found) == 1 else None
+
+
+def _require_alike(records: list[Record], period: int | None) -> None:
+    """Refuse records that are no realisations of one periodic experiment."""
+    first = records[0]
+    if period is None:
+        raise DataError(
+            f"{len(records)} records are taken as realisations of one periodic input, and they do not all repeat "
+            "themselves after the same number of samples; give the period in samples, or one record at a time"
+        )
+    for record in records[1:]:
+        same = abs((record.interval or 0.0) - (first.interval or 0.0)) <= REGULARITY * (first.interval or 0.0)
+        if not same or record.input.hold != first.input.hold:
+            raise DataError(f"{_named(record)}its clock or hold is not that of {first.name or 'the first record'}")
+
+
+def _named(record: Record) -> str:
+    return f"{record.name}: " if record.name else ""

@@ -1,0 +1,213 @@
+"""Frequency responses without a model, against the exact response of known systems."""
+
+import numpy as np
+import pytest
+
+from ctid_cli import DataError, HeldSignal, Record, TransferFunction, simulate
+from ctid_cli.inference.frequency_response import FrequencyResponse, estimate_frequency_response
+from ctid_cli.inference.periodic_response import find_period
+from ctid_cli.inference.response_lines import hold_factor
+
+INTERVAL, PERIOD = 0.1, 256
+MODEL = TransferFunction([2.0, 1.0], [1.0, 1.0, 3.0], delay=0.37)
+ODD = np.arange(1, 100, 2)
+
+
+def multisine(seed: int, harmonics: np.ndarray = ODD) -> np.ndarray:
+    phases = np.random.default_rng(seed).uniform(0, 2 * np.pi, harmonics.size)
+    return np.cos(2 * np.pi * np.outer(np.arange(PERIOD), harmonics) / PERIOD + phases).sum(axis=1)
+
+
+def periodic_record(once, periods, settling=40, noise=0.0, square=0.0, cube=0.0, seed=0, model=MODEL):
+    u = np.tile(once, periods + settling)
+    t = INTERVAL * np.arange(u.size)
+    x = simulate(model, HeldSignal(t, u), t)
+    y = x + square * x**2 + cube * x**3 + noise * np.random.default_rng(seed).standard_normal(u.size)
+    kept = slice(settling * PERIOD, None)
+    return Record(t[kept], y[kept], HeldSignal(t[kept], u[kept]))
+
+
+def sampled_response(model, w, hold="zoh"):
+    """What samples show: the spectrum of the answer to one held sample, over that of the hold."""
+    t = INTERVAL * np.arange(3000)
+    pulse = np.zeros(t.size)
+    pulse[1] = 1.0
+    answer = simulate(model, HeldSignal(t, pulse, hold), t)[1:]
+    return np.exp(-1j * np.outer(w, t[:-1])) @ answer / hold_factor(hold, w, INTERVAL)
+
+
+def exact(model, w):
+    s = 1j * w
+    return np.polyval(model.numerator, s) / np.polyval(model.denominator, s) * np.exp(-s * model.delay)
+
+
+def covered(found: FrequencyResponse, true) -> float:
+    return float(np.mean(np.abs(found.response - true) <= found.radius()))
+
+
+def random_record(seed, n=2000, noise=0.3, model=MODEL, warm_up=300):
+    rng = np.random.default_rng(seed)
+    t = INTERVAL * np.arange(n + warm_up)
+    u = rng.standard_normal(t.size)
+    x = simulate(model, HeldSignal(t, u), t)
+    y = x + noise * x.std() * rng.standard_normal(t.size)
+    return Record(t[warm_up:], y[warm_up:], HeldSignal(t[warm_up:], u[warm_up:]))
+
+
+def test_periods_without_noise_are_exact():
+    found = estimate_frequency_response(periodic_record(multisine(0), 4))
+    assert found.method == "periodic"
+    assert found.frequencies == pytest.approx(2 * np.pi / (PERIOD * INTERVAL) * ODD, rel=1e-12)
+    true = sampled_response(MODEL, found.frequencies)
+    assert np.abs(found.response - true).max() < 1e-10 * np.abs(true).max()
+    # The images that a hold leaves are within their bound.
+    assert (np.abs(true - exact(MODEL, found.frequencies)) <= 1.1 * found.bias).all()
+
+
+def test_variance_of_periods_covers():
+    shares = []
+    for seed in range(30):
+        found = estimate_frequency_response(periodic_record(multisine(seed), 4, settling=3, noise=0.5, seed=seed))
+        shares.append(covered(found, sampled_response(MODEL, found.frequencies)))
+    # 1,500 lines; variances are shared by neighbours.
+    assert 0.93 < np.mean(shares) < 0.97
+
+
+def test_a_start_that_has_not_settled_is_left_out():
+    found = estimate_frequency_response(periodic_record(multisine(0), 6, settling=0, noise=0.001))
+    assert "in which the output had not settled" in found.notes[0]
+    true = sampled_response(MODEL, found.frequencies)
+    assert np.abs(found.response - true).max() < 0.01 * np.abs(true).max()
+
+
+def test_distortions_show_on_lines_without_input():
+    linear = estimate_frequency_response(periodic_record(multisine(0), 4, noise=0.1))
+    even = estimate_frequency_response(periodic_record(multisine(0), 4, noise=0.1, square=0.02))
+    assert "even: no more than noise" in linear.notes[1]
+    assert "even: -" in even.notes[1]
+    assert even.distortion is None  # even distortions of an odd input do not touch its lines
+    gaps = np.setdiff1d(ODD, ODD[3::4])
+    linear = estimate_frequency_response(periodic_record(multisine(0, gaps), 4, noise=0.01))
+    cubic = estimate_frequency_response(periodic_record(multisine(0, gaps), 4, noise=0.01, cube=1e-3))
+    assert np.median(cubic.distortion) > 100 * np.median(linear.distortion)
+
+
+def test_realisations_tell_distortions_from_noise():
+    found = estimate_frequency_response([periodic_record(multisine(k), 3, noise=0.1, seed=k) for k in range(8)])
+    assert 0.9 < covered(found, sampled_response(MODEL, found.frequencies)) <= 1.0
+    cubic = [periodic_record(multisine(k), 3, noise=0.1, cube=1e-3, seed=k) for k in range(8)]
+    distorted = estimate_frequency_response(cubic)
+    assert np.median(distorted.distortion) > 10 * np.median(found.distortion)
+    # One realisation does not show odd distortions of an odd input; its lines differ from the mean by them.
+    once = estimate_frequency_response(cubic[0])
+    off = np.abs(once.response - distorted.response) ** 2
+    assert 0.3 < np.median(off / distorted.distortion.mean()) < 3
+
+
+def test_local_polynomials_cover():
+    shares = []
+    for seed in range(8):
+        found = estimate_frequency_response(random_record(seed, n=1200))
+        assert found.method == "local-polynomial"
+        shares.append(covered(found, sampled_response(MODEL, found.frequencies)))
+    assert 0.91 < np.mean(shares) < 0.985
+
+
+def test_local_polynomials_follow_a_long_delay():
+    model = TransferFunction([1.0], [0.5, 1.0], delay=20.03)
+    found = estimate_frequency_response(random_record(3, noise=0.05, model=model, warm_up=600))
+    low = found.frequencies < 3.0
+    true = sampled_response(model, found.frequencies)
+    assert np.median(np.abs(found.response - true)[low] / np.abs(true)[low]) < 0.05
+    assert np.mean((np.abs(found.response - true) <= found.radius())[low]) > 0.85
+
+
+def test_any_clock_covers():
+    shares = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        t = np.cumsum(INTERVAL * rng.uniform(0.5, 1.5, 1500))
+        breaks = np.arange(0.0, t[-1], 0.35)
+        signal = HeldSignal(breaks, rng.choice([-1.0, 1.0], breaks.size))
+        y = simulate(MODEL, signal, t)
+        record = Record(t, y + 0.2 * y.std() * rng.standard_normal(t.size), signal)
+        found = estimate_frequency_response(record)
+        inside = found.frequencies < 0.5 * np.pi / INTERVAL
+        shares.append(np.mean((np.abs(found.response - exact(MODEL, found.frequencies)) <= found.radius())[inside]))
+        assert any("the clock is irregular" in note for note in found.notes)
+    assert 0.88 < np.mean(shares) < 0.985
+
+
+def test_bands_of_gain_and_phase():
+    found = estimate_frequency_response(random_record(1))
+    low, high = found.gain_band()
+    assert (low <= np.abs(found.response)).all()
+    assert (np.abs(found.response) <= high).all()
+    half = found.phase_band()
+    clear = low > 0
+    assert np.sin(half[clear]) == pytest.approx((high - low)[clear] / 2 / np.abs(found.response)[clear])
+    assert (half[~clear] == np.pi).all()
+    assert (found.radius(0.99) > found.radius(0.9)).all()
+
+
+def test_welch_averages():
+    record = random_record(0, n=20_000, noise=0.1)
+    found = estimate_frequency_response(record, method="welch", segment=1000)
+    true = sampled_response(MODEL, found.frequencies)
+    low = found.frequencies < 5
+    assert np.median((np.abs(found.response - true) / np.abs(true))[low]) < 0.05
+    assert found.coherence[found.frequencies < 3].min() > 0.95
+    assert covered(found, true) > 0.8
+
+
+def test_the_period_of_an_input():
+    rng = np.random.default_rng(0)
+    assert find_period(np.tile(rng.standard_normal(37), 5)[:-9]) == 37
+    assert find_period(np.sin(2 * np.pi * np.arange(400) / 100)) == 100
+    assert find_period(rng.standard_normal(500)) is None
+    assert find_period(np.linspace(0.0, 1.0, 500)) is None
+
+
+def test_a_response_moves_and_scales_with_its_record():
+    record = random_record(2)
+    found = estimate_frequency_response(record)
+    moved = Record(record.t + 100.0, 3.0 * record.y + 7.0, HeldSignal(record.input.t + 100.0, record.input.values))
+    again = estimate_frequency_response(moved)
+    assert again.response == pytest.approx(3.0 * found.response, rel=1e-6)
+    assert again.variance == pytest.approx(9.0 * found.variance, rel=1e-6)
+
+
+def test_a_hold_is_divided_out():
+    record = random_record(2)
+    straight = Record(record.t, record.y, HeldSignal(record.t, record.input.values, "foh"))
+    zoh, foh = (estimate_frequency_response(each) for each in (record, straight))
+    factor = hold_factor("zoh", zoh.frequencies, INTERVAL) / hold_factor("foh", zoh.frequencies, INTERVAL)
+    assert foh.response == pytest.approx(zoh.response * factor, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"method": "welch", "segment": 1900}, "segments of 1900 samples are too long"),
+        ({"method": "periodic"}, "the input does not repeat itself"),
+        ({"period": 1500}, "hold no two periods of 1500"),
+    ],
+)
+def test_options_that_do_not_fit_the_record(options, words):
+    with pytest.raises(DataError, match=words):
+        estimate_frequency_response(random_record(0), **options)
+
+
+def test_records_that_have_no_frequency_response():
+    t = INTERVAL * np.arange(200)
+    with pytest.raises(DataError, match="the input is constant"):
+        estimate_frequency_response(Record.from_arrays(t, np.ones(t.size), t))
+    with pytest.raises(DataError, match="at least"):
+        estimate_frequency_response(Record.from_arrays(t[:10], np.sin(t[:10] * 30), t[:10]))
+    with pytest.raises(DataError, match="do not all repeat"):
+        estimate_frequency_response([random_record(0), random_record(1)])
+    irregular = Record.from_arrays(t**1.01, np.sin(t * t), np.cos(t))
+    with pytest.raises(DataError, match="the clock is irregular"):
+        estimate_frequency_response(irregular, method="welch")
+    with pytest.raises(ValueError, match="half_width"):
+        estimate_frequency_response(random_record(0), half_width=2)
