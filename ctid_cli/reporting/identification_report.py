@@ -124,47 +124,54 @@ def _covariance_object(result: Identification) -> dict[str, Any]:
 
 def identification_text(result: Identification, measurements: Sequence[Measurement], units: Units) -> str:
     """A fit for people, within 100 columns."""
-    fit, criteria, judged = result.fit, result.criteria, result.validation
     lines: list[str] = []
-
-    def row(label: str, text: str) -> None:
-        lines.append(wrapped(f"{label:16} {text}", hanging=" " * 17))
-
-    for measurement, use in zip(measurements, fit.used, strict=True):
-        lines.append(wrapped(_record_line(measurement, int(np.count_nonzero(use)), units)))
+    for measurement, use in zip(measurements, result.fit.used, strict=True):
+        lines.append(wrapped(record_line(measurement, int(np.count_nonzero(use)), units)))
         lines += [wrapped(note, "  ") for note in measurement.notes]
-    lines.append("")
-    for label, text in _asked_for(result, measurements, units):
-        row(label, text)
-    lines += ["", parameter_table(parameters_of(result, units)).draw(), wrapped(_covariance_line(result)), ""]
+    lines += ["", *map(_row, asked_for(result, measurements, units))]
+    lines += ["", parameter_table(parameters_of(result, units)).draw(), wrapped(covariance_line(result)), ""]
     lines += [Report([derived_block(derived_of(result, units))]).draw(), ""]
-    row("fit", f"{number(fit.fit_percent, 5)} % = {FIT_DEFINITION}")
-    row("R2", f"{number(fit.r2, 6)} = {R2_DEFINITION}")
-    row("", "y measured, x simulated, over the samples used")
+    lines += map(_row, quality(result, units))
+    return "\n".join([*lines, *warning_lines(untold_warnings(result))])
+
+
+def _row(row: tuple[str, str]) -> str:
+    return wrapped(f"{row[0]:16} {row[1]}", hanging=" " * 17)
+
+
+def untold_warnings(result: Identification) -> list[str]:
+    """Warnings, but what the line of the residuals says already."""
+    told = tuple(test.sentence for test in result.tests)
+    return [warning for warning in result.warnings if not warning.endswith(told)]
+
+
+def quality(result: Identification, units: Units) -> Iterator[tuple[str, str]]:
+    """What tells how good a fit is."""
+    fit, criteria, judged = result.fit, result.criteria, result.validation
+    yield "fit", f"{number(fit.fit_percent, 5)} % = {FIT_DEFINITION}"
+    yield "R2", f"{number(fit.r2, 6)} = {R2_DEFINITION}"
+    yield "", "y measured, x simulated, over the samples used"
     if judged is not None:
         text = f"fit {number(judged.fit_percent, 5)} %, R2 {number(judged.r2, 6)} on {judged.name}, "
-        row("validation", f"{text}{count(judged.count, 'sample')}; initial state and offset treated in the same way")
+        yield "validation", f"{text}{count(judged.count, 'sample')}; initial state and offset treated in the same way"
     what = "mean squared output error" if fit.weighting is None else "twice the mean loss"
-    row("cost", f"{number(fit.cost)} ({units.output})^2, {what}")
+    yield "cost", f"{number(fit.cost)} ({units.output})^2, {what}"
     sizes = f"N = {criteria.count} samples and p = {criteria.parameters} parameters"
-    row("AIC", f"{number(criteria.aic)} = N ln cost + 2 p with {sizes}")
-    row("AICc", f"{number(criteria.aicc)} = AIC + 2 (p + 1)(p + 2) / (N - p - 2)")
-    row("BIC", f"{number(criteria.bic)} = N ln cost + p ln N")
-    row("FPE", f"{number(criteria.fpe)} ({units.output})^2 = cost (N + p) / (N - p)")
-    row("YIC, R_T^2", f"{number(result.yic, 5)}, {number(result.r_t_squared, 6)}")
-    row("condition number", number(fit.condition_number, 3))
+    yield "AIC", f"{number(criteria.aic)} = N ln cost + 2 p with {sizes}"
+    yield "AICc", f"{number(criteria.aicc)} = AIC + 2 (p + 1)(p + 2) / (N - p - 2)"
+    yield "BIC", f"{number(criteria.bic)} = N ln cost + p ln N"
+    yield "FPE", f"{number(criteria.fpe)} ({units.output})^2 = cost (N + p) / (N - p)"
+    yield "YIC, R_T^2", f"{number(result.yic, 5)}, {number(result.r_t_squared, 6)}"
+    yield "condition number", number(fit.condition_number, 3)
     if fit.starts is not None:
-        row("search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}")
+        yield "search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}"
     if fit.box is not None and fit.status is Status.AT_BOUND:
-        row("admissible", _box_text(fit.box, units))
+        yield "admissible", _box_text(fit.box, units)
     for k, test in enumerate(result.tests, start=1):
-        row("residuals" if len(measurements) == 1 else f"residuals {k}", test.sentence)
-    # What the line of the residuals says need not be said again.
-    told = tuple(test.sentence for test in result.tests)
-    return "\n".join([*lines, *warning_lines(warning for warning in result.warnings if not warning.endswith(told))])
+        yield "residuals" if len(fit.residuals) == 1 else f"residuals {k}", test.sentence
 
 
-def _asked_for(result: Identification, measurements: Sequence[Measurement], units: Units) -> Iterator[tuple[str, str]]:
+def asked_for(result: Identification, measurements: Sequence[Measurement], units: Units) -> Iterator[tuple[str, str]]:
     """What was estimated, and how the records were taken."""
     options, hold = result.options, measurements[0].record.input.hold
     low, high = options.delay_bounds
@@ -194,7 +201,8 @@ def _box_text(box: Box, units: Units) -> str:
     return f"{poles}; pairs with a damping of at least {box.least_damping:g}"
 
 
-def _record_line(measurement: Measurement, used: int, units: Units) -> str:
+def record_line(measurement: Measurement, used: int, units: Units) -> str:
+    """One record: its samples, clock and columns."""
     record = measurement.record
     part = "" if used == record.n_samples else f" ({used} used)"
     clock = "regular clock" if record.interval is not None else "irregular clock"
@@ -212,7 +220,8 @@ def _offset(result: Identification, units: Units) -> str:
     return f"{TREATMENTS['remove']}: {means}"
 
 
-def _covariance_line(result: Identification) -> str:
+def covariance_line(result: Identification) -> str:
+    """What the standard errors hold for."""
     found, asked = result.uncertainty, all(test.white for test in result.tests)
     text = "Standard errors are those for white residuals"
     if not result.answer.seen:
