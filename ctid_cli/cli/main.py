@@ -9,6 +9,7 @@ from ctid_cli.cli._common import Command
 from ctid_cli.cli.check_commands import CheckCommand, check
 from ctid_cli.cli.experiment_commands import run, schema, validate
 from ctid_cli.cli.fit_command import fit
+from ctid_cli.cli.frf_command import frf
 from ctid_cli.cli.init_command import init
 from ctid_cli.cli.merge_command import merge
 from ctid_cli.cli.result_commands import export, figure, report, show, status, table
@@ -50,7 +51,7 @@ def _root(
 
 app.command(cls=CheckCommand)(check)
 _RESULTS = (status, table, figure, report, show, export, verify, repair)
-for _command in (fit, track, init, run, merge, *_RESULTS, validate, schema):
+for _command in (fit, frf, track, init, run, merge, *_RESULTS, validate, schema):
     app.command(cls=Command)(_command)
 app.add_typer(study, name="study")
 

@@ -1,0 +1,85 @@
+"""The figure of a frequency response without a model, and the part of it that stands behind that of a model."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ctid_cli.inference.frequency_response import FrequencyResponse
+from ctid_cli.reporting.estimate import Units
+from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, Drawing, plain
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: A point whose standard error exceeds this share of its gain has no phase to draw.
+NO_PHASE = 0.7
+
+
+def frf_drawing(found: FrequencyResponse, units: Units, title: str) -> Drawing:
+    """Gain, phase and coherence over frequency."""
+
+    def draw(figure: Figure) -> None:
+        gain, phase, coherence = figure.subplots(3, 1, sharex=True, height_ratios=[2.2, 1.5, 0.9])
+        draw_points(gain, phase, found, label=f"estimate, {found.method}")
+        if found.distortion is not None and found.distortion.any():
+            level = np.sqrt(found.distortion)
+            gain.semilogx(found.frequencies, _decibels(level), "x", color=MARK, markersize=3, label="distortion")
+        gain.semilogx(
+            found.frequencies,
+            _decibels(found.standard_error),
+            color=MIDDLE,
+            linewidth=0.8,
+            linestyle="--",
+            label="standard error",
+        )
+        if found.bias.any():
+            gain.semilogx(
+                found.frequencies,
+                _decibels(found.bias),
+                color=LIGHT,
+                linewidth=0.8,
+                linestyle=":",
+                label="bound of the images of the hold",
+            )
+        gain.set_ylabel(f"gain [dB re 1 {plain(units.gain)}]")
+        phase.set_ylabel("phase [°]")
+        coherence.semilogx(found.frequencies, found.coherence, ".", color=DARK, markersize=2.5)
+        coherence.set_ylim(-0.05, 1.05)
+        coherence.set_ylabel("coherence [-]")
+        coherence.set_xlabel(rf"frequency $\omega$ [rad/{plain(units.time)}]")
+        gain.margins(x=0.02)
+        # The bound falls for ever towards low frequencies.
+        lowest = np.nanmin(_decibels(np.minimum(np.abs(found.response), np.maximum(found.standard_error, 1e-12))))
+        gain.set_ylim(bottom=max(gain.get_ylim()[0], float(lowest) - 12.0))
+        gain.legend(loc="lower left", fontsize=8)
+        gain.set_title(plain(title), loc="left")
+
+    return Drawing(7.5, 6.4, draw)
+
+
+def draw_points(gain: Any, phase: Any, found: FrequencyResponse, label: str = "without a model") -> None:
+    """Points of gain [dB] and phase [degrees] with their pointwise 95 % intervals in grey, on logarithmic frequency.
+
+    A lower end of zero goes down to the standard error; points that are all noise have no phase.
+    """
+    low, high = found.gain_band()
+    size = np.abs(found.response)
+    floor = np.maximum(low, 0.1 * np.minimum(size, found.standard_error))
+    gain.set_xscale("log")
+    phase.set_xscale("log")
+    seen = size > 0
+    w = found.frequencies[seen]
+    gain.vlines(w, _decibels(floor[seen]), _decibels(high[seen]), color=BAND, linewidth=1.6, zorder=0)
+    gain.plot(w, _decibels(size[seen]), ".", color=MIDDLE, markersize=3, label=label, zorder=1)
+    known = found.standard_error < NO_PHASE * size
+    angle = np.rad2deg(np.unwrap(np.angle(found.response[known])))
+    half = np.rad2deg(found.phase_band()[known])
+    phase.vlines(found.frequencies[known], angle - half, angle + half, color=BAND, linewidth=1.6, zorder=0)
+    phase.plot(found.frequencies[known], angle, ".", color=MIDDLE, markersize=3, label=label, zorder=1)
+
+
+def _decibels(values: Any) -> Any:
+    with np.errstate(divide="ignore"):
+        return np.where(values > 0, 20 * np.log10(np.maximum(values, 1e-300)), np.nan)

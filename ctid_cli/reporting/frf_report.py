@@ -1,0 +1,123 @@
+"""What ``ctid frf`` answers: a frequency response without a model as text, as an object for JSON, and as a file."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctid_cli.arrays import Array
+from ctid_cli.canonical import plain
+from ctid_cli.inference.frequency_response import FrequencyResponse
+from ctid_cli.reporting.estimate import Units
+from ctid_cli.reporting.layout import Report, Table, count, number
+from ctid_cli.signals.measurement import ROLES, Measurement
+from ctid_cli.text import wrapped
+
+#: Rows of the printed table, about evenly spaced logarithmically.
+ROWS = 15
+#: How each method is called in text.
+METHODS = {
+    "periodic": "mean over periods",
+    "local-polynomial": "local polynomials",
+    "welch": "averages over segments (Welch)",
+}
+
+
+def frf_columns(found: FrequencyResponse, units: Units) -> dict[str, Array]:
+    """Columns of ``frf.csv`` by their headers; intervals hold with 95 %."""
+    low, high = found.gain_band()
+    columns = {
+        f"frequency [rad/{units.time}]": found.frequencies,
+        f"real [{units.gain}]": found.response.real,
+        f"imaginary [{units.gain}]": found.response.imag,
+        f"standard_error [{units.gain}]": found.standard_error,
+        f"gain [{units.gain}]": np.abs(found.response),
+        f"gain_low [{units.gain}]": low,
+        f"gain_high [{units.gain}]": high,
+        "phase [deg]": np.rad2deg(np.angle(found.response)),
+        "phase_half_width [deg]": np.rad2deg(found.phase_band()),
+        "coherence [-]": found.coherence,
+        f"hold_bias [{units.gain}]": found.bias,
+    }
+    if found.distortion is not None:
+        columns[f"distortion [{units.gain}]"] = np.sqrt(found.distortion)
+    return columns
+
+
+def frf_csv(found: FrequencyResponse, units: Units) -> bytes:
+    """The file of a frequency response."""
+    import pandas as pd
+
+    frame = pd.DataFrame(frf_columns(found, units))
+    return frame.to_csv(index=False, float_format="%.12g", lineterminator="\n").encode()
+
+
+def frf_object(
+    found: FrequencyResponse, measurements: Sequence[Measurement], units: Units, files: Sequence[Path]
+) -> dict[str, Any]:
+    """A frequency response for ``ctid frf --json``."""
+    content = {
+        "files": [measurement.record.name for measurement in measurements],
+        "columns": {role: getattr(measurements[0], role) for role in ROLES},
+        "units": {"time": units.time, "input": units.input, "output": units.output},
+        "method": found.method,
+        "hold": found.hold,
+        "frequencies": found.frequencies,
+        "real": found.response.real,
+        "imaginary": found.response.imag,
+        "standard_error": found.standard_error,
+        "freedom": found.freedom,
+        "coherence": found.coherence,
+        "distortion": None if found.distortion is None else np.sqrt(found.distortion),
+        "hold_bias": found.bias,
+        "notes": [*_in_unit(found, units), *_read(measurements)],
+        "written": [str(file) for file in files],
+    }
+    return dict(plain(content))
+
+
+def frf_text(found: FrequencyResponse, measurements: Sequence[Measurement], units: Units) -> str:
+    """A frequency response for people."""
+    names = ", ".join(measurement.record.name for measurement in measurements)
+    samples = sum(measurement.record.n_samples for measurement in measurements)
+    low, high = found.frequencies[[0, -1]]
+    span = f"{count(found.frequencies.size, 'frequency')} from {low:.4g} to {high:.4g} rad/{units.time}"
+    span = span.replace("frequencys", "frequencies")
+    head = f"{names}: {count(samples, 'sample')}; frequency response by {METHODS[found.method]}, {span}"
+    notes = [wrapped(f"- {note}", hanging="  ") for note in (*_in_unit(found, units), *_read(measurements))]
+    return "\n".join([wrapped(head), *notes, "", Report([[_table(found, units)]]).draw()])
+
+
+def _table(found: FrequencyResponse, units: Units) -> Table:
+    """Some of the frequencies."""
+    places = np.geomspace(found.frequencies[0], found.frequencies[-1], ROWS)
+    rows = np.unique(np.searchsorted(found.frequencies, places).clip(max=found.frequencies.size - 1))
+    gain, half = np.abs(found.response), np.rad2deg(found.phase_band())
+    known = half < 180
+    # Through points that are all noise no phase can be followed.
+    phase = np.full(gain.size, np.nan)
+    phase[known] = np.rad2deg(np.unwrap(np.angle(found.response[known])))
+    low, high = found.gain_band()
+    header = [f"[rad/{units.time}]", f"gain [{units.gain}]", "95 % low", "95 % high", "phase [°]", "±", "coherence"]
+    cells = [
+        [
+            *(number(float(values[k]), 4) for values in (found.frequencies, gain, low, high)),
+            *((f"{phase[k]:.1f}", f"{half[k]:.1f}") if known[k] else ("any", "")),
+            f"{found.coherence[k]:.3f}",
+        ]
+        for k in rows
+    ]
+    if found.distortion is not None:
+        header.append("distortion")
+        for row, k in zip(cells, rows, strict=True):
+            row.append(number(float(np.sqrt(found.distortion[k])), 2))
+    return Table(header, cells, "r" * len(header))
+
+
+def _in_unit(found: FrequencyResponse, units: Units) -> list[str]:
+    return [note.replace("rad/s", f"rad/{units.time}") for note in found.notes]
+
+
+def _read(measurements: Sequence[Measurement]) -> list[str]:
+    return list(dict.fromkeys(note for measurement in measurements for note in measurement.notes))
