@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,8 @@ LEVEL = 0.95
 #: An initial state or offset is asked for where it lowers the cost by this fraction, and Schwarz's criterion by ten.
 WORTHWHILE = 0.02
 DECISIVE = 10.0
+#: Delays about the estimate at which its cost is computed to be drawn, and how far: in half-widths of the interval.
+DRAWN_DELAYS, DRAWN_INTERVALS = 24, 2.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,6 +273,14 @@ def _free(fit: MeasuredFit) -> tuple[IndexArray, Array]:
 
 def _delay_interval(refinement: Refinement, fit: MeasuredFit, uncertainty: Uncertainty) -> DelayInterval | None:
     """Profile-likelihood interval of a free delay, None where estimate plus or minus two errors is as good."""
+    profile, reach, error = _cost_of_delay(refinement, fit, uncertainty)
+    return profile.interval(reach) if profile.quadratic_is_doubtful(error) else None
+
+
+def _cost_of_delay(
+    refinement: Refinement, fit: MeasuredFit, uncertainty: Uncertainty
+) -> tuple[CostOfDelay, float, float]:
+    """The cost about a delay, how many standard errors its interval reaches, and the standard error."""
     place = fit.parameter_names.index("delay")
     held = fit.status is Status.DELAY_AT_BOUND
     if held:
@@ -279,7 +289,6 @@ def _delay_interval(refinement: Refinement, fit: MeasuredFit, uncertainty: Uncer
         uncertainty = fit.uncertainty("white" if uncertainty.kind == "white" else "robust")
     variance = float(uncertainty.covariance[place, place])
     white = float(fit.uncertainty("white").covariance[place, place])
-    error = float("nan") if held else float(np.sqrt(variance))
     profile = CostOfDelay(
         cache(lambda trial: refinement.squared_error_at(fit.model, trial)),
         float(fit.theta[place]),
@@ -290,7 +299,35 @@ def _delay_interval(refinement: Refinement, fit: MeasuredFit, uncertainty: Uncer
         max(variance / white, np.finfo(float).tiny),
     )
     reach = uncertainty.quantile(np.eye(fit.theta.size)[place], LEVEL)
-    return profile.interval(reach) if profile.quadratic_is_doubtful(error) else None
+    return profile, reach, float("nan") if held else float(np.sqrt(variance))
+
+
+class DelayCosts(NamedTuple):
+    """The cost about the estimated delay, minimised over everything else."""
+
+    #: Shape (K,) [s], and shape (K,) [output unit^2].
+    delays: Array
+    costs: Array
+    least: float
+    #: The data do not reject delays of a cost below this.
+    allowed: float
+
+
+def costs_about_delay(result: Identification) -> DelayCosts | None:
+    """The cost so close to the estimated delay that its minimum is seen; None where no interval of it is known."""
+    fit = result.fit.linear
+    item = next(item for item in result.estimates if item.name == "delay")
+    if "delay" not in fit.parameter_names or not np.isfinite([item.low, item.high]).all():
+        return None
+    laid_out = result.options.prepare(result.records).laid_out
+    profile, reach, _ = _cost_of_delay(
+        laid_out.near(result.fit.residuals, result.fit.weighting), fit, result.uncertainty
+    )
+    half = DRAWN_INTERVALS * max(item.high - item.estimate, item.estimate - item.low)
+    low, high = max(item.estimate - half, profile.bounds[0]), min(item.estimate + half, profile.bounds[1])
+    delays = np.unique([*np.linspace(low, high, DRAWN_DELAYS), item.estimate])
+    costs = np.array([profile.squared_error_at(float(delay)) for delay in delays]) / fit.count
+    return DelayCosts(delays, costs, fit.cost, fit.cost * (1.0 + profile.allowed(reach)))
 
 
 # --- results ---------------------------------------------------------------------------------------

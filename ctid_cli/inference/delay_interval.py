@@ -47,10 +47,9 @@ class CostOfDelay:
         small one outward, then found by Brent's method to 1e-6 of its distance from the estimate. A second basin
         further away is not looked for.
         """
-        freedom = self.count - self.parameters
-        if freedom <= 0 or not np.isfinite(self.inflation) or not self.squared_error >= 0:
+        allowed = self.allowed(quantile)
+        if not np.isfinite(allowed) or not self.squared_error >= 0:
             return DelayInterval(float("nan"), float("nan"), False, False)
-        allowed = self.inflation * quantile**2 / freedom
 
         def excess(delay: float) -> float:
             value = self.squared_error_at(delay)
@@ -64,6 +63,11 @@ class CostOfDelay:
         low, at_low = _crossing(excess, self.estimate, self.bounds[0])
         high, at_high = _crossing(excess, self.estimate, self.bounds[1])
         return DelayInterval(low, high, at_low, at_high)
+
+    def allowed(self, quantile: float) -> float:
+        """By what share the squared error may rise within the interval; NaN where nothing is spare."""
+        freedom = self.count - self.parameters
+        return self.inflation * quantile**2 / freedom if freedom > 0 else float("nan")
 
     def quadratic_is_doubtful(self, standard_error: float) -> bool:
         r"""Whether the interval ``estimate +- z se`` of the delay should not be trusted.

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.arrays import Array, BoolArray, IntArray
 from ctid_cli.estimators.identification import Identification
+from ctid_cli.inference.residuals import ResidualTests
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, STRIPES, Drawing, outline
 from ctid_cli.signals.measurement import Measurement
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 Kind = Literal["all", "overlay", "residuals", "correlation", "profile"]
 #: Experiments that are drawn; the others would leave no room.
 MOST_DRAWN = 3
+#: A profile whose greatest cost is this many times its least one has a logarithmic scale.
+STEEP = 5.0
 
 
 def identification_drawing(
@@ -36,16 +39,18 @@ def identification_drawing(
                 part(axes, result, measurement, k, units)
                 axes.margins(x=0.0)
                 _name_panels(axes, axes, measurement, k, len(measurements), units)
-        elif kind in ("correlation", "profile"):
-            axes = figure.add_subplot()
-            if kind == "correlation":
-                _draw_correlation(axes, result, measurements)
-            else:
-                _draw_profile(axes, result, units)
+        elif kind == "correlation":
+            both = figure.subplots(1, 2)
+            draw_autocorrelation(both[0], result.tests, len(measurements))
+            draw_cross_correlation(both[1], result.tests, len(measurements))
+        elif kind == "profile":
+            draw_profile(figure.add_subplot(), result, units)
         else:
             _draw_all(figure, result, measurements, units)
 
-    if kind in ("correlation", "profile"):
+    if kind == "correlation":
+        return Drawing(8.0, 3.0, draw)
+    if kind == "profile":
         return Drawing(5.5, 3.4, draw)
     return Drawing(8.0, 2.8 * len(drawn) if kind in ("overlay", "residuals") else 3.4 * len(drawn) + 2.8, draw)
 
@@ -61,19 +66,24 @@ def _draw_all(figure: Figure, result: Identification, measurements: Sequence[Mea
         output.margins(x=0.0)
         _draw_residuals(error, result, measurement, k, units)
         _name_panels(output, error, measurement, k, len(measurements), units)
-    _draw_correlation(figure.add_subplot(grid[-1, 0]), result, measurements)
-    _draw_profile(figure.add_subplot(grid[-1, 1]), result, units)
+    draw_autocorrelation(figure.add_subplot(grid[-1, 0]), result.tests, len(measurements))
+    draw_profile(figure.add_subplot(grid[-1, 1]), result, units)
 
 
 def _draw_output(axes: Any, result: Identification, measurement: Measurement, k: int, units: Units) -> None:
-    record, use = measurement.record, result.fit.used[k]
-    simulated = outline(*_with_gaps(record.t, use, record.y[use] - result.fit.residuals[k]))
-    axes.plot(*outline(record.t, record.y), color=LIGHT, linewidth=2.2, label="measured")
-    axes.plot(*simulated, color=DARK, linewidth=0.9, label="simulated")
-    weighting = result.fit.weighting
+    record, use, weighting = measurement.record, result.fit.used[k], result.fit.weighting
     if weighting is not None and weighting.outliers[k].any():
         little = np.flatnonzero(use)[weighting.outliers[k]]
         axes.plot(record.t[little], record.y[little], "x", color="black", markersize=4, label="counts for little")
+    draw_overlay(axes, measurement, use, result.fit.residuals[k], units)
+
+
+def draw_overlay(axes: Any, measurement: Measurement, use: BoolArray, residuals: Array, units: Units) -> None:
+    """The measured output, and the simulated one at its used samples."""
+    record = measurement.record
+    simulated = outline(*_with_gaps(record.t, use, record.y[use] - residuals))
+    axes.plot(*outline(record.t, record.y), color=LIGHT, linewidth=2.2, zorder=1.9, label="measured")
+    axes.plot(*simulated, color=DARK, linewidth=0.9, label="simulated")
     axes.set_ylabel(f"{measurement.output} [{units.output}]")
     axes.legend(loc="lower right", ncols=3, fontsize=8)
     low, high = axes.get_ylim()
@@ -103,26 +113,42 @@ def _with_gaps(t: Array, use: BoolArray, values: Array) -> tuple[Array, Array]:
     return t, full
 
 
-def _draw_correlation(axes: Any, result: Identification, measurements: Sequence[Measurement]) -> None:
-    axes.set_xlabel("lag [samples]")
+def draw_autocorrelation(axes: Any, tests: Sequence[ResidualTests], experiments: int = 1) -> None:
+    """Autocorrelation of the residuals of each experiment, with the band of white ones."""
     axes.set_ylabel("autocorrelation\nof the residuals [-]")
-    if not result.tests:
+    _draw_lags(axes, [(np.arange(1, test.lags + 1), test.autocorrelation) for test in tests], experiments)
+    if tests:
+        _draw_band(axes, tests[0].autocorrelation_band, f"{100 * tests[0].level:.3g} % band if white")
+
+
+def draw_cross_correlation(axes: Any, tests: Sequence[ResidualTests], experiments: int = 1) -> None:
+    """Correlation of the residuals with the input, with the band of residuals that do not depend on it."""
+    axes.set_ylabel("correlation of the residuals\nwith the delayed input [-]")
+    _draw_lags(axes, [(np.arange(-test.lags, test.lags + 1), test.cross_correlation) for test in tests], experiments)
+    if tests:
+        _draw_band(axes, tests[0].cross_correlation_band, f"{100 * tests[0].level:.3g} % band if independent")
+
+
+def _draw_lags(axes: Any, curves: Sequence[tuple[IntArray, Array]], experiments: int) -> None:
+    axes.set_xlabel("lag [samples]")
+    if not curves:
         axes.text(0.5, 0.5, "too few residuals", ha="center", va="center", transform=axes.transAxes)
-        return
     styles = ("o-", "s--", "^:")
-    for k, (test, style) in enumerate(zip(result.tests[:MOST_DRAWN], styles, strict=False), start=1):
-        lags = np.arange(1, test.lags + 1)
-        label = f"experiment {k}" if len(measurements) > 1 else None
-        axes.plot(lags, test.autocorrelation, style, color=DARK, markersize=3, linewidth=0.8, label=label)
-    band = result.tests[0].autocorrelation_band
-    axes.axhspan(-band, band, color=BAND, zorder=0, label=f"{100 * result.tests[0].level:.3g} % band if white")
+    for k, ((lags, values), style) in enumerate(zip(curves[:MOST_DRAWN], styles, strict=False), start=1):
+        label = f"experiment {k}" if experiments > 1 else None
+        axes.plot(lags, values, style, color=DARK, markersize=3, linewidth=0.8, label=label)
+
+
+def _draw_band(axes: Any, band: float, label: str) -> None:
+    axes.axhspan(-band, band, color=BAND, zorder=0, label=label)
     axes.axhline(0.0, color="black", linewidth=0.6)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.25 * (high - low))
     axes.legend(loc="upper right", fontsize=8)
 
 
-def _draw_profile(axes: Any, result: Identification, units: Units) -> None:
+def draw_profile(axes: Any, result: Identification, units: Units) -> None:
+    """The search over the delay."""
     profile, delay = result.fit.profile, result.fit.model.delay
     axes.set_xlabel(f"delay [{units.time}]")
     axes.set_ylabel(f"cost [({units.output})²]")
@@ -142,5 +168,11 @@ def _draw_profile(axes: Any, result: Identification, units: Units) -> None:
             # The cost of the estimate is that of all frequencies and samples.
             axes.axvline(delay, color="black", linewidth=0.8, label=label)
     low, high = axes.get_ylim()
-    axes.set_ylim(low, high + 0.35 * (high - low))
+    if profile is not None and 0.0 < STEEP * profile.costs.min() < profile.costs[np.isfinite(profile.costs)].max():
+        # The least cost would lie on the axis of a straight scale, whatever the others around it are.
+        axes.set_yscale("log")
+        low, high = axes.get_ylim()
+        axes.set_ylim(low, high * (high / low) ** 0.35)
+    else:
+        axes.set_ylim(low, high + 0.35 * (high - low))
     axes.legend(loc="upper right", fontsize=8)

@@ -102,9 +102,10 @@ def plot(result: Identification | FrequencyTrack | ExperimentResults, kind: str 
         :func:`~ctid_cli.estimators.identification.identify` does.
     kind : str, optional
         Which figure. Of an identification ``"all"`` (the default) or one part of it: ``"overlay"`` of the measured and
-        the simulated output, ``"residuals"``, their ``"correlation"``, ``"profile"`` of the cost over the delay. Of a
-        track ``"tones"`` (the default): ``"frequencies"`` and, where it has them, ``"amplitudes"``. Of an experiment
-        ``"measure"``, ``"box"``, ``"errors"``, ``"delays"`` or ``"convergence"``, by default what tells most;
+        the simulated output, ``"residuals"``, ``"correlation"`` of these with themselves and with the input,
+        ``"profile"`` of the cost over the delay. Of a track ``"tones"`` (the default): ``"frequencies"`` and, where it
+        has them, ``"amplitudes"``. Of an experiment ``"measure"``, ``"box"``, ``"errors"``, ``"delays"`` or
+        ``"convergence"``, by default what tells most;
         its method ``figure`` has more options.
 
     Returns
