@@ -35,6 +35,8 @@ from .estimators.identification import Identification as Identification, identif
 
 # Results
 from .inference.fit import Fit as Fit
+from .inference.fitted_model import FittedModel as FittedModel
+from .inference.bands import FrequencyBand as FrequencyBand, PoleBand as PoleBand, ResponseBand as ResponseBand
 from .estimators.additive_srivc import AdditiveFit as AdditiveFit
 from .estimators.delay_profile import MeasuredFit as MeasuredFit
 from .estimators.useful_redundancy import RedundantFit as RedundantFit

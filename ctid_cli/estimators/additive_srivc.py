@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -18,12 +18,16 @@ from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.submodels import InitialState
 from ctid_cli.inference.derived import additive_derived
 from ctid_cli.inference.fit import Fit
+from ctid_cli.inference.fitted_model import responses
 from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
+
+if TYPE_CHECKING:
+    from ctid_cli.inference.responses import Estimated
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,6 +58,9 @@ class AdditiveFit(Fit):
     def parameters(self) -> dict[str, float]:
         """Parameters by name: ``g1_a1 … g1_b0 …, g2_a1 …``, where the number is the power of p."""
         return self.additive.parameters
+
+    def _estimated(self) -> Estimated:
+        return responses.with_covariance(self.additive, self.parameter_names, self.covariance)
 
     def derived(self, level: float = 0.95) -> tuple[UncertainValue, ...]:
         """Poles, natural frequencies, damping and static gains of the submodels.

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from ctid_cli.inference.covariance import condition_number
 from ctid_cli.inference.delay_interval import CostOfDelay, DelayInterval
 from ctid_cli.inference.derived import derived_parameters
 from ctid_cli.inference.diagnostics import fit_percent, r_squared
+from ctid_cli.inference.fitted_model import FittedModel, responses
 from ctid_cli.inference.later import FilledLater
 from ctid_cli.inference.residuals import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.status import Status
@@ -30,6 +31,9 @@ from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty
 from ctid_cli.signals.record import Record
 from ctid_cli.text import ShownAsTable
+
+if TYPE_CHECKING:
+    from ctid_cli.inference.responses import Estimated
 
 #: Confidence level of intervals and tests.
 LEVEL = 0.95
@@ -57,7 +61,7 @@ class Validation(FilledLater):
 
 
 @dataclass(frozen=True, eq=False)
-class Identification(FilledLater, ShownAsTable):
+class Identification(FilledLater, FittedModel, ShownAsTable):
     """A fit, its uncertainty, and its diagnostics.
 
     Parameters
@@ -109,6 +113,17 @@ class Identification(FilledLater, ShownAsTable):
 
     def __repr__(self) -> str:
         return f"Identification: {self.uncertainty.kind} covariance, {len(self.warnings)} warnings\n{self.fit!r}"
+
+    def _estimated(self) -> "Estimated":
+        """The model with what its reported errors and intervals are from."""
+        return responses.with_uncertainty(
+            self.fit.model, self.fit.parameter_names, self.uncertainty, defined=self._determined
+        )
+
+    @property
+    def _determined(self) -> bool:
+        """Whether the record says anything about the parameters."""
+        return self.answer.seen and any(item.status == "free" for item in self.estimates)
 
 
 def identify(

@@ -76,10 +76,7 @@ def _of_submodel(submodel: Submodel, covariance: Array, quantile: Quantile) -> l
     """All quantities of one submodel; covariance of its own parameters."""
     n = submodel.term().poles
     falling = submodel.denominator
-    poles = sorted_roots(falling)
-    # A = a_n times the monic polynomial, whose derivatives run from p^(n-1) down to 1; here they run from p to p^n.
-    with np.errstate(invalid="ignore"):
-        jacobian = poles[:, None] * pole_jacobian(falling / falling[0], poles)[:, ::-1] / falling[0]
+    poles, jacobian = submodel_poles(submodel)
     rows = _Rows(covariance, quantile)
     rows.add_poles(poles, jacobian, number_lone=False)
     if n == 2 and falling[0] > 0 and not poles.imag.any():
@@ -93,6 +90,15 @@ def _of_submodel(submodel: Submodel, covariance: Array, quantile: Quantile) -> l
     reason = "This submodel integrates and has no static gain." if submodel.integrators else ""
     rows.add("static_gain", submodel.dc_gain, gradient, GAIN_UNIT, reason)
     return rows.found
+
+
+def submodel_poles(submodel: Submodel) -> tuple[ComplexArray, ComplexArray]:
+    """Poles of a submodel but its integrators, and their derivatives by a_1 … a_n."""
+    falling = submodel.denominator
+    poles = sorted_roots(falling)
+    # A = a_n times the monic polynomial, whose derivatives run from p^(n-1) down to 1; here they run from p to p^n.
+    with np.errstate(invalid="ignore"):
+        return poles, poles[:, None] * pole_jacobian(falling / falling[0], poles)[:, ::-1] / falling[0]
 
 
 class _Rows:
@@ -154,14 +160,20 @@ class _Rows:
 
     def _undetermined(self, poles: ComplexArray, k: int, slope: ComplexArray, others: BoolArray) -> str:
         """Reason for which pole k has no standard error, or nothing."""
-        if not others.any():
-            return ""
-        distance = float(np.abs(poles[others] - poles[k]).min())
-        size = float(np.abs(poles).max())
-        text = "This pole is so close to another that these data cannot tell them apart; fewer poles may do."
-        if distance <= 1e-7 * size or not np.isfinite(slope).all():
-            return text
         A = self.covariance[: slope.size, : slope.size]
-        with np.errstate(invalid="ignore"):
-            spread = float(np.sqrt(slope.real @ A @ slope.real + slope.imag @ A @ slope.imag))
-        return text if self.quantile(slope.real) * spread >= distance else ""
+        text = "This pole is so close to another that these data cannot tell them apart; fewer poles may do."
+        return text if indistinct(poles, k, slope, others, A, self.quantile) else ""
+
+
+def indistinct(
+    poles: ComplexArray, k: int, slope: ComplexArray, others: BoolArray, covariance: Array, quantile: Quantile
+) -> bool:
+    """Whether the interval of pole k, whose derivatives are given, reaches one of the others."""
+    if not others.any():
+        return False
+    distance = float(np.abs(poles[others] - poles[k]).min())
+    if distance <= 1e-7 * float(np.abs(poles).max()) or not np.isfinite(slope).all():
+        return True
+    with np.errstate(invalid="ignore"):
+        spread = float(np.sqrt(slope.real @ covariance @ slope.real + slope.imag @ covariance @ slope.imag))
+    return quantile(slope.real) * spread >= distance

@@ -7,6 +7,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.bank import second_moments, standard_rows
 from ctid_cli.filtering.filter_data import filter_data
+from ctid_cli.filtering.simulate import feedthrough
 from ctid_cli.filtering.submodels import SubmodelFilter
 from ctid_cli.inference.covariance import sandwich, unit_inverse, white_noise_covariance
 from ctid_cli.inference.sensitivity import Structure
@@ -33,7 +34,15 @@ def sensitivities(
             raise DataError("the response of the system is not finite")
         return found[0]
     structure = Structure(model.order, model.numerator.size - 1 if zeros is None else zeros, estimate_delay)
-    rows = standard_rows(data, model.denominator, model.numerator, model.delay)
+    if model.order == 0:
+        return np.column_stack([signal.at(instants - model.delay), *[np.zeros(instants.size)] * estimate_delay])
+    n, (direct, rest) = model.order, feedthrough(model)
+    rows = standard_rows(data, model.denominator, rest if direct else model.numerator, model.delay)
+    if structure.zeros == n:
+        # p^n/A u = u - sum of a_i p^(n-i)/A u, and x is what passes at once besides. Between the breaks of a held input
+        # the derivative by the delay has nothing of that.
+        rows[:, n + 1 : 2 * n + 1] += direct * rows[:, :n]
+        rows[:, n] -= rows[:, n - 1 :: -1] @ model.denominator[1:]
     return np.asarray(rows[:, structure.sensitivity_rows] * structure.signs)
 
 

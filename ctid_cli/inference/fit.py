@@ -2,13 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ctid_cli.arrays import Array
+from ctid_cli.inference.fitted_model import FittedModel, responses
 from ctid_cli.inference.status import Status
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.text import ShownAsTable, wrapped
+
+if TYPE_CHECKING:
+    from ctid_cli.inference.responses import Estimated
 
 
 @dataclass(frozen=True)
@@ -26,7 +31,7 @@ class IterationRecord:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fit(ShownAsTable):
+class Fit(FittedModel, ShownAsTable):
     """An estimated model, its accuracy, and how it was reached.
 
     Parameters
@@ -91,3 +96,7 @@ class Fit(ShownAsTable):
         with np.errstate(invalid="ignore"):
             errors = np.sqrt(np.diag(self.covariance))
         return dict(zip(self.parameter_names, errors.tolist(), strict=True))
+
+    def _estimated(self) -> "Estimated":
+        """The model with its covariance, whose normal intervals are those of the parameters."""
+        return responses.with_covariance(self.model, self.parameter_names, self.covariance)

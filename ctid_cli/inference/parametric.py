@@ -1,0 +1,208 @@
+r"""Models as functions of their free parameters: what they answer, and the exact derivatives of that.
+
+With ``G = B/A exp(-tau p)``, ``theta = (a_1 … a_n, b_0 … b_m, tau)`` and monic A
+
+.. math:: \frac{\partial G}{\partial a_i} = -\frac{p^{n-i}}{A} G, \quad
+          \frac{\partial G}{\partial b_j} = \frac{p^{m-j}}{A} e^{-\tau p}, \quad
+          \frac{\partial G}{\partial\tau} = -p\,G,
+
+and of a submodel ``B/(p^l A)`` of a sum, whose coefficients go by the powers of p that they multiply,
+``-p^k/A G`` and ``p^k/(p^l A) exp(-tau p)``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.arrays import Array, ComplexArray, IndexArray
+from ctid_cli.errors import DataError
+from ctid_cli.filtering.sampled import simulate_additive
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.inference.derived import submodel_poles
+from ctid_cli.inference.finite_record import sensitivities
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.models.additive import AdditiveModel, Submodel
+from ctid_cli.models.factoring import pole_jacobian, unfactored
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+
+Number = TypeVar("Number", np.float64, np.complex128)
+Model = TransferFunction | AdditiveModel
+_COEFFICIENT = re.compile(r"(?:g\d+_)?[ab](\d+)|delay")
+
+
+@dataclass(frozen=True, eq=False)
+class Parametric:
+    """A model, and which of its numbers are free."""
+
+    model: Model
+    #: Of all free parameters of a fit, initial states and offsets among them, which no response of the model has.
+    names: tuple[str, ...]
+    #: Whether responses over time are those behind a differentiator.
+    differentiated: bool = False
+
+    @cached_property
+    def zeros(self) -> int:
+        """Degree of the numerator of a fraction, a leading coefficient that is zero included."""
+        own = [int(name[1:]) for name in self.names if re.fullmatch(r"b\d+", name)]
+        return max([self.fraction.numerator.size - 1, *own])
+
+    @property
+    def fraction(self) -> TransferFunction:
+        """The model as one transfer function."""
+        return unfactored(self.model) if isinstance(self.model, AdditiveModel) else self.model
+
+    @cached_property
+    def every(self) -> tuple[str, ...]:
+        """Names of all numbers of the model, free or not."""
+        if isinstance(self.model, AdditiveModel):
+            return (*self.model.names, "delay")
+        return Structure(self.model.order, self.zeros, delay=True).names
+
+    @cached_property
+    def free(self) -> tuple[IndexArray, IndexArray]:
+        """Places of the free numbers of the model: among the names of the fit, and among all of the model."""
+        mine = [k for k, name in enumerate(self.names) if _COEFFICIENT.fullmatch(name)]
+        places = {name: k for k, name in enumerate(self.every)}
+        unknown = [self.names[k] for k in mine if self.names[k] not in places]
+        if unknown:
+            raise DataError(f"the model has no parameter {unknown[0]!r}; it has {', '.join(self.every)}")
+        return np.array(mine, dtype=np.intp), np.array([places[self.names[k]] for k in mine], dtype=np.intp)
+
+    @cached_property
+    def theta(self) -> Array:
+        """All numbers of the model, in the order of ``every``."""
+        model = self.model
+        if isinstance(model, AdditiveModel):
+            return np.append(model.theta, model.delay)
+        b = np.concatenate((np.zeros(self.zeros + 1 - model.numerator.size), model.numerator))
+        return np.concatenate((model.denominator[1:], b, [model.delay]))
+
+    def at(self, change: Array) -> Parametric:
+        """The model whose free numbers have changed so much; a delay does not fall below zero."""
+        theta = self.theta.copy()
+        theta[self.free[1]] += change
+        delay = max(float(theta[-1]), 0.0)
+        if isinstance(self.model, AdditiveModel):
+            return replace(self, model=AdditiveModel.from_theta(theta[:-1], self.model.terms, delay))
+        n = self.model.order
+        return replace(self, model=TransferFunction(theta[n:-1], np.concatenate(([1.0], theta[:n])), delay))
+
+    def _among_all(self, every: NDArray[Number]) -> NDArray[Number]:
+        """Derivatives by all numbers of the model as derivatives by all parameters of the fit."""
+        mine, places = self.free
+        found = np.zeros((len(every), len(self.names)), dtype=every.dtype)
+        found[:, mine] = every[:, places]
+        return found
+
+    # --- frequency response ------------------------------------------------------------------------
+
+    def frequency_slopes(self, frequencies: Array) -> ComplexArray:
+        """Derivatives of ``G(j w)``, shape (N, p)."""
+        s, model = np.asarray(1j * frequencies, dtype=complex), self.model
+        late = np.exp(-s * model.delay)
+        if isinstance(model, AdditiveModel):
+            columns: list[ComplexArray] = [
+                column * late for part in model.submodels for column in _submodel_slopes(part, s)
+            ]
+        else:
+            over: ComplexArray = np.asarray(np.polyval(model.denominator, s), dtype=complex)
+            plain: ComplexArray = np.asarray(np.polyval(model.numerator, s) / over, dtype=complex)
+            columns = [-(s**k) / over * plain * late for k in range(model.order - 1, -1, -1)]
+            columns += [s**k / over * late for k in range(self.zeros, -1, -1)]
+        columns.append(-s * model.frequency_response(frequencies))
+        return np.asarray(self._among_all(np.column_stack(columns)))
+
+    # --- responses over time -----------------------------------------------------------------------
+
+    def simulated(self, signal: HeldSignal, times: Array) -> Array:
+        """Output from rest."""
+        if not self.differentiated and isinstance(self.model, AdditiveModel):
+            return simulate_additive(self.model, signal, times)
+        return np.asarray(np.sum([simulate(part, signal, times) for part in self._fractions], axis=0))
+
+    def output_slopes(self, signal: HeldSignal, times: Array) -> Array:
+        """Derivatives of the output from rest, shape (N, p)."""
+        model, more = self.model, int(self.differentiated)
+        if not isinstance(model, AdditiveModel):
+            found = sensitivities(self._fractions[0], signal, times, self.zeros + more, estimate_delay=True)
+            # What a differentiator is behind has no constant term.
+            return self._among_all(np.delete(found, np.s_[found.shape[1] - 1 - more : found.shape[1] - 1], axis=1))
+        columns = []
+        for part in self._submodels:
+            found = sensitivities(AdditiveModel([part], model.delay), signal, times)
+            columns.append(np.delete(found, np.s_[part.term().poles : part.term().poles + more], axis=1))
+        delay = np.zeros((times.size, 1))
+        if "delay" in self.names:
+            for one in self._fractions:
+                delay += sensitivities(one, signal, times, estimate_delay=True)[:, -1:]
+        return self._among_all(np.hstack([*columns, delay]))
+
+    @property
+    def derivative(self) -> Parametric:
+        """The model behind a differentiator, whose step response is the impulse response of this one."""
+        parts = self.model.submodels if isinstance(self.model, AdditiveModel) else (self.model,)
+        if any(part.relative_degree < 1 for part in parts):
+            raise DataError(
+                "a model with as many zeros as poles passes on an impulse itself, which is no number at any instant; "
+                "look at its step response"
+            )
+        return replace(self, differentiated=True)
+
+    @property
+    def _submodels(self) -> list[Submodel]:
+        """The submodels of a sum, differentiated where that is asked for."""
+        assert isinstance(self.model, AdditiveModel)
+        if not self.differentiated:
+            return list(self.model.submodels)
+        return [Submodel(_times_p(s.numerator), s.denominator, s.integrators) for s in self.model.submodels]
+
+    @property
+    def _fractions(self) -> list[TransferFunction]:
+        """The model, or each of its submodels, with the delay, differentiated where that is asked for."""
+        model = self.model
+        if isinstance(model, AdditiveModel):
+            parts = [part.transfer_function() for part in self._submodels]
+            return [TransferFunction(part.numerator, part.denominator, model.delay) for part in parts]
+        b = _times_p(model.numerator) if self.differentiated else model.numerator
+        return [TransferFunction(b, model.denominator, model.delay)]
+
+    # --- poles -------------------------------------------------------------------------------------
+
+    def poles(self) -> tuple[ComplexArray, ComplexArray]:
+        """Poles, and their derivatives, shape (n, p)."""
+        model = self.model
+        if not isinstance(model, AdditiveModel):
+            slopes = np.zeros((model.order, len(self.every)), dtype=complex)
+            slopes[:, : model.order] = pole_jacobian(model.denominator, model.poles)
+            return model.poles, self._among_all(slopes)
+        rows, found, first = [], [], 0
+        for part in model.submodels:
+            poles, jacobian = submodel_poles(part)
+            slopes = np.zeros((part.order, len(self.every)), dtype=complex)
+            # Integrators come last and stay where they are.
+            slopes[: poles.size, first : first + poles.size] = jacobian
+            found.append(np.concatenate((poles, np.zeros(part.integrators))))
+            rows.append(slopes)
+            first += part.term().size
+        return np.concatenate(found), self._among_all(np.vstack(rows))
+
+
+def _submodel_slopes(part: Submodel, s: ComplexArray) -> Sequence[ComplexArray]:
+    """Derivatives of the frequency response of a submodel without delay by its parameters."""
+    over = s**part.integrators * np.polyval(part.denominator, s)
+    plain = np.polyval(part.numerator, s) / over
+    term = part.term()
+    of_denominator = [-(s**k) / np.polyval(part.denominator, s) * plain for k in range(1, term.poles + 1)]
+    return of_denominator + [s**k / over for k in range(term.zeros + 1)]
+
+
+def _times_p(numerator: Array) -> Array:
+    return np.append(numerator, 0.0)
