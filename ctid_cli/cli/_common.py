@@ -6,6 +6,7 @@ import functools
 import json
 import os
 import re
+import shlex
 import sys
 import tempfile
 import time
@@ -77,6 +78,19 @@ def duration(text: str) -> float:
         raise typer.BadParameter(f"{text!r} is no time; write for example 90s, 30m or 1h30m")
     hours, minutes, rest = parts
     return 3600 * hours + 60 * minutes + rest
+
+
+def given_command(context: typer.Context) -> str:
+    """The command that runs, with the options that are not as they would be without being given, but for outputs."""
+    words = context.command_path.split()
+    for option in context.command.params:
+        value = context.params.get(str(option.name))
+        if value == option.get_default(context) or option.name in ("as_json", "out", "report"):
+            continue
+        name = [max(option.opts, key=len)] if option.param_type_name == "option" else []
+        for each in value if isinstance(value, list | tuple) else [value]:
+            words += name if each is True else [*name, str(getattr(each, "value", each))]
+    return shlex.join(words)
 
 
 def answer(as_json: bool, content: Callable[[], object], text: Callable[[], str]) -> None:

@@ -1,13 +1,25 @@
 """``ctid fit``."""
 
 import contextlib
+import json
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from ctid_cli.cli._common import From, InputColumn, InputHold, Json, OutputColumn, TimeColumn, To, guarded, write_files
+from ctid_cli.cli._common import (
+    From,
+    InputColumn,
+    InputHold,
+    Json,
+    OutputColumn,
+    TimeColumn,
+    To,
+    given_command,
+    guarded,
+    write_files,
+)
 from ctid_cli.cli._progress import FitProgress
 from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import InitialState, LossKind, Offset
@@ -15,6 +27,7 @@ from ctid_cli.signals.treatment import InitialState, LossKind, Offset
 
 @guarded
 def fit(
+    context: typer.Context,
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat), an experiment each.")],
     poles: Annotated[int | None, typer.Option("--poles", help="Number of poles, 1 to 12; must be given.")] = None,
     zeros: Annotated[int, typer.Option("--zeros", help="Number of zeros, fewer than poles.")] = 0,
@@ -30,6 +43,7 @@ def fit(
     stop: To = None,
     validate: Annotated[Path | None, typer.Option("--validate", metavar="FILE", help="Judge on this record.")] = None,
     bootstrap: Annotated[int | None, typer.Option("--bootstrap", metavar="DRAWS", help="Bootstrap intervals.")] = None,
+    report: Annotated[bool, typer.Option("--report", help="Write the page fit.html too.")] = False,
     as_json: Json = False,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for fit.json and fit.svg.")] = Path("."),
 ) -> None:
@@ -72,14 +86,19 @@ def fit(
         noise: Any = ("auto",) if bootstrap is None else ("bootstrap", bootstrap, progress)
         result = identify(options, [item.record for item in measurements], validation, *noise)
     content = identification_object(result, measurements, units, other)
-    text = fit_text(result, content, measurements, other, out)
+    text = fit_text(result, content, measurements, other, out, given_command(context))
     figure = identification_drawing(result, measurements, units).saved()
-    write_files({out / "fit.json": text.encode() + b"\n", out / "fit.svg": figure})
+    files = {out / "fit.json": text.encode() + b"\n", out / "fit.svg": figure}
+    if report:
+        from ctid_cli.reporting.pages.fit_page import fit_page
+
+        files[out / "fit.html"] = fit_page(result, measurements, other, json.loads(text)).encode()
+    write_files(files)
     if as_json:
         typer.echo(text)
     else:
         typer.echo(identification_text(result, measurements, units))
-        typer.echo(f"\nWritten: {out / 'fit.json'}, {out / 'fit.svg'}")
+        typer.echo(f"\nWritten: {', '.join(map(str, files))}")
 
 
 def _delay_bounds(text: str) -> tuple[float, float]:

@@ -236,18 +236,34 @@ def _format_of(file: Path | None) -> Literal["svg", "png", "pdf"]:
 
 @guarded
 def report(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Experiment (quickstart) or study (additive).")],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Fit (fit.json), experiment (quickstart) or study (additive).")
+    ],
     out: Out = Path("results"),
     file: Annotated[
         Path | None,
-        typer.Option("--file", metavar="FILE", help="Where the page goes; OUT/<experiment>/report.html by default."),
+        typer.Option(
+            "--file", metavar="FILE", help="Where the page goes; OUT/<experiment>/report.html or fit.html by default."
+        ),
+    ] = None,
+    record: Annotated[
+        list[Path] | None, typer.Option("--record", metavar="FILE", help="Of a fit: where its record is now.")
+    ] = None,
+    validate: Annotated[
+        Path | None, typer.Option("--validate", metavar="FILE", help="Of a fit: where its validation record is now.")
     ] = None,
 ) -> None:
-    """Write a page about an experiment or a study, to read, print or send.
+    """Write a page about a fit, an experiment or a study, to read, print or send.
 
-    One HTML file that opens anywhere and loads nothing: the question, tables, figures, differences of the estimators on
-    the same data sets, what went wrong and the commands that show it, how all of it was computed, and how to cite it.
+    One HTML file that opens anywhere and loads nothing. Of a fit: data, model, what it does, its residuals, and what to
+    know before using it. Of an experiment or study: the question, tables, figures, differences of the estimators on the
+    same data sets, what went wrong and the commands that show it, how all of it was computed. And how to cite it.
     """
+    if Path(name).suffix.lower() == ".json" or Path(name).is_file():
+        _report_fit(Path(name), record, validate, file)
+        return
+    if record or validate:
+        raise UsageError("--record and --validate go with a fit, such as: ctid report fit.json --record FILE")
     from ctid_cli.reporting.pages.experiment_page import experiment_page
     from ctid_cli.reporting.results import experiments_in, read_results
     from ctid_cli.studies.catalogue import all_studies
@@ -267,3 +283,14 @@ def report(
     path = path if file is None else file
     write_files({path: page.encode()})
     typer.echo(path)
+
+
+def _report_fit(path: Path, record: list[Path] | None, validate: Path | None, file: Path | None) -> None:
+    from ctid_cli.reporting.pages.fit_page import fit_page
+    from ctid_cli.storage.fit_file import read_fit
+
+    stored = read_fit(path, record, validate)
+    page = fit_page(stored.result, stored.measurements, stored.validation, stored.content)
+    place = path.with_suffix(".html") if file is None else file
+    write_files({place: page.encode()})
+    typer.echo(place)

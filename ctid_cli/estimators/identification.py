@@ -332,7 +332,7 @@ def costs_about_delay(result: Identification) -> DelayCosts | None:
     """The cost so close to the estimated delay that its minimum is seen; None where no interval of it is known."""
     fit = result.fit.linear
     item = next(item for item in result.estimates if item.name == "delay")
-    if "delay" not in fit.parameter_names or not np.isfinite([item.low, item.high]).all():
+    if "delay" not in fit.parameter_names or not (np.isfinite([item.low, item.high]).all() and fit.cost > 0):
         return None
     laid_out = result.options.prepare(result.records).laid_out
     profile, reach, _ = _cost_of_delay(

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ctid_cli.arrays import Array
 from ctid_cli.inference.frequency_response import FrequencyResponse
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, Drawing, plain
@@ -25,10 +26,10 @@ def frf_drawing(found: FrequencyResponse, units: Units, title: str) -> Drawing:
         draw_points(gain, phase, found, label=f"estimate, {found.method}")
         if found.distortion is not None and found.distortion.any():
             level = np.sqrt(found.distortion)
-            gain.semilogx(found.frequencies, _decibels(level), "x", color=MARK, markersize=3, label="distortion")
+            gain.semilogx(found.frequencies, decibels(level), "x", color=MARK, markersize=3, label="distortion")
         gain.semilogx(
             found.frequencies,
-            _decibels(found.standard_error),
+            decibels(found.standard_error),
             color=MIDDLE,
             linewidth=0.8,
             linestyle="--",
@@ -37,7 +38,7 @@ def frf_drawing(found: FrequencyResponse, units: Units, title: str) -> Drawing:
         if found.bias.any():
             gain.semilogx(
                 found.frequencies,
-                _decibels(found.bias),
+                decibels(found.bias),
                 color=LIGHT,
                 linewidth=0.8,
                 linestyle=":",
@@ -51,7 +52,7 @@ def frf_drawing(found: FrequencyResponse, units: Units, title: str) -> Drawing:
         coherence.set_xlabel(rf"frequency $\omega$ [rad/{plain(units.time)}]")
         gain.margins(x=0.02)
         # The bound falls for ever towards low frequencies.
-        lowest = np.nanmin(_decibels(np.minimum(np.abs(found.response), np.maximum(found.standard_error, 1e-12))))
+        lowest = np.nanmin(decibels(np.minimum(np.abs(found.response), np.maximum(found.standard_error, 1e-12))))
         gain.set_ylim(bottom=max(gain.get_ylim()[0], float(lowest) - 12.0))
         gain.legend(loc="lower left", fontsize=8)
         gain.set_title(plain(title), loc="left")
@@ -59,10 +60,13 @@ def frf_drawing(found: FrequencyResponse, units: Units, title: str) -> Drawing:
     return Drawing(7.5, 6.4, draw)
 
 
-def draw_points(gain: Any, phase: Any, found: FrequencyResponse, label: str = "without a model") -> None:
+def draw_points(
+    gain: Any, phase: Any, found: FrequencyResponse, label: str = "without a model", around: Array | None = None
+) -> None:
     """Points of gain [dB] and phase [degrees] with their pointwise 95 % intervals in grey, on logarithmic frequency.
 
-    A lower end of zero goes down to the standard error; points that are all noise have no phase.
+    A lower end of zero goes down to the standard error; points that are all noise have no phase. Of all angles that a
+    phase may be, those next to the phases ``around`` [rad] are drawn, if they are given.
     """
     low, high = found.gain_band()
     size = np.abs(found.response)
@@ -71,15 +75,19 @@ def draw_points(gain: Any, phase: Any, found: FrequencyResponse, label: str = "w
     phase.set_xscale("log")
     seen = size > 0
     w = found.frequencies[seen]
-    gain.vlines(w, _decibels(floor[seen]), _decibels(high[seen]), color=BAND, linewidth=1.6, zorder=0)
-    gain.plot(w, _decibels(size[seen]), ".", color=MIDDLE, markersize=3, label=label, zorder=1)
+    gain.vlines(w, decibels(floor[seen]), decibels(high[seen]), color=BAND, linewidth=1.6, zorder=0)
+    gain.plot(w, decibels(size[seen]), ".", color=MIDDLE, markersize=3, label=label, zorder=1)
     known = found.standard_error < NO_PHASE * size
-    angle = np.rad2deg(np.unwrap(np.angle(found.response[known])))
+    if around is None:
+        angle = np.rad2deg(np.unwrap(np.angle(found.response[known])))
+    else:
+        angle = np.rad2deg(around[known] + np.angle(found.response[known] * np.exp(-1j * around[known])))
     half = np.rad2deg(found.phase_band()[known])
     phase.vlines(found.frequencies[known], angle - half, angle + half, color=BAND, linewidth=1.6, zorder=0)
     phase.plot(found.frequencies[known], angle, ".", color=MIDDLE, markersize=3, label=label, zorder=1)
 
 
-def _decibels(values: Any) -> Any:
+def decibels(values: Any) -> Any:
+    """Sizes in decibels; NaN where there is none."""
     with np.errstate(divide="ignore"):
         return np.where(values > 0, 20 * np.log10(np.maximum(values, 1e-300)), np.nan)

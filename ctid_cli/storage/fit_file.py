@@ -41,17 +41,18 @@ def fit_text(
     measurements: Sequence[Measurement],
     validation: Measurement | None,
     folder: Path,
+    command: str | None = None,
 ) -> str:
     """The file's text: what is said of a fit, the fit itself, and its records, seen from the folder that it lies in."""
-    whole = {"kind": KIND, "format": FORMAT, "ctid": ctid_cli.__version__, **content}
+    whole = {"kind": KIND, "format": FORMAT, "ctid": ctid_cli.__version__, "command": command, **content}
     whole["records"] = [
         {**said, **_source(item, folder)} for said, item in zip(content["records"], measurements, strict=True)
     ]
     if validation is not None:
         whole["validation"] = {**content["validation"], **_source(validation, folder)}
     whole["result"] = encoded(result)
-    whole["checksum"] = content_hash(json.loads(json.dumps(whole, allow_nan=False)))
-    return json.dumps(whole, allow_nan=False)
+    text = json.dumps(whole, allow_nan=False)
+    return json.dumps(whole | {"checksum": content_hash(json.loads(text))}, allow_nan=False)
 
 
 def _source(measurement: Measurement, folder: Path) -> dict[str, Any]:
@@ -233,11 +234,6 @@ def read_fit(
     return stored
 
 
-def is_fit(path: Path) -> bool:
-    """Whether a name is meant as that of a fit rather than of an experiment."""
-    return path.suffix.lower() == ".json" or path.is_file()
-
-
 def _content(file: str) -> dict[str, Any]:
     """What the file says, if it is a fit as it was written."""
     require_file(file)
@@ -254,7 +250,7 @@ def _content(file: str) -> dict[str, Any]:
     if not isinstance(content.get("format"), int) or content["format"] > FORMAT:
         written = f"was written by a newer ctid ({str(content.get('ctid'))[:20]}): its format is "
         _refuse(file, f"{written}{str(content.get('format'))[:20]}, and this one reads up to {FORMAT}")
-    if content.pop("checksum", None) != content_hash(content):
+    if content.get("checksum") != content_hash({key: item for key, item in content.items() if key != "checksum"}):
         _refuse(file, "is damaged, or was changed after it was written: its checksum is that of other content")
     return content
 

@@ -104,13 +104,13 @@ def equation(settings: Mapping[str, Any]) -> tuple[list[Fraction], bool] | None:
     return fractions, bool(system.get("delay"))
 
 
-def polynomial(coefficients: Sequence[float]) -> list[tuple[str, str, int]]:
+def polynomial(coefficients: Sequence[float], digits: int = 15) -> list[tuple[str, str, int]]:
     """Sign, size and power of s of the terms of a polynomial in descending powers; a size of 1 is not written."""
     found: list[tuple[str, str, int]] = []
     for power, value in zip(range(len(coefficients) - 1, -1, -1), coefficients, strict=True):
         if value:
             sign = "−" if value < 0 else "+" if found else ""
-            found.append((sign, "" if abs(value) == 1 and power else number(abs(float(value)), 15), power))
+            found.append((sign, "" if abs(value) == 1 and power else number(abs(float(value)), digits), power))
     return found or [("", "0", 0)]
 
 

@@ -1,0 +1,63 @@
+"""What to cite for a fit, as BibTeX: ctid, and the methods of others that this fit used."""
+
+import ctid_cli
+from ctid_cli.estimators.identification import Identification
+
+_CTID = """\
+@software{{ctid,
+  author  = {{{{the ctid developers}}}},
+  title   = {{ctid: identification of continuous-time models with a time delay}},
+  version = {{{version}}},
+}}"""
+
+_PROJECTION = """\
+@article{kaufman1975,
+  author  = {Kaufman, L.},
+  title   = {A variable projection method for solving separable nonlinear least squares problems},
+  journal = {BIT},
+  volume  = {15},
+  pages   = {49--57},
+  year    = {1975},
+  doi     = {10.1007/BF01932995},
+}"""
+
+_ROBUST = """\
+@book{huber2009,
+  author    = {Huber, P. J. and Ronchetti, E. M.},
+  title     = {Robust Statistics},
+  edition   = {2},
+  publisher = {Wiley},
+  year      = {2009},
+  doi       = {10.1002/9780470434697},
+}"""
+
+_LIKELIHOOD = """\
+@article{patterson1971,
+  author  = {Patterson, H. D. and Thompson, R.},
+  title   = {Recovery of inter-block information when block sizes are unequal},
+  journal = {Biometrika},
+  volume  = {58},
+  pages   = {545--554},
+  year    = {1971},
+  doi     = {10.1093/biomet/58.3.545},
+}"""
+
+_FREQUENCY = """\
+@book{pintelon2012,
+  author    = {Pintelon, R. and Schoukens, J.},
+  title     = {System Identification: A Frequency Domain Approach},
+  edition   = {2},
+  publisher = {Wiley},
+  year      = {2012},
+  doi       = {10.1002/9781118287422},
+}"""
+
+
+def bibtex(result: Identification) -> str:
+    """Entries for a fit and for the frequency response that stands beside it."""
+    entries = [_CTID.format(version=ctid_cli.__version__), _PROJECTION]
+    if result.fit.weighting is not None:
+        entries.append(_ROBUST)
+    if result.uncertainty.kind != "white":
+        entries.append(_LIKELIHOOD)
+    return "\n\n".join([*entries, _FREQUENCY])
