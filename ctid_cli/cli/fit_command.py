@@ -88,17 +88,17 @@ def fit(
     content = identification_object(result, measurements, units, other)
     text = fit_text(result, content, measurements, other, out, given_command(context))
     figure = identification_drawing(result, measurements, units).saved()
-    files = {out / "fit.json": text.encode() + b"\n", out / "fit.svg": figure}
+    contents = {out / "fit.json": text.encode() + b"\n", out / "fit.svg": figure}
     if report:
         from ctid_cli.reporting.pages.fit_page import fit_page
 
-        files[out / "fit.html"] = fit_page(result, measurements, other, json.loads(text)).encode()
-    write_files(files)
+        contents[out / "fit.html"] = fit_page(result, measurements, other, json.loads(text)).encode()
+    write_files(contents)
     if as_json:
         typer.echo(text)
     else:
         typer.echo(identification_text(result, measurements, units))
-        typer.echo(f"\nWritten: {', '.join(map(str, files))}")
+        typer.echo(f"\nWritten: {', '.join(map(str, contents))}")
 
 
 def _delay_bounds(text: str) -> tuple[float, float]:

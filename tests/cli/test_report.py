@@ -1,6 +1,9 @@
 """``ctid report``, and ``ctid figure`` of experiments: files, where they go, and what is refused."""
 
+import numpy as np
 import pytest
+
+from ctid_cli import HeldSignal, TransferFunction, simulate
 
 
 def test_the_figure_of_an_experiment_goes_to_its_folder(ctid, done):
@@ -53,3 +56,47 @@ def test_an_unknown_name_is_refused(ctid, done):
     stderr = ctid("report", "tinny", "--out", done, code=2).stderr
     assert "'tinny' is neither an experiment with results in" in stderr
     assert "did you mean 'tiny'? Known: measured-tiny, tiny, additive" in stderr
+
+
+@pytest.fixture
+def fitted(ctid, tmp_path):
+    """A folder with a record, its fit and the fit's page."""
+    t = 0.1 * np.arange(200)
+    u = np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], 40), 5)
+    y = simulate(TransferFunction([2.0], [1.0, 1.0], 0.3), HeldSignal(t, u), t) + 0.05 * np.cos(37.0 * t)
+    rows = ["t,u,y", *(",".join(map(repr, row)) for row in np.column_stack((t, u, y)).tolist())]
+    (tmp_path / "record.csv").write_text("\n".join(rows), encoding="utf-8")
+    shown = ctid("fit", tmp_path / "record.csv", "--poles", 1, "--delay", 0.3, "--report", "--out", tmp_path).stdout
+    assert f"Written: {tmp_path / 'fit.json'}, {tmp_path / 'fit.svg'}, {tmp_path / 'fit.html'}" in shown
+    return tmp_path
+
+
+def test_the_page_of_a_fit_is_that_of_its_file(ctid, fitted):
+    first = (fitted / "fit.html").read_bytes()
+    assert b"--poles 1 --delay 0.3" in first
+    assert b"<h1>Fit of " in first
+    (fitted / "record.csv").rename(fitted / "moved.csv")
+    stderr = ctid("report", fitted / "fit.json", code=2).stderr
+    assert "record.csv does not exist; say where it is now: --record FILE" in stderr
+    page = fitted / "new" / "page.html"
+    shown = ctid("report", fitted / "fit.json", "--record", fitted / "moved.csv", "--file", page).stdout
+    assert shown == f"{page}\n"
+    assert page.read_bytes() == first
+
+
+def test_what_is_no_fit_has_no_page(ctid, fitted):
+    before = sorted(fitted.iterdir())
+    (fitted / "track.json").write_text('{"kind": "ctid track"}', encoding="utf-8")
+    cases = {
+        (fitted / "track.json",): "is no fit but of kind 'ctid track'",
+        (fitted / "none.json",): "none.json: does not exist",
+        (fitted / "record.csv",): "is no JSON, or damaged",
+        (fitted / "fit.json", "--record", fitted / "fit.json"): "is not the file that the fit is of",
+        (fitted / "fit.json", "--validate", fitted / "record.csv"): "has no validation record",
+        ("quickstart", "--record", fitted / "record.csv"): "--record and --validate go with a fit",
+    }
+    for arguments, sentence in cases.items():
+        stderr = ctid("report", *arguments, code=2).stderr
+        assert sentence in stderr
+        assert stderr.count("\n") == 1
+    assert sorted(path for path in fitted.iterdir() if path.name != "track.json") == before

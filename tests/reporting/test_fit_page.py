@@ -1,0 +1,142 @@
+"""The page of a fit: complete in itself, and safe whatever names files and columns have."""
+
+import re
+from collections import Counter
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from ctid_cli import DelayProfile, HeldSignal, Record, TransferFunction, identify, simulate
+from ctid_cli.estimators.identification import costs_about_delay
+from ctid_cli.reporting.citations import bibtex
+from ctid_cli.reporting.estimate import Units
+from ctid_cli.reporting.identification_report import identification_object
+from ctid_cli.reporting.pages.fit_page import fit_page
+from ctid_cli.signals.measurement import Measurement
+from ctid_cli.storage.fit_file import fit_text, read_fit
+
+HOSTILE = "<script>alert(1)</script>&$x_{\"'"
+SYSTEM = TransferFunction([3.0], [1.0, 1.2, 4.0], 0.73)
+VOID = {"meta", "link", "br", "img", "input", "hr"}
+
+
+def measurement(seed, name, n=400, noise=0.1):
+    rng = np.random.default_rng(seed)
+    t = 0.1 * np.arange(n)
+    u = HeldSignal(t, np.repeat(rng.choice([-1.0, 1.0], n // 5), 5))
+    y = simulate(SYSTEM, u, t) + noise * rng.standard_normal(n)
+    return Measurement(Record(t, y, u, name=name), "s", HOSTILE, "mm", "t", HOSTILE, HOSTILE, notes=(HOSTILE,))
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """A fit with everything, its records and its page."""
+    measured, other = [measurement(0, HOSTILE)], measurement(1, "other.csv")
+    options = DelayProfile(2, 0, (0, 2), initial_state="estimate", offset="estimate")
+    result = identify(options, [item.record for item in measured], other.record)
+    return result, measured, other
+
+
+def page_of(result, measured, other, folder):
+    units = Units("s", HOSTILE, "mm")
+    content = identification_object(result, measured, units, other)
+    path = folder / "fit.json"
+    path.write_text(fit_text(result, content, measured, other, folder, f"ctid fit {HOSTILE}"), encoding="utf-8")
+    stored = read_fit(path)
+    return fit_page(result, measured, other, stored.content), fit_page(stored.result, measured, other, stored.content)
+
+
+class Page(HTMLParser):
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.tags, self.attributes, self.text = [], Counter(), [], ""
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags[tag] += 1
+        self.attributes += attrs
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags[tag] += 1
+        self.attributes += attrs
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def test_a_page_says_all_and_needs_nothing_but_itself(fitted, tmp_path):
+    text, again = page_of(*fitted, tmp_path)
+    assert text == again  # what is read from the file draws the same page, to the byte
+    page = Page(text)
+    titles = ["Before using it", "Data", "Model", "Output", "Residuals", "Responses", "Poles", "Delay", "Provenance"]
+    for title in [*titles, "How to cite"]:
+        assert title in page.text
+    assert page.tags["svg"] == 8
+    for words in ("natural_frequency_1", "95 % low", "without a model", "cost above the least", "@software{ctid"):
+        assert words in page.text or words in text
+    assert page.tags["script"] == page.tags["link"] == page.tags["img"] == page.tags["iframe"] == 0
+    places = [value for name, value in page.attributes if name in ("href", "xlink:href", "src", "action")]
+    assert all(value.startswith("#") for value in places)
+    names = Counter(value for name, value in page.attributes if name == "id")
+    assert max(names.values()) == 1
+    assert {value[1:] for value in places} <= names.keys()
+    assert not [name for name, _ in page.attributes if name.startswith("on")]
+    assert page.text.count(HOSTILE) >= 5  # title, column, note, unit, command
+    assert "url(http" not in text
+    assert len(text) < 2_000_000
+
+
+def test_nothing_of_the_machine_is_on_the_page(fitted, tmp_path):
+    result, measured, _ = fitted
+    file = tmp_path / "far" / "r.csv"
+    file.parent.mkdir()
+    file.write_text("t,u,y\n", encoding="utf-8")
+    moved = [replace(measured[0], path=file)]
+    (tmp_path / "near").mkdir()
+    content = identification_object(result, moved, Units())
+    text = fit_text(replace(result, validation=None), content | {"validation": None}, moved, None, tmp_path / "near")
+    (tmp_path / "near" / "fit.json").write_text(text, encoding="utf-8")
+    page = fit_page(replace(result, validation=None), moved, None, read_fit(tmp_path / "near" / "fit.json").content)
+    assert "r.csv, hold zoh" in page
+    assert str(tmp_path) not in page
+
+
+def test_the_cost_about_the_delay_is_least_at_the_estimate(fitted):
+    result = fitted[0]
+    near = costs_about_delay(result)
+    assert near.delays[np.argmin(near.costs)] == pytest.approx(result.fit.model.delay, abs=1e-9)
+    assert near.costs.min() == pytest.approx(near.least, rel=1e-9)
+    inside = near.delays[near.costs <= near.allowed]
+    item = next(item for item in result.estimates if item.name == "delay")
+    step = np.diff(near.delays).max()
+    assert abs(inside[0] - item.low) <= 1.5 * step
+    assert abs(inside[-1] - item.high) <= 1.5 * step
+
+
+def test_a_known_delay_and_a_model_of_nothing_have_pages_too(tmp_path):
+    rng = np.random.default_rng(3)
+    t = 0.1 * np.arange(200)
+    record = Record.from_arrays(t, np.repeat(rng.choice([-1.0, 1.0], 40), 5), rng.standard_normal(200), name="noise")
+    measured = [Measurement.of(record)]
+    result = identify(DelayProfile(1, 0, (0.5, 0.5)), [record])
+    text, again = page_of(result, measured, None, tmp_path)
+    assert text == again
+    page = Page(text)
+    assert '<section id="delay">' not in text
+    assert "no answer" in page.text.lower()
+
+
+def test_what_a_fit_used_is_cited(fitted):
+    entries = bibtex(fitted[0])
+    assert entries.count("{") == entries.count("}")
+    keys = re.findall(r"^@\w+\{(\w+),$", entries, re.MULTILINE)
+    assert keys == ["ctid", "kaufman1975", "pintelon2012"]
