@@ -32,7 +32,7 @@ def validation_drawing(judged: Validation, measurement: Measurement, units: Unit
         axes = figure.add_subplot()
         draw_overlay(axes, measurement, judged.applied.used[0], judged.applied.residuals[0], units)
         axes.margins(x=0.0)
-        axes.set_xlabel(f"{plain(measurement.time)} [{plain(units.time)}]")
+        axes.set_xlabel(plain(measurement.label("time", units.time)))
 
     return Drawing(8.0, 2.8, draw)
 

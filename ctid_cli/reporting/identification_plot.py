@@ -11,7 +11,7 @@ from ctid_cli.arrays import Array, BoolArray, IntArray
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.inference.residuals import ResidualTests
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, STRIPES, Drawing, outline
+from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, STRIPES, Drawing, outline, plain
 from ctid_cli.signals.measurement import Measurement
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def draw_overlay(axes: Any, measurement: Measurement, use: BoolArray, residuals:
     simulated = outline(*_with_gaps(record.t, use, record.y[use] - residuals))
     axes.plot(*outline(record.t, record.y), color=LIGHT, linewidth=2.2, zorder=1.9, label="measured")
     axes.plot(*simulated, color=DARK, linewidth=0.9, label="simulated")
-    axes.set_ylabel(f"{measurement.output} [{units.output}]")
+    axes.set_ylabel(plain(measurement.label("output", units.output)))
     axes.legend(loc="lower right", ncols=3, fontsize=8)
     low, high = axes.get_ylim()
     axes.set_ylim(low - 0.18 * (high - low), high)  # room for the legend below the curves
@@ -94,14 +94,15 @@ def _draw_residuals(axes: Any, result: Identification, measurement: Measurement,
     t = measurement.record.t
     axes.plot(*outline(*_with_gaps(t, result.fit.used[k], result.fit.residuals[k])), color=DARK, linewidth=0.7)
     axes.axhline(0.0, color="black", linewidth=0.6)
-    axes.set_ylabel(f"residual [{units.output}]")
+    axes.set_ylabel(plain(f"residual [{units.output}]"))
 
 
 def _name_panels(upper: Any, lower: Any, measurement: Measurement, k: int, n: int, units: Units) -> None:
     """Name the axis of time below the lower panel, and above the upper one which of n experiments it is."""
     t = measurement.record.t
     thinned = f"; the least and the greatest of each {t.size // STRIPES} samples are drawn"
-    lower.set_xlabel(f"{measurement.time} [{units.time}]{thinned * (outline(t, t)[0].size < t.size)}")
+    label = plain(measurement.label("time", units.time))
+    lower.set_xlabel(label + thinned * (outline(t, t)[0].size < t.size))
     if n > 1:
         upper.set_title(f"experiment {k + 1} of {n}", loc="left")
 
@@ -150,18 +151,24 @@ def _draw_band(axes: Any, band: float, label: str) -> None:
 def draw_profile(axes: Any, result: Identification, units: Units) -> None:
     """The search over the delay."""
     profile, delay = result.fit.profile, result.fit.model.delay
-    axes.set_xlabel(f"delay [{units.time}]")
-    axes.set_ylabel(f"cost [({units.output})²]")
+    axes.set_xlabel(plain(f"delay [{units.time}]"))
+    axes.set_ylabel(plain(f"cost [({units.output})²]"))
     if profile is None:
-        axes.plot([delay], [result.fit.cost], "o", color=DARK, label=f"known delay {delay:.4g} {units.time}")
+        axes.plot([delay], [result.fit.cost], "o", color=DARK, label=plain(f"known delay {delay:.4g} {units.time}"))
     else:
         whole = profile.samples >= result.fit.count
         behind = "" if whole else f" of the liveliest {profile.samples} samples"
         behind += "" if profile.cutoff is None else f" below {profile.cutoff:.3g} rad/{units.time}"
         axes.plot(
-            profile.delays, profile.costs, ".-", color=DARK, linewidth=0.8, markersize=4, label=f"profile{behind}"
+            profile.delays,
+            profile.costs,
+            ".-",
+            color=DARK,
+            linewidth=0.8,
+            markersize=4,
+            label=plain(f"profile{behind}"),
         )
-        label = f"minimum at {delay:.4g} {units.time}"
+        label = plain(f"minimum at {delay:.4g} {units.time}")
         if profile.cutoff is None and whole:
             axes.plot([delay], [result.fit.cost], "v", color="black", markersize=7, label=label)
         else:

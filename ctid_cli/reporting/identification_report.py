@@ -207,7 +207,8 @@ def record_line(measurement: Measurement, used: int, units: Units) -> str:
     part = "" if used == record.n_samples else f" ({used} used)"
     clock = "regular clock" if record.interval is not None else "irregular clock"
     span = f"{part} from {record.t[0]:.6g} to {record.t[-1]:.6g} {units.time}, {clock}"
-    columns = f"input {measurement.input} [{units.input}], output {measurement.output} [{units.output}]"
+    labels = measurement.label("input", units.input), measurement.label("output", units.output)
+    columns = f"input {labels[0]}, output {labels[1]}"
     return f"{record.name}: {count(record.n_samples, 'sample')}{span}; {columns}"
 
 

@@ -56,6 +56,10 @@ class Measurement:
         """A record of which nothing else is known."""
         return cls(record, None, None, None, "t", "u", "y")
 
+    def label(self, role: Role, unit: str) -> str:
+        """Name of a column, with a unit, whether or not its header has one too."""
+        return f"{split_header(str(getattr(self, role)))[0]} [{unit}]"
+
 
 def read_measurement(
     path: str | os.PathLike[str],

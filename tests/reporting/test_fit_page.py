@@ -1,6 +1,7 @@
 """The page of a fit: complete in itself, and safe whatever names files and columns have."""
 
 import re
+import shlex
 from collections import Counter
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -17,7 +18,7 @@ from ctid_cli.reporting.pages.fit_page import fit_page
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.storage.fit_file import fit_text, read_fit
 
-HOSTILE = "<script>alert(1)</script>&$x_{\"'"
+HOSTILE = "<script>alert(1)</script>&$x_{$\"'"
 SYSTEM = TransferFunction([3.0], [1.0, 1.2, 4.0], 0.73)
 VOID = {"meta", "link", "br", "img", "input", "hr"}
 
@@ -43,7 +44,10 @@ def page_of(result, measured, other, folder):
     units = Units("s", HOSTILE, "mm")
     content = identification_object(result, measured, units, other)
     path = folder / "fit.json"
-    path.write_text(fit_text(result, content, measured, other, folder, f"ctid fit {HOSTILE}"), encoding="utf-8")
+    path.write_text(
+        fit_text(result, content, measured, other, folder, shlex.join(["ctid", "fit", HOSTILE, "/far/away.csv"])),
+        encoding="utf-8",
+    )
     stored = read_fit(path)
     return fit_page(result, measured, other, stored.content), fit_page(stored.result, measured, other, stored.content)
 
@@ -90,7 +94,8 @@ def test_a_page_says_all_and_needs_nothing_but_itself(fitted, tmp_path):
     assert max(names.values()) == 1
     assert {value[1:] for value in places} <= names.keys()
     assert not [name for name, _ in page.attributes if name.startswith("on")]
-    assert page.text.count(HOSTILE) >= 5  # title, column, note, unit, command
+    assert page.text.count(HOSTILE) >= 5  # title, columns, note, units
+    assert shlex.join(["ctid", "fit", HOSTILE, "away.csv"]) in page.text
     assert "url(http" not in text
     assert len(text) < 2_000_000
 

@@ -1,5 +1,6 @@
 """The page of one fit: what was measured, the model, what it does, and whether to believe it."""
 
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import PurePath
 from typing import Any, NamedTuple
@@ -72,7 +73,7 @@ def fit_page(
         chapters=chapters,
         titles=[(chapter.name, chapter.title) for chapter in chapters],
         provenance=_provenance(content),
-        command=content["command"] or "",
+        command=shlex.join(map(_shown, shlex.split(content["command"] or ""))),
         bibtex=bibtex(result),
     )
 
@@ -125,13 +126,15 @@ def _provenance(content: Mapping[str, Any]) -> Report:
             rows.append([label, "its samples are in the file of the fit"])
         else:
             window = [f"{word} {each[word]}" for word in ("from", "to") if each[word] is not None]
-            # A page is sent to others: nothing in it names a folder of this machine.
-            path = PurePath(str(each["path"]))
-            shown = path.name if path.is_absolute() else str(path)
-            rows.append([label, ", ".join([shown, f"hold {each['hold']}", *window])])
+            rows.append([label, ", ".join([_shown(str(each["path"])), f"hold {each['hold']}", *window])])
             rows.append(["its SHA-256", str(each["sha256"])])
     rows.append(["checksum of the fit", str(content.get("checksum", ""))])
     return Report([[Table(["", ""], rows, "ll")]])
+
+
+def _shown(word: str) -> str:
+    """A page is sent to others: nothing in it names a folder of this machine."""
+    return PurePath(word).name if PurePath(word).is_absolute() else word
 
 
 # --- figures ---------------------------------------------------------------------------------------
