@@ -1,6 +1,5 @@
 """``ctid fit``."""
 
-import contextlib
 import json
 from functools import partial
 from pathlib import Path
@@ -21,6 +20,7 @@ from ctid_cli.cli._common import (
     write_files,
 )
 from ctid_cli.cli._progress import FitProgress
+from ctid_cli.cli.fit_structure import Asked, ModelForm, check_loop, delay_bounds, estimator_of, with_loop
 from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import InitialState, LossKind, Offset
 
@@ -30,8 +30,25 @@ def fit(
     context: typer.Context,
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat), an experiment each.")],
     poles: Annotated[int | None, typer.Option("--poles", help="Number of poles, 1 to 12; must be given.")] = None,
-    zeros: Annotated[int, typer.Option("--zeros", help="Number of zeros, fewer than poles.")] = 0,
+    zeros: Annotated[int | None, typer.Option("--zeros", help="Number of zeros, fewer than poles.")] = None,
     delay: Annotated[str, typer.Option("--delay", metavar="LOW:HIGH|VALUE", help="Range or value [time unit].")] = "0",
+    model: Annotated[ModelForm, typer.Option("--model", help="One fraction, or a sum of submodels.")] = "fraction",
+    terms: Annotated[
+        str | None, typer.Option("--terms", metavar="P/Z,P/Z,...", help="Poles/zeros of each submodel.")
+    ] = None,
+    integrators: Annotated[
+        int, typer.Option("--integrators", help="Further poles at the origin, of the first submodel.")
+    ] = 0,
+    fix: Annotated[
+        list[str] | None, typer.Option("--fix", metavar="NAME=VALUE", help="Hold a parameter; repeatable.")
+    ] = None,
+    loop: Annotated[
+        Path | None, typer.Option("--loop", metavar="FILE", help="YAML with the section loop of the record.")
+    ] = None,
+    reference: Annotated[
+        str | None, typer.Option("--reference", metavar="NAME", help="Column of the loop's reference.")
+    ] = None,
+    ignore_loop: Annotated[bool, typer.Option("--ignore-loop", help="Fit as if there were no loop.")] = False,
     initial_state: Annotated[InitialState, typer.Option("--initial-state", help="State before the record.")] = "rest",
     offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output.")] = "none",
     loss: Annotated[LossKind, typer.Option("--loss", help="What large output errors count.")] = "squares",
@@ -53,33 +70,30 @@ def fit(
     fit.svg. The delay is searched over its whole range: no start is needed.
     """
     from ctid_cli.estimation.common import LEAST_DRAWS
-    from ctid_cli.estimators.delay_profile import DelayProfile
     from ctid_cli.estimators.identification import identify
     from ctid_cli.reporting.identification_plot import identification_drawing
     from ctid_cli.reporting.identification_report import common_units, identification_object, identification_text
     from ctid_cli.signals.measurement import read_measurement
     from ctid_cli.storage.fit_file import fit_text
 
-    if poles is None:
+    if poles is None and model == "fraction":
         raise UsageError(f"--poles is missing; to see what the record allows and a first fit: ctid check {files[0]}")
     if bootstrap is not None and bootstrap < LEAST_DRAWS:
         raise UsageError(f"--bootstrap must be at least {LEAST_DRAWS} draws, for example 500; got {bootstrap}")
-    bounds = _delay_bounds(delay)
-    try:
-        options = DelayProfile(
-            poles,
-            zeros,
-            bounds,
-            initial_state=initial_state,
-            offset=offset,
-            loss=loss,
-            nested=True,
-        )
-    except ValueError as error:
-        raise UsageError(str(error)) from None
-    read = partial(read_measurement, time=time, input=input, output=output, hold=hold)
+    check_loop(loop, reference, ignore_loop)
+    asked = Asked(
+        *(model, terms, poles, zeros, integrators, delay_bounds(delay), fix or (), initial_state, offset, loss, hold),
+        loop=loop is not None and not ignore_loop,
+    )
+    options = estimator_of(asked)
+    if asked.iterated and len(files) > 1:
+        raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")
+    read = partial(read_measurement, time=time, input=input, output=output, hold=hold, reference=reference)
     measurements = [read(file, start=start, stop=stop) for file in files]
     other = None if validate is None else read(validate)
+    if loop is not None:
+        measurements = [with_loop(loop, measurement, ignore_loop) for measurement in measurements]
+        other = other and with_loop(loop, other, ignore_loop)
     units = common_units(measurements if other is None else [*measurements, other])
     validation = None if other is None else other.record
     with FitProgress(sum(item.record.n_samples for item in measurements)) as progress:
@@ -99,13 +113,3 @@ def fit(
     else:
         typer.echo(identification_text(result, measurements, units))
         typer.echo(f"\nWritten: {', '.join(map(str, contents))}")
-
-
-def _delay_bounds(text: str) -> tuple[float, float]:
-    low, colon, high = text.partition(":")
-    with contextlib.suppress(ValueError):
-        bounds = float(low), float(high if colon else low)
-        if 0 <= bounds[0] <= bounds[1] < float("inf"):
-            return bounds
-    allowed = "LOW:HIGH, a range to search, or one known VALUE, in the record's unit of time and not negative"
-    raise UsageError(f"--delay must be {allowed}, for example 0:2 or 0.3; got {text!r}")

@@ -54,6 +54,8 @@ class SubmodelEstimate(NamedTuple):
 
     #: Parameters of the model, in the order of the problem's terms, shape (p,).
     theta: Array
+    #: The same and those of the free response.
+    whole: Array
     #: Covariance, status and all else that a `Fit` says of them, by its names.
     values: dict[str, Any]
 
@@ -67,8 +69,8 @@ def estimate_submodels(
     loop, if that does not help, goes on with guarded steps.
     """
     p, y = problem.size, problem.data.y_used
-    whole = np.concatenate((theta, np.zeros(problem.filter.free)))
-    radius = radius_in_loop(problem, problem.model(theta)) if problem.filter.loop.closed else 0.0
+    whole = problem.with_fixed(np.concatenate((theta, np.zeros(problem.filter.free))))
+    radius = radius_in_loop(problem, problem.model(whole)) if problem.filter.loop.closed else 0.0
     if radius > 1.0 and problem.data.y.size * np.log(radius) > np.log(LARGEST_GROWTH):
         raise DataError(
             "the start makes an unstable loop with the controller: its poles reach the magnitude "
@@ -89,15 +91,15 @@ def estimate_submodels(
         result = _better(result, run("refine_guarded", problem, result.theta, steps._replace(rule=GUARDED)))
     values: dict[str, Any] = {"iterations": history.steps, "history": history}
     if result is None:
-        return SubmodelEstimate(theta, {**values, **diverged(p, y.size)})
+        return SubmodelEstimate(whole[:p], whole, {**values, **diverged(p, y.size)})
     equations, status = result.equations, result.status
     matrix = np.full((p, p), np.nan)
     if status is not Status.DIVERGED:
         matrix = _covariance(problem, result.theta, equations, covariance, draws)[:p, :p]
-        if status is Status.CONVERGED and np.isnan(matrix).any():
+        if status is Status.CONVERGED and np.isnan(np.delete(np.diag(matrix), list(problem.fixed))).any():
             status = Status.SINGULAR
     values |= {"covariance": matrix, "status": status, **quality(equations, float(np.sum((y - y.mean()) ** 2)), y.size)}
-    return SubmodelEstimate(result.theta[:p], values)
+    return SubmodelEstimate(result.theta[:p], result.theta, values)
 
 
 def _better(one: Iterated | None, other: Iterated | None) -> Iterated | None:
@@ -111,13 +113,15 @@ def _better(one: Iterated | None, other: Iterated | None) -> Iterated | None:
 
 def _covariance(problem: AdditiveProblem, theta: Array, equations: Equations, kind: Covariance, draws: int) -> Array:
     """Covariance of all parameters, those of a free response included."""
-    if kind == "white":
+    if kind == "white" and not problem.fixed:
         return white_noise_covariance(equations.hessian, equations.squared_error, problem.data.count)
     rows = problem.filter.rows(theta)
     if rows is None:
         return np.full((theta.size, theta.size), np.nan)
     psi, _, error, _ = rows
-    return estimate_uncertainty([psi], [error], kind, draws, regular=problem.data.interval > 0.0).widened()
+    tangent = problem.tangent if problem.fixed else None
+    found = estimate_uncertainty([psi], [error], kind, draws, regular=problem.data.interval > 0.0, tangent=tangent)
+    return found.widened()
 
 
 def radius_in_loop(problem: AdditiveProblem, model: AdditiveModel) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Literal
 
@@ -62,17 +62,36 @@ class AdditiveProblem:
         delay: float,
         loop: LoopData = OPEN_LOOP,
         initial_state: InitialState = "rest",
+        fixed: Mapping[int, float] | None = None,
     ) -> None:
         self.data = data
         self.terms = tuple(terms)
         self.delay = delay
         self.initial_state: InitialState = initial_state
         self.filter = SubmodelFilter(data, terms, delay, loop, initial_state)
+        #: Parameters that are known, by their places, and their values.
+        self.fixed = dict(fixed or {})
 
     def with_other_hold(self) -> AdditiveProblem:
         """The same problem with the other interpolation of the output in the regressors."""
         data = self.data._replace(y_foh=not self.data.y_foh)
-        return AdditiveProblem(data, self.terms, self.delay, self.filter.loop, self.initial_state)
+        return AdditiveProblem(data, self.terms, self.delay, self.filter.loop, self.initial_state, self.fixed)
+
+    def with_known(self, fixed: Mapping[int, float]) -> AdditiveProblem:
+        """The same problem with other known parameters."""
+        return AdditiveProblem(self.data, self.terms, self.delay, self.filter.loop, self.initial_state, fixed)
+
+    @property
+    def tangent(self) -> Array:
+        """Directions in which the parameters are free, those of a free response included, shape (p, f)."""
+        return np.delete(np.eye(self.free), list(self.fixed), axis=1)
+
+    def with_fixed(self, theta: Array) -> Array:
+        """Parameters with the known ones at their values."""
+        found = theta.copy()
+        for place, value in self.fixed.items():
+            found[place] = value
+        return found
 
     @property
     def samples(self) -> int:
@@ -110,6 +129,15 @@ class AdditiveProblem:
         """
         if not np.isfinite(theta).all():
             return theta
+        if self.fixed:
+            # To mirror a pole may move what is known; what is then still unstable is no model, and the step shorter.
+            mirrored = self.with_fixed(self._mirrored(self.with_fixed(theta)))
+            stable = np.array_equal(self._mirrored(mirrored), mirrored)
+            return mirrored if stable else np.full_like(theta, np.nan)
+        return self._mirrored(theta)
+
+    def _mirrored(self, theta: Array) -> Array:
+        """Parameters of stable submodels."""
         result = theta.copy()
         offset = 0
         for term in self.terms:
@@ -141,4 +169,14 @@ class AdditiveProblem:
         """Second moments of the iteration."""
         moments = self.filter.moments(theta) if np.isfinite(theta).all() else None
         found: Equations = inadmissible(theta.size) if moments is None else Equations(**vars(moments))
-        return found
+        return self._without_fixed(found) if self.fixed else found
+
+    def _without_fixed(self, found: Equations) -> Equations:
+        """Equations in which a known parameter has a row and a column of its own, and nothing moves it."""
+        matrices = [found.instrument_regressor.copy(), found.hessian.copy()]
+        error, known = found.instrument_error.copy(), list(self.fixed)
+        for matrix in matrices:
+            matrix[known] = matrix[:, known] = 0.0
+            matrix[known, known] = 1.0
+        error[known] = 0.0
+        return found._replace(instrument_regressor=matrices[0], hessian=matrices[1], instrument_error=error)

@@ -50,7 +50,7 @@ class MeasuredRecords:
             self._check_input(record)
         removed = treatment.offset == "remove"
         bridged = [_bridged(record) if treatment.bridge else record for record in records]
-        centred = [_without_means(record) if removed else (record, 0.0, 0.0) for record in bridged]
+        centred = [without_means(record) if removed else (record, 0.0, 0.0) for record in bridged]
         self.records = [one for one, _, _ in centred]
         self.input_offsets = [u0 for _, u0, _ in centred]
         self.offsets = [y0 for _, _, y0 in centred]
@@ -126,7 +126,7 @@ class MeasuredRecords:
         """The first record without its means, for starts that know no offset and no initial state."""
         if self.treatment.offset != "estimate":
             return self.data[0]
-        return self._lay_out(_without_means(self.records[0])[0])
+        return self._lay_out(without_means(self.records[0])[0])
 
     def used(self) -> tuple[BoolArray, ...]:
         """Which samples of each record enter the sums."""
@@ -149,13 +149,14 @@ def _cut(record: Record, part: slice) -> Record:
     return Record(t, record.y[part], HeldSignal(t, signal.values[part], signal.hold), name=record.name)
 
 
-def _without_means(record: Record) -> tuple[Record, float, float]:
+def without_means(record: Record) -> tuple[Record, float, float]:
     """Record less the mean of its output samples and the time average of its input."""
     y0 = float(np.nanmean(record.y))
     signal = record.input
     u0 = float(np.mean(signal.at(record.t)))
-    centred = Record(record.t, record.y - y0, HeldSignal(signal.t, signal.values - u0, signal.hold), name=record.name)
-    return centred, u0, y0
+    centred = HeldSignal(signal.t, signal.values - u0, signal.hold)
+    loop = record.loop and replace(record.loop, reference=record.loop.reference - record.loop.reference.mean())
+    return Record(record.t, record.y - y0, centred, name=record.name, loop=loop), u0, y0
 
 
 def _period(record: Record) -> float:

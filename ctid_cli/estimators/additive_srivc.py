@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import islice, permutations
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.additive_estimate import SubmodelEstimate, estimate_submodels, radius_in_loop
 from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_record, named
+from ctid_cli.estimation.fixed import Fixed, places_of
 from ctid_cli.estimation.iteration import RULES, StepRule, Steps
 from ctid_cli.estimation.modal_start import ModalStart, automatic_start
 from ctid_cli.filtering.filter_data import filter_data
@@ -21,13 +25,17 @@ from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.fitted_model import responses
 from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
-from ctid_cli.models.additive import AdditiveModel, Term
+from ctid_cli.models.additive import AdditiveModel, Term, names_of
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
 if TYPE_CHECKING:
     from ctid_cli.inference.responses import Estimated
+
+#: Orders of the submodels that are tried to find the one that known parameters belong to.
+MOST_ORDERS = 5040
+TINY = float(np.finfo(float).tiny)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -110,6 +118,9 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         Where the iteration does not converge it is run once more with the other one.
     bootstrap_draws : int, default 500
         Simulated noise sequences of a bootstrap [-].
+    fixed : tuple of Fixed, optional
+        Parameters that are known, by their names: their rows and columns leave the equations. Submodels then keep the
+        order of ``terms``.
 
     Raises
     ------
@@ -163,12 +174,14 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
     variant: StepRule = "relaxed"
     hold_output: Hold = "foh"
     bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
+    fixed: tuple[Fixed, ...] | None = field(default=None, metadata={"added_later": True})
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.terms:
             raise OptionError("terms", "terms must list at least one submodel, for example {poles: 2, zeros: 0}")
         check_terms(self.terms)
+        places_of(self.fixed, names_of(self.terms))
         check_closed_loop(self.instruments, self.variant)
         if self.initial_state == "periodic":
             text = "initial_state periodic needs open-loop instruments, and terms without integrators"
@@ -182,7 +195,8 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         if self.initial_state == "periodic" and (data.interval == 0.0 or not record.valid.all()):
             wanted = "one period of a steady state needs one regular clock without missing samples"
             raise DataError(f"{named(record)}{wanted}; use initial_state 'estimated'")
-        problem = AdditiveProblem(data, self.terms, self.delay, loop, self.initial_state)
+        fixed = places_of(self.fixed, names_of(self.terms))
+        problem = AdditiveProblem(data, self.terms, self.delay, loop, self.initial_state, fixed)
         check_record(record, data, problem.free)
         return Submodels(record, problem)
 
@@ -193,10 +207,19 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
                 raise DataError(f"the start has the submodels {model.terms} and the estimator {self.terms}")
         else:
             model, method = laid_out.start
+        return _fit(laid_out.problem, self.iterate(laid_out.problem, model), model, method)
+
+    def iterate(self, problem: AdditiveProblem, start: AdditiveModel) -> SubmodelEstimate:
+        """Estimate from a start."""
         steps = Steps(self.max_iterations, self.tolerance, RULES[self.variant])
         noise = self.covariance, self.bootstrap_draws
-        estimate = estimate_submodels(laid_out.problem, model.theta, steps, *noise)
-        return _fit(laid_out.problem, estimate, model, method)
+        if not problem.fixed:
+            return estimate_submodels(problem, start.theta, steps, *noise)
+        # From the start, and from what all parameters together would be.
+        free = estimate_submodels(problem.with_known({}), start.theta, steps, "white", 0)
+        near = [_nearest(theta, self.terms, problem.fixed) for theta in (free.theta, start.theta)]
+        found = [estimate_submodels(problem, theta, steps, *noise) for theta in near]
+        return min(found, key=lambda one: np.nan_to_num(one.values["cost"], nan=np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,6 +246,22 @@ def check_terms(terms: tuple[Term, ...]) -> None:
         raise OptionError("terms", f"terms have {order} poles together; at most 40 are supported")
 
 
+def _nearest(theta: Array, terms: tuple[Term, ...], fixed: Mapping[int, float]) -> Array:
+    """Parameters with submodels of one structure exchanged so that the known ones are nearest to their values."""
+    parts = np.split(theta, np.cumsum([term.size for term in terms])[:-1])
+    best, least = theta, np.inf
+    for order in islice(permutations(range(len(terms))), MOST_ORDERS):
+        if any(terms[k] != term for k, term in zip(order, terms, strict=True)):
+            continue
+        trial = np.concatenate([parts[k] for k in order])
+        away = sum(
+            abs(trial[place] - value) / (abs(trial[place]) + abs(value) + TINY) for place, value in fixed.items()
+        )
+        if away < least:
+            best, least = trial, away
+    return best
+
+
 def _fit(problem: AdditiveProblem, estimate: SubmodelEstimate, start: AdditiveModel, method: str) -> AdditiveFit:
     """The result, with submodels by rising natural frequency."""
     try:
@@ -230,8 +269,11 @@ def _fit(problem: AdditiveProblem, estimate: SubmodelEstimate, start: AdditiveMo
     except DataError as error:
         raise DataError(f"the iterations ended where the terms cannot be told apart: {error} Start closer.") from None
     places = np.split(np.arange(problem.size), np.cumsum([term.size for term in problem.terms])[:-1])
-    order = np.concatenate([places[k] for k in model.order_of_sorting])
-    ordered = model.sorted()
+    # Known parameters have names, so that submodels stay where they are.
+    order = (
+        np.concatenate([places[k] for k in model.order_of_sorting]) if not problem.fixed else np.arange(problem.size)
+    )
+    ordered = model if problem.fixed else model.sorted()
     return AdditiveFit(
         model=unfactored(ordered),
         parameter_names=ordered.names,

@@ -1,6 +1,6 @@
 """Global estimation from measured records: a one-dimensional search over the delay, then the least output error."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -9,7 +9,9 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Estimator, Start, checked_bounds, quality
+from ctid_cli.estimation.fixed import Fixed, places_of
 from ctid_cli.estimation.iteration import Equations
+from ctid_cli.estimation.known_parameters import with_known
 from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
 from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.box import Box
@@ -96,6 +98,8 @@ class MeasuredFit(FilledLater, Fit):
         Directions in which the parameters could move: those of the identity unless poles or the delay are held.
     regular : bool
         Whether lags counted in samples are lags in time, up to jitter.
+    known : tuple of str
+        Names of the parameters that were fixed.
     """
 
     later: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used")
@@ -115,6 +119,7 @@ class MeasuredFit(FilledLater, Fit):
     held_poles: tuple[complex, ...] = ()
     tangent: Array = field(default_factory=lambda: np.zeros((0, 0)))
     regular: bool = True
+    known: tuple[str, ...] = ()
 
     def uncertainty(
         self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
@@ -188,6 +193,10 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
         1.96 of them make the interval of a bootstrap-t. ``sandwich`` is an earlier name of ``robust``.
     bootstrap_draws : int, default 500
         Simulated noise sequences of a bootstrap [-].
+    fixed : tuple of Fixed, optional
+        Parameters that are known, by their names ``a1 ... an, b0 ... bm``: their columns leave the normal equations.
+        The search starts from what they would be if they were estimated too. A known delay is given in
+        ``delay_bounds``.
 
     Raises
     ------
@@ -226,9 +235,12 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
     hold_output: Hold = "foh"
     covariance: Covariance = field(default="white", metadata={"added_later": True})
     bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
+    fixed: tuple[Fixed, ...] | None = field(default=None, metadata={"added_later": True})
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if places_of(self.fixed, Structure(self.poles, self.zeros).names) and self.loss != "squares":
+            raise OptionError("fixed", f"fixed needs the loss squares, not {self.loss}")
         low, high = bounds = checked_bounds(self.delay_bounds, known_allowed=True)
         object.__setattr__(self, "delay_bounds", bounds)
         allowed = self.poles if low == high else self.poles - 1
@@ -253,8 +265,13 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
             if minima:
                 a = [np.concatenate(([1.0], minimum.theta[: self.poles])) for minimum in minima]
                 starts = [(each, minimum.delay) for each, minimum in zip(a, minima, strict=True)]
+                known = places_of(self.fixed, refinement.structure.names)
                 if self.loss == "squares":
-                    fit = _fit(refinement, refinement.best(starts, self.nested), profile, None)
+                    best = refinement.best(starts, self.nested)
+                    if known:
+                        size = refinement.structure.size
+                        best = with_known(refinement, known, [each.theta[:size] for each in minima], best)
+                    fit = _fit(refinement, best, profile, None, known)
                 else:
                     robust = robust_fit(refinement, self.loss, starts, self.nested)
                     fit = _fit(refinement, robust.found, profile, robust)
@@ -265,7 +282,13 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
         raise DataError(Status.SINGULAR.value)
 
 
-def _fit(refinement: Refinement, found: Optimum, profile: Profile | None, robust: RobustFit | None) -> MeasuredFit:
+def _fit(
+    refinement: Refinement,
+    found: Optimum,
+    profile: Profile | None,
+    robust: RobustFit | None,
+    known: Collection[int] = (),
+) -> MeasuredFit:
     """The result, but for its covariance."""
     measured = refinement.measured
     layout, theta = refinement.parameters(found)
@@ -301,7 +324,8 @@ def _fit(refinement: Refinement, found: Optimum, profile: Profile | None, robust
         box=found.box,
         weighting=samples.weighting,
         held_poles=tuple(found.held_poles.tolist()),
-        tangent=_tangent(layout, found),
+        tangent=np.delete(_tangent(layout, found), list(known), axis=1),
+        known=tuple(layout.names[k] for k in known),
         regular=all(nearly_regular(data.t) for data in refinement.problem.records),
         **values,
     )

@@ -28,9 +28,17 @@ def fall_with_other_hold(refinement: Refinement, fit: MeasuredFit, records: Sequ
         return 0.0
     most = MOST // len(records)
     short = [_beginning(record, most) for record in records]
-    given, other = (_least(refinement, fit, [_held(record, swap) for record in short]) for swap in (False, True))
+    given, other = (
+        _least(refinement, fit, [otherwise_held(record) if swap else record for record in short])
+        for swap in (False, True)
+    )
+    return decisive(given, other, fit, short)
+
+
+def decisive(given: float, other: float, fit: MeasuredFit, records: Sequence[Record]) -> float:
+    """Fraction by which a cost falls; 0 where that is not decisive."""
     # Correlated samples count for fewer.
-    count = fit_noise_model(fit.residuals).effective_count(sum(record.n_samples for record in short))
+    count = fit_noise_model(fit.residuals).effective_count(sum(record.n_samples for record in records))
     fall = 1.0 - other / given
     return fall if fall > WORTHWHILE and -0.5 * count * np.log1p(-fall) > DECISIVE else 0.0
 
@@ -53,7 +61,7 @@ def _beginning(record: Record, samples: int) -> Record:
     return Record(t, record.y[:samples], signal, name=record.name)
 
 
-def _held(record: Record, otherwise: bool) -> Record:
-    hold: Hold = "foh" if (record.input.hold == "zoh") is otherwise else "zoh"
-    signal = HeldSignal(record.input.t, record.input.values, hold)
-    return Record(record.t, record.y, signal, name=record.name)
+def otherwise_held(record: Record) -> Record:
+    """The record with the other hold of its input."""
+    hold: Hold = "foh" if record.input.hold == "zoh" else "zoh"
+    return Record(record.t, record.y, HeldSignal(record.input.t, record.input.values, hold), name=record.name)

@@ -1,7 +1,7 @@
 """A fit to measured records with everything that tells whether to believe it."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
-from ctid_cli.errors import DataError
 from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
 from ctid_cli.estimators import identification_warnings as warnings
-from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators import judging
+from ctid_cli.estimators.delay_profile import MeasuredFit
+from ctid_cli.estimators.judging import Options
+from ctid_cli.estimators.measured_submodels import SubmodelsFit
 from ctid_cli.estimators.second_look import SecondLook, look_again
 from ctid_cli.estimators.second_look_words import of_second_look
 from ctid_cli.inference import criteria as criteria_of
@@ -21,7 +23,6 @@ from ctid_cli.inference.bootstrap import Progress
 from ctid_cli.inference.conditioning import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR
 from ctid_cli.inference.covariance import condition_number
 from ctid_cli.inference.delay_interval import CostOfDelay, DelayInterval
-from ctid_cli.inference.derived import derived_parameters
 from ctid_cli.inference.diagnostics import fit_percent, r_squared
 from ctid_cli.inference.fitted_model import FittedModel, responses
 from ctid_cli.inference.later import FilledLater
@@ -66,7 +67,7 @@ class Identification(FilledLater, FittedModel, ShownAsTable):
 
     Parameters
     ----------
-    options : DelayProfile
+    options : DelayProfile or MeasuredSubmodels
         What was asked for.
     fit : MeasuredFit
         The estimate.
@@ -96,8 +97,8 @@ class Identification(FilledLater, FittedModel, ShownAsTable):
 
     later: ClassVar[tuple[str, ...]] = ("records",)
 
-    options: DelayProfile
-    fit: MeasuredFit
+    options: Options
+    fit: MeasuredFit | SubmodelsFit
     answer: AnswerTest
     uncertainty: Uncertainty
     estimates: tuple[UncertainValue, ...]
@@ -127,7 +128,7 @@ class Identification(FilledLater, FittedModel, ShownAsTable):
 
 
 def identify(
-    options: DelayProfile,
+    options: Options,
     records: Sequence[Record],
     validation: Record | None = None,
     covariance: Covariance = "auto",
@@ -138,7 +139,7 @@ def identify(
 
     Parameters
     ----------
-    options : DelayProfile
+    options : DelayProfile or MeasuredSubmodels
         The estimator.
     records : sequence of Record
         One for each experiment.
@@ -172,22 +173,24 @@ def identify(
     against noise of the outputs' colour, the search over poles and delays included.
     """
     # Before the fit takes its time.
-    checked = None if validation is None else laid_out_validation(options, validation)
+    checked = None if validation is None else judging.laid_out_validation(options, validation)
     prepared = options.prepare(records)
-    fit = prepared.fit()
+    fit: MeasuredFit | SubmodelsFit = prepared.fit()
     # What the estimate is by least squares near it: pseudo-errors where the loss is another.
-    linear, refinement = fit.linear, prepared.laid_out.near(fit.residuals, fit.weighting)
+    linear, laid_out = fit.linear, prepared.laid_out
+    if isinstance(laid_out, Refinement):
+        laid_out = laid_out.near(fit.residuals, fit.weighting)
     residuals = np.concatenate(fit.residuals)
     output = np.concatenate([record.y[use] for record, use in zip(records, fit.used, strict=True)])
     answer = answer_test(
-        prepared.laid_out.measured.records,
+        judging.answering(options, prepared.laid_out),
         fit.used,
         options.delay_bounds,
         free_response=options.initial_state == "estimate",
         periodic=options.initial_state == "periodic",
     )
     squared_error = float(residuals @ residuals) if fit.weighting is None else fit.cost * fit.count
-    tests = _tests(linear, records, answer)
+    tests = _tests(options, linear, records, answer)
     uncertainty = fit.uncertainty(covariance, bootstrap_draws, progress)
     matrix = uncertainty.covariance
     free, hessian = _free(linear)
@@ -196,11 +199,11 @@ def identify(
     if not answer.seen:
         unclear |= {name for name in fit.parameter_names if not name.startswith("offset")}
     interval = None
-    if refinement.structure.delay and "delay" not in unclear:
-        interval = _delay_interval(refinement, linear, uncertainty)
-    judged = None if checked is None or validation is None else _validate(checked, fit, validation)
-    size = fit.model.order + options.zeros + 1
-    coefficients = np.full((size, size), np.nan) if singular or not answer.seen else matrix[:size, :size]
+    if isinstance(laid_out, Refinement) and "delay" in fit.parameter_names and "delay" not in unclear:
+        interval = _delay_interval(laid_out, linear, uncertainty)
+    judged = None
+    if checked is not None and validation is not None:
+        judged = _validate(judging.applied(fit, options, checked), validation)
     found = Identification(
         options=replace(options, covariance=covariance, bootstrap_draws=bootstrap_draws),
         fit=fit,
@@ -208,9 +211,7 @@ def identify(
         uncertainty=uncertainty,
         estimates=_estimates(fit, uncertainty, unclear, interval),
         delay_interval=interval,
-        derived=derived_parameters(
-            fit.model, coefficients, uncertainty.quantile, fit.tangent[:size] if fit.held_poles else None
-        ),
+        derived=judging.derived(fit, uncertainty, answer.seen and not singular),
         tests=tests,
         criteria=criteria_of.information_criteria(squared_error, fit.count, fit.theta.size),
         yic=criteria_of.young_information_criterion(residuals, output, fit.theta[free], matrix[np.ix_(free, free)]),
@@ -219,16 +220,9 @@ def identify(
         validation=judged,
         records=tuple(records),
     )
-    look = look_again(refinement, linear, records, holds=options.loss == "squares")
-    return replace(found, warnings=tuple(_warnings(found, look, hessian, _gains(options, refinement, linear))))
-
-
-def laid_out_validation(options: DelayProfile, validation: Record) -> Refinement:
-    """Another record as those of the estimate are laid out."""
-    try:
-        return options.prepare(validation).laid_out
-    except DataError as error:
-        raise DataError(f"validation record: {error}") from None
+    look = look_again(linear, records, judging.fall_of_hold(options, laid_out, linear, records))
+    gains = _gains(linear, judging.lowered(options, laid_out, linear))
+    return replace(found, warnings=tuple(_warnings(found, look, hessian, gains)))
 
 
 def _warnings(found: Identification, look: SecondLook, hessian: Array, gains: dict[str, float]) -> Iterator[str]:
@@ -250,13 +244,15 @@ def _warnings(found: Identification, look: SecondLook, hessian: Array, gains: di
 # --- residuals and uncertainty ----------------------------------------------------------------------
 
 
-def _tests(fit: MeasuredFit, records: Sequence[Record], answer: AnswerTest) -> tuple[ResidualTests, ...]:
+def _tests(
+    options: Options, fit: MeasuredFit, records: Sequence[Record], answer: AnswerTest
+) -> tuple[ResidualTests, ...]:
     """Tests of each experiment, at levels that make a false alarm as likely as with one."""
     level = 1.0 - (1.0 - LEVEL) / len(records)
     found = []
     for record, eps, psi, use in zip(records, fit.residuals, fit.sensitivities, fit.used, strict=True):
         if eps.size >= FEWEST_TESTED:
-            delayed = record.input.at(record.t[use] - fit.model.delay)
+            delayed = judging.acting(options, record).input.at(record.t[use] - fit.model.delay)
             tested = residual_tests(eps, delayed, level=level, sensitivities=psi)
             found.append(replace(tested, answered=answer.seen))
     return tuple(found)
@@ -268,7 +264,7 @@ def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
     A coefficient or delay with ten times its own size for a standard error, and whatever moves along with it.
     """
     names, errors = fit.parameter_names, np.sqrt(np.diag(covariance))
-    looked_at = np.array([re.fullmatch(r"[ab]\d+|delay", name) is not None for name in names])
+    looked_at = np.array([re.fullmatch(r"(g\d+_)?[ab]\d+|delay", name) is not None for name in names])
     unclear = ~np.isfinite(errors) | (looked_at & (errors > LARGE_STANDARD_ERROR * np.abs(fit.theta)))
     unclear[~fit.tangent.any(axis=1)] = False
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -348,22 +344,16 @@ def costs_about_delay(result: Identification) -> DelayCosts | None:
 # --- results ---------------------------------------------------------------------------------------
 
 
-def _gains(options: DelayProfile, refinement: Refinement, fit: MeasuredFit) -> dict[str, float]:
+def _gains(fit: MeasuredFit, squared_errors: Mapping[str, float]) -> dict[str, float]:
     """Shares by which estimating what was taken as zero would lower the cost, where that is worth it."""
-    squared_error = fit.cost * fit.count
-
-    def gain(added: int, **treatment: bool) -> float:
-        lowered = refinement.squared_error_with(fit.model, **treatment)
+    squared_error, gains = fit.cost * fit.count, {}
+    for name, lowered in squared_errors.items():
+        added = fit.model.order if name == "initial_state" else 1
         share = 1.0 - lowered / squared_error if squared_error > 0 else 0.0
         evidence = -fit.count * np.log(max(1.0 - share, 1e-300)) - added * len(fit.residuals) * np.log(fit.count)
-        return share if share > WORTHWHILE and evidence > DECISIVE else 0.0
-
-    gains = {}
-    if options.initial_state == "rest":
-        gains["initial_state"] = gain(fit.model.order, initial_state=True)
-    if options.offset == "none":
-        gains["offset"] = gain(1, offset=True)
-    return {name: share for name, share in gains.items() if share}
+        if share > WORTHWHILE and evidence > DECISIVE:
+            gains[name] = share
+    return gains
 
 
 def _estimates(
@@ -381,16 +371,15 @@ def _estimates(
             reach = uncertainty.quantile(np.eye(errors.size)[k], LEVEL)
             found[name] = UncertainValue.symmetric(name, value, float(errors[k]), quantile=reach)
         else:
-            found[name] = UncertainValue(name, value, status="at bound")
+            found[name] = UncertainValue(name, value, status="fixed" if name in fit.known else "at bound")
         if name == "delay" and interval is not None:
             found[name] = replace(found[name], low=interval.low, high=interval.high)
     found.setdefault("delay", UncertainValue("delay", fit.model.delay, status="fixed"))
-    order = {"b": 0, "a": 1, "d": 2}
+    order = {"b": 0, "a": 1, "g": 1, "d": 2}
     return tuple(sorted(found.values(), key=lambda item: order.get(item.name[0], 3)))
 
 
-def _validate(refinement: Refinement, fit: MeasuredFit, record: Record) -> Validation:
-    applied = refinement.errors_of(fit.model)
+def _validate(applied: AppliedModel, record: Record) -> Validation:
     y = record.y[applied.used[0]]
     simulated = y - applied.residuals[0]
     return Validation(record.name, record, applied, fit_percent(y, simulated), r_squared(y, simulated), y.size)

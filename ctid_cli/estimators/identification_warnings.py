@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.delay_profile import MeasuredFit
+from ctid_cli.estimators.judging import Options
 from ctid_cli.inference.answer_test import AnswerTest
 from ctid_cli.inference.conditioning import describe_conditioning
 from ctid_cli.inference.covariance import condition_number
@@ -16,7 +17,7 @@ from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.text import listed
 
 
-def of_answer(answer: AnswerTest, options: DelayProfile) -> list[str]:
+def of_answer(answer: AnswerTest, options: Options) -> list[str]:
     """That no answer to the input is seen, so that the model describes noise."""
     if answer.seen:
         return []
@@ -88,7 +89,7 @@ def of_short_record(uncertainty: Uncertainty, count: int) -> list[str]:
     ]
 
 
-def of_interval(interval: DelayInterval | None, options: DelayProfile, fit: MeasuredFit) -> list[str]:
+def of_interval(interval: DelayInterval | None, options: Options, fit: MeasuredFit) -> list[str]:
     """Whether the interval of the delay ends where its search ended."""
     if interval is None:
         return []

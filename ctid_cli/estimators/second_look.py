@@ -6,9 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.profile_refinement import Refinement
 from ctid_cli.estimators.delay_profile import MeasuredFit
-from ctid_cli.estimators.hold_comparison import fall_with_other_hold
 from ctid_cli.inference import faults
 from ctid_cli.inference.beside import SideBySide, constant, rest_of
 from ctid_cli.inference.input_dependence import InputDependence, input_dependence
@@ -51,10 +49,9 @@ class SecondLook:
     integrator: float
 
 
-def look_again(refinement: Refinement, fit: MeasuredFit, records: Sequence[Record], *, holds: bool) -> SecondLook:
-    """Look at the records, at what the fit leaves of them, and if wanted at what it does with the other hold."""
+def look_again(fit: MeasuredFit, records: Sequence[Record], other_hold: float) -> SecondLook:
+    """Look at the records, and at what the fit leaves of them."""
     looks = tuple(_look(record, fit, k) for k, record in enumerate(records))
-    other_hold = fall_with_other_hold(refinement, fit, records) if holds else 0.0
     return SecondLook(looks, other_hold, _integrator(fit, records))
 
 

@@ -2,7 +2,8 @@
 
 from collections.abc import Iterator
 
-from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.delay_profile import MeasuredFit
+from ctid_cli.estimators.judging import Options
 from ctid_cli.estimators.second_look import RecordLook, SecondLook
 from ctid_cli.inference.residuals import ResidualTests
 
@@ -15,7 +16,7 @@ GAPS = 0.05
 
 
 def of_second_look(
-    look: SecondLook, options: DelayProfile, fit: MeasuredFit, tests: tuple[ResidualTests, ...], *, answered: bool
+    look: SecondLook, options: Options, fit: MeasuredFit, tests: tuple[ResidualTests, ...], *, answered: bool
 ) -> list[str]:
     """Everything that should be said; nothing of a record and a model that fit each other.
 
@@ -37,9 +38,7 @@ def of_second_look(
     return words
 
 
-def _of_record(
-    one: RecordLook, look: SecondLook, options: DelayProfile, fit: MeasuredFit, poor: float
-) -> Iterator[str]:
+def _of_record(one: RecordLook, look: SecondLook, options: Options, fit: MeasuredFit, poor: float) -> Iterator[str]:
     if one.growth_time > 0:
         yield (
             f"The output diverges: it grows by a factor of e every {one.growth_time:.2g}, and the input does not. An "
@@ -119,7 +118,7 @@ def _poorest_share(look: SecondLook, tests: tuple[ResidualTests, ...]) -> float:
     return 0.0 if passed else max(_poor_share(one) for one in look.records)
 
 
-def _of_structure(one: RecordLook, options: DelayProfile, fit: MeasuredFit) -> str:
+def _of_structure(one: RecordLook, options: Options, fit: MeasuredFit) -> str:
     low, high = options.delay_bounds
     report, found = one.examined.report, f"About {100 * _poor_share(one):.2g} % of the residuals' variance"
     if low == high and report.delay_early > low and report.suggested_delay is not None:
@@ -140,7 +139,7 @@ def _of_hold(look: SecondLook) -> str:
     )
 
 
-def _of_integrator(look: SecondLook, options: DelayProfile, fit: MeasuredFit) -> str:
+def _of_integrator(look: SecondLook, options: Options, fit: MeasuredFit) -> str:
     poles = fit.model.order - 1
     terms = f"[{{poles: {poles}, zeros: {options.zeros}, integrators: 1}}]"
     return (

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -55,18 +56,26 @@ def derived_parameters(
     return tuple(rows.found)
 
 
-def additive_derived(model: AdditiveModel, covariance: Array, *, level: float = 0.95) -> tuple[UncertainValue, ...]:
+def additive_derived(
+    model: AdditiveModel,
+    covariance: Array,
+    *,
+    level: float = 0.95,
+    reach: Callable[[int, Array], float] | None = None,
+) -> tuple[UncertainValue, ...]:
     r"""What users read off the submodels of a sum, as :func:`derived_parameters`.
 
     Each quantity depends on the parameters of its own submodel alone, so a pole is undetermined only where it cannot
     be told from another one of the same submodel. With ``A = 1 + a_1 p + … + a_n p^n``, a pole moves by
-    ``dp/da_k = -p^k/A'(p)``.
+    ``dp/da_k = -p^k/A'(p)``. Intervals are those of the normal distribution, or reach as many standard errors as is
+    told of a gradient and the place of its first parameter.
     """
     found: list[UncertainValue] = []
     first = 0
     for number, (submodel, term) in enumerate(zip(model.submodels, model.terms, strict=True), 1):
         own = slice(first, first + term.size)
-        rows = _of_submodel(submodel, covariance[own, own], lambda _: normal_quantile(level))
+        quantile: Quantile = (lambda _: normal_quantile(level)) if reach is None else partial(reach, first)
+        rows = _of_submodel(submodel, covariance[own, own], quantile)
         found += [replace(row, name=f"g{number}_{row.name}") for row in rows]
         first = own.stop
     return tuple(found)

@@ -262,11 +262,7 @@ class AdditiveModel(ContinuousModel):
     @property
     def names(self) -> tuple[str, ...]:
         """Parameter names in the order of :attr:`theta`: ``g1_a1 … g1_b0 …, g2_a1 …``."""
-        names: list[str] = []
-        for number, term in enumerate(self.terms, 1):
-            names += [f"g{number}_a{k}" for k in range(1, term.poles + 1)]
-            names += [f"g{number}_b{k}" for k in range(term.zeros + 1)]
-        return tuple(names)
+        return names_of(self.terms)
 
     @property
     def theta(self) -> Array:
@@ -325,6 +321,15 @@ class AdditiveModel(ContinuousModel):
         w = np.asarray(frequencies, dtype=float)
         total = np.sum([submodel.frequency_response(w) for submodel in self.submodels], axis=0)
         return np.asarray(total * np.exp(-1j * w * self.delay), dtype=complex)
+
+
+def names_of(terms: Iterable[Term]) -> tuple[str, ...]:
+    """Names of the parameters of a sum of terms."""
+    names: list[str] = []
+    for number, term in enumerate(terms, 1):
+        names += [f"g{number}_a{k}" for k in range(1, term.poles + 1)]
+        names += [f"g{number}_b{k}" for k in range(term.zeros + 1)]
+    return tuple(names)
 
 
 def same_pole(one: ArrayLike, other: ArrayLike) -> BoolArray:

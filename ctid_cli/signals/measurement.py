@@ -50,6 +50,9 @@ class Measurement:
     notes: tuple[str, ...] = ()
     #: Its file; None for a record that comes from none.
     path: Path | None = None
+    #: Column of the reference of its loop, and its samples.
+    reference: str | None = None
+    reference_values: Array | None = None
 
     @classmethod
     def of(cls, record: Record) -> "Measurement":
@@ -70,8 +73,9 @@ def read_measurement(
     hold: Hold = "zoh",
     start: float | None = None,
     stop: float | None = None,
+    reference: str | None = None,
 ) -> Measurement:
-    """Record from a comma-separated or MATLAB file, with its units.
+    """Record from a comma-separated or MATLAB file, with its units, and the reference of its loop from another column.
 
     A window is read as if the file had no other lines: the input before it is not used, since the state that it
     left behind is estimated with the model where that is asked for.
@@ -79,7 +83,8 @@ def read_measurement(
     require_choice("hold", hold, get_args(Hold))
     cure = "export the record as comma-separated text (.csv) whose first line names the columns, or from MATLAB as"
     table = read_table(path, f"{cure} vectors (.mat)")
-    columns, notes = _choose(table, {"time": time, "input": input, "output": output})
+    other = None if reference is None else table.named(reference)
+    columns, notes = _choose(table, {"time": time, "input": input, "output": output}, other)
     unit = {role: split_header(name)[1] for role, name in columns.items()}
     t, u, y = (table.numbers(columns[role]) for role in ROLES)
     label = unit["time"] or "s"
@@ -95,14 +100,18 @@ def read_measurement(
     if last - first < t.size:
         part = f"Only the {last - first} of {t.size} samples from {t[first]:.6g} to {t[last - 1]:.6g} {label} are used"
         notes.append(f"{part}; the input before them is not.")
-    t = t[first:last]
+    whole, t = y, t[first:last]
     u = table.check_input(columns["input"], u[first:last], first)
     y = table.check_output(columns["output"], y[first:last], first)
     record = Record(t, y, HeldSignal(t, u, hold), name=table.file)
     named = (columns["time"], columns["input"], columns["output"])
-    return Measurement(
-        record, unit["time"], unit["input"], unit["output"], *named, start, stop, tuple(notes), Path(path)
-    )
+    r = None
+    if other is not None:
+        r = table.numbers(other)
+        table.require_as_many(other, r, columns["output"], whole)
+        r = table.check_input(other, r[first:last], first, "reference")
+    units = unit["time"], unit["input"], unit["output"]
+    return Measurement(record, *units, *named, start, stop, tuple(notes), Path(path), other, r)
 
 
 def read_table(path: str | os.PathLike[str], otherwise: str) -> Table:
@@ -115,7 +124,7 @@ def read_table(path: str | os.PathLike[str], otherwise: str) -> Table:
     raise DataError(f"{os.fspath(path)}: files ending in {extension} are not read; {otherwise}")
 
 
-def _choose(table: Table, asked: Mapping[Role, str | None]) -> tuple[dict[Role, str], list[str]]:
+def _choose(table: Table, asked: Mapping[Role, str | None], reference: str | None) -> tuple[dict[Role, str], list[str]]:
     """The column of each role, and what was assumed."""
     chosen = {role: table.named(wanted) for role in ROLES if (wanted := asked[role]) is not None}
     refuse_nameless(table)
@@ -126,7 +135,10 @@ def _choose(table: Table, asked: Mapping[Role, str | None]) -> tuple[dict[Role, 
     for one, other in itertools.combinations(ROLES, 2):
         if chosen[one] == chosen[other]:
             raise DataError(f"{table.head}: {chosen[one]!r} cannot be both the {one} and the {other}")
-    unused = [repr(name) for name in table.names if name not in chosen.values()]
+    for role, name in chosen.items():
+        if name == reference:
+            raise DataError(f"{table.head}: {name!r} cannot be both the {role} and the reference")
+    unused = [repr(name) for name in table.names if name not in (*chosen.values(), reference)]
     if unused and table.lines is not None:
         words = ("Column", "is") if len(unused) == 1 else ("Columns", "are")
         notes.append(f"{words[0]} {listed(unused)} {words[1]} not used.")

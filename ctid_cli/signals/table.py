@@ -90,10 +90,10 @@ class Table:
         require_steps(label, t)
         return t
 
-    def check_input(self, name: str, u: Array, first: int = 0) -> Array:
+    def check_input(self, name: str, u: Array, first: int = 0, role: str = "input") -> Array:
         """Refuse an input with gaps: the system answers to its input whether or not that was recorded."""
-        self._refuse(~np.isfinite(u), f"input {name!r} is missing or not finite; only the output may have gaps", first)
-        require_scale(f"{self.file}: the input {name!r}", u)
+        self._refuse(~np.isfinite(u), f"{role} {name!r} is missing or not finite; only the output may have gaps", first)
+        require_scale(f"{self.file}: the {role} {name!r}", u)
         return u
 
     def check_output(self, name: str, y: Array, first: int = 0) -> Array:

@@ -9,13 +9,14 @@ from pydantic import ValidationError, create_model
 from ctid_cli.errors import DataError, Problem, RefusedError, SpecError
 from ctid_cli.signals.csv_file import read_held_signal
 from ctid_cli.signals.files import is_inside
-from ctid_cli.simulation.dataset import file_sha256, joined, located
+from ctid_cli.simulation.dataset import LoopOptions, file_sha256, joined, located
 from ctid_cli.specification.joint_checks import joint_complaints, too_many_cases
 from ctid_cli.specification.joint_warnings import joint_warnings
+from ctid_cli.specification.loop_section import LoopSection
 from ctid_cli.specification.messages import Complaint, Located, explained, shown
 from ctid_cli.specification.option_sections import EstimatorSection
 from ctid_cli.specification.own_sections import names_code, own_places, with_own_kinds
-from ctid_cli.specification.sections import replaced, variants
+from ctid_cli.specification.sections import case_count, replaced, variants
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.yaml_source import (
     OVERRIDE_FILE,
@@ -84,6 +85,27 @@ def load_spec(
     spec._warnings = tuple(str(source.problem(where, message)) for where, message in joint_warnings(spec))
     spec._text = text
     return spec
+
+
+def load_loop(path: Path) -> LoopOptions:
+    """The section ``loop`` of a file, for a record whose reference is a column of it."""
+    source = read_yaml(path)
+    tree = source.tree.get("loop") if isinstance(source.tree, dict) else None
+    if tree is None:
+        raise SpecError([source.problem((), "there is no section loop; write loop: {controller: {...}}")])
+    problems: list[Located] = []
+    try:
+        section = LoopSection.model_validate(tree)
+        if section.reference is not None:
+            problems = [(("reference",), "belongs to simulated data; that of a record is a column, --reference", True)]
+        elif case_count(section) > 1:
+            problems = [((), "has lists of values; a record was taken in one loop: keep one of each", False)]
+    except ValidationError as error:
+        problems = [explained(detail, {}) for detail in error.errors(include_url=False)]
+    if problems:
+        raise SpecError([source.problem(("loop", *where), message, key=key) for where, message, key in problems])
+    options: LoopOptions = section.options()
+    return options
 
 
 def spec_from_canonical(canonical: Mapping[str, Any], folder: Path | None = None, *, allow_code: bool = False) -> Spec:

@@ -16,8 +16,8 @@ from typing import Any, NoReturn
 import ctid_cli
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError, UsageError
-from ctid_cli.estimators.delay_profile import samples_at
-from ctid_cli.estimators.identification import Identification, laid_out_validation
+from ctid_cli.estimators import judging
+from ctid_cli.estimators.identification import Identification
 from ctid_cli.inference.loss import Weighting
 from ctid_cli.signals.files import require_file
 from ctid_cli.signals.measurement import Measurement, read_measurement
@@ -139,10 +139,8 @@ class StoredFit:
         return {"records": tuple(item.record for item in self.measurements)}
 
     def _samples(self) -> dict[str, Any]:
-        fit = self.result.fit
-        refinement = self.result.options.prepare(self.result.records).laid_out
-        losses = None if fit.weighting is None else fit.weighting.losses
-        return samples_at(refinement, fit.model, fit.theta, losses)._asdict()
+        fit, options = self.result.fit, self.result.options
+        return judging.samples(fit, options, options.prepare(self.result.records).laid_out)._asdict()
 
     def _weights(self) -> dict[str, Any]:
         weighting = self._samples()["weighting"]
@@ -150,8 +148,9 @@ class StoredFit:
 
     def _applied(self) -> dict[str, Any]:
         assert self.validation is not None
-        refinement = laid_out_validation(self.result.options, self.validation.record)
-        return {"record": self.validation.record, "applied": refinement.errors_of(self.result.fit.model)}
+        fit, options, record = self.result.fit, self.result.options, self.validation.record
+        laid_out = judging.laid_out_validation(options, record)
+        return {"record": record, "applied": judging.applied(fit, options, laid_out)}
 
 
 def load_fit(

@@ -1,0 +1,184 @@
+"""From the options of ``ctid fit`` that say what the model is to the estimator of it."""
+
+import contextlib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from ctid_cli.errors import UsageError
+from ctid_cli.signals.treatment import Hold, InitialState, LossKind, Offset
+
+if TYPE_CHECKING:
+    from ctid_cli.estimation.fixed import Fixed
+    from ctid_cli.estimators.judging import Options
+    from ctid_cli.models.additive import Term
+    from ctid_cli.signals.measurement import Measurement
+
+#: One transfer function, or a sum of submodels.
+ModelForm = Literal["fraction", "additive"]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What the command line says of the model."""
+
+    model: ModelForm
+    terms: str | None
+    poles: int | None
+    zeros: int | None
+    integrators: int
+    delay: tuple[float, float]
+    fix: Sequence[str]
+    initial_state: InitialState
+    offset: Offset
+    loss: LossKind
+    hold: Hold
+    #: Whether the loop that the record was taken in is given, and counts.
+    loop: bool = False
+
+    @property
+    def iterated(self) -> bool:
+        """Whether the estimator is that of submodels, which knows the delay and takes one record."""
+        return self.model == "additive" or self.integrators > 0 or self.loop
+
+
+def estimator_of(asked: Asked) -> "Options":
+    """The estimator; a UsageError says which options do not go together."""
+    _refuse_strangers(asked)
+    if asked.iterated:
+        _refuse_unable(asked)
+    try:
+        return _submodels(asked) if asked.iterated else _fraction(asked)
+    except ValueError as error:
+        raise UsageError(re.sub(r"^fixed\b", "--fix", str(error))) from None
+
+
+def _fraction(asked: Asked) -> "Options":
+    from ctid_cli.estimators.delay_profile import DelayProfile
+
+    assert asked.poles is not None
+    treatment: dict[str, Any] = {"initial_state": asked.initial_state, "offset": asked.offset, "loss": asked.loss}
+    return DelayProfile(asked.poles, asked.zeros or 0, asked.delay, **treatment, nested=True, fixed=_fixed(asked.fix))
+
+
+def _submodels(asked: Asked) -> "Options":
+    from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
+    from ctid_cli.models.additive import Term
+
+    if asked.terms is None:
+        assert asked.poles is not None
+        terms: tuple[Term, ...] = (Term(asked.poles, asked.zeros or 0, asked.integrators),)
+    else:
+        first, *others = _terms(asked.terms, asked.integrators)
+        terms = (first, *others)
+    return MeasuredSubmodels(
+        terms,
+        asked.delay[0],
+        "closed_loop" if asked.loop else "open_loop",
+        asked.initial_state,
+        asked.offset,
+        factored=asked.model == "additive" or asked.integrators > 0,
+        fixed=_fixed(asked.fix),
+    )
+
+
+def _refuse_strangers(asked: Asked) -> None:
+    """Options of one form of the model beside those of the other."""
+    if asked.model == "additive":
+        if asked.terms is None:
+            raise UsageError(
+                "--model additive needs --terms, poles/zeros of each submodel, for example --terms 2/0,2/1"
+            )
+        for name, value in (("--poles", asked.poles), ("--zeros", asked.zeros)):
+            if value is not None:
+                raise UsageError(f"{name} is for one transfer function; --terms has the degrees of a sum, drop {name}")
+    elif asked.terms is not None:
+        raise UsageError("--terms is for a sum of submodels; add --model additive, or give --poles and --zeros")
+    if asked.integrators < 0:
+        raise UsageError(f"--integrators must be 0 or more; got {asked.integrators}")
+
+
+def _refuse_unable(asked: Asked) -> None:
+    """What refined instrumental variables at a known delay cannot do."""
+    what = "a record in a loop" if asked.loop else "a model with integrators or submodels"
+    low, high = asked.delay
+    if low < high:
+        why = "noise that comes back through the loop would move it" * asked.loop or "a known delay is needed"
+        raise UsageError(
+            f"--delay {low:g}:{high:g} cannot be searched for {what}: {why}; give one value, --delay VALUE"
+        )
+    if asked.loss != "squares":
+        raise UsageError(f"--loss {asked.loss} is not there for {what}: it is fitted by squares; drop --loss")
+    if asked.offset == "estimate":
+        raise UsageError(f"--offset estimate is not there for {what}; use --offset remove")
+    if asked.loop and asked.hold != "zoh":
+        raise UsageError(f"--hold {asked.hold} does not go with --loop: a discrete controller holds its input (zoh)")
+    if asked.loop and asked.fix and asked.model == "fraction" and not asked.integrators:
+        raise UsageError("--fix in a loop goes by the names of submodels; add --model additive --terms POLES/ZEROS")
+
+
+def _terms(text: str, integrators: int) -> "list[Term]":
+    """Terms such as ``2/0,2/1``; integrators belong to the first."""
+    from ctid_cli.models.additive import Term
+
+    found = []
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*(\d{1,2})(?:/(\d{1,2}))?\s*", part)
+        if match is None:
+            allowed = "poles/zeros of each submodel with commas between them, for example 2/0,2/1"
+            raise UsageError(f"--terms must be {allowed}; got {text!r}")
+        found.append((int(match[1]), int(match[2] or 0)))
+    return [Term(*degrees, integrators * (k == 0)) for k, degrees in enumerate(found)]
+
+
+def _fixed(given: Sequence[str]) -> "tuple[Fixed, ...] | None":
+    from ctid_cli.estimation.fixed import Fixed
+
+    found = []
+    for text in given:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if name == "delay":
+            raise UsageError("--fix delay=VALUE is --delay VALUE; use that")
+        try:
+            found.append(Fixed(name, float(value if equals and name else "")))
+        except ValueError:
+            raise UsageError(f"--fix must be NAME=VALUE with a finite number, for example a1=2; got {text!r}") from None
+    return tuple(found) or None
+
+
+def delay_bounds(text: str) -> tuple[float, float]:
+    """The range of the delay, or a known one twice."""
+    low, colon, high = text.partition(":")
+    with contextlib.suppress(ValueError):
+        bounds = float(low), float(high if colon else low)
+        if 0 <= bounds[0] <= bounds[1] < float("inf"):
+            return bounds
+    allowed = "LOW:HIGH, a range to search, or one known VALUE, in the record's unit of time and not negative"
+    raise UsageError(f"--delay must be {allowed}, for example 0:2 or 0.3; got {text!r}")
+
+
+# --- the loop ----------------------------------------------------------------------------------------
+
+
+def check_loop(loop: Path | None, reference: str | None, ignored: bool) -> None:
+    """Refuse half of what a loop needs."""
+    if loop is None and reference is not None:
+        raise UsageError("--reference needs the controller too; add --loop FILE with a section loop")
+    if loop is not None and reference is None and not ignored:
+        raise UsageError("--loop needs the reference too; add --reference COLUMN, or --ignore-loop to fit without it")
+    if ignored and loop is None:
+        raise UsageError("--ignore-loop has no loop to ignore; drop it")
+
+
+def with_loop(loop: Path, measured: "Measurement", ignored: bool) -> "Measurement":
+    """The measurement in its loop, or with a note that this is ignored."""
+    from ctid_cli.simulation.measured_loop import in_loop
+    from ctid_cli.specification.load import load_loop
+
+    options = load_loop(loop)
+    if ignored:
+        note = "The loop is ignored (--ignore-loop): noise that comes back through it biases the estimate."
+        return replace(measured, notes=(*measured.notes, note))
+    return in_loop(measured, options)

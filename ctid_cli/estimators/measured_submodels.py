@@ -1,0 +1,318 @@
+"""A sum of submodels, or one transfer function in a loop, from a measured record, with all that a fit is judged by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.errors import DataError, OptionError
+from ctid_cli.estimation.additive_estimate import radius_in_loop
+from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments
+from ctid_cli.estimation.common import Estimator, Start, named
+from ctid_cli.estimation.fixed import Fixed
+from ctid_cli.estimation.measured_records import without_means
+from ctid_cli.estimation.profile_refinement import AppliedModel
+from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
+from ctid_cli.estimators.delay_profile import FittedSamples, MeasuredFit
+from ctid_cli.filtering.free_response import free_response
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.uncertainty import DRAWS, Covariance
+from ctid_cli.models.additive import AdditiveModel, Term
+from ctid_cli.models.factoring import unfactored, unfactored_jacobian
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import InitialState, LossKind, Offset
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SubmodelsFit(MeasuredFit):
+    """A fit of submodels to a measured record.
+
+    Parameters
+    ----------
+    additive : AdditiveModel or None
+        The submodels; None where one transfer function was asked for.
+    start_method : str
+        How the start was found, in a sentence.
+    loop_radius : float
+        Largest magnitude of the poles of the sampled loop with the controller [-]; NaN in open loop.
+    coefficients : ndarray, shape (p, n + m + 1)
+        Derivatives of the coefficients of ``model``, ``a_1 ... a_n, b_0 ... b_m``, to the parameters, transposed.
+    """
+
+    additive: AdditiveModel | None = None
+    start_method: str = ""
+    loop_radius: float = float("nan")
+    coefficients: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+
+@dataclass(frozen=True, eq=False)
+class LaidOutSubmodels:
+    """A measured record laid out for submodels."""
+
+    record: Record
+    submodels: Submodels
+    #: Means that were subtracted.
+    input_offset: float
+    offset: float
+
+    @property
+    def problem(self) -> AdditiveProblem:
+        """What is solved."""
+        return self.submodels.problem
+
+    def free_columns(self, theta: Array) -> Array:
+        """Free responses of a model at the used samples, a column for each of their coefficients."""
+        problem, data = self.problem, self.problem.data
+        size = sum(term.order for term in problem.terms)
+        found = free_response(theta[: problem.size], np.zeros(size), problem.terms, data.t - data.t[0])
+        return np.zeros((data.count, 0)) if found is None else found[2][data.use]
+
+    def errors_of(self, theta: Array, estimated: bool) -> AppliedModel:
+        """Errors of a given model, with its own best initial state if that is estimated."""
+        problem = self.problem
+        rows = replace_initial(problem).filter.rows(theta[: problem.size])
+        if rows is None:
+            raise DataError(f"{named(self.record)}the response of the model is not finite on this record")
+        error: Array = np.asarray(rows[2], dtype=float)
+        state: Array = np.zeros(0)
+        if estimated:
+            columns = self.free_columns(theta)
+            state = np.asarray(np.linalg.lstsq(columns, error)[0], dtype=float)
+            error = np.asarray(error - columns @ state, dtype=float)
+        return AppliedModel((error,), (problem.data.use,), (state,), (self.offset,))
+
+
+def replace_initial(problem: AdditiveProblem) -> AdditiveProblem:
+    """The same problem without a free response."""
+    if problem.initial_state != "estimated":
+        return problem
+    return AdditiveProblem(problem.data, problem.terms, problem.delay, problem.filter.loop)
+
+
+@dataclass(frozen=True)
+class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
+    """Refined instrumental variables for a sum of submodels, as :class:`AdditiveSrivc`, judged as measured records are.
+
+    Parameters
+    ----------
+    terms : tuple of Term
+        Degrees of the submodels.
+    delay : float, default 0.0
+        Known delay [s].
+    instruments : {"open_loop", "closed_loop"}, default "open_loop"
+        ``closed_loop`` for a record with the loop that it was taken in.
+    initial_state : {"rest", "estimate", "periodic"}, default "rest"
+        State before the record.
+    offset : {"none", "remove"}, default "none"
+        Whether the means of input and output are subtracted first.
+    factored : bool, default True
+        Whether parameters are those of the submodels; else those of the monic transfer function of the only term.
+    fixed : tuple of Fixed, optional
+        Known parameters of the submodels.
+    covariance : {"auto", "white", "robust", "bootstrap"}, default "white"
+        As in :class:`AdditiveSrivc`.
+    bootstrap_draws : int, default 500
+        Simulated noise sequences of a bootstrap [-].
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+    """
+
+    kind: ClassVar[str] = "measured_submodels"
+    loss: ClassVar[LossKind] = "squares"
+
+    terms: tuple[Term, ...]
+    delay: float = 0.0
+    instruments: Instruments = "open_loop"
+    initial_state: InitialState = "rest"
+    offset: Offset = "none"
+    factored: bool = True
+    fixed: tuple[Fixed, ...] | None = None
+    covariance: Covariance = "white"
+    bootstrap_draws: int = DRAWS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.offset == "estimate":
+            raise OptionError("offset", "submodels have no offset to estimate; use remove, or none")
+        if not self.factored and (len(self.terms) > 1 or self.fixed or self.terms[0].integrators):
+            raise OptionError("factored", "only one term without integrators and known parameters is one fraction")
+        self.estimator  # noqa: B018 - checks the options that both have
+
+    @property
+    def estimator(self) -> AdditiveSrivc:
+        """The iteration."""
+        return AdditiveSrivc(
+            self.terms,
+            self.delay,
+            self.instruments,
+            "estimated" if self.initial_state == "estimate" else self.initial_state,
+            fixed=self.fixed,
+        )
+
+    @property
+    def poles(self) -> int:
+        """Number of poles, integrators included."""
+        return sum(term.order for term in self.terms)
+
+    @property
+    def zeros(self) -> int:
+        """Degree of the numerator of the sum."""
+        return max(self.poles - term.order + term.zeros for term in self.terms)
+
+    @property
+    def delay_bounds(self) -> tuple[float, float]:
+        """The known delay, twice."""
+        return self.delay, self.delay
+
+    @property
+    def closed(self) -> bool:
+        """Whether instruments come from the loop."""
+        return self.instruments == "closed_loop"
+
+    def _lay_out(self, records: Record | Sequence[Record]) -> LaidOutSubmodels:
+        several = [records] if isinstance(records, Record) else list(records)
+        if len(several) != 1:
+            raise DataError("submodels are estimated from one record; give one file")
+        record, u0, y0 = without_means(several[0]) if self.offset == "remove" else (several[0], 0.0, 0.0)
+        return LaidOutSubmodels(record, self.estimator._lay_out(record), u0, y0)
+
+    def _estimate(self, laid_out: LaidOutSubmodels, start: Start | None) -> SubmodelsFit:
+        problem = laid_out.problem
+        model, method = laid_out.submodels.start
+        if start is not None and start.model is not None:
+            model, method = start.model, "The start was given."
+        found = self.estimator.iterate(problem, model)
+        rows = problem.filter.rows(found.whole)
+        if rows is None or not np.isfinite(rows[2]).all():
+            raise DataError(
+                f"{named(laid_out.record)}the iterations for these terms diverged; use fewer or other terms, another "
+                "delay, or a longer record"
+            )
+        order = _order(problem, found.whole, sort=self.factored and not self.fixed)
+        theta = found.whole[order]
+        ordered = problem.model(found.whole) if self.fixed else problem.model(found.whole).sorted()
+        names = (*ordered.names, *(f"x{k}" for k in range(1, problem.filter.free + 1)))
+        slopes = self._slopes(ordered, theta.size)
+        if not self.factored:
+            size, structure = problem.size, Structure(self.poles, self.zeros)
+            whole = unfactored(ordered)
+            theta = np.concatenate((whole.denominator[1:], _padded(whole.numerator, self.zeros + 1), theta[size:]))
+            slopes = np.eye(theta.size)[:, :size]
+            names = (*structure.names, *names[size:])
+        values: dict[str, Any] = {name: found.values[name] for name in ("status", "iterations", "cost", "count", "r2")}
+        values |= {name: found.values[name] for name in ("fit_percent", "condition_number")}
+        fixed = np.isin(order, list(problem.fixed))
+        fit = SubmodelsFit(
+            model=unfactored(ordered),
+            parameter_names=names,
+            covariance=np.full((theta.size, theta.size), np.nan),
+            theta=theta,
+            initial_states=(theta[problem.size :],),
+            offsets=(laid_out.offset,),
+            input_offsets=(laid_out.input_offset,),
+            tangent=np.delete(np.eye(theta.size), np.flatnonzero(fixed), axis=1),
+            regular=problem.data.interval > 0.0,
+            known=tuple(names[k] for k in np.flatnonzero(fixed)),
+            additive=ordered if self.factored else None,
+            start_method=method,
+            loop_radius=radius_in_loop(problem, ordered),
+            coefficients=slopes,
+            **values,
+        )
+        samples = self.samples(fit, laid_out)
+        fit = replace(fit, residuals=samples.residuals, sensitivities=samples.sensitivities, used=samples.used)
+        uncertainty = fit.uncertainty(self.covariance, self.bootstrap_draws)
+        return replace(fit, covariance=uncertainty.widened())
+
+    def _slopes(self, model: AdditiveModel, size: int) -> Array:
+        """Derivatives of the coefficients of the fraction to the parameters, transposed, shape (p, n + m + 1)."""
+        jacobian = unfactored_jacobian(model)
+        kept = [*range(self.poles), *range(jacobian.shape[0] - self.zeros - 1, jacobian.shape[0])]
+        slopes = np.zeros((size, len(kept)))
+        slopes[: jacobian.shape[1]] = jacobian[kept].T
+        return slopes
+
+    # --- what a fit is judged by -----------------------------------------------------------------------
+
+    def start_at(self, fit: SubmodelsFit) -> Start:
+        """A start at an estimate."""
+        return Start(model=self.factors(fit))
+
+    def factors(self, fit: SubmodelsFit) -> AdditiveModel:
+        """The submodels of an estimate."""
+        return fit.additive or AdditiveModel.from_theta(_single(fit), self.terms, self.delay)
+
+    def samples(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> FittedSamples:
+        """What a fit says of each used sample, from its parameters."""
+        return self._samples(self.factors(fit), fit.initial_states[0], laid_out.problem)
+
+    def _samples(self, model: AdditiveModel, state: Array, problem: AdditiveProblem) -> FittedSamples:
+        """Residuals and sensitivities, those of a monic fraction by its coefficients."""
+        ordered = AdditiveProblem(problem.data, model.terms, self.delay, problem.filter.loop, problem.initial_state)
+        rows = ordered.filter.rows(np.concatenate((model.theta, state)))
+        assert rows is not None
+        psi, size = rows[0], ordered.size
+        if not self.factored:
+            slopes = self._slopes(model, size)
+            psi = np.column_stack((psi[:, :size] @ np.linalg.inv(slopes.T), psi[:, size:]))
+        return FittedSamples((rows[2],), (psi,), (problem.data.use,), None)
+
+    def apply(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> AppliedModel:
+        """The model on another record."""
+        model = self.factors(fit)
+        problem = laid_out.problem
+        ordered = AdditiveProblem(problem.data, model.terms, self.delay, initial_state=problem.initial_state)
+        submodels = Submodels(laid_out.record, ordered)
+        return replace(laid_out, submodels=submodels).errors_of(model.theta, self.initial_state == "estimate")
+
+    def lowered(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> dict[str, float]:
+        """Sums of squared errors if an initial state or an offset were estimated too, to first order."""
+        error, psi = fit.residuals[0], fit.sensitivities[0] @ fit.tangent
+
+        def left(columns: Array) -> float:
+            beside = np.column_stack((psi, columns))
+            beside = beside / np.maximum(np.linalg.norm(beside, axis=0), TINY)
+            rest = error - beside @ np.linalg.lstsq(beside, error)[0]
+            return float(rest @ rest)
+
+        found = {}
+        model = self.factors(fit)
+        if self.initial_state == "rest":
+            found["initial_state"] = left(laid_out.free_columns(model.theta))
+        if self.offset == "none":
+            found["offset"] = left(np.ones((error.size, 1)))
+        return found
+
+
+TINY = float(np.finfo(float).tiny)
+
+
+def _single(fit: SubmodelsFit) -> Array:
+    """Parameters of the only term from those of the monic fraction."""
+    whole = fit.model
+    a, b = whole.denominator / whole.denominator[-1], whole.numerator / whole.denominator[-1]
+    zeros = sum(name.startswith("b") for name in fit.parameter_names) - 1
+    return np.concatenate((a[:-1][::-1], _padded(b, zeros + 1)[::-1]))
+
+
+def _padded(b: Array, size: int) -> Array:
+    """Numerator with its declared length."""
+    return np.concatenate((np.zeros(size - b.size), b))
+
+
+def _order(problem: AdditiveProblem, whole: Array, *, sort: bool) -> IndexArray:
+    """Places of all parameters with submodels by rising natural frequency, those of free responses likewise."""
+    if not sort:
+        return np.arange(whole.size)
+    sorting, places = problem.model(whole).order_of_sorting, []
+    for first, widths in ((0, [term.size for term in problem.terms]), (problem.size, [t.order for t in problem.terms])):
+        own = np.split(np.arange(first, first + sum(widths)), np.cumsum(widths)[:-1])
+        places += [own[k] for k in sorting if first < whole.size]
+    return np.concatenate(places)
