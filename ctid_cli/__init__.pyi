@@ -31,6 +31,8 @@ from .estimators.td_srivc import TdSrivc as TdSrivc
 from .estimators.useful_redundancy import UsefulRedundancy as UsefulRedundancy
 from .estimators.delay_profile import DelayProfile as DelayProfile
 from .estimators.additive_srivc import AdditiveSrivc as AdditiveSrivc
+from .estimators.measured_submodels import MeasuredSubmodels as MeasuredSubmodels
+from .estimation.fixed import Fixed as Fixed
 from .estimators.identification import Identification as Identification, identify as identify
 
 # Results
@@ -39,6 +41,7 @@ from .inference.fitted_model import FittedModel as FittedModel
 from .inference.bands import FrequencyBand as FrequencyBand, PoleBand as PoleBand, ResponseBand as ResponseBand
 from .estimators.additive_srivc import AdditiveFit as AdditiveFit
 from .estimators.delay_profile import MeasuredFit as MeasuredFit
+from .estimators.measured_submodels import SubmodelsFit as SubmodelsFit
 from .estimators.useful_redundancy import RedundantFit as RedundantFit
 from .inference.status import Status as Status
 from .inference.diagnostics import fit_percent as fit_percent

@@ -76,7 +76,7 @@ def fit(
     from ctid_cli.signals.measurement import read_measurement
     from ctid_cli.storage.fit_file import fit_text
 
-    if poles is None and model == "fraction":
+    if poles is None and model == "fraction" and terms is None:
         raise UsageError(f"--poles is missing; to see what the record allows and a first fit: ctid check {files[0]}")
     if bootstrap is not None and bootstrap < LEAST_DRAWS:
         raise UsageError(f"--bootstrap must be at least {LEAST_DRAWS} draws, for example 500; got {bootstrap}")

@@ -99,7 +99,7 @@ def with_known(
         given = theta[places].copy()
         for stage in range(1, STAGES + 1):
             theta = theta.copy()
-            theta[places] = given + (values - given) * stage / STAGES
+            theta[places] = values + (given - values) * (STAGES - stage) / STAGES
             theta, squared, done = search.descend(theta, free, MOST if stage == STAGES else ON_THE_WAY)
         ends.append((squared, theta, done))
     squared, theta, done = min(ends, key=lambda end: end[0])

@@ -199,7 +199,9 @@ def identify(
     if not answer.seen:
         unclear |= {name for name in fit.parameter_names if not name.startswith("offset")}
     interval = None
-    if isinstance(laid_out, Refinement) and "delay" in fit.parameter_names and "delay" not in unclear:
+    # The profile would free what is known.
+    searched = "delay" in fit.parameter_names and not fit.known
+    if isinstance(laid_out, Refinement) and searched and "delay" not in unclear:
         interval = _delay_interval(laid_out, linear, uncertainty)
     judged = None
     if checked is not None and validation is not None:
@@ -213,14 +215,15 @@ def identify(
         delay_interval=interval,
         derived=judging.derived(fit, uncertainty, answer.seen and not singular),
         tests=tests,
-        criteria=criteria_of.information_criteria(squared_error, fit.count, fit.theta.size),
+        criteria=criteria_of.information_criteria(squared_error, fit.count, fit.theta.size - len(fit.known)),
         yic=criteria_of.young_information_criterion(residuals, output, fit.theta[free], matrix[np.ix_(free, free)]),
         r_t_squared=criteria_of.r_t_squared(residuals, output),
         warnings=(),
         validation=judged,
         records=tuple(records),
     )
-    look = look_again(linear, records, judging.fall_of_hold(options, laid_out, linear, records))
+    acting = [judging.acting(options, record) for record in records]
+    look = look_again(linear, acting, judging.fall_of_hold(options, laid_out, linear, records))
     gains = _gains(linear, judging.lowered(options, laid_out, linear))
     return replace(found, warnings=tuple(_warnings(found, look, hessian, gains)))
 
@@ -236,7 +239,7 @@ def _warnings(found: Identification, look: SecondLook, hessian: Array, gains: di
         yield from warnings.of_short_record(found.uncertainty, fit.count)
         yield from warnings.of_interval(found.delay_interval, options, fit)
     yield from warnings.of_residuals(found.tests, len(fit.residuals), FEWEST_TESTED)
-    yield from warnings.of_treatment(gains)
+    yield from warnings.of_treatment(gains, options)
     if found.validation is not None:
         yield from warnings.of_validation(fit.r2, found.validation.r2)
 

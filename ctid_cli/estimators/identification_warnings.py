@@ -7,6 +7,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.judging import Options
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.inference.answer_test import AnswerTest
 from ctid_cli.inference.conditioning import describe_conditioning
 from ctid_cli.inference.covariance import condition_number
@@ -117,13 +118,15 @@ def of_residuals(tests: Sequence[ResidualTests], experiments: int, fewest: int) 
     return words
 
 
-def of_treatment(gains: Mapping[str, float]) -> list[str]:
+def of_treatment(gains: Mapping[str, float], options: Options) -> list[str]:
     """What else should be estimated, from the shares by which the cost would fall."""
+    able = not isinstance(options, MeasuredSubmodels)
     advice = {
         "initial_state": "The record does not start at rest: estimating the initial state would lower the cost by "
         "{:.2g} %; use --initial-state estimate (or periodic, if the input repeats the record).",
-        "offset": "The output has an offset: estimating it would lower the cost by {:.2g} %; use --offset estimate "
-        "(or remove, to subtract the means of input and output).",
+        "offset": "The output has an offset: estimating it would lower the cost by {:.2g} %; use "
+        + ("--offset estimate (or remove, to " if able else "--offset remove (to ")
+        + "subtract the means of input and output).",
     }
     return [advice[name].format(100 * share) for name, share in gains.items()]
 

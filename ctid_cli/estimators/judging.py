@@ -65,7 +65,10 @@ def lowered(options: Options, laid_out: LaidOut, fit: MeasuredFit) -> dict[str, 
     if isinstance(laid_out, LaidOutSubmodels):
         own, submodels = _of_submodels(options, fit)
         return own.lowered(submodels, laid_out)
-    found = {}
+    found: dict[str, float] = {}
+    if fit.known:
+        # It would free what is known too.
+        return found
     if options.initial_state == "rest":
         found["initial_state"] = laid_out.squared_error_with(fit.model, initial_state=True)
     if options.offset == "none":
@@ -76,7 +79,8 @@ def lowered(options: Options, laid_out: LaidOut, fit: MeasuredFit) -> dict[str, 
 def fall_of_hold(options: Options, laid_out: LaidOut, fit: MeasuredFit, records: Sequence[Record]) -> float:
     """Fraction by which the other hold of the input lowers the cost; 0 where that is not decisive."""
     if isinstance(laid_out, Refinement):
-        return fall_with_other_hold(laid_out, fit, records) if options.loss == "squares" else 0.0
+        comparable = options.loss == "squares" and not fit.known
+        return fall_with_other_hold(laid_out, fit, records) if comparable else 0.0
     own, submodels = _of_submodels(options, fit)
     if own.closed:
         # A discrete controller holds its input.
@@ -97,6 +101,9 @@ def _of_submodels(options: Options, fit: MeasuredFit) -> tuple[MeasuredSubmodels
 def derived(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool) -> tuple[UncertainValue, ...]:
     """Poles, time constants, frequencies, damping and gain; without errors where the answer is not seen."""
     covariance = uncertainty.covariance if seen else np.full_like(uncertainty.covariance, np.nan)
+    # What is known has no variance.
+    known = np.isin(fit.parameter_names, fit.known)
+    covariance[known] = covariance[:, known] = 0.0
     if not isinstance(fit, SubmodelsFit) or fit.additive is None:
         size = fit.model.denominator.size + sum(name.startswith("b") for name in fit.parameter_names) - 1
         held = fit.tangent[:size] if fit.held_poles else None
@@ -105,7 +112,4 @@ def derived(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool) -> tuple[Unc
     def reach(first: int, gradient: Array) -> float:
         return uncertainty.quantile(np.concatenate((np.zeros(first), gradient)))
 
-    # What is known has no variance.
-    known = ~fit.tangent.any(axis=1)
-    covariance[known] = covariance[:, known] = 0.0
     return additive_derived(fit.additive, covariance, reach=reach)

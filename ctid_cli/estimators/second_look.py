@@ -88,6 +88,7 @@ def _drift(e: Array, psi: Array, t: Array) -> float:
 
 def _integrator(fit: MeasuredFit, records: Sequence[Record]) -> float:
     poles = fit.model.poles
-    slow = np.abs(poles[poles.imag == 0.0])
+    # Poles at the origin were asked for.
+    slow = np.abs(poles[(poles.imag == 0.0) & (poles.real != 0.0)])
     longest = max(record.duration for record in records)
     return float(1 / slow.min()) if slow.size and slow.min() * longest < 1 / INTEGRATES else float("nan")

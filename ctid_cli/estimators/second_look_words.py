@@ -43,7 +43,7 @@ def _of_record(one: RecordLook, look: SecondLook, options: Options, fit: Measure
         yield (
             f"The output diverges: it grows by a factor of e every {one.growth_time:.2g}, and the input does not. An "
             "unstable plant shows its dynamics in a stabilising loop only: record the reference there too, and use "
-            "srivc or additive_srivc with instruments: closed_loop in an experiment (ctid run)."
+            "--loop FILE --reference COLUMN."
         )
         return
     yield from _of_faults(one)
@@ -51,8 +51,7 @@ def _of_record(one: RecordLook, look: SecondLook, options: Options, fit: Measure
     if chance < FED_BACK:
         yield (
             f"The input answers the output (p = {chance:.1g}), as in a closed loop, where noise biases the estimate. "
-            "Record the reference, and use srivc or additive_srivc with instruments: closed_loop in an experiment "
-            "(ctid run); without a controller, look at the time stamps."
+            "Record the reference, and use --loop FILE --reference COLUMN; without a controller, look at the clock."
         )
     elif poor > look.other_hold and _poor_share(one):
         yield _of_structure(one, options, fit)
@@ -141,9 +140,8 @@ def _of_hold(look: SecondLook) -> str:
 
 def _of_integrator(look: SecondLook, options: Options, fit: MeasuredFit) -> str:
     poles = fit.model.order - 1
-    terms = f"[{{poles: {poles}, zeros: {options.zeros}, integrators: 1}}]"
     return (
         f"A pole has a time constant of {look.integrator:.4g}, too slow for this record: the system seems to integrate"
-        f", or the output drifts, and the static gain means nothing. Use additive_srivc with terms: {terms} in an "
-        "experiment (ctid run), or a longer record."
+        f", or the output drifts, and the static gain means nothing. Use --poles {poles} --integrators 1 (with a known "
+        "delay), or a longer record."
     )

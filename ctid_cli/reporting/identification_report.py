@@ -9,9 +9,13 @@ import numpy as np
 from ctid_cli.canonical import plain
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.optimum.box import Box
+from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.identification import Identification, Validation
+from ctid_cli.estimators.judging import Options
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, SubmodelsFit
 from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
 from ctid_cli.reporting.layout import Report, Table, count, number, picked
 from ctid_cli.reporting.loss_report import loss_object, loss_text
@@ -48,8 +52,28 @@ def common_units(measurements: Sequence[Measurement]) -> Units:
 
 def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:
     """Parameters with the units of the records."""
+    additive = additive_of(result.fit)
+    if additive is not None:
+        return [replace(item, unit=_unit_in_sum(item.name, additive, units)) for item in result.estimates]
     poles, zeros = result.fit.model.order, result.options.zeros
     return [replace(item, unit=units.of(item.name, poles, zeros)) for item in result.estimates]
+
+
+def additive_of(fit: MeasuredFit) -> AdditiveModel | None:
+    """The submodels of a fit, None of a fit of one transfer function."""
+    return fit.additive if isinstance(fit, SubmodelsFit) else None
+
+
+def _unit_in_sum(name: str, model: AdditiveModel, units: Units) -> str:
+    """Unit of a parameter of a sum, or of a coefficient of its free response."""
+    if name.startswith("g"):
+        return units.of_submodel(name, model.submodels[int(name[1:].partition("_")[0]) - 1].integrators)
+    if name == "delay":
+        return units.time
+    # c_k p^k/(p^l A) on an impulse.
+    power = [k + 1 - part.integrators for part in model.submodels for k in range(part.order)][int(name[1:]) - 1]
+    times = units.time if power == 1 else f"{units.time}^{power}"
+    return units.output if power == 0 else f"{units.output}*{times}"
 
 
 def derived_of(result: Identification, units: Units) -> list[UncertainValue]:
@@ -73,7 +97,12 @@ def identification_object(
     interval, profile, judged = result.delay_interval, fit.profile, result.validation
     numerator = [item.estimate for item in result.estimates if item.name.startswith("b")]
     content = {
-        "model": {"numerator": numerator, "denominator": fit.model.denominator, "delay": fit.model.delay},
+        "model": {
+            "numerator": numerator or fit.model.numerator,
+            "denominator": fit.model.denominator,
+            "delay": fit.model.delay,
+            **_submodels_object(fit),
+        },
         "parameters": [parameter_object(item) for item in parameters_of(result, units)],
         **picked(fit, ("fit_percent", "r2", "cost")),
         "loss": loss_object(fit, [item.record for item in measurements]),
@@ -105,9 +134,14 @@ def identification_object(
         "validation": judged and _validation_object(judged, validation),
         "records": [_record_object(item, use) for item, use in zip(measurements, fit.used, strict=True)],
         "units": asdict(units),
-        "settings": asdict(options) | {"hold": measurements[0].record.input.hold},
+        "settings": asdict(options) | {"kind": options.kind, "hold": measurements[0].record.input.hold},
     }
     return dict(plain(content))
+
+
+def _submodels_object(fit: MeasuredFit) -> dict[str, Any]:
+    model = additive_of(fit)
+    return {} if model is None else {"submodels": [asdict(part) for part in model.submodels]}
 
 
 def _covariance_object(result: Identification) -> dict[str, Any]:
@@ -176,12 +210,45 @@ def asked_for(result: Identification, measurements: Sequence[Measurement], units
     options, hold = result.options, measurements[0].record.input.hold
     low, high = options.delay_bounds
     searched = f"searched from {low:g} to {high:g} {units.time}" if low < high else f"known, {low:g} {units.time}"
-    yield "model", f"{count(options.poles, 'pole')}, {count(options.zeros, 'zero')}; delay {searched}"
+    yield "model", f"{_structure(options)}; delay {searched}"
+    if options.fixed:
+        yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
+    if isinstance(options, MeasuredSubmodels):
+        yield from _of_iteration(result, options, measurements[0])
     yield "initial state", f"{TREATMENTS[options.initial_state]} (--initial-state {options.initial_state})"
     yield "offset", f"{_offset(result, units)} (--offset {options.offset})"
     yield "input", f"{'constant' if hold == 'zoh' else 'straight lines'} between its samples (--hold {hold})"
     if loss := loss_text(result.fit, [item.record for item in measurements], units):
         yield "loss", loss
+
+
+def _structure(options: Options) -> str:
+    """Poles and zeros, of each submodel if there are several."""
+    if not isinstance(options, MeasuredSubmodels) or not options.factored:
+        return f"{count(options.poles, 'pole')}, {count(options.zeros, 'zero')}"
+    parts = ", ".join(
+        f"{term.poles}/{term.zeros}" + f" and {count(term.integrators, 'integrator')}" * (term.integrators > 0)
+        for term in options.terms
+    )
+    what = f"sum of {len(options.terms)} submodels with" if len(options.terms) > 1 else "one submodel with"
+    return f"{what} poles/zeros {parts}"
+
+
+def _of_iteration(
+    result: Identification, options: MeasuredSubmodels, measurement: Measurement
+) -> Iterator[tuple[str, str]]:
+    """The loop of a record, and where the iterations started."""
+    loop = measurement.record.loop
+    if options.closed and loop is not None:
+        b, a = (
+            " ".join(f"{c:.6g}" for c in np.asarray(side))
+            for side in (loop.controller.numerator, loop.controller.denominator)
+        )
+        where = "u = C(q) (r - y)" if loop.enters == "controller" else "u = r - C(q) y"
+        text = f"{where}, r = {measurement.reference}, C = ({b})/({a}) in descending powers of q"
+        yield "loop", f"{text}; instruments from the noise-free loop"
+    if isinstance(result.fit, SubmodelsFit):
+        yield "start", result.fit.start_method
 
 
 def _box_object(box: Box) -> dict[str, Any]:
@@ -226,7 +293,7 @@ def covariance_line(result: Identification) -> str:
     found, asked = result.uncertainty, all(test.white for test in result.tests)
     text = "Standard errors are those for white residuals"
     if not result.answer.seen:
-        return "There are no standard errors, as no answer to the input is seen. Monic denominator, descending powers."
+        return f"There are no standard errors, as no answer to the input is seen. {_form(result.fit)}"
     if found.kind != "white":
         text = "Standard errors are those for coloured noise" + ", because the residuals are not white" * (not asked)
     elif result.tests:
@@ -239,7 +306,14 @@ def covariance_line(result: Identification) -> str:
         text += f"; intervals are estimate -+ as many of them as {draws} keep within (bootstrap-t)"
     if result.delay_interval is not None:
         text += ", that of the delay from the profile of the cost, which is not quadratic there"
-    return text + ". Monic denominator, descending powers."
+    return f"{text}. {_form(result.fit)}"
+
+
+def _form(fit: MeasuredFit) -> str:
+    """How coefficients are scaled and counted."""
+    if additive_of(fit) is None:
+        return "Monic denominator, descending powers."
+    return "g1_a2 multiplies p^2 in the denominator of the first submodel, whose constant term is 1."
 
 
 def derived_block(rows: Sequence[UncertainValue]) -> list[str | Table]:
@@ -254,7 +328,8 @@ def derived_block(rows: Sequence[UncertainValue]) -> list[str | Table]:
 
 def _modes(result: Identification, units: Units) -> list[dict[str, float | None]]:
     """Natural frequency and damping of every real pole and every pair."""
-    rows = {row.name: row.estimate for row in result.derived}
+    additive = additive_of(result.fit)
+    rows = {row.name: row.estimate for row in result.derived if additive is None}
     modes: list[dict[str, float | None]] = []
     for k in range(1, result.fit.model.order + 1):
         if f"damping_{k}" in rows:
@@ -263,9 +338,16 @@ def _modes(result: Identification, units: Units) -> list[dict[str, float | None]
             frequency, damping = abs(rows[f"pole_{k}"]), float(-np.sign(rows[f"pole_{k}"]))
         else:
             break
-        hertz = None if units.seconds is None else frequency / (2 * np.pi * units.seconds)
-        modes.append({"frequency_hz": hertz, "damping": damping})
+        modes.append(_mode(frequency, damping, units))
+    if additive is not None:
+        poles = [pole for pole in additive.poles.tolist() if pole.imag >= 0]
+        return [_mode(abs(pole), -pole.real / abs(pole) if pole else None, units) for pole in poles]
     return modes
+
+
+def _mode(frequency: float, damping: float | None, units: Units) -> dict[str, float | None]:
+    hertz = None if units.seconds is None else frequency / (2 * np.pi * units.seconds)
+    return {"frequency_hz": hertz, "damping": damping}
 
 
 def _validation_object(judged: Validation, validation: Measurement | None) -> dict[str, Any]:

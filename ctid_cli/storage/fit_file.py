@@ -13,15 +13,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
+
 import ctid_cli
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.estimators import judging
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.inference.loss import Weighting
+from ctid_cli.models.controller import DiscreteController
 from ctid_cli.signals.files import require_file
 from ctid_cli.signals.measurement import Measurement, read_measurement
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Loop, Record
 from ctid_cli.simulation.dataset import file_sha256
 from ctid_cli.storage.exact import decoded, encoded
 
@@ -68,7 +71,17 @@ def _source(measurement: Measurement, folder: Path) -> dict[str, Any]:
         "hold": measurement.record.input.hold,
         "from": measurement.start,
         "to": measurement.stop,
+        **_loop(measurement),
     }
+
+
+def _loop(measurement: Measurement) -> dict[str, Any]:
+    """The loop of a record, if it is known."""
+    loop = measurement.record.loop
+    if loop is None:
+        return {}
+    sides = {name: np.asarray(getattr(loop.controller, name)).tolist() for name in ("numerator", "denominator")}
+    return {"loop": {"reference": measurement.reference, "enters": loop.enters, **sides}}
 
 
 # --- reading ---------------------------------------------------------------------------------------
@@ -99,7 +112,13 @@ class RecordSource:
         self.require_same()
         columns = {role: content["columns"][role] for role in ("time", "input", "output")}
         window = {"start": content["from"], "stop": content["to"]}
-        found = read_measurement(self.place, **columns, hold=content["hold"], **window)
+        loop = content.get("loop")
+        reference = None if loop is None else loop["reference"]
+        found = read_measurement(self.place, **columns, hold=content["hold"], **window, reference=reference)
+        if loop is not None and found.reference_values is not None:
+            controller = DiscreteController(loop["numerator"], loop["denominator"])
+            closed = Loop(found.reference_values, controller, loop["enters"])
+            found = replace(found, record=replace(found.record, loop=closed))
         return replace(found, record=replace(found.record, name=self.name))
 
     def require_same(self) -> None:

@@ -64,7 +64,7 @@ FAULTS = {
     "a recorder that stood still": (stopped(CLEAN, 300, 320), KNOWN, "keeps one value from t = 60 to 63.8"),
     "drift": (changed(CLEAN, CLEAN.y + 2 * NOISE * np.linspace(0, 1, 1000)), KNOWN, "drifts by"),
     "the wrong hold": (record_of(hold="foh", read_as="zoh", interval=0.8), KNOWN, "use --hold foh"),
-    "an integrator": (record_of(TransferFunction([1.0], [1.0, 1.0, 0.0])), KNOWN, "poles: 1, zeros: 0, integrators: 1"),
+    "an integrator": (record_of(TransferFunction([1.0], [1.0, 1.0, 0.0])), KNOWN, "--poles 1 --integrators 1"),
     "an unstable plant": (record_of(TransferFunction([1.0], [1.0, -0.04])), FIRST_ORDER, "The output diverges"),
     "feedback": (looped(), FIRST_ORDER, "The input answers the output"),
     "one pole too few": (CLEAN, FIRST_ORDER, "try --poles 2"),

@@ -1,0 +1,186 @@
+"""``ctid fit`` with submodels, integrators, known parameters and loops."""
+
+import json
+
+import numpy as np
+import pytest
+
+from ctid_cli import HeldSignal, TransferFunction, load_fit
+from ctid_cli.filtering.loop import simulate_loop
+from ctid_cli.filtering.sampled import simulate_additive
+from ctid_cli.models.additive import AdditiveModel, Submodel
+from ctid_cli.models.controller import DiscreteController
+
+STEP = 0.05
+MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
+RIGID = AdditiveModel([Submodel([0.5], [1.0], 1), Submodel([2.0], [0.3, 0.2, 1.0])])
+PLANT = TransferFunction([2.0], [1.0, 1.5])
+CONTROLLER = DiscreteController([0.8, -0.7], [1.0, -1.0])
+LOOP = "loop:\n  controller: {numerator: [0.8, -0.7], denominator: [1.0, -1.0]}\n"
+
+
+def write(file, columns, header):
+    np.savetxt(file, np.column_stack(columns), delimiter=",", header=header, comments="", fmt="%.12g")
+    return file
+
+
+def record(file, system, n=800, noise=0.05, seed=0):
+    rng = np.random.default_rng(seed)
+    t = STEP * np.arange(n)
+    u = rng.standard_normal(n)
+    y = simulate_additive(system, HeldSignal(t, u), t) + noise * rng.standard_normal(n)
+    return write(file, (t, u, y), "t,u,y")
+
+
+@pytest.fixture
+def closed(tmp_path):
+    (tmp_path / "loop.yaml").write_text(LOOP, encoding="utf-8")
+    rng = np.random.default_rng(4)
+    t = STEP * np.arange(1500)
+    r = np.repeat(rng.choice([-1.0, 1.0], 150), 10)
+    noise = np.zeros(1500)
+    for k in range(1, 1500):
+        noise[k] = 0.95 * noise[k - 1] + 0.05 * rng.standard_normal()
+    found = simulate_loop(PLANT, CONTROLLER, r, noise, STEP)
+    spoilt = found.u + 0.1 * rng.standard_normal(1500)
+    return write(tmp_path / "closed.csv", (t, found.u, found.x + noise, r, spoilt), "t,u [V],y [rpm],r [rpm],v [V]")
+
+
+def fitted(ctid, *arguments):
+    return json.loads(ctid("fit", *arguments, "--json").stdout)
+
+
+def near(content, expected, errors=5.0):
+    """Whether parameters are within so many standard errors of what they should be."""
+    found = {item["name"]: item for item in content["parameters"]}
+    for name, value in expected.items():
+        assert found[name]["estimate"] == pytest.approx(value, abs=errors * found[name]["standard_error"])
+        assert found[name]["standard_error"] < 0.2 * abs(value) + 0.01
+
+
+def test_a_sum_of_submodels_is_printed_written_and_read_back(ctid, tmp_path):
+    file, other = record(tmp_path / "one.csv", MODES), record(tmp_path / "other.csv", MODES, seed=1)
+    arguments = (file, "--model", "additive", "--terms", "2/0,2/0", "--validate", other, "--out", tmp_path)
+    content = fitted(ctid, *arguments)
+    near(content, {"g1_b0": 3.0, "g1_a1": 0.25, "g1_a2": 0.25, "g2_b0": 1.0, "g2_a2": 0.025})
+    assert [len(part["denominator"]) for part in content["model"]["submodels"]] == [3, 3]
+    assert content["validation"]["r2"] > 0.99
+    assert content["warnings"] == []
+    text = ctid("fit", *arguments).stdout
+    assert "sum of 2 submodels with poles/zeros 2/0, 2/0; delay known, 0 s" in text
+    assert (tmp_path / "fit.svg").read_bytes().startswith(b"<?xml")
+    again = load_fit(tmp_path / "fit.json")
+    assert again.fit.additive.parameters == {
+        item["name"]: item["estimate"] for item in content["parameters"] if item["name"] != "delay"
+    }
+    assert np.mean(again.fit.residuals[0] ** 2) == pytest.approx(content["cost"], rel=1e-12)
+    assert again.validation.applied.residuals[0].size == 800
+
+
+@pytest.mark.parametrize("state", ["estimate", "periodic"])
+def test_the_state_before_the_record(ctid, tmp_path, state):
+    file = record(tmp_path / "one.csv", MODES)
+    content = fitted(ctid, file, "--model", "additive", "--terms", "2,2", "--initial-state", state, "--out", tmp_path)
+    states = [item["name"] for item in content["parameters"] if item["name"].startswith("x")]
+    assert states == (["x1", "x2", "x3", "x4"] if state == "estimate" else [])
+
+
+def test_integrators_belong_to_the_first_submodel(ctid, tmp_path):
+    file = record(tmp_path / "rigid.csv", RIGID)
+    options = ("--model", "additive", "--terms", "0/0,2/0", "--integrators", 1, "--out", tmp_path)
+    content = fitted(ctid, file, *options)
+    near(content, {"g1_b0": 0.5, "g2_b0": 2.0, "g2_a1": 0.2, "g2_a2": 0.3})
+    assert content["parameters"][0]["unit"] == "out/in/s"
+    assert content["warnings"] == []
+
+
+def test_an_integrator_beside_poles_needs_no_other_words(ctid, tmp_path):
+    file = record(tmp_path / "one.csv", AdditiveModel([Submodel([1.0], [0.5, 1.0], 1)]))
+    content = fitted(ctid, file, "--poles", 1, "--integrators", 1, "--out", tmp_path)
+    near(content, {"g1_a1": 0.5, "g1_b0": 1.0})
+
+
+def test_fixed_parameters_have_their_values_and_no_errors(ctid, tmp_path):
+    file = record(tmp_path / "one.csv", MODES)
+    options = ("--model", "additive", "--terms", "2/0,2/0", "--fix", "g1_a2=0.25", "--fix", "g2_b0=1")
+    content = fitted(ctid, file, *options, "--out", tmp_path)
+    found = {item["name"]: item for item in content["parameters"]}
+    for name, value in (("g1_a2", 0.25), ("g2_b0", 1.0)):
+        assert (found[name]["estimate"], found[name]["status"]) == (value, "fixed")
+        assert found[name]["standard_error"] is None
+    assert content["criteria"]["parameters"] == 4
+    plain = fitted(ctid, file, "--poles", 4, "--zeros", 2, "--fix", "a4=160", "--out", tmp_path)
+    assert plain["model"]["denominator"][-1] == 160.0
+
+
+def test_a_loop_removes_the_bias_that_coloured_noise_makes(ctid, closed, tmp_path):
+    options = (closed, "--input", "u", "--poles", 1, "--out", tmp_path)
+    content = fitted(ctid, *options, "--loop", tmp_path / "loop.yaml", "--reference", "r")
+    near(content, {"a1": 1.5, "b0": 2.0}, errors=3.0)
+    assert not any("answers the output" in warning for warning in content["warnings"])
+    ignored = fitted(ctid, *options, "--loop", tmp_path / "loop.yaml", "--ignore-loop")
+    assert any("The loop is ignored" in note for note in ignored["notes"])
+    assert ignored["parameters"] == fitted(ctid, *options)["parameters"]
+    again = load_fit(tmp_path / "fit.json")
+    assert again.records[0].n_samples == 1500
+
+
+def test_the_loop_is_stored_with_the_fit(ctid, closed, tmp_path):
+    options = (closed, "--input", "u", "--poles", 1, "--out", tmp_path)
+    content = fitted(ctid, *options, "--loop", tmp_path / "loop.yaml", "--reference", "r")
+    again = load_fit(tmp_path / "fit.json")
+    assert again.records[0].loop.controller.numerator.tolist() == [0.8, -0.7]
+    assert np.mean(again.fit.residuals[0] ** 2) == pytest.approx(content["cost"], rel=1e-12)
+
+
+ADDITIVE = ("--model", "additive", "--terms", "2/0")
+REFUSED = {
+    "terms alone": (("--terms", "2/0"), "add --model additive"),
+    "no terms": (("--model", "additive"), "--model additive needs --terms"),
+    "degrees twice": ((*ADDITIVE, "--poles", 2), "drop --poles"),
+    "bad terms": (("--model", "additive", "--terms", "2-0"), "for example 2/0,2/1"),
+    "too many zeros": (("--model", "additive", "--terms", "1/2"), "more zeros than poles"),
+    "a searched delay": ((*ADDITIVE, "--delay", "0:2"), "give one value, --delay VALUE"),
+    "a robust loss": ((*ADDITIVE, "--loss", "huber"), "drop --loss"),
+    "an estimated offset": ((*ADDITIVE, "--offset", "estimate"), "use --offset remove"),
+    "negative integrators": (("--poles", 1, "--integrators", -1), "--integrators must be 0 or more"),
+    "a fixed delay": (("--poles", 1, "--fix", "delay=1"), "--delay VALUE"),
+    "a fixed word": (("--poles", 1, "--fix", "a1"), "NAME=VALUE"),
+    "an unknown name": (("--poles", 1, "--fix", "a2=1"), "there are a1 and b0"),
+    "nothing left": (("--poles", 1, "--fix", "a1=1", "--fix", "b0=1"), "nothing to estimate"),
+    "half a loop": (("--poles", 1, "--reference", "u"), "add --loop FILE"),
+    "the other half": (("--poles", 1, "--loop", "loop.yaml"), "add --reference COLUMN"),
+    "no loop to ignore": (("--poles", 1, "--ignore-loop"), "drop it"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_options_that_do_not_go_together_are_one_sentence(ctid, tmp_path, case):
+    options, said = REFUSED[case]
+    file = record(tmp_path / "one.csv", MODES, n=100)
+    done = ctid("fit", file, *options, "--out", tmp_path / "out", code=2)
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+LOOPS = {
+    "an input of another origin": ("v", "r", LOOP, "the input is not what the controller makes"),
+    "a reference that is the output": ("u", "y", LOOP, "cannot be both the output and the reference"),
+    "a column that is not there": ("u", "q", LOOP, "there is no column 'q'"),
+    "a reference in another unit": ("u", "v", LOOP, "is in V, and the output"),
+    "a relay": ("u", "r", "loop: {controller: {relay: {amplitude: 1.0}}}\n", "no relay"),
+    "no loop in the file": ("u", "r", "experiment: x\n", "there is no section loop"),
+    "another sign": ("u", "r", LOOP.replace("0.8", "-0.8"), "the input is not what the controller makes"),
+    "a key that is not there": ("u", "r", "loop:\n  control: {}\n", "controller"),
+}
+
+
+@pytest.mark.parametrize("case", LOOPS)
+def test_a_loop_that_does_not_fit_the_record_is_refused(ctid, closed, tmp_path, case):
+    column, reference, text, said = LOOPS[case]
+    (tmp_path / "loop.yaml").write_text(text, encoding="utf-8")
+    options = ("--input", column, "--output", "y", "--poles", 1, "--loop", tmp_path / "loop.yaml")
+    done = ctid("fit", closed, *options, "--reference", reference, "--out", tmp_path / "out", code=2)
+    assert said in done.stderr
+    assert not (tmp_path / "out").exists()
