@@ -207,9 +207,9 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
                 raise DataError(f"the start has the submodels {model.terms} and the estimator {self.terms}")
         else:
             model, method = laid_out.start
-        return _fit(laid_out.problem, self.iterate(laid_out.problem, model), model, method)
+        return _fit(laid_out.problem, self._iterate(laid_out.problem, model), model, method)
 
-    def iterate(self, problem: AdditiveProblem, start: AdditiveModel) -> SubmodelEstimate:
+    def _iterate(self, problem: AdditiveProblem, start: AdditiveModel) -> SubmodelEstimate:
         """Estimate from a start."""
         steps = Steps(self.max_iterations, self.tolerance, RULES[self.variant])
         noise = self.covariance, self.bootstrap_draws

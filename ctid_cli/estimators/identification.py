@@ -118,7 +118,7 @@ class Identification(FilledLater, FittedModel, ShownAsTable):
     def _estimated(self) -> "Estimated":
         """The model with what its reported errors and intervals are from."""
         return responses.with_uncertainty(
-            self.fit.model, self.fit.parameter_names, self.uncertainty, defined=self._determined
+            self.fit.parametrised, self.fit.parameter_names, self.uncertainty, defined=self._determined
         )
 
     @property
@@ -334,6 +334,8 @@ def costs_about_delay(result: Identification) -> DelayCosts | None:
     if "delay" not in fit.parameter_names or not (np.isfinite([item.low, item.high]).all() and fit.cost > 0):
         return None
     laid_out = result.options.prepare(result.records).laid_out
+    if not isinstance(laid_out, Refinement) or fit.known:
+        return None
     profile, reach, _ = _cost_of_delay(
         laid_out.near(result.fit.residuals, result.fit.weighting), fit, result.uncertainty
     )

@@ -48,7 +48,7 @@ def applied(fit: MeasuredFit, options: Options, laid_out: LaidOut) -> AppliedMod
     if isinstance(laid_out, Refinement):
         return laid_out.errors_of(fit.model)
     own, submodels = _of_submodels(options, fit)
-    return own.apply(submodels, laid_out)
+    return own._apply(submodels, laid_out)
 
 
 def samples(fit: MeasuredFit, options: Options, laid_out: LaidOut) -> FittedSamples:
@@ -57,14 +57,14 @@ def samples(fit: MeasuredFit, options: Options, laid_out: LaidOut) -> FittedSamp
         losses = None if fit.weighting is None else fit.weighting.losses
         return samples_at(laid_out, fit.model, fit.theta, losses)
     own, submodels = _of_submodels(options, fit)
-    return own.samples(submodels, laid_out)
+    return own._samples_of(submodels, laid_out)
 
 
 def lowered(options: Options, laid_out: LaidOut, fit: MeasuredFit) -> dict[str, float]:
     """Sums of squared errors if what was taken as zero were estimated too."""
     if isinstance(laid_out, LaidOutSubmodels):
         own, submodels = _of_submodels(options, fit)
-        return own.lowered(submodels, laid_out)
+        return own._lowered(submodels, laid_out)
     found: dict[str, float] = {}
     if fit.known:
         # It would free what is known too.
@@ -86,7 +86,7 @@ def fall_of_hold(options: Options, laid_out: LaidOut, fit: MeasuredFit, records:
         # A discrete controller holds its input.
         return 0.0
     try:
-        other = own.prepare(otherwise_held(records[0])).fit(own.start_at(submodels))
+        other = own.prepare(otherwise_held(records[0])).fit(own._start_at(submodels))
     except DataError:
         return 0.0
     return decisive(fit.cost, other.cost, fit, records)

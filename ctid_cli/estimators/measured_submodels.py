@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,6 +23,7 @@ from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
+from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import InitialState, LossKind, Offset
 
@@ -33,20 +34,28 @@ class SubmodelsFit(MeasuredFit):
 
     Parameters
     ----------
+    model, parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number
+        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
+    history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
+        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
+    poles_at_infinity, box, weighting, held_poles, tangent, regular, known
+        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
     additive : AdditiveModel or None
         The submodels; None where one transfer function was asked for.
     start_method : str
         How the start was found, in a sentence.
     loop_radius : float
         Largest magnitude of the poles of the sampled loop with the controller [-]; NaN in open loop.
-    coefficients : ndarray, shape (p, n + m + 1)
-        Derivatives of the coefficients of ``model``, ``a_1 ... a_n, b_0 ... b_m``, to the parameters, transposed.
     """
 
     additive: AdditiveModel | None = None
     start_method: str = ""
     loop_radius: float = float("nan")
-    coefficients: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def parametrised(self) -> TransferFunction | AdditiveModel:
+        """The model in the form that has the parameters."""
+        return self.model if self.additive is None else self.additive
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +197,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         model, method = laid_out.submodels.start
         if start is not None and start.model is not None:
             model, method = start.model, "The start was given."
-        found = self.estimator.iterate(problem, model)
+        found = self.estimator._iterate(problem, model)
         rows = problem.filter.rows(found.whole)
         if rows is None or not np.isfinite(rows[2]).all():
             raise DataError(
@@ -199,12 +208,10 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         theta = found.whole[order]
         ordered = problem.model(found.whole) if self.fixed else problem.model(found.whole).sorted()
         names = (*ordered.names, *(f"x{k}" for k in range(1, problem.filter.free + 1)))
-        slopes = self._slopes(ordered, theta.size)
         if not self.factored:
             size, structure = problem.size, Structure(self.poles, self.zeros)
             whole = unfactored(ordered)
             theta = np.concatenate((whole.denominator[1:], _padded(whole.numerator, self.zeros + 1), theta[size:]))
-            slopes = np.eye(theta.size)[:, :size]
             names = (*structure.names, *names[size:])
         values: dict[str, Any] = {name: found.values[name] for name in ("status", "iterations", "cost", "count", "r2")}
         values |= {name: found.values[name] for name in ("fit_percent", "condition_number")}
@@ -223,10 +230,9 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             additive=ordered if self.factored else None,
             start_method=method,
             loop_radius=radius_in_loop(problem, ordered),
-            coefficients=slopes,
             **values,
         )
-        samples = self.samples(fit, laid_out)
+        samples = self._samples_of(fit, laid_out)
         fit = replace(fit, residuals=samples.residuals, sensitivities=samples.sensitivities, used=samples.used)
         uncertainty = fit.uncertainty(self.covariance, self.bootstrap_draws)
         return replace(fit, covariance=uncertainty.widened())
@@ -241,17 +247,17 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
 
     # --- what a fit is judged by -----------------------------------------------------------------------
 
-    def start_at(self, fit: SubmodelsFit) -> Start:
+    def _start_at(self, fit: SubmodelsFit) -> Start:
         """A start at an estimate."""
-        return Start(model=self.factors(fit))
+        return Start(model=self._factors(fit))
 
-    def factors(self, fit: SubmodelsFit) -> AdditiveModel:
+    def _factors(self, fit: SubmodelsFit) -> AdditiveModel:
         """The submodels of an estimate."""
         return fit.additive or AdditiveModel.from_theta(_single(fit), self.terms, self.delay)
 
-    def samples(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> FittedSamples:
+    def _samples_of(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> FittedSamples:
         """What a fit says of each used sample, from its parameters."""
-        return self._samples(self.factors(fit), fit.initial_states[0], laid_out.problem)
+        return self._samples(self._factors(fit), fit.initial_states[0], laid_out.problem)
 
     def _samples(self, model: AdditiveModel, state: Array, problem: AdditiveProblem) -> FittedSamples:
         """Residuals and sensitivities, those of a monic fraction by its coefficients."""
@@ -264,15 +270,15 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             psi = np.column_stack((psi[:, :size] @ np.linalg.inv(slopes.T), psi[:, size:]))
         return FittedSamples((rows[2],), (psi,), (problem.data.use,), None)
 
-    def apply(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> AppliedModel:
+    def _apply(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> AppliedModel:
         """The model on another record."""
-        model = self.factors(fit)
+        model = self._factors(fit)
         problem = laid_out.problem
         ordered = AdditiveProblem(problem.data, model.terms, self.delay, initial_state=problem.initial_state)
         submodels = Submodels(laid_out.record, ordered)
         return replace(laid_out, submodels=submodels).errors_of(model.theta, self.initial_state == "estimate")
 
-    def lowered(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> dict[str, float]:
+    def _lowered(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> dict[str, float]:
         """Sums of squared errors if an initial state or an offset were estimated too, to first order."""
         error, psi = fit.residuals[0], fit.sensitivities[0] @ fit.tangent
 
@@ -283,7 +289,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             return float(rest @ rest)
 
         found = {}
-        model = self.factors(fit)
+        model = self._factors(fit)
         if self.initial_state == "rest":
             found["initial_state"] = left(laid_out.free_columns(model.theta))
         if self.offset == "none":
