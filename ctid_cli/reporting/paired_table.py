@@ -188,7 +188,7 @@ def _lost(rows: Sequence[Row], pair: Sequence[str], out: Path) -> Iterator[list[
     """Data sets on which the first fails and the second does not, with the commands that show them."""
     ids = [name for row in rows for name in row.get("failed_ids") or ()]
     if ids:
-        what = f"{count(len(ids), 'estimate')} of {pair[0]} failed on data sets where {pair[1]} did not:"
+        what = f"{count(len(ids), 'estimate')} of {pair[0]} missed on data sets where {pair[1]} did not:"
         commands = [f"  ctid show {name}{out_option(out)}" for name in ids[:LISTED]]
         more = [f"  and {len(ids) - LISTED} more: --format json has them all"] if len(ids) > LISTED else []
         yield ["\n".join([what, *commands, *more])]

@@ -40,6 +40,8 @@ def test_a_page_is_written_beside_the_results(ctid, done, name):
     text = path.read_text(encoding="utf-8")
     assert text.startswith("<!DOCTYPE html>")
     assert len(text) < 2_000_000
+    assert ("One measured record, the same for all estimators." in text) == (name == "measured-tiny")
+    assert "seed None" not in text
 
 
 def test_the_page_of_a_study_has_its_tables_and_figures(ctid, tmp_path):

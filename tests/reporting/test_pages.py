@@ -10,7 +10,7 @@ import pytest
 from ctid_cli.reporting.layout import Report, Table
 from ctid_cli.reporting.pages.experiment_page import experiment_page
 from ctid_cli.reporting.pages.page import ROWS, inline, report_of
-from ctid_cli.reporting.pages.question import equation, polynomial
+from ctid_cli.reporting.pages.question import equation, parts, polynomial
 from ctid_cli.storage.folder import SPEC
 
 HOSTILE = "<script>alert(1)</script> & \"quotes\" 'too' --> {{ 7 * 7 }} {% include 'x' %}"
@@ -127,3 +127,10 @@ def test_styles_are_those_of_print_and_phones():
     assert "@media print" in css
     assert "overflow-x: auto" in css
     assert "http" not in css
+
+
+def test_of_a_noise_the_polynomials_are_options():
+    noise = {"kind": "arma", "numerator": [1.0], "denominator": [1.0, -0.9], "variance": 0.02}
+    system = {"numerator": [2.0], "denominator": [1.0, 1.0], "delay": 0.5}
+    found = {part.title: [option.name for option in part.options] for part in parts({"noise": noise, "system": system})}
+    assert found == {"System": ["delay"], "Noise": ["numerator", "denominator", "variance"]}

@@ -24,6 +24,9 @@ TITLES = {
     "tracks": "Stored tracks",
 }
 
+#: What of a system is in its equation.
+IN_EQUATION = ("numerator", "denominator", "additive")
+
 
 class Option(NamedTuple):
     """A value of a specification."""
@@ -72,7 +75,7 @@ def _part(title: str, section: str, content: Mapping[str, Any]) -> Part:
     options = [
         Option(name, _text(value), *_unit_and_meaning(docs.get(name, "")))
         for name, value in content.items()
-        if name != "kind" and value is not None and name not in ("numerator", "denominator", "additive")
+        if name != "kind" and value is not None and not (section == "system" and name in IN_EQUATION)
     ]
     return Part(title, str(content.get("kind") or ""), summary if content.get("kind") else "", options)
 
