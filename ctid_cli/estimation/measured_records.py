@@ -19,9 +19,9 @@ from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.faults import outliers
 from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.signals.held import HeldSignal, Hold
+from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.treatment import InitialState, Offset
+from ctid_cli.signals.treatment import InitialState, Offset, OutputHold
 
 
 class Treatment(NamedTuple):
@@ -30,7 +30,7 @@ class Treatment(NamedTuple):
     delay_bounds: tuple[float, float]
     initial_state: InitialState
     offset: Offset
-    hold_output: Hold
+    hold_output: OutputHold
     #: Whether samples far from their neighbours are bridged while the search looks for starts.
     bridge: bool = False
 
@@ -90,7 +90,8 @@ class MeasuredRecords:
         # known too; otherwise it is not known.
         treatment = self.treatment
         known_after = treatment.delay_bounds[1] if treatment.initial_state == "estimate" else 0.0
-        return filter_data(record, known_after, treatment.hold_output)
+        periodic = treatment.initial_state == "periodic"
+        return filter_data(record, known_after, treatment.hold_output, periodic=periodic)
 
     @cached_property
     def options(self) -> SearchOptions:

@@ -27,8 +27,8 @@ from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Term, names_of
 from ctid_cli.models.factoring import unfactored
-from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import OutputHold
 
 if TYPE_CHECKING:
     from ctid_cli.inference.responses import Estimated
@@ -172,7 +172,7 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
     max_iterations: int = 100
     tolerance: float = 1e-8
     variant: StepRule = "relaxed"
-    hold_output: Hold = "foh"
+    hold_output: OutputHold = "foh"
     bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
     fixed: tuple[Fixed, ...] | None = field(default=None, metadata={"added_later": True})
 
@@ -191,7 +191,8 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
     def _lay_out(self, record: Record) -> Submodels:
         loop = loop_data(record, self.instruments)
         # A record of one period has an input before its first sample: the same one.
-        data = filter_data(record, 0.0 if self.initial_state == "periodic" else self.delay, self.hold_output)
+        periodic = self.initial_state == "periodic"
+        data = filter_data(record, 0.0 if periodic else self.delay, self.hold_output, periodic=periodic)
         if self.initial_state == "periodic" and (data.interval == 0.0 or not record.valid.all()):
             wanted = "one period of a steady state needs one regular clock without missing samples"
             raise DataError(f"{named(record)}{wanted}; use initial_state 'estimated'")

@@ -29,9 +29,8 @@ from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty, estimate_uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.treatment import InitialState, LossKind, Offset
+from ctid_cli.signals.treatment import InitialState, LossKind, Offset, OutputHold
 
 
 class Starts(NamedTuple):
@@ -238,7 +237,7 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
     loss: LossKind = "squares"
     svf_cutoff: float | None = None
     nested: bool = False
-    hold_output: Hold = "foh"
+    hold_output: OutputHold = "foh"
     covariance: Covariance = field(default="white", metadata={"added_later": True})
     bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
     fixed: tuple[Fixed, ...] | None = field(default=None, metadata={"added_later": True})

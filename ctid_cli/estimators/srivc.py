@@ -20,8 +20,8 @@ from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
-from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import OutputHold
 
 #: How steps are accepted; ``auto`` depends on the instruments.
 SrivcVariant = Literal["auto", "guarded", "plain", "relaxed"]
@@ -108,7 +108,7 @@ class Srivc(Estimator[Iteration, Fit]):
     max_iterations: int = 50
     tolerance: float = 1e-6
     variant: SrivcVariant = "auto"
-    hold_output: Hold = "foh"
+    hold_output: OutputHold = "foh"
     instruments: Instruments = field(default="open_loop", metadata={"added_later": True})
     covariance: Covariance = field(default="white", metadata={"added_later": True})
     bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})

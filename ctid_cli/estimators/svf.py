@@ -10,8 +10,8 @@ from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
-from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import OutputHold
 
 
 class Equation(NamedTuple):
@@ -60,7 +60,7 @@ class Svf(Estimator[Equation, Fit]):
     zeros: int
     delay: float = 0.0
     svf_cutoff: float | None = None
-    hold_output: Hold = "foh"
+    hold_output: OutputHold = "foh"
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -42,8 +42,8 @@ from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
-from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import OutputHold
 
 #: SRIVC iterations at each trial delay while searching.
 INNER_ITERATIONS = 20
@@ -118,7 +118,7 @@ class TdSrivc(Estimator["Searches", Fit]):
     max_iterations: int = 50
     tolerance: float = 1e-6
     variant: Variant = "guarded"
-    hold_output: Hold = "foh"
+    hold_output: OutputHold = "foh"
     covariance: Covariance = field(default="white", metadata={"added_later": True})
     bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
 

@@ -23,8 +23,8 @@ from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
-from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import OutputHold
 
 #: How hard to work at each trial delay.
 EFFORT = Steps(6, 1e-2, GAUSS_NEWTON, 2)
@@ -158,7 +158,7 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
     max_iterations: int = 10
     tolerance: float = 1e-3
     max_rounds: int = 20
-    hold_output: Hold = "foh"
+    hold_output: OutputHold = "foh"
     variant: Variant = field(default="guarded", metadata={"added_later": True})
     max_delay_step: float | None = field(default=None, metadata={"added_later": True})
 

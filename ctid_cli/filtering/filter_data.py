@@ -7,8 +7,8 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import OutputHold
 
 #: A delay closer to a whole number of intervals than this fraction of one is that whole number.
 WHOLE_INTERVAL = 1e-10
@@ -53,19 +53,22 @@ def plain_array(values: ArrayLike) -> Array:
     return np.array(values, dtype=np.float64, order="C")
 
 
-def filter_data(record: Record, start: float = 0.0, hold_output: Hold = "foh") -> FilterData:
-    """Lay a record out for filtering."""
+def filter_data(
+    record: Record, start: float = 0.0, hold_output: OutputHold = "foh", *, periodic: bool = False
+) -> FilterData:
+    """Lay a record out for filtering; a periodic one repeats itself one interval after its end."""
+    signal = record.input.periodic_lines if periodic else record.input.lines
     slack = 1e-9 * (record.interval or 0.0)
     use = record.valid & (record.t >= record.input.t[0] + start - slack)
-    on_grid = record.input_on_grid
-    same = record.input.t.size == record.t.size and bool(np.array_equal(record.input.t, record.t))
+    on_grid = record.input_on_grid and signal is record.input
+    same = signal.t.size == record.t.size and bool(np.array_equal(signal.t, record.t))
     return FilterData(
         t=plain_array(record.t),
         y=plain_array(record.bridged_y),
         use=use,
-        tu=plain_array(record.input.t),
-        u=plain_array(record.input.values),
-        input_foh=record.input.hold == "foh",
+        tu=plain_array(signal.t),
+        u=plain_array(signal.values),
+        input_foh=signal.hold == "foh",
         y_foh=hold_output == "foh",
         interval=(record.interval or 0.0) if on_grid else 0.0,
         common_clock=same,

@@ -13,7 +13,7 @@ from ctid_cli.filtering.realisation import chain, scaled_roots
 from ctid_cli.filtering.row_sink import RowSink
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.record import REGULARITY, regular_interval
+from ctid_cli.signals.regularity import REGULARITY, regular_interval
 
 
 def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> Array:
@@ -55,6 +55,7 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
         raise DataError("the instants of a simulation must be finite numbers that increase strictly")
     if t.size == 0:
         return t
+    signal = signal.lines
     direct, strictly_proper = feedthrough(model)
     if model.order == 0:
         return np.asarray(direct * signal.at(t - model.delay))

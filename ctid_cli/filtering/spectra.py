@@ -143,6 +143,7 @@ def _held_spectrum(
     signal: HeldSignal, start: float, duration: float, greatest_delay: float, count: int
 ) -> HeldSpectrum:
     """Lay out a signal for ``count`` frequencies."""
+    signal = signal.lines
     times, values, foh = signal.t - start, plain_array(signal.values), signal.hold == "foh"
     steps = np.diff(times)
     slopes = np.zeros(times.size)

@@ -16,7 +16,9 @@ from ctid_cli.inference.periodic_response import find_period, from_periods
 from ctid_cli.inference.response_lines import ResponseLines, hold_factor, images
 from ctid_cli.inference.welch_response import welch
 from ctid_cli.signals.checks import require_choice, require_integer
-from ctid_cli.signals.record import REGULARITY, Record
+from ctid_cli.signals.held import Hold
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.regularity import REGULARITY
 
 ResponseMethod = Literal["auto", "periodic", "local-polynomial", "welch"]
 
@@ -71,7 +73,7 @@ class FrequencyResponse:
     distortion: Array | None
     bias: Array
     method: Literal["periodic", "local-polynomial", "welch"]
-    hold: str
+    hold: Hold
     notes: tuple[str, ...]
 
     def __repr__(self) -> str:
@@ -297,7 +299,7 @@ def _require_some(lines: ResponseLines, record: Record) -> None:
 def _finished(
     lines: ResponseLines,
     method: Literal["periodic", "local-polynomial", "welch"],
-    hold: str,
+    hold: Hold,
     interval: float,
     record: Record,
 ) -> FrequencyResponse:
@@ -323,7 +325,7 @@ def _finished(
     )
 
 
-def _of_hold(hold: str, frequencies: Array, bias: Array, gain: Array) -> str:
+def _of_hold(hold: Hold, frequencies: Array, bias: Array, gain: Array) -> str:
     """What the hold means for the estimate."""
     if hold == "band-limited":
         return (

@@ -71,7 +71,7 @@ def input_dependence(e: Array, x: Array, psi: Array, t: Array, record: Record, d
     earlier = inputs(delay, range(min(LATE, int(delay / interval)), -past, -1))
     known = SideBySide((beside, earlier))
     # Between its samples an input along straight lines has moved before the residual.
-    first = 1 if record.input.hold == "foh" else 0
+    first = 0 if record.input.hold == "zoh" else 1
     later = dependence(e, inputs(0.0, range(first, first + future)), noise, known)
     found = [(later.p_value, (later.statistic - later.freedom) / e.size)] if later.freedom else []
     if not first:

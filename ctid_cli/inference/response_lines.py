@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.signals.treatment import Hold
 
 #: Images on each side that are summed; those beyond add less than a hundredth of the first.
 IMAGES = 20
@@ -39,7 +40,7 @@ class ResponseLines(NamedTuple):
     notes: tuple[str, ...]
 
 
-def hold_factor(hold: str, frequencies: Array, interval: float) -> ComplexArray:
+def hold_factor(hold: Hold, frequencies: Array, interval: float) -> ComplexArray:
     """Spectrum of a held input over that of its samples."""
     across = np.sinc(frequencies * interval / (2 * np.pi))
     if hold == "zoh":
@@ -47,7 +48,7 @@ def hold_factor(hold: str, frequencies: Array, interval: float) -> ComplexArray:
     return np.asarray(across**2 if hold == "foh" else np.ones(frequencies.size), dtype=np.complex128)
 
 
-def images(hold: str, frequencies: Array, response: ComplexArray, variance: Array, interval: float) -> Array:
+def images(hold: Hold, frequencies: Array, response: ComplexArray, variance: Array, interval: float) -> Array:
     """What the images may add to a response [its unit], if its gain falls like 1/w or faster from where it was seen."""
     order = {"zoh": 1, "foh": 2}.get(hold, 0)
     if not order:

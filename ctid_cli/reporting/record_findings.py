@@ -165,8 +165,11 @@ class _Words:
 
     def _output(self) -> Iterator[Finding]:
         r = self.r
-        if r.input_kind == "continuous" and self.found.record.input.hold != "foh":
-            text = "The input was not held: if it moves between the samples, straight lines (--hold foh) fit better."
+        if r.input_kind == "continuous" and self.found.record.input.hold == "zoh":
+            text = (
+                "The input was not held: if it moves between the samples, straight lines (--hold foh) fit better, and "
+                "behind an anti-alias filter a band-limited input (--hold band-limited); ctid fit compares them."
+            )
             yield Finding("note", "hold", text)
         if not r.output_deviation > 1e-9 * abs(r.output_mean):
             yield Finding(

@@ -48,7 +48,7 @@ def read_record(
         Column of the input [input unit].
     output : str, default "y"
         Column of the output [output unit]; an empty field or NaN is a missing sample.
-    hold : {"zoh", "foh"}, default "zoh"
+    hold : {"zoh", "foh", "band-limited"}, default "zoh"
         How the input behaves between its samples.
     offset : {"none", "remove"}, default "none"
         ``remove`` subtracts the mean of the input and the mean of the present output samples.

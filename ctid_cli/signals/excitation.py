@@ -253,7 +253,7 @@ class InputFile(Excitation):
         Column of the break times [s], strictly increasing; they need not be the sampling instants.
     input : str, default "u"
         Column of the values [input unit].
-    hold : {"zoh", "foh"}, default "zoh"
+    hold : {"zoh", "foh", "band-limited"}, default "zoh"
         How the input behaves between its breaks.
     sha256 : str, optional
         SHA-256 of the file, to make sure of its content; a specification fills it in from the file.

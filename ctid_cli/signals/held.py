@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
+from ctid_cli.signals.band_limited import finer_times, finer_values
 from ctid_cli.signals.checks import freeze, require_increasing
+from ctid_cli.signals.regularity import regular_interval
 from ctid_cli.signals.treatment import Hold as Hold
 
 #: Instants closer than this fraction of the shortest break interval count as the same instant.
@@ -28,14 +31,16 @@ class HeldSignal:
         Break times [s], strictly increasing.
     values : ndarray, shape (M,)
         Values at the break times [input unit].
-    hold : {"zoh", "foh"}
-        ``zoh`` keeps each value until the next break; ``foh`` joins the values by straight lines.
-        After the last break both keep the last value.
+    hold : {"zoh", "foh", "band-limited"}
+        ``zoh`` keeps each value until the next break; ``foh`` joins the values by straight lines; ``band-limited``
+        has no power above half the sampling frequency, as signals behind an anti-alias filter, and needs a regular
+        clock. After the last break all keep the last value.
 
     Raises
     ------
     DataError
-        If the arrays differ in length, hold non-finite numbers, or the times do not increase.
+        If the arrays differ in length, hold non-finite numbers, or the times do not increase; or if a band-limited
+        signal has no regular clock.
     """
 
     t: Array
@@ -48,11 +53,13 @@ class HeldSignal:
         if t.ndim != 1 or t.shape != values.shape or t.size == 0:
             shapes = f"{t.shape} and {values.shape}"
             raise DataError(f"a held signal needs times and values of one equal, non-zero length; got {shapes}")
-        if self.hold not in ("zoh", "foh"):
-            raise DataError(f"hold must be 'zoh' or 'foh', not {self.hold!r}")
+        if self.hold not in get_args(Hold):
+            raise DataError(f"hold must be 'zoh', 'foh' or 'band-limited', not {self.hold!r}")
         if not (np.isfinite(t).all() and np.isfinite(values).all()):
             raise DataError("the input holds a value or a time that is not a finite number")
         require_increasing("input times", t)
+        if self.hold == "band-limited" and regular_interval(t) is None:
+            raise DataError("a band-limited input needs a regular clock; take straight lines between its samples (foh)")
         freeze(self, t=t, values=values)
 
     def __repr__(self) -> str:
@@ -62,6 +69,22 @@ class HeldSignal:
     def slack(self) -> float:
         """Instants closer than this count as the same [s]."""
         return COINCIDENCE * float(np.diff(self.t).min()) if self.t.size > 1 else 0.0
+
+    @cached_property
+    def lines(self) -> HeldSignal:
+        """The signal as exact passes take it: itself, or if it is band-limited, straight lines on a finer clock."""
+        return self._in_lines(periodic=False)
+
+    @cached_property
+    def periodic_lines(self) -> HeldSignal:
+        """The same of a signal that repeats itself one interval after its last sample."""
+        return self._in_lines(periodic=True)
+
+    def _in_lines(self, *, periodic: bool) -> HeldSignal:
+        if self.hold != "band-limited":
+            return self
+        times = finer_times(self.t, periodic=periodic)
+        return HeldSignal(times, finer_values(self.values, periodic=periodic), "foh")
 
     @cached_property
     def mean(self) -> float:
@@ -81,6 +104,8 @@ class HeldSignal:
         ndarray, shape (N,)
             Values [input unit]; zero before the first break.
         """
+        if self.hold == "band-limited":
+            return self.lines.at(times)
         instants = np.asarray(times, dtype=float)
         index = np.searchsorted(self.t, instants + self.slack, side="right") - 1
         if self.hold == "zoh":

@@ -13,10 +13,7 @@ from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import LONGEST, freeze, require_choice, require_increasing, require_scale, require_steps
 from ctid_cli.signals.held import HeldSignal, Hold
-
-#: A clock counts as regular when no instant is further than this fraction of the interval from its place.
-REGULARITY = 1e-7
-
+from ctid_cli.signals.regularity import REGULARITY, regular_interval
 
 #: Where the reference enters a loop.
 Enters = Literal["controller", "input"]
@@ -158,7 +155,7 @@ class Record:
             Input samples [input unit].
         y : array_like, shape (N,)
             Output samples [output unit]; NaN marks a missing sample.
-        hold : {"zoh", "foh"}, default "zoh"
+        hold : {"zoh", "foh", "band-limited"}, default "zoh"
             How the input behaves between its samples.
         name : str, default ""
             Appears in messages.
@@ -209,14 +206,3 @@ class Record:
         if self.interval is None or self.input.t.size != self.t.size:
             return False
         return bool(np.abs(self.input.t - self.t).max() <= REGULARITY * self.interval)
-
-
-def regular_interval(t: Array) -> float | None:
-    """Interval of a regular clock."""
-    if t.size < 2:
-        return None
-    interval = float((t[-1] - t[0]) / (t.size - 1))
-    grid = t[0] + interval * np.arange(t.size)
-    # Large times carry their own rounding, which is no sign of an irregular clock.
-    tolerance = REGULARITY * interval + 4 * np.finfo(float).eps * float(np.abs(t).max())
-    return interval if float(np.abs(t - grid).max()) <= tolerance else None

@@ -2,8 +2,10 @@
 
 from typing import Literal
 
-#: The input between its samples: held, or straight lines.
-Hold = Literal["zoh", "foh"]
+#: The input between its samples: held, straight lines, or without power above half the sampling frequency.
+Hold = Literal["zoh", "foh", "band-limited"]
+#: How an estimator's filters join the samples of the output.
+OutputHold = Literal["zoh", "foh"]
 #: The state of the system before the record.
 InitialState = Literal["rest", "estimate", "periodic"]
 #: A constant that the output has beside the answer to the input.

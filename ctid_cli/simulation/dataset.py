@@ -24,8 +24,9 @@ from ctid_cli.signals.excitation import Excitation, InputFile
 from ctid_cli.signals.files import require_file
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.noise import Noise
-from ctid_cli.signals.record import Enters, Loop, Record, regular_interval
+from ctid_cli.signals.record import Enters, Loop, Record
 from ctid_cli.signals.recorder import Recorder
+from ctid_cli.signals.regularity import regular_interval
 from ctid_cli.signals.sampling import Sampling
 from ctid_cli.signals.send_on_delta import SendOnDelta
 from ctid_cli.signals.streams import stream
@@ -197,7 +198,7 @@ class MeasuredSource:
         Column of the input [input unit].
     output : str, default "y"
         Column of the output [output unit]; empty or NaN is a missing sample.
-    hold : {"zoh", "foh"}, default "zoh"
+    hold : {"zoh", "foh", "band-limited"}, default "zoh"
         How the input behaves between its samples.
     offset : {"remove", "none"}, default "none"
         What is done to the means of input and output over the samples for estimation.

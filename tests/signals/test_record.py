@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
 from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.record import Loop, Record, regular_interval
+from ctid_cli.signals.record import Loop, Record
+from ctid_cli.signals.regularity import regular_interval
 
 ONE = HeldSignal([0.0], [1.0])
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.signals.record import regular_interval
+from ctid_cli.signals.regularity import regular_interval
 from ctid_cli.signals.sampling import RegularSampling, UniformIntervals, geometric_sizes
 from ctid_cli.signals.streams import ROLES, stream
 
