@@ -15,7 +15,7 @@ from ctid_cli.estimation.optimum.best_model import SearchOptions, problem_of
 from ctid_cli.estimation.optimum.pilot import liveliest_parts
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.output_error import Layout
-from ctid_cli.filtering.filter_data import FilterData, filter_data
+from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
 from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.faults import outliers
 from ctid_cli.inference.sensitivity import Structure
@@ -59,7 +59,7 @@ class MeasuredRecords:
             check_record(record, data, self.layout.size, self.layout.initial_state)
         each = zip(records, self.offsets, self.data, strict=True)
         #: Outputs at the used samples as they were measured, less their means where those are removed.
-        self.outputs = [record.y[data.use] - y0 for record, y0, data in each]
+        self.outputs = [record.y[used_samples(data, record)] - y0 for record, y0, data in each]
 
     @cached_property
     def bandwidth(self) -> float:
@@ -131,7 +131,7 @@ class MeasuredRecords:
 
     def used(self) -> tuple[BoolArray, ...]:
         """Which samples of each record enter the sums."""
-        return tuple(data.use for data in self.data)
+        return tuple(used_samples(*pair) for pair in zip(self.data, self.records, strict=True))
 
 
 def _bridged(record: Record) -> Record:

@@ -7,6 +7,7 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.signals.band_limited import FINER
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import OutputHold
 
@@ -56,10 +57,28 @@ def plain_array(values: ArrayLike) -> Array:
 def filter_data(
     record: Record, start: float = 0.0, hold_output: OutputHold = "foh", *, periodic: bool = False
 ) -> FilterData:
-    """Lay a record out for filtering; a periodic one repeats itself one interval after its end."""
+    """Lay a record out for filtering; a periodic one repeats itself one interval after its end.
+
+    The samples of a record whose input is band-limited are every so many points of its finer clock: regular passes are
+    many times faster than those over any clock.
+    """
     signal = record.input.periodic_lines if periodic else record.input.lines
     slack = 1e-9 * (record.interval or 0.0)
     use = record.valid & (record.t >= record.input.t[0] + start - slack)
+    if signal is not record.input and record.input_on_grid:
+        points = np.zeros(signal.t.size, dtype=bool)
+        points[::FINER] = use
+        return FilterData(
+            t=plain_array(signal.t),
+            y=plain_array(np.interp(signal.t, record.t, record.bridged_y)),
+            use=points,
+            tu=plain_array(signal.t),
+            u=plain_array(signal.values),
+            input_foh=True,
+            y_foh=hold_output == "foh",
+            interval=(record.interval or 0.0) / FINER,
+            common_clock=False,
+        )
     on_grid = record.input_on_grid and signal is record.input
     same = signal.t.size == record.t.size and bool(np.array_equal(signal.t, record.t))
     return FilterData(
@@ -73,6 +92,11 @@ def filter_data(
         interval=(record.interval or 0.0) if on_grid else 0.0,
         common_clock=same,
     )
+
+
+def used_samples(data: FilterData, record: Record) -> BoolArray:
+    """Samples of a record that enter sums, shape (N,)."""
+    return data.use if data.use.size == record.n_samples else data.use[::FINER]
 
 
 @njit(cache=True, nogil=True)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.signals.band_limited import finer_times, finer_values
+from ctid_cli.signals.band_limited import finer_times, finer_values, values_between
 from ctid_cli.signals.checks import freeze, require_increasing
 from ctid_cli.signals.regularity import regular_interval
 from ctid_cli.signals.treatment import Hold as Hold
@@ -87,6 +87,11 @@ class HeldSignal:
         return HeldSignal(times, finer_values(self.values, periodic=periodic), "foh")
 
     @cached_property
+    def _between(self) -> HeldSignal:
+        """The values of a band-limited signal, close enough together for straight lines."""
+        return HeldSignal(finer_times(self.t, periodic=False), values_between(self.values), "foh")
+
+    @cached_property
     def mean(self) -> float:
         """Mean of the values at the breaks [input unit]."""
         return float(self.values.mean())
@@ -105,7 +110,7 @@ class HeldSignal:
             Values [input unit]; zero before the first break.
         """
         if self.hold == "band-limited":
-            return self.lines.at(times)
+            return self._between.at(times)
         instants = np.asarray(times, dtype=float)
         index = np.searchsorted(self.t, instants + self.slack, side="right") - 1
         if self.hold == "zoh":

@@ -79,7 +79,7 @@ def test_signal_never_changes():
         ([0.0, np.inf], [1.0, 2.0], "zoh", "not a finite number"),
         ([0.0, 2.0, 1.0], [1.0, 2.0, 3.0], "zoh", "samples 1 and 2 are at 2 and 1 s"),
         ([0.0, 2.0, 2.0], [1.0, 2.0, 3.0], "zoh", "must increase strictly"),
-        ([0.0], [1.0], "cubic", "hold must be 'zoh' or 'foh', not 'cubic'"),
+        ([0.0], [1.0], "cubic", "hold must be 'zoh', 'foh' or 'band-limited', not 'cubic'"),
     ],
 )
 def test_unusable_signals_are_refused(t, values, hold, message):

@@ -148,7 +148,9 @@ def box_of(records: Sequence[FilterData], delays: tuple[float, float]) -> Box:
     length, interval, rate, cells = 0.0, np.inf, 0.0, set()
     for data in records:
         used, steps = data.t[data.use], np.diff(data.t)
-        length, interval = max(length, float(used[-1] - used[0])), min(interval, float(np.median(steps)))
+        # Of a record on the finer clock of its input the samples are some of the points.
+        points = max(1, round(float(np.diff(used).min()) / data.interval)) if data.interval > 0 and used.size > 1 else 1
+        length, interval = max(length, float(used[-1] - used[0])), min(interval, points * float(np.median(steps)))
         # Root mean square frequency of the output, from its differences.
         power = float(np.sum((data.y[1:] - data.y.mean()) ** 2 * steps))
         if power > 0:

@@ -1,0 +1,130 @@
+"""A band-limited signal as straight lines on a finer clock, against exact answers to periodic inputs."""
+
+import numpy as np
+import pytest
+
+from ctid_cli import DataError, HeldSignal, Record, TransferFunction, estimate_frequency_response, simulate
+from ctid_cli.filtering.filter_data import filter_data, used_samples
+from ctid_cli.filtering.spectra import record_spectra
+from ctid_cli.signals.band_limited import FINER, REACH, band_limited_doubt
+
+INTERVAL, PERIOD = 0.2, 400
+MODELS = {
+    "first order": TransferFunction([1.0], [1.0, 1.0], delay=0.33),
+    "resonant": TransferFunction([4.0], [1.0, 0.4, 4.0], delay=0.33),
+    "with a zero": TransferFunction([1.0, 1.0], [1.0, 0.4, 4.0]),
+}
+
+
+def period(top, seed=0):
+    """Harmonics up to a fraction of half the sampling frequency: frequencies, phases."""
+    harmonics = np.arange(1, int(top * PERIOD / 2))
+    phases = np.random.default_rng(seed).uniform(0, 2 * np.pi, harmonics.size)
+    return 2 * np.pi * harmonics / (PERIOD * INTERVAL), phases
+
+
+def waves(t, w, phases, response=None):
+    factors = np.ones(w.size) if response is None else response
+    return (np.abs(factors) * np.cos(np.outer(t, w) + phases + np.angle(factors))).sum(axis=1)
+
+
+def exact(model, w):
+    s = 1j * w
+    return np.polyval(model.numerator, s) / np.polyval(model.denominator, s) * np.exp(-s * model.delay)
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=list(MODELS))
+@pytest.mark.parametrize("top", [0.4, 0.85])
+def test_answers_are_those_of_the_harmonics(model, top):
+    w, phases = period(top)
+    t = INTERVAL * np.arange(5 * PERIOD)
+    true = waves(t, w, phases, exact(model, w))
+    u = waves(t, w, phases)
+    middle = slice(3 * PERIOD, 4 * PERIOD)
+    off = {}
+    for hold in ("foh", "band-limited"):
+        off[hold] = np.std((simulate(model, HeldSignal(t, u, hold), t) - true)[middle]) / np.std(true)
+    assert off["band-limited"] < 2e-4
+    assert off["foh"] > 50 * off["band-limited"]
+    # Any other instants take another way, and see the same.
+    some = t[3 * PERIOD : 4 * PERIOD] + 0.07
+    between = simulate(model, HeldSignal(t, u, "band-limited"), some)
+    assert np.std(between - waves(some, w, phases, exact(model, w))) < 4e-4 * np.std(true)
+
+
+def test_a_periodic_signal_is_exact_at_its_ends_too():
+    w, phases = period(0.95)
+    t = INTERVAL * np.arange(PERIOD)
+    signal = HeldSignal(t, waves(t, w, phases), "band-limited")
+    lines = signal.periodic_lines
+    damped = np.sinc(w * INTERVAL / FINER / (2 * np.pi)) ** 2
+    assert lines.t.size == FINER * PERIOD
+    assert lines.values == pytest.approx(waves(lines.t, w, phases, 1 / damped), abs=1e-9)
+
+
+def test_values_between_the_samples():
+    w, phases = period(0.5)
+    t = INTERVAL * np.arange(PERIOD)
+    signal = HeldSignal(t, waves(t, w, phases), "band-limited")
+    within = np.random.default_rng(0).uniform(t[REACH], t[-REACH], 200)
+    assert signal.at(t) == pytest.approx(signal.values, abs=1e-9)
+    assert signal.at(within) == pytest.approx(waves(within, w, phases), abs=0.02 * signal.values.std())
+    constant = HeldSignal(t, np.full(t.size, 3.0), "band-limited")
+    assert constant.lines.values == pytest.approx(np.full(constant.lines.t.size, 3.0), rel=1e-12)
+
+
+def test_what_is_not_known_at_the_ends():
+    t = INTERVAL * np.arange(PERIOD)
+    w, phases = period(0.6)
+    wide, narrow = (band_limited_doubt(t, waves(t, *period(top))) for top in (0.97, 0.2))
+    assert wide.beyond > 0.01 > narrow.beyond
+    assert narrow.ends < 0.2 * wide.ends
+    # The doubt is of the size of the error.
+    values = waves(t, w, phases)
+    lines = HeldSignal(t, values, "band-limited").lines
+    damped = np.sinc(w * INTERVAL / FINER / (2 * np.pi)) ** 2
+    edge = REACH * FINER
+    off = (lines.values - waves(lines.t, w, phases, 1 / damped))[np.r_[:edge, -edge:0]]
+    doubt = band_limited_doubt(t, values)
+    assert doubt.reach == pytest.approx(REACH * INTERVAL)
+    assert 0.2 < doubt.ends / np.sqrt(np.mean(off**2)) < 5
+
+
+def test_passes_see_the_samples_of_the_record():
+    t = INTERVAL * np.arange(100)
+    y = np.cos(t)
+    y[7] = np.nan
+    record = Record(t, y, HeldSignal(t, np.sin(t), "band-limited"))
+    for periodic in (False, True):
+        data = filter_data(record, 2.0, periodic=periodic)
+        assert data.interval == pytest.approx(INTERVAL / FINER)
+        used = used_samples(data, record)
+        assert used.tolist() == (record.valid & (t >= 2.0 - 1e-9)).tolist()
+        assert data.y_used.tolist() == y[used].tolist()
+
+
+def test_spectra_of_the_input():
+    w, phases = period(0.5)
+    t = INTERVAL * np.arange(3 * PERIOD + 1)
+    u = waves(t, w, phases)
+    record = Record(t, u, HeldSignal(t, u, "band-limited"))
+    found = record_spectra(record, PERIOD * INTERVAL, np.pi / INTERVAL, 1.0).inputs(0.45)
+    # Two periods: every other line is excited, with half the amplitude of a cosine.
+    lines = np.rint(w * 2 * PERIOD * INTERVAL / (2 * np.pi)).astype(int)
+    assert found[lines] == pytest.approx(0.5 * np.exp(1j * (phases - 0.45 * w)), abs=2e-3)
+
+
+def test_the_frequency_response_of_a_band_limited_record_is_exact():
+    model = MODELS["resonant"]
+    w, phases = period(0.9)
+    t = INTERVAL * np.arange(3 * PERIOD)
+    u, y = waves(t, w, phases), waves(t, w, phases, exact(model, w))
+    found = estimate_frequency_response(Record(t, y, HeldSignal(t, u, "band-limited")))
+    assert found.frequencies == pytest.approx(w, rel=1e-9)
+    assert np.abs(found.response - exact(model, w)).max() < 1e-10 * np.abs(exact(model, w)).max()
+    assert not found.bias.any()
+
+
+def test_an_irregular_clock_is_refused():
+    with pytest.raises(DataError, match="needs a regular clock"):
+        HeldSignal([0.0, 1.0, 2.5], [1.0, 2.0, 3.0], "band-limited")
