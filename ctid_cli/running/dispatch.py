@@ -8,12 +8,13 @@ estimates are computed once more when all others are done, each with the machine
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from ctid_cli.running.executor import Computed, Done, Executor, Hindered, Lost, Message
+from ctid_cli.running.executor import Begun, Computed, Done, Executor, Hindered, Lost, Message
 from ctid_cli.running.job import Job
 from ctid_cli.running.job_order import JobQueue
 from ctid_cli.storage.columns import failed
@@ -24,9 +25,9 @@ TICK = 0.05
 #: How long running jobs may go on after a request to stop [s].
 DRAIN = 1.0
 #: After so many misfortunes for each job at work, without a single finished estimate in between, the machine is not
-#: fit to go on; with nothing at work, the next attempt waits the longer the more there were [s].
+#: fit to go on; with nothing at work, the next attempt waits the longer the more there were, up to a limit [s].
 PATIENCE = 4
-PAUSE = 0.2
+PAUSE, LONGEST_PAUSE = 0.2, 1.0
 #: An estimate that takes so long is mentioned, and again after twice the time [s].
 SLOW = 600.0
 
@@ -72,17 +73,17 @@ def run_jobs(jobs: Sequence[Job], executor: Executor, stopping: Callable[[], boo
 
 @dataclass
 class _Work:
-    """A job in work."""
+    """A job in work, or kept ready."""
 
     job: Job
     #: Its estimates that are still to come, in their order.
     left: list[Key]
-    #: Since when the first of them has been expected [s], and how often that was mentioned.
-    since: float
+    #: Since when the first of them has been in work [s], and how often that was mentioned.
+    since: float = math.inf
     mentioned: int = 0
 
     def take_off(self, keys: Iterable[Key]) -> None:
-        """Note that estimates need not be waited for any more."""
+        """Note that the next estimate is in work, and that some need not be waited for any more."""
         gone = set(keys)
         self.left = [key for key in self.left if key not in gone]
         self.since, self.mentioned = time.monotonic(), 0
@@ -105,7 +106,7 @@ class _Dispatch:
     def run(self) -> Iterator[Event]:
         while not self._stopping() and self._misfortunes < PATIENCE * self._most:
             if not self._running:
-                time.sleep(PAUSE * self._misfortunes)
+                time.sleep(min(PAUSE * self._misfortunes, LONGEST_PAUSE))
             self._submit()
             if not self._running:
                 return
@@ -136,7 +137,7 @@ class _Dispatch:
                 job = self._last.popleft()
             else:
                 return
-            self._running[id(job)] = _Work(job, list(job.keys), time.monotonic())
+            self._running[id(job)] = _Work(job, list(job.keys))
             self._most = max(self._most, len(self._running))
             self._executor.submit(job, alone=alone)
 
@@ -151,6 +152,8 @@ class _Dispatch:
         work = self._running[id(message.job)]
         job = work.job
         match message:
+            case Begun():
+                work.take_off(())
             case Computed():
                 self._misfortunes = 0
                 work.take_off(outcome.key for outcome in message.outcomes)

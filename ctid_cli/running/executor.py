@@ -3,7 +3,7 @@
 An executor takes jobs as long as it has room, and tells what became of them:
 
     executor.submit(job)                     while executor.room
-    for message in executor.collect(0.05):   Computed, Hindered, Done or Lost
+    for message in executor.collect(0.05):   Begun, Computed, Hindered, Done or Lost
     executor.stop()                          abandons what is in work; its processes are gone when this returns
     executor.close()                         no further jobs come; idle processes may be kept for another run
 
@@ -25,6 +25,13 @@ from ctid_cli.storage.manifest import Key, Outcome
 #: Why a job was lost: an estimate exceeded a limit of time or memory, its process ended by itself, the machine was
 #: short of something, or nothing that concerns the estimates, which are simply to be computed again.
 Cause = Literal["time", "memory", "crash", "machine", "chance"]
+
+
+@dataclass(frozen=True)
+class Begun:
+    """A job that may have been kept ready is in work now."""
+
+    job: Job
 
 
 @dataclass(frozen=True)
@@ -62,7 +69,7 @@ class Lost:
     keys: Sequence[Key] = ()
 
 
-Message = Computed | Hindered | Done | Lost
+Message = Begun | Computed | Hindered | Done | Lost
 
 
 class Executor(Protocol):

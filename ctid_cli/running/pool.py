@@ -21,13 +21,15 @@ from pathlib import Path
 from typing import Any
 
 from ctid_cli import own_code
-from ctid_cli.running.executor import Cause, Computed, Done, Hindered, Lost, Message
+from ctid_cli.running.executor import Begun, Cause, Computed, Done, Hindered, Lost, Message
 from ctid_cli.running.job import Job, Short, shortage
 from ctid_cli.running.limits import Limits, Usage, usage
 from ctid_cli.running.progress import ProgressReader
 from ctid_cli.running.worker import Mark, Received, call, compute, initialise
 from ctid_cli.storage.manifest import Key, Outcome
 
+#: Jobs that a worker has ready, beside the one it is at: it never waits for what is to be stored first.
+AHEAD = 1
 #: How often running jobs are looked at [s].
 TICK = 0.05
 #: The most that counts between two looks [s]: this process may have been stopped meanwhile, and its workers too.
@@ -50,54 +52,64 @@ class LokyPool:
         end_idle_workers()
         self._folder = tempfile.TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True)
         self._numbers = itertools.count()
-        self._over: queue.SimpleQueue[tuple[_Worker, bool, Any]] = queue.SimpleQueue()
+        self._over: queue.SimpleQueue[tuple[_Worker, _Turn]] = queue.SimpleQueue()
         self._messages: list[Message] = []
-        #: Jobs for which no process could be started while others were at work, and whether they are to be alone.
+        #: Jobs that no process could take yet, and whether they are to be alone.
         self._held: list[tuple[Job, bool]] = []
         #: Time that was watched [s].
         self._clock, self._looked = 0.0, time.monotonic()
 
     @property
     def room(self) -> int:
-        """How many further jobs it would begin now."""
-        return max(sum(worker.job is None for worker in self._workers) - len(self._held), 0)
+        """How many further jobs it would begin, or keep ready, now."""
+        if self._messages or any(alone for _, alone in self._held):
+            # A process could not be started, or some worker is to become idle.
+            return 0
+        return max(sum(1 + AHEAD - len(worker.turns) for worker in self._workers) - len(self._held), 0)
 
     def submit(self, job: Job, *, alone: bool = False) -> None:
         """Take a job."""
+        # What is to be alone gets a new process, other jobs one that is there.
+        worker = min(self._workers, key=lambda one: (len(one.turns), one.used == alone))
+        if len(worker.turns) > (0 if alone else AHEAD):
+            self._held.append((job, alone))
+            return
         try:
             content = packed(job, self._limits)
         except Exception as error:
             self._messages.append(Lost(job, "crash", _in_one_line(error)))
             return
-        # What is to be alone gets a new process, other jobs one that is there.
-        idle = [worker for worker in self._workers if worker.job is None]
-        worker = min(idle, key=lambda one: one.used == alone)
         if alone:
             worker.end()
-        worker.take(job, Path(self._folder.name) / str(next(self._numbers)))
+        turn = _Turn(job, alone, ProgressReader(Path(self._folder.name) / str(next(self._numbers))))
+        worker.turns.append(turn)
         try:
-            future = worker.start(compute, str(worker.reader.path), content)
+            turn.future = worker.start(compute, str(turn.reader.path), content)
         except Exception as error:
-            self._not_begun(worker, job, alone, _in_one_line(error))
+            if len(worker.turns) == 1:
+                self._not_begun(worker, _in_one_line(error))
+            else:
+                # Its process has died, of which the job before this one will tell.
+                self._held.append((worker.turns.pop().job, alone))
             return
-        future.add_done_callback(lambda future: self._over.put((worker, alone, future)))
+        turn.future.add_done_callback(lambda _: self._over.put((worker, turn)))
 
-    def _not_begun(self, worker: _Worker, job: Job, alone: bool, reason: str) -> None:
+    def _not_begun(self, worker: _Worker, reason: str) -> None:
         """A process could not be started, or ended before it had its job: there may be room for fewer."""
-        was_used = worker.used
+        was_used, turns = worker.used, worker.leave()
         worker.end()
-        worker.leave()
-        if was_used:
-            # It ended while it was idle.
-            self._held.append((job, alone))
-        elif any(other.job is not None for other in self._workers):
+        if not was_used:
+            if not any(other.turns for other in self._workers):
+                said = f"no worker process could be started ({reason})"
+                self._messages += [Lost(turn.job, "machine", said) for turn in turns]
+                return
             self._workers.remove(worker)
-            self._held.append((job, alone))
-        else:
-            self._messages.append(Lost(job, "machine", f"no worker process could be started ({reason})"))
+        # Otherwise it ended while it was idle.
+        self._held += [(turn.job, turn.alone) for turn in turns]
 
     def collect(self, seconds: float) -> list[Message]:
         """What has happened since the last call."""
+        self._spread()
         if not self._messages:
             with suppress(queue.Empty):
                 self._finish(*self._over.get(timeout=seconds))
@@ -106,47 +118,72 @@ class LokyPool:
                 self._finish(*self._over.get_nowait())
         if time.monotonic() - self._looked >= TICK:
             self._look()
-        while self._held and any(worker.job is None for worker in self._workers):
-            job, alone = self._held.pop()
+        held, self._held = self._held, []
+        for job, alone in held:
             self.submit(job, alone=alone)
         messages, self._messages = self._messages, []
         return messages
 
-    def _finish(self, worker: _Worker, alone: bool, future: Any) -> None:
-        """A worker is through with its job, or its process has died."""
-        job = worker.job
-        if job is None or future is not worker.future:
-            return
-        error = future.exception()
-        self._read(worker, job)
-        if isinstance(error, BrokenExecutor) and not worker.process:
-            self._not_begun(worker, job, alone, _ending(error)[1])
-            return
-        if error is None:
-            worker.used = True
-            self._messages.append(Done(job))
-        else:
-            self._messages.append(Lost(job, *cause_of(error), worker.keys))
-            worker.end()
-        worker.leave()
+    def _spread(self) -> None:
+        """Give an idle worker, for which there was no other job, what a busy one was to do next."""
+        idle = [worker for worker in self._workers if not worker.turns]
+        busy = [worker for worker in self._workers if len(worker.turns) > 1]
+        for _, worker in zip(idle, busy, strict=False):
+            if (job := worker.take_back()) is not None:
+                self.submit(job)
 
-    def _read(self, worker: _Worker, job: Job) -> None:
-        """What the progress of a worker's job says that is new."""
+    def _finish(self, worker: _Worker, turn: _Turn) -> None:
+        """A worker is through with a job, or its process has died."""
+        if turn not in worker.turns:
+            return
+        error = turn.future.exception()
+        if error is None:
+            self._read(turn)
+            worker.used = True
+            worker.drop(turn)
+            self._messages.append(Done(turn.job))
+            return
+        if isinstance(error, BrokenExecutor):
+            for one in worker.turns:
+                self._read(one)
+            # The process works on one after the other: it was at the last that it has begun.
+            if worker.at_work is None:
+                self._not_begun(worker, _ending(error)[1])
+                return
+            turn = worker.at_work
+        self._lose(worker, turn)
+        self._messages.append(Lost(turn.job, *cause_of(error), turn.keys))
+
+    def _lose(self, worker: _Worker, culprit: _Turn) -> None:
+        """End the process of a worker because of one of its jobs; no other is to blame."""
+        _end([worker])
+        for turn in worker.leave():
+            self._read(turn)
+            if turn is culprit:
+                continue
+            if turn.process:
+                self._messages.append(Lost(turn.job, "chance", "its process was ended because of another job"))
+            else:
+                self._held.append((turn.job, turn.alone))
+
+    def _read(self, turn: _Turn) -> None:
+        """What the progress of a job says that is new."""
         outcomes = []
-        for entry in worker.reader.news():
+        for entry in turn.reader.news():
             match entry:
                 case Received():
-                    worker.process = entry.process
+                    turn.process = entry.process
+                    self._messages.append(Begun(turn.job))
                 case Mark():
-                    worker.keys, worker.mark, worker.since = entry.began.keys, entry, self._clock
+                    turn.keys, turn.mark, turn.since = entry.began.keys, entry, self._clock
                 case Outcome():
                     outcomes.append(entry)
-                    worker.keys = tuple(key for key in worker.keys if key != entry.key)
+                    turn.keys = tuple(key for key in turn.keys if key != entry.key)
                 case Short():
-                    self._messages.append(Hindered(job, entry.keys, entry.reason))
-                    worker.keys = tuple(key for key in worker.keys if key not in entry.keys)
+                    self._messages.append(Hindered(turn.job, entry.keys, entry.reason))
+                    turn.keys = tuple(key for key in turn.keys if key not in entry.keys)
         if outcomes:
-            self._messages.append(Computed(job, outcomes))
+            self._messages.append(Computed(turn.job, outcomes))
 
     def _look(self) -> None:
         """Read what all workers have written, and end those that exceed a limit."""
@@ -154,31 +191,31 @@ class LokyPool:
         self._clock += min(now - self._looked, LONGEST_LOOK)
         self._looked = now
         for worker in self._workers:
-            if worker.job is not None:
-                self._read(worker, worker.job)
-                if self._limits:
-                    self._watch(worker, worker.job)
+            for turn in worker.turns:
+                self._read(turn)
+            if self._limits and worker.at_work is not None:
+                self._watch(worker, worker.at_work)
 
-    def _watch(self, worker: _Worker, job: Job) -> None:
+    def _watch(self, worker: _Worker, turn: _Turn) -> None:
         """End a process whose estimate exceeds a limit."""
-        blamed, exceeded = worker.keys, self._exceeded(worker)
+        blamed, exceeded = turn.keys, self._exceeded(turn)
         if not blamed or exceeded is None:
             return
-        _end([worker])
+        self._lose(worker, turn)
         # It may have been finished just before.
-        self._read(worker, job)
-        left = tuple(key for key in worker.keys if key in blamed)
-        self._messages.append(Lost(job, *exceeded, left) if left else Lost(job, "chance", "another was in work"))
-        worker.leave()
+        left = tuple(key for key in turn.keys if key in blamed)
+        self._messages.append(
+            Lost(turn.job, *exceeded, left) if left else Lost(turn.job, "chance", "another was at work")
+        )
 
-    def _exceeded(self, worker: _Worker) -> tuple[Cause, str] | None:
-        mark = worker.mark
+    def _exceeded(self, turn: _Turn) -> tuple[Cause, str] | None:
+        mark = turn.mark
         if mark is None:
             return None
         wall, cpu = mark.began.spent
-        now = usage(worker.process) if mark.used is not None and self._limits.of_processes else None
+        now = usage(turn.process) if mark.used is not None and self._limits.of_processes else None
         grown = Usage(0.0, 0.0) if now is None or mark.used is None else now - mark.used
-        return self._limits.exceeded(wall + self._clock - worker.since, cpu + grown.cpu, grown.memory)
+        return self._limits.exceeded(wall + self._clock - turn.since, cpu + grown.cpu, grown.memory)
 
     def stop(self) -> None:
         """Abandon what is in work at once."""
@@ -189,31 +226,18 @@ class LokyPool:
 
     def close(self) -> None:
         """Keep idle processes for another run."""
-        if any(worker.job is not None for worker in self._workers):
+        if any(worker.turns for worker in self._workers):
             self.stop()
         _idle.extend(worker for worker in self._workers if worker.used)
         self._workers = []
         self._folder.cleanup()
 
 
-class _Worker:
-    """One process at a time, and the job that it has."""
+class _Turn:
+    """A job that a worker is at, or will be at next, and how far it is."""
 
-    def __init__(self) -> None:
-        self._executor: Any = None
-        #: Whether the process has done something.
-        self.used = False
-        self.take(None, Path())
-
-    def leave(self) -> None:
-        """Forget the job, finished or not."""
-        with suppress(OSError):
-            self.reader.path.unlink(missing_ok=True)
-        self.take(None, Path())
-
-    def take(self, job: Job | None, path: Path) -> None:
-        """Note a job, and where its progress is written."""
-        self.job, self.reader = job, ProgressReader(path)
+    def __init__(self, job: Job, alone: bool, reader: ProgressReader) -> None:
+        self.job, self.alone, self.reader = job, alone, reader
         self.future: Any = None
         #: Number of the process, once it has the job; what it is at, and since when.
         self.process = 0
@@ -221,12 +245,46 @@ class _Worker:
         self.mark: Mark | None = None
         self.since = 0.0
 
+
+class _Worker:
+    """One process at a time, and the jobs that it has."""
+
+    def __init__(self) -> None:
+        self._executor: Any = None
+        #: Whether the process has done something.
+        self.used = False
+        self.turns: list[_Turn] = []
+
+    @property
+    def at_work(self) -> _Turn | None:
+        """The job that the process is at, as far as is known."""
+        return next((turn for turn in reversed(self.turns) if turn.process), None)
+
+    def drop(self, turn: _Turn) -> None:
+        """Forget a job that is over."""
+        self.turns.remove(turn)
+        with suppress(OSError):
+            turn.reader.path.unlink(missing_ok=True)
+
+    def leave(self) -> list[_Turn]:
+        """Forget all jobs, finished or not."""
+        turns, self.turns = self.turns, []
+        return turns
+
+    def take_back(self) -> Job | None:
+        """The last job, unless the process has begun it: whoever makes the file of its progress has it."""
+        turn = self.turns[-1]
+        try:
+            turn.reader.path.touch(exist_ok=False)
+        except OSError:
+            return None
+        return self.turns.pop().job
+
     def start(self, function: Callable[..., Any], path: str, packed: bytes) -> Any:
         """Have a function called in the process."""
         if self._executor is None:
             self._executor = _executor()
-        self.future = self._executor.submit(function, path, packed)
-        return self.future
+        return self._executor.submit(function, path, packed)
 
     def usage(self) -> Usage | None:
         """What the process uses."""

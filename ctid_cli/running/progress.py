@@ -15,10 +15,10 @@ _LENGTH = struct.Struct("<Q")
 
 
 class ProgressWriter:
-    """Appends entries to the file of a job."""
+    """Makes the file of a job, which must not be there yet, and appends entries to it."""
 
     def __init__(self, path: str) -> None:
-        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o600)
 
     def write(self, entry: Any) -> None:
         """Add an entry."""

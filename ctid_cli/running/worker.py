@@ -35,8 +35,11 @@ class Mark:
 
 
 def compute(path: str, packed: bytes) -> None:
-    """Compute a job, and write what comes of it to its file."""
-    progress = ProgressWriter(path)
+    """Compute a job, and write what comes of it to its file; nothing is to be done where that is there already."""
+    try:
+        progress = ProgressWriter(path)
+    except FileExistsError:
+        return
     try:
         progress.write(Received(os.getpid()))
         # Code of one's own is imported here.

@@ -10,7 +10,7 @@ import pytest
 
 from ctid_cli.running import dispatch, engine
 from ctid_cli.running.dispatch import Died, GivenUp, Slow, Unable, run_jobs
-from ctid_cli.running.executor import Computed, Done, Hindered, Lost, Message
+from ctid_cli.running.executor import Begun, Computed, Done, Hindered, Lost, Message
 from ctid_cli.running.job import Job
 from ctid_cli.storage.columns import no_result
 from ctid_cli.storage.manifest import Key, Outcome
@@ -127,13 +127,16 @@ def test_a_stop_abandons_what_takes_long(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(dispatch, "SLOW", 0.01)
 
     class Stuck(Scripted):
+        """Begins the first job, and keeps the second one ready."""
+
         def collect(self, seconds: float) -> list[Message]:
             dispatch.time.sleep(0.005)
-            return []
+            begun, self.fates = self.fates, None
+            return [] if begun is None else [Begun(self.jobs[0])]
 
     executor, asked = Stuck(2), iter([False] * 12)
     found, others = run(executor, stopping=lambda: next(asked, True))
     assert executor.stopped
     assert found == {}
     assert {type(event) for event in others} == {Slow}
-    assert [event.key.start for event in others[:2]] == ["3", "3"]
+    assert {event.key.replicate for event in others} == {0}, "nobody waits for what is only kept ready"
