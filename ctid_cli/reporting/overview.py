@@ -36,7 +36,7 @@ def status_object(
 def overview_text(found: Sequence[ExperimentStatus]) -> str:
     """One line per experiment."""
     rows = [
-        [item.experiment, *map(number, (item.done, item.planned, item.failed, item.left_aside)), _remark(item)]
+        [_name(item), *map(number, (item.done, item.planned, item.failed, item.left_aside)), _remark(item)]
         for item in found
     ]
     return Table(["experiment", "done", "planned", "failed", "set aside", ""], rows, "lrrrrl").draw()
@@ -50,7 +50,7 @@ def status_text(
 ) -> str:
     """Progress of one experiment: by estimator and data, by precision, by outcome, and the first failures."""
     remark = _remark(status)
-    blocks = [f"{status.experiment} in {status.folder}: {status.done} of {status.planned} estimates done"]
+    blocks = [f"{_name(status)} in {status.folder}: {status.done} of {status.planned} estimates done"]
     blocks[0] += f" ({remark})" if remark else ""
     if status.groups:
         swept = list(dict.fromkeys(name for group in status.groups for name in group.swept))
@@ -66,7 +66,7 @@ def status_text(
         blocks.append("\n".join(_outcomes(estimates)))
     if status.left_aside:
         blocks.append(f"{status.left_aside} stored estimates are set aside: the latest run asked for others.")
-    command = f"ctid table {status.experiment}{out_option(out)}"
+    command = f"ctid table {status.folder.name if status.shard else status.experiment}{out_option(out)}"
     if status.todo and not status.running:
         blocks.append(f"To continue, run the same `ctid run` command again; so far: {command}")
     elif status.done:
@@ -103,6 +103,11 @@ def _running(progress: Mapping[str, Any]) -> str:
     if progress.get("data_sets_per_second") is not None:
         words += [rate(progress["data_sets_per_second"]), f"to end about {progress['expected_end']}"]
     return ", ".join(words)
+
+
+def _name(status: ExperimentStatus) -> str:
+    """What the numbers are of: a shard has only those of its own data sets."""
+    return f"shard {status.shard[0]}/{status.shard[1]} of {status.experiment}" if status.shard else status.experiment
 
 
 def _remark(status: ExperimentStatus) -> str:

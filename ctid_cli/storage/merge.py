@@ -10,9 +10,11 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from typing import Any
 
+from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import RefusedError, StorageError, UsageError
 from ctid_cli.storage import folder as place
 from ctid_cli.storage import journal
@@ -23,6 +25,9 @@ from ctid_cli.storage.store import seal
 
 #: What a session is called, apart from what is known of it.
 _OF_SESSION = ("session", "started", "stopped", "reason")
+#: Statuses of estimates that exceeded a limit, and the limits, of which the first counts first.
+LIMITED = ("TIMEOUT", "MEMORY")
+LIMITS = ("wall_seconds", "cpu_seconds", "memory_mb")
 _SHARD = re.compile(r"\.shard-\d+-of-\d+$")
 
 
@@ -50,7 +55,7 @@ class Merged:
     sources: int
     planned: int
     stored: int
-    #: Estimates that were not in the folder before.
+    #: Estimates that were not in the folder before, or exceeded a limit there.
     new: int
     mixed: bool
     checksum: str
@@ -189,13 +194,26 @@ def _new_entries(present: Sequence[Source], read: Sequence[Source]) -> dict[Key,
     for source in (*present, *read):
         for key, entry in source.entries.items():
             other, stored = found.setdefault(key, (source, entry))
-            if stored.result != entry.result:
+            if stored.result == entry.result:
+                continue
+            if any(one.result["status"] in LIMITED for one in (stored, entry)):
+                found[key] = max(found[key], (source, entry), key=_rank)
+            else:
                 raise RefusedError(
                     f"estimate {key.id} is one thing in {other.folder} and another in {source.folder}; 'ctid show "
                     f"{key.id}' prints each, and --fresh computes one of the folders anew"
                 )
     ours = set(map(id, present))
     return {key: value for key, value in found.items() if id(value[0]) not in ours}
+
+
+def _rank(found: tuple[Source, journal.Entry]) -> tuple[bool, list[float], str]:
+    """Which of two is better, where one exceeded a limit: a result, or else what had the higher limits."""
+    source, entry = found
+    session = next((one for one in source.sessions if one["session"] == entry.session), {})
+    limits = session.get("limits") or {}
+    allowed = [inf if (limit := limits.get(name)) is None else float(limit) for name in LIMITS]
+    return entry.result["status"] not in LIMITED, allowed, canonical_json(entry.result)
 
 
 def _missing(plan: Manifest, read: Sequence[Source], keys: set[Key]) -> Iterator[str]:

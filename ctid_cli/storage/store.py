@@ -26,6 +26,7 @@ from ctid_cli.storage.manifest import (
     assemble,
     is_of_signal,
     row_columns,
+    shard_of,
     slots,
     swept_names,
     true_values,
@@ -129,6 +130,8 @@ class ExperimentStatus(Progress):
     mixed: bool
     running: dict[str, Any] | None
     groups: tuple[GroupStatus, ...]
+    #: Which shard it is, of how many; None for all of an experiment.
+    shard: tuple[int, int] | None = None
 
 
 def seal(folder: Path, log: journal.Journal) -> tuple[int, str]:
@@ -362,4 +365,6 @@ def _status(
         counts = (len(wanted), len(found), failed)
         groups.append(GroupStatus(*counts, slot.estimator["name"], slot.key.data_hash, slot.swept))
     counts = tuple(sum(getattr(group, name) for group in groups) for name in ("planned", "done", "failed"))
-    return ExperimentStatus(*counts, manifest["experiment"], folder, left_aside, mixed, running, tuple(groups))
+    name, found_groups, part = manifest["experiment"], tuple(groups), shard_of(manifest)
+    shard = None if part is None else (part.number, part.of)
+    return ExperimentStatus(*counts, name, folder, left_aside, mixed, running, found_groups, shard)

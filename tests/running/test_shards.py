@@ -15,13 +15,15 @@ from pathlib import Path
 import pytest
 
 from ctid_cli.errors import DamageError, RefusedError, UsageError
+from ctid_cli.reporting.overview import overview_text, status_text
 from ctid_cli.running.engine import preview, run_experiment
 from ctid_cli.running.plan import build_plan
 from ctid_cli.running.shard_plan import shard_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import journal
+from ctid_cli.storage.columns import failed
 from ctid_cli.storage.manifest import slots
-from ctid_cli.storage.merge import find_sources, merge, merge_all, read_source
+from ctid_cli.storage.merge import Source, find_sources, merge, merge_all, read_source
 from ctid_cli.storage.shards import Shard
 from ctid_cli.storage.store import experiment_status, load_estimates
 from tests.running.fakes import FakePlan
@@ -91,6 +93,9 @@ def test_rows_keep_their_times_and_the_runs_they_come_from(parts: list[Path], tm
 def test_a_shard_counts_its_own_estimates(parts: list[Path]) -> None:
     status = experiment_status(parts[1])
     assert (status.planned, status.done, status.left_aside) == (12, 12, 0)
+    assert "shard 2/3 of toys" in overview_text([status])
+    assert status_text(status, [], parts[1].parent).startswith(f"shard 2/3 of toys in {parts[1]}: 12 of 12")
+    assert "ctid table toys.shard-2-of-3 " in status_text(status, [], parts[1].parent)
     assert len(load_estimates(parts[1])) == 12
 
 
@@ -123,6 +128,34 @@ def test_shards_without_data_sets_are_not_missed(tmp_path: Path) -> None:
 
 def test_the_same_estimate_twice_counts_once(parts: list[Path], whole: Path, tmp_path: Path) -> None:
     assert joined([*parts, whole], tmp_path / "toys") == (whole / "runs.h5").read_bytes()
+
+
+def limited(source: Source, status: str, **limits: float) -> Source:
+    """The same shard, as if its first estimate had exceeded one of these limits."""
+    (key, entry), *_ = source.entries.items()
+    result = failed(f"under {sorted(limits.items())}", status)
+    sessions = [{**session, "limits": limits} for session in source.sessions]
+    return replace(source, entries={**source.entries, key: replace(entry, result=result)}, sessions=sessions)
+
+
+def test_a_result_is_better_than_a_limit_and_a_high_limit_better_than_a_low_one(
+    parts: list[Path], whole: Path, tmp_path: Path
+) -> None:
+    one, *others = (read_source(part) for part in parts)
+    low = limited(one, "TIMEOUT", wall_seconds=1, cpu_seconds=9)
+    high = limited(one, "TIMEOUT", wall_seconds=2, cpu_seconds=1)
+    for number, order in enumerate(itertools.permutations([low, one, high])):
+        merge([*order, *others], tmp_path / f"{number}")
+        assert (tmp_path / f"{number}" / "runs.h5").read_bytes() == (whole / "runs.h5").read_bytes()
+    for number, order in enumerate([[low, high], [high, low]]):
+        merge([*order, *others], tmp_path / "limited" / f"{number}")
+        assert set(load_estimates(tmp_path / "limited" / f"{number}")["message"]) > {
+            "under [('cpu_seconds', 1), ('wall_seconds', 2)]"
+        }
+    # What is there already is replaced too.
+    again = merge([one], tmp_path / "limited" / "0")
+    assert (again.new, again.missing) == (1, ())
+    assert (tmp_path / "limited" / "0" / "runs.h5").read_bytes() == (whole / "runs.h5").read_bytes()
 
 
 def test_two_results_of_one_estimate_are_refused(parts: list[Path], tmp_path: Path) -> None:
