@@ -164,7 +164,8 @@ class Reporter(_Progress):
                 what = f"{event.estimator} on replicate {event.replicate} has been at work for {seconds(event.seconds)}"
                 self._say(f"{what}; limits.wall_seconds would end what takes longer than it says")
             case events.GivenUp():
-                self._say(f"{count(event.estimates, 'estimate')} given up, not stored: {event.reason}")
+                what = f"{count(event.estimates, 'estimate')} given up, not stored ({event.names[0]}"
+                self._say(f"{what}{', …' if event.estimates > 1 else ''}): {event.reason}")
             case events.Stopping():
                 self._say(f"stopping ({event.reason}): storing what is finished; once more to stop at once")
 

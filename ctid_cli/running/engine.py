@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 #: Finished estimates are committed after this time [s], or when there are this many of them.
 COMMIT_SECONDS = 0.2
 COMMIT_ESTIMATES = 200
+#: So many of the estimates that were given up are named at the end.
+CULPRITS = 3
 
 _EXIT_CODES = {"SIGINT": 130, "SIGTERM": 143, MACHINE: MachineError.exit_code}
 #: Exit code after any other stop.
@@ -73,6 +75,8 @@ class RunSummary:
     #: Estimates that the machine did not let finish, and what was in their way.
     given_up: int = 0
     hindrance: str = ""
+    #: Estimator and replicate of the first of them.
+    culprits: tuple[str, ...] = ()
 
     @property
     def missing(self) -> int:
@@ -90,6 +94,9 @@ class RunSummary:
     def machine_error(self) -> MachineError:
         """What to say where the machine stood in the way."""
         text = f"{self.experiment}: the machine did not let estimates finish, {self.missing} are missing"
+        if self.culprits:
+            more = ", …" if self.given_up > len(self.culprits) else ""
+            text += f" ({', '.join(self.culprits)}{more})"
         return MachineError(f"{text}: {self.hindrance}. What helps: {advice(self.hindrance)}. The same command goes on")
 
 
@@ -172,6 +179,7 @@ class _Run:
         self.stock, self.again = stock, set(stock.again)
         self.computed = self.done = self.total = self.failures = self.given_up = 0
         self.hindrance = ""
+        self.culprits: tuple[str, ...] = ()
         self.precision: tuple[CellPrecision, ...] = ()
         self.started = now()
         self._lay_out()
@@ -247,13 +255,17 @@ class _Run:
             case GivenUp():
                 self.given_up += len(item.keys)
                 self.hindrance = item.reason
-                self.on_event(events.GivenUp(len(item.keys), item.reason))
+                names = tuple(f"{self._name(key)} on replicate {key.replicate}" for key in item.keys)
+                self.culprits = (self.culprits + names)[:CULPRITS]
+                self.on_event(events.GivenUp(names, item.reason))
             case Slow():
-                name = self.slots[item.key][0].estimator["name"]
-                self.on_event(events.Slow(item.key.id, name, item.key.replicate, item.seconds))
+                self.on_event(events.Slow(item.key.id, self._name(item.key), item.key.replicate, item.seconds))
             case Unable():
                 self.hindrance = item.reason
                 stopping.ask(MACHINE)
+
+    def _name(self, key: Key) -> str:
+        return str(self.slots[key][0].estimator["name"])
 
     def _commit(self, batch: Sequence[Outcome]) -> None:
         self.log.add(batch, self.session)
@@ -301,6 +313,7 @@ class _Run:
             precision=self.precision,
             given_up=self.given_up,
             hindrance=self.hindrance,
+            culprits=self.culprits,
         )
 
     def cleanup(self) -> None:

@@ -77,8 +77,14 @@ class WorkerDied:
 class GivenUp:
     """Estimates that the machine did not let finish, twice; they are not stored."""
 
-    estimates: int
+    #: Estimator and replicate of each.
+    names: tuple[str, ...]
     reason: str
+
+    @property
+    def estimates(self) -> int:
+        """How many there are."""
+        return len(self.names)
 
 
 @dataclass(frozen=True)
