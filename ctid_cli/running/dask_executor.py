@@ -8,8 +8,10 @@ shown that it has the same code, packages and arithmetic as this process.
 from __future__ import annotations
 
 import logging
+import pickle
 import queue
 import time
+import uuid
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -18,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.errors import DataError, MachineError, RefusedError, UsageError
-from ctid_cli.running.executor import Lost, Message
+from ctid_cli.running.executor import Done, Lost, Message
 from ctid_cli.running.job import Job
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.origins import current_origins
@@ -35,8 +37,17 @@ AHEAD = 1
 #: How often it is asked which workers there are [s], and how long one is waited for.
 LOOK = 0.5
 PATIENCE = 120.0
+ANSWER = 10.0
 #: So often may workers die of a job before the machine is said not to let it finish.
 DEATHS = 3
+
+
+@dataclass
+class _Task:
+    """A job that a worker has."""
+
+    job: Job
+    future: Any
 
 
 @dataclass
@@ -45,11 +56,12 @@ class _Remote:
 
     address: str
     threads: int
-    jobs: dict[Any, Job] = field(default_factory=dict)
+    #: What it has, by the keys of dask, in the order in which it takes them.
+    tasks: dict[str, _Task] = field(default_factory=dict)
 
     @property
     def room(self) -> int:
-        return self.threads * (1 + AHEAD) - len(self.jobs)
+        return self.threads * (1 + AHEAD) - len(self.tasks)
 
 
 class DaskExecutor:
@@ -66,10 +78,15 @@ class DaskExecutor:
         self._origins = [origins[cell.hash] for cell in plan.estimators]
         self._question = packed(parts), _contents([cell.source for cell in plan.data_cells])
         self._remotes: dict[str, _Remote] = {}
+        #: Which worker has a task.
+        self._where: dict[str, _Remote] = {}
         #: Workers that were asked what they are, and those that may not take part.
         self._asked: dict[str, Any] = {}
         self._refused: dict[str, str] = {}
-        self._over: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        #: What workers tell, and futures that are done, after all that was told of them.
+        self._news: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._topic = f"ctid-{uuid.uuid4().hex}"
+        self._client.subscribe_topic(self._topic, lambda event: self._news.put(event[1]))
         self._held: list[tuple[Job, bool]] = []
         self._deaths: Counter[Key] = Counter()
         self._messages: list[Message] = []
@@ -98,7 +115,7 @@ class DaskExecutor:
         """How many further jobs it would begin, or keep ready, now."""
         free = sum(max(remote.room, 0) for remote in self._remotes.values()) - len(self._held)
         # A run without anything in work would end.
-        idle = not self._held and not any(remote.jobs for remote in self._remotes.values())
+        idle = not self._held and not self._where
         return max(free, int(idle))
 
     def submit(self, job: Job, *, alone: bool = False) -> None:
@@ -112,17 +129,19 @@ class DaskExecutor:
         except Exception as error:
             self._messages.append(Lost(job, *cause_of(error)))
             return
-        future = self._client.submit(compute_here, content, self._limits, alone, **_only(remote.address))
-        remote.jobs[future] = job
-        future.add_done_callback(self._over.put)
+        future = self._client.submit(compute_here, content, self._limits, alone, self._topic, **_only(remote.address))
+        remote.tasks[future.key] = _Task(job, future)
+        self._where[future.key] = remote
+        future.add_done_callback(self._news.put)
 
     def collect(self, seconds: float) -> list[Message]:
         """What has happened since the last call."""
         messages, self._messages = self._messages, []
+        self._spread()
         with suppress(queue.Empty):
-            messages += self._finished(self._over.get(timeout=seconds))
+            messages += self._heard(self._news.get(timeout=seconds))
             while True:
-                messages += self._finished(self._over.get_nowait())
+                messages += self._heard(self._news.get_nowait())
         if time.monotonic() - self._looked >= LOOK:
             messages += self._look()
             self._require_workers()
@@ -131,22 +150,38 @@ class DaskExecutor:
             self.submit(job, alone=alone)
         return messages
 
-    def _finished(self, future: Any) -> list[Message]:
-        """What became of a job."""
-        remote = next((one for one in self._remotes.values() if future in one.jobs), None)
+    def _spread(self) -> None:
+        """Give idle workers, for which there was no other job, what busy ones were to do next."""
+        idle = sum(remote.threads for remote in self._remotes.values() if not remote.tasks)
+        busy = [remote for remote in self._remotes.values() if len(remote.tasks) > remote.threads] if idle else []
+        for remote in busy[:idle]:
+            task = self._forget(next(reversed(remote.tasks)))
+            # If it was begun in this moment, the worker gives it up.
+            self._client.cancel([task.future], force=True)
+            self._held.append((task.job, False))
+
+    def _forget(self, key: str) -> _Task:
+        """A task that is over, or to be done elsewhere."""
+        return self._where.pop(key).tasks.pop(key)
+
+    def _heard(self, news: Any) -> list[Message]:
+        """What became of a job, or of the first of its estimates."""
+        remote = self._where.get(news["task"] if isinstance(news, dict) else news.key)
         if remote is None:
             return []
-        job = remote.jobs.pop(future)
-        if future.status == "finished":
-            found: Sequence[Message] = future.result()
-            return [replace(message, job=job) for message in found]
-        if future.status == "error":
-            return [Lost(job, *cause_of(future.exception()))]
-        return [self._bereaved(job)]
+        if isinstance(news, dict):
+            job, messages = remote.tasks[news["task"]].job, pickle.loads(news["messages"])
+            if any(isinstance(message, Done | Lost) for message in messages):
+                self._forget(news["task"])
+            return [replace(message, job=job) for message in messages]
+        job = self._forget(news.key).job
+        if news.status == "error":
+            return [Lost(job, *cause_of(news.exception()))]
+        return [Lost(job, "chance", "it was given up") if news.status == "finished" else self._bereaved(job)]
 
-    def _bereaved(self, job: Job) -> Message:
-        """A job whose worker is gone."""
-        self._deaths[job.keys[0]] += 1
+    def _bereaved(self, job: Job, at_work: bool = True) -> Message:
+        """A job whose worker is gone; what it had not begun did not kill it."""
+        self._deaths[job.keys[0]] += at_work
         if self._deaths[job.keys[0]] < DEATHS:
             return Lost(job, "chance", "its worker is gone")
         return Lost(job, "machine", f"{DEATHS} workers died of it, one after another")
@@ -161,9 +196,10 @@ class DaskExecutor:
         lost: list[Message] = []
         for address in self._remotes.keys() - present.keys():
             gone = self._remotes.pop(address)
-            self._tell(f"worker {address} is gone; others take over its {len(gone.jobs)} jobs")
-            self._client.cancel(list(gone.jobs), force=True)
-            lost += [self._bereaved(job) for job in gone.jobs.values()]
+            self._tell(f"worker {address} is gone; others take over its {len(gone.tasks)} jobs")
+            tasks = [self._forget(key) for key in list(gone.tasks)]
+            self._client.cancel([task.future for task in tasks], force=True)
+            lost += [self._bereaved(task.job, number < gone.threads) for number, task in enumerate(tasks)]
         known = self._remotes.keys() | self._asked.keys() | self._refused.keys()
         for address in present.keys() - known:
             self._asked[address] = self._client.submit(identify, *self._question, **_only(address))
@@ -180,7 +216,11 @@ class DaskExecutor:
         if future.status != "finished":
             reason = f"worker {address} cannot be used: {future.exception()}"
         else:
-            host, origins = future.result()
+            try:
+                host, origins = future.result(timeout=ANSWER)
+            except TimeoutError:
+                # It died with its answer; if it did not, it is asked once more.
+                return
             pairs = [
                 pair
                 for ours, theirs in zip(self._origins, origins, strict=True)
@@ -205,9 +245,10 @@ class DaskExecutor:
     def stop(self) -> None:
         """Abandon what is in work at once; workers elsewhere notice by themselves."""
         with suppress(Exception):
-            self._client.cancel([future for one in self._remotes.values() for future in one.jobs], force=True)
-        for remote in self._remotes.values():
-            remote.jobs.clear()
+            tasks = [task for remote in self._remotes.values() for task in remote.tasks.values()]
+            self._client.cancel([task.future for task in tasks], force=True)
+        for key in list(self._where):
+            self._forget(key)
         self._held.clear()
 
     def close(self) -> None:

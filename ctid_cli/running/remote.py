@@ -13,6 +13,7 @@ import pickle
 import platform
 import tempfile
 import threading
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,8 @@ from ctid_cli.running.limits import Limits
 from ctid_cli.running.pool import LokyPool
 from ctid_cli.storage.identity import Origin, origin_of
 
-#: How often a worker looks whether its job is still wanted [s].
-TICK = 0.1
+#: How often a worker looks whether its job is still wanted, and tells what is finished of it [s].
+TICK, TELL = 0.1, 1.0
 
 _of_thread = threading.local()
 #: Files that were sent along, by the hash of their content.
@@ -54,8 +55,11 @@ def identify(packed: bytes, contents: Mapping[str, bytes]) -> tuple[str, list[Or
     return platform.node(), [origin_of(source, estimator) for source, estimator in parts]
 
 
-def compute_here(packed: bytes, limits: Limits, alone: bool) -> list[Message]:
-    """What becomes of a job; the messages do not name it."""
+def compute_here(packed: bytes, limits: Limits, alone: bool, topic: str) -> None:
+    """Compute a job, and tell the run what becomes of it.
+
+    That goes by events, at once: results of tasks stay with their worker until they are asked for, and die with it.
+    """
     _, job = pickle.loads(packed)
     source = _located(job.cell.source)
     if source is not job.cell.source:
@@ -67,12 +71,24 @@ def compute_here(packed: bytes, limits: Limits, alone: bool) -> list[Message]:
     pool = pools.get(limits) or pools.setdefault(limits, LokyPool(1, limits))
     pool.submit(job, alone=alone)
     messages: list[Message] = []
-    while not any(isinstance(message, Done | Lost) for message in messages):
+    over, when = False, time.monotonic()
+    while not over:
         messages += pool.collect(TICK)
         if _is_abandoned():
             pool.stop()
-            break
-    return [dataclasses.replace(message, job=None) for message in messages]  # type: ignore[arg-type]
+            return
+        over = any(isinstance(message, Done | Lost) for message in messages)
+        if over or (messages and time.monotonic() - when >= TELL):
+            _tell(topic, messages)
+            messages, when = [], time.monotonic()
+
+
+def _tell(topic: str, messages: list[Message]) -> None:
+    """Tell the run what has happened in the present task; the messages do not name the job."""
+    from distributed import get_worker
+
+    worker, nameless = get_worker(), [dataclasses.replace(message, job=None) for message in messages]  # type: ignore[arg-type]
+    worker.log_event(topic, {"task": worker.get_current_task(), "messages": pickle.dumps(nameless)})
 
 
 def _located(source: Any) -> Any:
