@@ -6,6 +6,7 @@ only they can be given one BLAS thread: with more, results have other last bits.
 
 from __future__ import annotations
 
+import atexit
 import itertools
 import os
 import queue
@@ -307,6 +308,9 @@ class _Worker:
 def _executor() -> Any:
     from joblib.externals.loky import ProcessPoolExecutor
 
+    # Executors that are left when Python takes its modules apart complain of that.
+    atexit.unregister(end_idle_workers)
+    atexit.register(end_idle_workers)
     return ProcessPoolExecutor(1, timeout=IDLE, initializer=initialise, initargs=(os.getpid(),), env=_ONE_THREAD)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from tests.running.fakes import FakeFit, FakeRecord, FakeStart, Prepared, Toy
 
 
-@numba.njit
+@numba.njit(cache=True)
 def for_ever(x: float) -> float:
     while x < 2.0:
         x = math.sin(x)
