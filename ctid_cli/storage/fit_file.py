@@ -7,11 +7,11 @@ for.
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, get_args
 
 import numpy as np
 
@@ -23,7 +23,8 @@ from ctid_cli.estimators.identification import Identification
 from ctid_cli.inference.loss import Weighting
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.signals.files import require_file
-from ctid_cli.signals.measurement import Measurement, read_measurement
+from ctid_cli.signals.held import Hold
+from ctid_cli.signals.measurement import ROLES, Measurement, read_measurement
 from ctid_cli.signals.record import Loop, Record
 from ctid_cli.simulation.dataset import file_sha256
 from ctid_cli.storage.exact import decoded, encoded
@@ -224,6 +225,7 @@ def read_fit(
     try:
         result = decoded(content["result"], Identification)
         listed = content["records"]
+        _require_sources(content)
         if moved and len(moved) != len(listed):
             raise UsageError(f"{file} is of {len(listed)} records; --record names {len(moved)}")
         places: list[str | None] = [os.fspath(each) for each in moved]
@@ -271,6 +273,28 @@ def _content(file: str) -> dict[str, Any]:
     if content.get("checksum") != content_hash({key: item for key, item in content.items() if key != "checksum"}):
         _refuse(file, "is damaged, or was changed after it was written: its checksum is that of other content")
     return content
+
+
+def _require_sources(content: Mapping[str, Any]) -> None:
+    """Refuse a file that does not say of its records what is needed to read them."""
+    _require("units", list(content["units"]) == ["time", "input", "output"] and _texts(content["units"].values()))
+    _require("command", content["command"] is None or isinstance(content["command"], str))
+    for each in (*content["records"], *([content["validation"]] if content["validation"] else [])):
+        if each["path"] is not None:
+            _require("path", _texts([each["path"], each["sha256"]]))
+            _require("columns", _texts(each["columns"][role] for role in ROLES))
+            _require("hold", each["hold"] in get_args(Hold))
+            ends = [each[word] for word in ("from", "to")]
+            _require("from and to", all(end is None or isinstance(end, int | float) for end in ends))
+
+
+def _texts(values: Iterable[Any]) -> bool:
+    return all(isinstance(value, str) for value in values)
+
+
+def _require(what: str, right: bool) -> None:
+    if not right:
+        raise DataError(f"its {what}")
 
 
 def _no_constant(name: str) -> NoReturn:

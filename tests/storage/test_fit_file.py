@@ -165,6 +165,12 @@ BAD = {
     "a NaN model": (lambda c: c["result"]["fit"]["model"].update(delay="nan"), True, "damaged .*delay"),
     "another class": (lambda c: c["result"]["fit"].update(type="Popen"), True, r"damaged \(result.fit is not"),
     "shape": (lambda c: c["result"]["fit"]["covariance"].update(shape=[2, 3]), True, "damaged"),
+    "units": (lambda c: c.update(units={"time": 1}), True, r"damaged \(its units"),
+    "command": (lambda c: c.update(command=["rm"]), True, r"damaged \(its command"),
+    "columns": (lambda c: c["records"][0]["columns"].update(time=None), True, r"damaged \(its columns"),
+    "hold": (lambda c: c["records"][0].update(hold="no"), True, r"damaged \(its hold"),
+    "path": (lambda c: c["records"][0].update(path=7), True, r"damaged \(its path"),
+    "window": (lambda c: c["records"][0].update({"from": "now"}), True, r"damaged \(its from and to"),
     "missing": (lambda c: c.pop("records"), True, "damaged"),
 }
 
