@@ -53,6 +53,7 @@ from .inference.finite_record import cramer_rao_bound as cramer_rao_bound
 from .reporting.result_views import plot as plot, summary as summary, to_frame as to_frame
 
 # Fits as files
+from .estimators.model_comparison import ModelOnRecord as ModelOnRecord, compare as compare
 from .storage.fit_file import load_fit as load_fit
 from .reporting.saved_fit import save_fit as save_fit
 

@@ -12,6 +12,7 @@ from ctid_cli.cli.fit_command import fit
 from ctid_cli.cli.frf_command import frf
 from ctid_cli.cli.init_command import init
 from ctid_cli.cli.merge_command import merge
+from ctid_cli.cli.model_commands import model
 from ctid_cli.cli.result_commands import export, figure, report, show, status, table
 from ctid_cli.cli.storage_commands import repair, verify
 from ctid_cli.cli.study_command import study
@@ -53,6 +54,7 @@ app.command(cls=CheckCommand)(check)
 _RESULTS = (status, table, figure, report, show, export, verify, repair)
 for _command in (fit, frf, track, init, run, merge, *_RESULTS, validate, schema):
     app.command(cls=Command)(_command)
+app.add_typer(model, name="model")
 app.add_typer(study, name="study")
 
 

@@ -29,6 +29,9 @@ class AppliedModel:
     initial_states: tuple[Array, ...]
     #: Output offset of each experiment [output unit].
     offsets: tuple[float, ...]
+    #: Derivatives of the output at the used samples to all parameters, the delay and what is each experiment's among
+    #: them, shape (count, p).
+    sensitivities: tuple[Array, ...] = field(repr=False)
 
 
 class Refinement:
@@ -104,14 +107,16 @@ class Refinement:
 
     def errors_of(self, model: TransferFunction) -> AppliedModel:
         """Errors of a given model on these records, each with its own best initial state and offset."""
-        layout = self.layout_of(model.order, delay=False)
+        layout = self.layout_of(model.order, delay=True)
         theta, residuals = layout.theta(model), []
-        for k, (psi, eps) in enumerate(sensitivities(self.problem, layout, theta, model.delay)):
+        found = sensitivities(self.problem, layout, theta, model.delay)
+        for k, (psi, eps) in enumerate(found):
             own = slice(layout.first(k), layout.first(k) + layout.own)
             theta[own] = np.linalg.lstsq(psi[:, own], eps)[0]
             bridged = self.problem.records[k].y_used
             residuals.append(eps - psi[:, own] @ theta[own] + (self.measured.outputs[k] - bridged))
-        return AppliedModel(tuple(residuals), self.measured.used(), *self.own(layout, theta))
+        slopes = tuple(psi for psi, _ in found)
+        return AppliedModel(tuple(residuals), self.measured.used(), *self.own(layout, theta), slopes)
 
     def layout_of(self, poles: int, delay: bool) -> Layout:
         """Which numbers stand where for so many poles."""

@@ -1,5 +1,6 @@
 """An estimated model as an object or a text of other tools."""
 
+import keyword
 import re
 
 import numpy as np
@@ -22,6 +23,8 @@ MATLAB_UNITS = {
 }
 #: How the delay is called in each kind of object.
 DELAYS = {"idtf": "IODelay", "tf": "InputDelay"}
+#: Module of each library, and the name it is imported by.
+LIBRARIES: dict[str, tuple[str, str | None]] = {"control": ("control", None), "scipy": ("scipy.signal", "signal")}
 
 
 def to_control(model: TransferFunction, pade: int | None) -> SystemWithDelay:
@@ -30,8 +33,7 @@ def to_control(model: TransferFunction, pade: int | None) -> SystemWithDelay:
         import control
     except ImportError:
         raise UsageError("python-control is not installed: pip install 'ctid[control]'") from None
-    if pade is not None and pade < 1:
-        raise UsageError(f"the order of a Padé approximation must be at least 1; got {pade}")
+    _check_pade(pade)
     system = control.TransferFunction(model.numerator.tolist(), model.denominator.tolist())
     if pade is None or not model.delay:
         return SystemWithDelay(system, model.delay)
@@ -67,6 +69,34 @@ def to_matlab(found: Estimated, name: str, kind: str, time_unit: str) -> str:
         *(f"%   {_row(row)}" for row in found.reported),
     ]
     return "\n".join(lines) + "\n"
+
+
+def to_python(found: Estimated, name: str, library: str, pade: int | None) -> str:
+    """Code that builds the model with python-control or SciPy."""
+    if not name.isidentifier() or keyword.iskeyword(name):
+        raise UsageError(f"a variable of Python is a letter, then letters, digits and underscores; got {name!r}")
+    _check_pade(pade)
+    model = found.parametric.fraction
+    module, alias = LIBRARIES[library]
+    lines = [
+        f"# {name}(s) = B(s)/A(s) exp(-delay s), coefficients in descending powers of s",
+        f"import {module}" if alias is None else f"from {module.rpartition('.')[0]} import {alias}",
+        "",
+        f"numerator = {model.numerator.tolist()!r}",
+        f"denominator = {model.denominator.tolist()!r}",
+        f"delay = {model.delay!r}  # not part of {name}",
+        f"{name} = {alias or module}.TransferFunction(numerator, denominator)",
+    ]
+    if pade is not None:
+        lines[-2] = f"delay = {model.delay!r}"
+        lines.append(f"{name} *= control.TransferFunction(*control.pade(delay, {pade}))  # the delay, approximately")
+    lines.append(f"# covariance of the estimates of {', '.join(found.parametric.names)}:")
+    return "\n".join([*lines, *(f"#   {_row(row)}" for row in found.reported)]) + "\n"
+
+
+def _check_pade(order: int | None) -> None:
+    if order is not None and order < 1:
+        raise UsageError(f"the order of a Padé approximation must be at least 1; got {order}")
 
 
 def _row(values: Array) -> str:

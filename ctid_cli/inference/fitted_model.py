@@ -256,3 +256,29 @@ class FittedModel(ABC):
             If the name is none that MATLAB takes, the kind is neither, or MATLAB has no such unit of time.
         """
         return exported.to_matlab(self._estimated(), name, kind, time_unit)
+
+    def to_python(
+        self, name: str = "G", library: Literal["control", "scipy"] = "control", pade: int | None = None
+    ) -> str:
+        """Python code that builds the model without ctid.
+
+        Parameters
+        ----------
+        name : str, default "G"
+            Variable that gets the model.
+        library : {"control", "scipy"}, default "control"
+            Library that it is built with.
+        pade : int, optional
+            Order of a Padé approximation of the delay, for python-control only; by default the delay is kept apart.
+
+        Returns
+        -------
+        str
+            Lines of code with all digits; the covariance of the parameters follows as a comment.
+
+        Raises
+        ------
+        UsageError
+            If the name is no variable's, or the order is not positive.
+        """
+        return exported.to_python(self._estimated(), name, library, pade)

@@ -55,6 +55,11 @@ class Parametric:
         return max([self.fraction.numerator.size - 1, *own])
 
     @property
+    def zeros_of_fraction(self) -> int:
+        """The same of the model as one transfer function."""
+        return self.fraction.numerator.size - 1 if isinstance(self.model, AdditiveModel) else self.zeros
+
+    @property
     def fraction(self) -> TransferFunction:
         """The model as one transfer function."""
         return unfactored(self.model) if isinstance(self.model, AdditiveModel) else self.model

@@ -214,3 +214,43 @@ def no_sample(table: Table, low: float, high: float, begin: float, end: float, u
         where = f"before {high:g} {unit}"
     runs = f"the record runs from {begin:.9g} to {end:.9g} {unit}"
     return DataError(f"{table.file}: no sample lies {where}; {runs}")
+
+
+@dataclass(frozen=True)
+class MeasuredInput:
+    """An input without an output, and the units of its file."""
+
+    signal: HeldSignal
+    time_unit: str | None
+    input_unit: str | None
+
+
+def read_input(
+    path: str | os.PathLike[str], *, time: str | None = None, input: str | None = None, hold: Hold = "zoh"
+) -> MeasuredInput:
+    """An input to simulate with, from a file whose other columns do not matter."""
+    require_choice("hold", hold, get_args(Hold))
+    table = read_table(path, "export the input as comma-separated text (.csv) whose first line names the columns")
+    roles: dict[Role, str | None] = {"time": time, "input": input}
+    chosen = {role: table.named(wanted) for role, wanted in roles.items() if wanted is not None}
+    refuse_nameless(table)
+    for role in roles:
+        if role not in chosen and (found := _recognised(table, role, chosen)) is not None:
+            chosen[role] = found
+    missing = [role for role in roles if role not in chosen]
+    left = [name for name in table.names if name not in chosen.values()]
+    if missing and len(table.names) == len(roles) == len(missing) + len(chosen) and len(left) == len(missing):
+        chosen.update(zip(missing, left, strict=True))
+    elif missing:
+        refuse_one_column(table)
+        what = f"{table.head}: no {table.noun} is called {' or '.join(map(repr, USUAL_NAMES[missing[0]][:2]))}"
+        raise DataError(f"{what}; {listing(table)}. Say which one is the {missing[0]} (option {missing[0]})")
+    if chosen["time"] == chosen["input"]:
+        raise DataError(f"{table.head}: {chosen['time']!r} cannot be both the time and the input")
+    unit = {role: split_header(name)[1] for role, name in chosen.items()}
+    t, u = table.numbers(chosen["time"]), table.numbers(chosen["input"])
+    if t.size == 1 and u.size > 1:
+        t = table.lone_interval(chosen["time"], float(t[0])) * np.arange(u.size, dtype=float)
+    table.require_as_many(chosen["time"], t, chosen["input"], u)
+    table.check_times(chosen["time"], t, unit["time"] or "s")
+    return MeasuredInput(HeldSignal(t, table.check_input(chosen["input"], u), hold), unit["time"], unit["input"])

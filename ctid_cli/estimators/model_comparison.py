@@ -1,0 +1,154 @@
+"""Estimated models on one record: what each leaves of the output, and what the residuals tell."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.errors import DataError, UsageError
+from ctid_cli.estimation.common import named
+from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
+from ctid_cli.estimation.profile_refinement import Refinement
+from ctid_cli.estimators.identification import Identification
+from ctid_cli.inference.diagnostics import fit_percent, r_squared
+from ctid_cli.inference.fitted_model import FittedModel
+from ctid_cli.inference.residuals import FEWEST_TESTED, ResidualTests, residual_tests
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import InitialState, Offset
+
+
+@dataclass(frozen=True, eq=False)
+class ModelOnRecord:
+    """An estimated model on a record, the model fixed.
+
+    Parameters
+    ----------
+    fit_percent : float
+        ``100 (1 - ||y - x|| / ||y - mean y||)`` over the used samples [%].
+    r2 : float
+        ``1 - ||y - x||^2 / ||y - mean y||^2`` [-].
+    rms : float
+        Root mean square of the residuals [output unit].
+    count : int
+        Number of samples used.
+    initial_state, offset : str
+        What was done about the state before the record and a constant offset.
+    t : ndarray, shape (count,)
+        Instants of the used samples [s].
+    measured, simulated, residuals : ndarray, shape (count,)
+        Output, what the model answers, and the difference [output unit].
+    tests : ResidualTests or None
+        Auto- and cross-correlation of the residuals with what they mean; None of too few samples.
+    """
+
+    fit_percent: float
+    r2: float
+    rms: float
+    count: int
+    initial_state: InitialState
+    offset: Offset
+    t: Array = field(repr=False)
+    measured: Array = field(repr=False)
+    simulated: Array = field(repr=False)
+    residuals: Array = field(repr=False)
+    tests: ResidualTests | None = field(repr=False)
+
+
+def compare(
+    fits: Sequence[FittedModel],
+    record: Record,
+    *,
+    initial_state: InitialState | None = None,
+    offset: Offset | None = None,
+) -> tuple[ModelOnRecord, ...]:
+    """Several models on one record, none of them fitted to it.
+
+    Parameters
+    ----------
+    fits : sequence of FittedModel
+        Fits, identifications, loaded ones among them.
+    record : Record
+        A record of the same system, best one that no model was estimated from.
+    initial_state : {"rest", "estimate", "periodic"}, optional
+        State before the record; by default for each model as in its own estimation, and at rest where that is not
+        known.
+    offset : {"none", "remove", "estimate"}, optional
+        Constant offset of the output; by default as in the estimation of each model.
+
+    Returns
+    -------
+    tuple of ModelOnRecord
+        One for each model, in their order.
+
+    Raises
+    ------
+    DataError
+        If the record is too short for a model's delay or initial state.
+    UsageError
+        If there is no model.
+
+    Notes
+    -----
+    A part of the residuals along the sensitivities of the output to the parameters counts neither for nor against their
+    independence of the input: on the record of the estimation there is none, and on another one the parameters'
+    uncertainty puts it there.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli import DelayProfile, Record, compare
+    >>> t = 0.1 * np.arange(300)
+    >>> record = Record.from_arrays(t, np.sign(np.sin(t)), np.sin(t) + 0.1 * np.cos(9 * t))
+    >>> fits = [DelayProfile(poles, 0, (0, 2)).fit(record, None) for poles in (1, 2)]
+    >>> one, two = compare(fits, record)
+    >>> one.fit_percent < two.fit_percent
+    True
+    """
+    if not fits:
+        raise UsageError("there is no model to compare")
+    return tuple(_on_record(fit, record, initial_state, offset) for fit in fits)
+
+
+def _on_record(
+    fit: FittedModel, record: Record, initial_state: InitialState | None, offset: Offset | None
+) -> ModelOnRecord:
+    own: tuple[InitialState, Offset] = "rest", "none"
+    if isinstance(fit, Identification):
+        own = fit.options.initial_state, fit.options.offset
+    state, shift = initial_state or own[0], offset or own[1]
+    parametric = fit._estimated().parametric
+    model = parametric.fraction
+    if model.delay > record.t[-1] - record.input.t[0]:
+        span = f"ends {record.t[-1] - record.input.t[0]:.6g} after its first input"
+        raise DataError(f"{named(record)}the record {span}, before the model's delay of {model.delay:.6g} has passed")
+    if (state, shift) == ("rest", "none"):
+        use: BoolArray = record.valid & (record.t >= record.input.t[0])
+        residuals = (record.y - parametric.simulated(record.input, record.t))[use]
+        psi = parametric.output_slopes(record.input, record.t)[use]
+    else:
+        structure = Structure(model.order, parametric.zeros_of_fraction)
+        measured = MeasuredRecords([record], structure, Treatment((model.delay, model.delay), state, shift, "foh"))
+        applied = Refinement(measured).errors_of(model)
+        use, residuals, psi = applied.used[0], applied.residuals[0], applied.sensitivities[0]
+    measured_output = record.y[use]
+    simulated = measured_output - residuals
+    tests = None
+    if residuals.size >= FEWEST_TESTED:
+        delayed = record.input.at(record.t[use] - model.delay)
+        moving = psi[:, psi.any(axis=0)]
+        tests = residual_tests(residuals, delayed, sensitivities=moving if moving.size else None)
+    return ModelOnRecord(
+        fit_percent(measured_output, simulated),
+        r_squared(measured_output, simulated),
+        float(np.sqrt(np.mean(residuals**2))),
+        residuals.size,
+        state,
+        shift,
+        record.t[use],
+        measured_output,
+        simulated,
+        residuals,
+        tests,
+    )
