@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice, permutations
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,16 +22,12 @@ from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.submodels import InitialState
 from ctid_cli.inference.derived import additive_derived
 from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.fitted_model import responses
 from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Term, names_of
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import OutputHold
-
-if TYPE_CHECKING:
-    from ctid_cli.inference.responses import Estimated
 
 #: Orders of the submodels that are tried to find the one that known parameters belong to.
 MOST_ORDERS = 5040
@@ -67,8 +63,10 @@ class AdditiveFit(Fit):
         """Parameters by name: ``g1_a1 … g1_b0 …, g2_a1 …``, where the number is the power of p."""
         return self.additive.parameters
 
-    def _estimated(self) -> Estimated:
-        return responses.with_covariance(self.additive, self.parameter_names, self.covariance)
+    @property
+    def parametrised(self) -> AdditiveModel:
+        """The model in the form that has the parameters."""
+        return self.additive
 
     def derived(self, level: float = 0.95) -> tuple[UncertainValue, ...]:
         """Poles, natural frequencies, damping and static gains of the submodels.

@@ -27,7 +27,6 @@ from ctid_cli.inference.robust import nearly_regular
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty, estimate_uncertainty
-from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import InitialState, LossKind, Offset, OutputHold
@@ -153,11 +152,6 @@ class MeasuredFit(FilledLater, Fit):
         count = sum(eps.size for eps in law.residuals)
         cost = sum(float(eps @ eps) for eps in law.residuals) / count
         return replace(self, **law._asdict(), count=count, cost=cost, weighting=None)
-
-    @property
-    def parametrised(self) -> TransferFunction | AdditiveModel:
-        """The model in the form that has the parameters."""
-        return self.model
 
     @property
     def parameters(self) -> dict[str, float]:

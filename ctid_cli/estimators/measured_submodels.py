@@ -88,11 +88,13 @@ class LaidOutSubmodels:
             raise DataError(f"{named(self.record)}the response of the model is not finite on this record")
         error: Array = np.asarray(rows[2], dtype=float)
         state: Array = np.zeros(0)
+        psi: Array = np.asarray(rows[0], dtype=float)
         if estimated:
             columns = self.free_columns(theta)
+            psi = np.column_stack((psi, columns))
             state = np.asarray(np.linalg.lstsq(columns, error)[0], dtype=float)
             error = np.asarray(error - columns @ state, dtype=float)
-        return AppliedModel((error,), (problem.data.use,), (state,), (self.offset,))
+        return AppliedModel((error,), (problem.data.use,), (state,), (self.offset,), (psi,))
 
 
 def replace_initial(problem: AdditiveProblem) -> AdditiveProblem:

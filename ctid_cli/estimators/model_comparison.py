@@ -1,7 +1,7 @@
 """Estimated models on one record: what each leaves of the output, and what the residuals tell."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -9,10 +9,12 @@ from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.estimation.common import named
 from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
-from ctid_cli.estimation.profile_refinement import Refinement
+from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
+from ctid_cli.estimators import judging
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.inference.diagnostics import fit_percent, r_squared
 from ctid_cli.inference.fitted_model import FittedModel
+from ctid_cli.inference.parametric import Parametric
 from ctid_cli.inference.residuals import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.signals.record import Record
@@ -119,36 +121,49 @@ def _on_record(
         own = fit.options.initial_state, fit.options.offset
     state, shift = initial_state or own[0], offset or own[1]
     parametric = fit._estimated().parametric
-    model = parametric.fraction
-    if model.delay > record.t[-1] - record.input.t[0]:
-        span = f"ends {record.t[-1] - record.input.t[0]:.6g} after its first input"
-        raise DataError(f"{named(record)}the record {span}, before the model's delay of {model.delay:.6g} has passed")
+    delay, span = parametric.model.delay, float(record.t[-1] - record.input.t[0])
+    if delay >= span:
+        text = f"the record ends {span:.6g} after its first input, before the model's delay of {delay:.6g} has passed"
+        raise DataError(f"{named(record)}{text}")
     if (state, shift) == ("rest", "none"):
         use: BoolArray = record.valid & (record.t >= record.input.t[0])
         residuals = (record.y - parametric.simulated(record.input, record.t))[use]
         psi = parametric.output_slopes(record.input, record.t)[use]
     else:
-        structure = Structure(model.order, parametric.zeros_of_fraction)
-        measured = MeasuredRecords([record], structure, Treatment((model.delay, model.delay), state, shift, "foh"))
-        applied = Refinement(measured).errors_of(model)
+        applied = _treated(fit, parametric, record, state, shift)
         use, residuals, psi = applied.used[0], applied.residuals[0], applied.sensitivities[0]
-    measured_output = record.y[use]
-    simulated = measured_output - residuals
+    measured = record.y[use]
     tests = None
     if residuals.size >= FEWEST_TESTED:
-        delayed = record.input.at(record.t[use] - model.delay)
         moving = psi[:, psi.any(axis=0)]
+        delayed = record.input.at(record.t[use] - delay)
         tests = residual_tests(residuals, delayed, sensitivities=moving if moving.size else None)
     return ModelOnRecord(
-        fit_percent(measured_output, simulated),
-        r_squared(measured_output, simulated),
-        float(np.sqrt(np.mean(residuals**2))),
-        residuals.size,
-        state,
-        shift,
-        record.t[use],
-        measured_output,
-        simulated,
-        residuals,
-        tests,
+        fit_percent=fit_percent(measured, measured - residuals),
+        r2=r_squared(measured, measured - residuals),
+        rms=float(np.sqrt(np.mean(residuals**2))),
+        count=residuals.size,
+        initial_state=state,
+        offset=shift,
+        t=record.t[use],
+        measured=measured,
+        simulated=measured - residuals,
+        residuals=residuals,
+        tests=tests,
     )
+
+
+def _treated(
+    fit: FittedModel, parametric: Parametric, record: Record, state: InitialState, shift: Offset
+) -> AppliedModel:
+    """The model with its best initial state and offset: as its own estimator has them, or as one fraction."""
+    if isinstance(fit, Identification):
+        try:
+            options = replace(fit.options, initial_state=state, offset=shift)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+        return judging.applied(fit.fit, options, options.prepare(record).laid_out)
+    model = parametric.fraction
+    structure = Structure(model.order, parametric.zeros_of_fraction)
+    treatment = Treatment((model.delay, model.delay), state, shift, "foh")
+    return Refinement(MeasuredRecords([record], structure, treatment)).errors_of(model)

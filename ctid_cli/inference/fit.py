@@ -14,6 +14,7 @@ from ctid_cli.text import ShownAsTable, wrapped
 
 if TYPE_CHECKING:
     from ctid_cli.inference.responses import Estimated
+    from ctid_cli.models.additive import AdditiveModel
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,11 @@ class Fit(FittedModel, ShownAsTable):
             errors = np.sqrt(np.diag(self.covariance))
         return dict(zip(self.parameter_names, errors.tolist(), strict=True))
 
+    @property
+    def parametrised(self) -> "TransferFunction | AdditiveModel":
+        """The model in the form that has the parameters."""
+        return self.model
+
     def _estimated(self) -> "Estimated":
         """The model with its covariance, whose normal intervals are those of the parameters."""
-        return responses.with_covariance(self.model, self.parameter_names, self.covariance)
+        return responses.with_covariance(self.parametrised, self.parameter_names, self.covariance)
