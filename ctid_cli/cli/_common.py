@@ -49,7 +49,7 @@ Configs = Annotated[list[Path], typer.Argument(metavar="CONFIG", help="Experimen
 TimeColumn = Annotated[str | None, typer.Option("--time", metavar="NAME", help="Column of the times.")]
 InputColumn = Annotated[str | None, typer.Option("--input", metavar="NAME", help="Column of the input.")]
 OutputColumn = Annotated[str | None, typer.Option("--output", metavar="NAME", help="Column of the output.")]
-InputHold = Annotated[Hold, typer.Option("--hold", help="The input between its samples: held, or straight lines.")]
+InputHold = Annotated[Hold, typer.Option("--hold", help="The input between its samples.")]
 From = Annotated[float | None, typer.Option("--from", metavar="TIME", help="First instant to use [unit of the file].")]
 To = Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")]
 

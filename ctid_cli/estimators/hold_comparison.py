@@ -1,6 +1,9 @@
-"""Whether records are described better with the other hold of their input."""
+"""Whether records are described better with another hold of their input."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
@@ -12,27 +15,51 @@ from ctid_cli.inference.input_moves import input_moves
 from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.record import Record
+from ctid_cli.signals.regularity import regular_interval
 
 #: Samples of all records on which the holds are compared.
 MOST = 20_000
-#: The other hold is better where the cost falls by this fraction, and the logarithm of the likelihood rises by so much.
+#: Another hold is better where the cost falls by this fraction, and the logarithm of the likelihood rises by so much.
 WORTHWHILE, DECISIVE = 0.02, 10.0
 
 
-def fall_with_other_hold(refinement: Refinement, fit: MeasuredFit, records: Sequence[Record]) -> float:
-    """Fraction by which the other hold lowers the cost; 0 where that is not decisive.
+@dataclass(frozen=True)
+class OtherHold:
+    """The other hold that describes records best."""
 
-    The steps of an input that moves a few times only show their shape themselves.
+    hold: Hold
+    #: Fraction by which it lowers the cost; 0 where that is not decisive.
+    fall: float
+    #: The delay that goes with it less that of the fit [s].
+    later: float = 0.0
+    #: Whether the records tell the holds apart at all.
+    told: bool = True
+    #: The sampling interval [s].
+    interval: float = math.nan
+
+
+def best_other_hold(refinement: Refinement, fit: MeasuredFit, records: Sequence[Record]) -> OtherHold | None:
+    """The best other hold; None where there is none to try.
+
+    The steps of an input that moves a few times only show their shape themselves, and an input that jumps between
+    levels is not band-limited.
     """
-    if all(input_moves(record).kind in ("constant", "steps") for record in records):
-        return 0.0
+    kinds = {input_moves(record).kind for record in records}
+    if kinds <= {"constant", "steps"}:
+        return None
     most = MOST // len(records)
     short = [_beginning(record, most) for record in records]
-    given, other = (
-        _least(refinement, fit, [otherwise_held(record) if swap else record for record in short])
-        for swap in (False, True)
-    )
-    return decisive(given, other, fit, short)
+    given, delay = _least(refinement, fit, short)
+    tried: list[Hold] = [hold for hold in get_args(Hold) if hold != records[0].input.hold]
+    if kinds != {"continuous"} or any(regular_interval(record.input.t) is None for record in short):
+        tried = [hold for hold in tried if hold != "band-limited"]
+    found = {hold: _least(refinement, fit, [_held(record, hold) for record in short]) for hold in tried}
+    best = min(tried, key=lambda hold: found[hold][0])
+    cost, changed = found[best]
+    interval = float(np.median(np.diff(records[0].t)))
+    # As much worse would be as decisive.
+    told = max(decisive(given, cost, fit, short), decisive(cost, given, fit, short)) > 0.0
+    return OtherHold(best, decisive(given, cost, fit, short), changed - delay, told, interval)
 
 
 def decisive(given: float, other: float, fit: MeasuredFit, records: Sequence[Record]) -> float:
@@ -43,12 +70,11 @@ def decisive(given: float, other: float, fit: MeasuredFit, records: Sequence[Rec
     return fall if fall > WORTHWHILE and -0.5 * count * np.log1p(-fall) > DECISIVE else 0.0
 
 
-def _least(refinement: Refinement, fit: MeasuredFit, records: Sequence[Record]) -> float:
-    """Least sum of squared output errors near a fit."""
+def _least(refinement: Refinement, fit: MeasuredFit, records: Sequence[Record]) -> tuple[float, float]:
+    """Least sum of squared output errors near a fit, and its delay."""
     measured = MeasuredRecords(records, refinement.structure, refinement.measured.treatment)
-    return local_minimum(
-        measured.problem, fit.model.poles, fit.model.delay, measured.treatment.delay_bounds
-    ).squared_error
+    found = local_minimum(measured.problem, fit.model.poles, fit.model.delay, measured.treatment.delay_bounds)
+    return found.squared_error, found.point.delay.seconds
 
 
 def _beginning(record: Record, samples: int) -> Record:
@@ -62,6 +88,9 @@ def _beginning(record: Record, samples: int) -> Record:
 
 
 def otherwise_held(record: Record) -> Record:
-    """The record with the other hold of its input."""
-    hold: Hold = "foh" if record.input.hold == "zoh" else "zoh"
+    """The record with the other of two holds of its input."""
+    return _held(record, "foh" if record.input.hold == "zoh" else "zoh")
+
+
+def _held(record: Record, hold: Hold) -> Record:
     return Record(record.t, record.y, HeldSignal(record.input.t, record.input.values, hold), name=record.name)

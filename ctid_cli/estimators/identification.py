@@ -223,7 +223,7 @@ def identify(
         records=tuple(records),
     )
     acting = [judging.acting(options, record) for record in records]
-    look = look_again(linear, acting, judging.fall_of_hold(options, laid_out, linear, records))
+    look = look_again(linear, acting, judging.other_hold(options, laid_out, linear, records))
     gains = _gains(linear, judging.lowered(options, laid_out, linear))
     return replace(found, warnings=tuple(_warnings(found, look, hessian, gains)))
 

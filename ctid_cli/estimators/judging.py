@@ -8,7 +8,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
 from ctid_cli.estimators.delay_profile import DelayProfile, FittedSamples, MeasuredFit, samples_at
-from ctid_cli.estimators.hold_comparison import decisive, fall_with_other_hold, otherwise_held
+from ctid_cli.estimators.hold_comparison import OtherHold, best_other_hold, decisive, otherwise_held
 from ctid_cli.estimators.measured_submodels import LaidOutSubmodels, MeasuredSubmodels, SubmodelsFit
 from ctid_cli.inference.derived import additive_derived, derived_parameters
 from ctid_cli.inference.uncertain_value import UncertainValue
@@ -76,20 +76,21 @@ def lowered(options: Options, laid_out: LaidOut, fit: MeasuredFit) -> dict[str, 
     return found
 
 
-def fall_of_hold(options: Options, laid_out: LaidOut, fit: MeasuredFit, records: Sequence[Record]) -> float:
-    """Fraction by which the other hold of the input lowers the cost; 0 where that is not decisive."""
+def other_hold(options: Options, laid_out: LaidOut, fit: MeasuredFit, records: Sequence[Record]) -> OtherHold | None:
+    """The best other hold of the input; None where the holds cannot be compared."""
     if isinstance(laid_out, Refinement):
         comparable = options.loss == "squares" and not fit.known
-        return fall_with_other_hold(laid_out, fit, records) if comparable else 0.0
+        return best_other_hold(laid_out, fit, records) if comparable else None
     own, submodels = _of_submodels(options, fit)
     if own.closed:
         # A discrete controller holds its input.
-        return 0.0
+        return None
     try:
-        other = own.prepare(otherwise_held(records[0])).fit(own._start_at(submodels))
+        held = otherwise_held(records[0])
+        other = own.prepare(held).fit(own._start_at(submodels))
     except DataError:
-        return 0.0
-    return decisive(fit.cost, other.cost, fit, records)
+        return None
+    return OtherHold(held.input.hold, decisive(fit.cost, other.cost, fit, records))
 
 
 def _of_submodels(options: Options, fit: MeasuredFit) -> tuple[MeasuredSubmodels, SubmodelsFit]:

@@ -7,6 +7,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimators.delay_profile import MeasuredFit
+from ctid_cli.estimators.hold_comparison import OtherHold
 from ctid_cli.inference import faults
 from ctid_cli.inference.beside import SideBySide, constant, rest_of
 from ctid_cli.inference.input_dependence import InputDependence, input_dependence
@@ -45,14 +46,16 @@ class SecondLook:
     records: tuple[RecordLook, ...]
     #: Fraction by which the other hold of the input lowers the cost; 0 where that is not decisive.
     other_hold: float
+    #: The hold that lowers the cost most; None where there is none to compare with.
+    held: OtherHold | None
     #: Time constant of a pole too slow to be told from an integrator [s]; nan for none.
     integrator: float
 
 
-def look_again(fit: MeasuredFit, records: Sequence[Record], other_hold: float) -> SecondLook:
+def look_again(fit: MeasuredFit, records: Sequence[Record], held: OtherHold | None) -> SecondLook:
     """Look at the records, and at what the fit leaves of them."""
     looks = tuple(_look(record, fit, k) for k, record in enumerate(records))
-    return SecondLook(looks, other_hold, _integrator(fit, records))
+    return SecondLook(looks, held.fall if held else 0.0, held, _integrator(fit, records))
 
 
 def _look(record: Record, fit: MeasuredFit, k: int) -> RecordLook:

@@ -3,14 +3,24 @@
 from collections.abc import Iterator
 
 from ctid_cli.estimators.delay_profile import MeasuredFit
+from ctid_cli.estimators.hold_comparison import OtherHold
 from ctid_cli.estimators.judging import Options
 from ctid_cli.estimators.second_look import RecordLook, SecondLook
 from ctid_cli.inference.residuals import ResidualTests
+from ctid_cli.signals.treatment import Hold
 
 #: Chances of a test statistic like this without feedback, and without missing dynamics.
 FED_BACK, TOO_POOR = 1e-4, 1e-3
 #: Shares of the residuals' variance below these are not worth a pole, and may be what a nonlinear system leaves.
 WORTH_A_POLE, WORTH_A_LOOP = 0.05, 0.01
+#: A delay that depends on the hold is worth a word from this many sampling intervals on.
+FELT = 0.2
+#: What each hold takes the input for.
+TAKEN: dict[Hold, str] = {
+    "zoh": "held between its samples",
+    "foh": "straight lines between its samples",
+    "band-limited": "band-limited",
+}
 #: Where more of the intervals are long the clock is irregular, and has no gaps.
 GAPS = 0.05
 
@@ -33,8 +43,8 @@ def of_second_look(
     diverges = any(one.growth_time > 0 for one in look.records)
     if look.integrator > 0 and not diverges:
         words.append(_of_integrator(look, options, fit))
-    if look.other_hold and poor <= look.other_hold and not any(_faulty(one) for one in look.records):
-        words.append(_of_hold(look))
+    if look.held is not None and poor <= look.other_hold and not any(_faulty(one) for one in look.records):
+        words += _of_hold(look, look.held)
     return words
 
 
@@ -129,13 +139,22 @@ def _of_structure(one: RecordLook, options: Options, fit: MeasuredFit) -> str:
     return f"{found} is what one more pole may explain: the structure is too poor (try --poles {options.poles + 1})."
 
 
-def _of_hold(look: SecondLook) -> str:
-    held = look.records[0].examined.record.input.hold == "zoh"
-    other, taken, not_as = ("foh", "straight lines between its samples", "held") if held else ("zoh", "held", "lines")
-    return (
-        f"Taken as {taken}, not as {not_as}, the input lowers the cost by {100 * look.other_hold:.2g} %: "
-        f"use --hold {other}, unless you know better."
-    )
+def _of_hold(look: SecondLook, other: OtherHold) -> Iterator[str]:
+    """That another hold is better, or that the records do not tell and the delay depends on it."""
+    given = look.records[0].examined.record.input.hold
+    change, size = f"{'longer' if other.later > 0 else 'shorter'} by", abs(other.later) / other.interval
+    delay = f"the delay is {change} {abs(other.later):.3g}, {size:.2g} sampling intervals" if size > FELT else ""
+    if other.fall:
+        yield (
+            f"Taken as {TAKEN[other.hold]}, not as {TAKEN[given]}, the input lowers the cost by "
+            f"{100 * other.fall:.2g} %{' and ' + delay if delay else ''}: use --hold {other.hold}, unless you know "
+            "better."
+        )
+    elif delay and not other.told:
+        yield (
+            f"The record does not tell whether its input was {TAKEN[given]} or {TAKEN[other.hold]}: with --hold "
+            f"{other.hold} {delay}. Say how it was made."
+        )
 
 
 def _of_integrator(look: SecondLook, options: Options, fit: MeasuredFit) -> str:

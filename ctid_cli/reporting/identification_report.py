@@ -19,7 +19,9 @@ from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
 from ctid_cli.reporting.layout import Report, Table, count, number, picked
 from ctid_cli.reporting.loss_report import loss_object, loss_text
+from ctid_cli.signals.band_limited import band_limited_doubt
 from ctid_cli.signals.measurement import Measurement
+from ctid_cli.signals.treatment import Hold
 from ctid_cli.text import warning_lines, wrapped
 
 FIT_DEFINITION = "100 (1 - ||y - x|| / ||y - mean y||)"
@@ -28,6 +30,12 @@ R2_DEFINITION = "1 - ||y - x||^2 / ||y - mean y||^2"
 DERIVED_KEYS = ("name", "estimate", "standard_error", "low", "high", "unit", "reason")
 TEST_KEYS = ("white", "whiteness_p_value", "uncorrelated", "cross_p_value", "level", "lags", "sentence")
 
+#: The input between its samples.
+HOLDS: dict[Hold, str] = {
+    "zoh": "constant between its samples",
+    "foh": "straight lines between its samples",
+    "band-limited": "without power above the Nyquist frequency",
+}
 #: What was done about the initial state and the offset, in words.
 TREATMENTS = {
     "rest": "at rest before the record",
@@ -205,6 +213,17 @@ def quality(result: Identification, units: Units) -> Iterator[tuple[str, str]]:
         yield "residuals" if len(fit.residuals) == 1 else f"residuals {k}", test.sentence
 
 
+def _unknown_ends(measurement: Measurement, options: Options, units: Units) -> str:
+    """What is not known of a band-limited input for want of the samples beyond the ends."""
+    signal = measurement.record.input
+    if signal.hold != "band-limited" or options.initial_state == "periodic":
+        return ""
+    doubt = band_limited_doubt(signal.t, signal.values)
+    known = f"within {doubt.reach:.3g} {units.time} of the ends known to about {doubt.ends:.2g} {units.input}"
+    rough = f"; {100 * doubt.beyond:.2g} % of its power is too close to the Nyquist frequency" * (doubt.beyond > 0.01)
+    return f", {known}{rough}"
+
+
 def asked_for(result: Identification, measurements: Sequence[Measurement], units: Units) -> Iterator[tuple[str, str]]:
     """What was estimated, and how the records were taken."""
     options, hold = result.options, measurements[0].record.input.hold
@@ -217,7 +236,7 @@ def asked_for(result: Identification, measurements: Sequence[Measurement], units
         yield from _of_iteration(result, options, measurements[0])
     yield "initial state", f"{TREATMENTS[options.initial_state]} (--initial-state {options.initial_state})"
     yield "offset", f"{_offset(result, units)} (--offset {options.offset})"
-    yield "input", f"{'constant' if hold == 'zoh' else 'straight lines'} between its samples (--hold {hold})"
+    yield "input", f"{HOLDS[hold]} (--hold {hold}){_unknown_ends(measurements[0], options, units)}"
     if loss := loss_text(result.fit, [item.record for item in measurements], units):
         yield "loss", loss
 

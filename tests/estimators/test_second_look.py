@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.estimators.delay_profile import DelayProfile
-from ctid_cli.estimators.hold_comparison import fall_with_other_hold
+from ctid_cli.estimators.hold_comparison import best_other_hold
 from ctid_cli.estimators.identification import identify
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.transfer_function import TransferFunction
@@ -103,4 +103,6 @@ def test_the_other_hold_is_fitted_as_if_it_had_been_given():
     prepared = KNOWN.prepare([wrong])
     fit = prepared.fit()
     expected = 1 - KNOWN.fit([right]).cost / fit.cost
-    assert fall_with_other_hold(prepared.laid_out, fit, [wrong]) == pytest.approx(expected, rel=1e-6)
+    other = best_other_hold(prepared.laid_out, fit, [wrong])
+    assert other.hold == "foh"
+    assert other.fall == pytest.approx(expected, rel=1e-6)
