@@ -57,8 +57,8 @@ def best_other_hold(refinement: Refinement, fit: MeasuredFit, records: Sequence[
     best = min(tried, key=lambda hold: found[hold][0])
     cost, changed = found[best]
     interval = float(np.median(np.diff(records[0].t)))
-    # As much worse would be as decisive.
-    told = max(decisive(given, cost, fit, short), decisive(cost, given, fit, short)) > 0.0
+    # As much worse would be as decisive; an input that jumps shows its hold itself.
+    told = kinds != {"continuous"} or max(decisive(given, cost, fit, short), decisive(cost, given, fit, short)) > 0.0
     return OtherHold(best, decisive(given, cost, fit, short), changed - delay, told, interval)
 
 
