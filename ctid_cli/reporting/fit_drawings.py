@@ -127,7 +127,7 @@ def draw_poles(axes: Any, band: PoleBand) -> None:
             ends = pole.real + ring[0], pole.imag + ring[1]
             axes.fill(*ends, facecolor=BAND, edgecolor=DARK, linewidth=1.2, label=words)
         words = None
-    axes.plot(band.value.real, band.value.imag, "x", color=DARK, markersize=7, markeredgewidth=1.6, label="pole")
+    axes.plot(band.value.real, band.value.imag, "x", color=DARK, markersize=5, markeredgewidth=1.2, label="pole")
 
 
 def delay_drawing(result: Identification, near: DelayCosts | None, units: Units) -> Drawing:
