@@ -106,3 +106,20 @@ def test_the_other_hold_is_fitted_as_if_it_had_been_given():
     other = best_other_hold(prepared.laid_out, fit, [wrong])
     assert other.hold == "foh"
     assert other.fall == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_band_limited_input_is_named_as_such():
+    """Exact samples of a sum of waves, read as held: the better hold is named, and fits when it is given."""
+    t = 0.2 * np.arange(1500)
+    rng = np.random.default_rng(5)
+    w, phases = 2 * np.pi / 300.0 * np.arange(1, 600), rng.uniform(0, 2 * np.pi, 599)
+    gain = np.exp(-0.5j * w) * 2 / (1j * w + 1)
+    u = np.cos(np.outer(t, w) + phases).sum(axis=1)
+    y = (np.abs(gain) * np.cos(np.outer(t, w) + phases + np.angle(gain))).sum(axis=1)
+    y = y + 0.02 * y.std() * rng.standard_normal(t.size)
+    options = DelayProfile(1, 0, (0, 2), initial_state="estimate")
+    warnings = identify(options, [Record.from_arrays(t, u, y)]).warnings
+    assert any("Taken as band-limited" in warning and "--hold band-limited" in warning for warning in warnings)
+    right = options.fit([Record.from_arrays(t, u, y, "band-limited")])
+    assert right.model.delay == pytest.approx(0.5, abs=0.01)
+    assert right.model.numerator == pytest.approx([2.0], rel=0.02)
