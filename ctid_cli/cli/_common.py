@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar, cast
 
@@ -98,7 +98,7 @@ def answer(as_json: bool, content: Callable[[], object], text: Callable[[], str]
     typer.echo(json.dumps(content(), allow_nan=False) if as_json else text())
 
 
-def write_files(files: Mapping[Path, bytes]) -> None:
+def write_files(files: Mapping[Path, bytes | Iterable[bytes]]) -> None:
     """Write files, and make the folders that they need."""
     for path, content in files.items():
         try:

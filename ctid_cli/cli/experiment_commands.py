@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -119,6 +120,7 @@ def run(
         typer.Option("--time-budget", metavar="TIME", parser=duration, help="Stop after e.g. 90s, 30m or 1h30m."),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and stop.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before a very large run.")] = False,
     out: Out = Path("results"),
     fresh: Fresh = False,
     allow_mixed: AllowMixed = False,
@@ -160,6 +162,9 @@ def run(
             ready = preview(plan, folder, **how)
             typer.echo(json_lines(ready)[0] if as_json else _intention(ready))
         return
+    if not yes:
+        for plan, folder in zip(plans, folders, strict=True):
+            _ask_if_large(plan, folder, jobs, how)
     hopeless, ends = [], None if time_budget is None else time.monotonic() + time_budget
     for plan, folder in zip(plans, folders, strict=True):
         left = None if ends is None else max(ends - time.monotonic(), 0.0)
@@ -181,6 +186,30 @@ def run(
             hopeless.append(f"{plan.experiment}: all {summary.planned} estimates failed")
     if hopeless:
         raise TooManyFailuresError("\n".join(hopeless))
+
+
+def _ask_if_large(plan: Plan, folder: Path, jobs: int | None, how: dict[str, Any]) -> None:
+    """Say what a very large run will take, and ask whether it is meant."""
+    from ctid_cli.running.engine import preview, usable_processors
+    from ctid_cli.running.forecast import LARGE, forecast
+
+    if plan.data_sets * plan.estimates_each <= LARGE:
+        return
+    ready = preview(plan, folder, **how)
+    if ready.estimates <= LARGE:
+        return
+    processes = jobs or usable_processors()
+    found = forecast(ready, processes, fresh=how["fresh"])
+    text = f"{plan.experiment}: {found.estimates} estimates to compute, about {found.bytes / 1e9:.2g} GB of disk"
+    if found.seconds is not None:
+        workers = count(processes, "worker")
+        text += f" and {seconds(found.seconds)} with {workers}, going by the {found.known_from} that are stored"
+    else:
+        text += "; --runs 10 first, and the same command again tells how long it will take"
+    if not sys.stdin.isatty():
+        raise UsageError(f"{text}. If that is meant: --yes")
+    if not typer.confirm(f"{text}. Go on?", err=True):
+        raise typer.Exit(UsageError.exit_code)
 
 
 def _on_dask(plan: Plan, scheduler: str | None, jobs: int | None) -> Callable[[Limits], Executor]:

@@ -21,7 +21,8 @@ def status(
 
     Counts estimates: done, planned, failed, and those that the latest settings set aside.
     """
-    from ctid_cli.reporting.overview import overview_text, status_object, status_text
+    from ctid_cli.reporting.exporting import with_list
+    from ctid_cli.reporting.overview import OF_STATUS, overview_text, status_object, status_text
     from ctid_cli.reporting.results import experiments_in, read_results
     from ctid_cli.running.cell_precision import cell_precisions
     from ctid_cli.storage.store import experiment_status
@@ -39,9 +40,14 @@ def status(
     one = experiment_status(out / experiment)
     # A first run that is still going on has nothing to read yet.
     results = read_results(out, experiment) if one.done else None
-    rows = [] if results is None else results.rows
+    rows = () if results is None else results.rows
     cells = () if results is None else cell_precisions(results.manifest, results.stored.results)
-    answer(as_json, lambda: status_object(one, rows, cells), lambda: status_text(one, rows, out, cells))
+    if as_json:
+        for text in with_list(status_object(one, cells), "estimates", rows):
+            typer.echo(text, nl=False)
+    else:
+        some = rows if results is None else results.rows.only(*OF_STATUS)
+        typer.echo(status_text(one, some, out, cells))
 
 
 @guarded
@@ -145,20 +151,16 @@ def export(
     file: Annotated[Path | None, typer.Option("--file", metavar="FILE", help="Write here, not to stdout.")] = None,
 ) -> None:
     """Write every estimate of an experiment, one row each."""
-    from ctid_cli.reporting.estimate import as_object
+    from ctid_cli.reporting.exporting import csv_lines, json_lines
     from ctid_cli.reporting.results import read_results
-    from ctid_cli.storage.store import load_estimates
-    from ctid_cli.storage.summary import export_rows
 
     results = read_results(out, experiment)
-    if style == "csv":
-        text = str(export_rows(load_estimates(results.folder)).to_csv(index=False, lineterminator="\n"))
-    else:
-        text = json.dumps([as_object(row) for row in results.rows], indent=1, allow_nan=False) + "\n"
+    lines = csv_lines(results.stored) if style == "csv" else json_lines(results.rows)
     if file is None:
-        typer.echo(text, nl=False)
+        for text in lines:
+            typer.echo(text, nl=False)
         return
-    write_files({file: text.encode()})
+    write_files({file: (text.encode() for text in lines)})
     typer.echo(f"{len(results.rows)} estimates written to {file}", err=True)
 
 

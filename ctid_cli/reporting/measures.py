@@ -14,7 +14,6 @@ Keys of a row
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -27,8 +26,8 @@ from ctid_cli.reporting.model_measures import distance_of, distances, pole_estim
 from ctid_cli.reporting.parameter_errors import ParameterEstimates, estimates_by_group, least_variances
 from ctid_cli.reporting.percentages import Row, labelled_groups
 from ctid_cli.reporting.results import Results
-from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.manifest import true_values
+from ctid_cli.storage.stored import Rows
 from ctid_cli.text import did_you_mean, listed
 
 #: Statuses of estimates with which nothing is wrong.
@@ -50,13 +49,16 @@ def measure_rows(results: Results, names: Sequence[str], first: int | None = Non
     groups = results.groups()
     of_errors = any(requested(name).source == "errors" for name in names)
     estimates = {one.group: one for one in estimates_by_group(results)} if of_errors else {}
-    statuses = sorted({row["status"] for row in results.rows} - SUCCESSES) or ["FAILED"]
+    known = {status.decode() for status in set(results.stored.column("status").tolist())}
+    statuses = sorted(known - SUCCESSES) or ["FAILED"]
     bounds = least_variances(results) if any(name.startswith("efficiency") for name in names) else {}
     cells = {cell["hash"]: cell for cell in results.manifest["data_cells"]}
     rows = []
     for group, labels in labelled_groups(results):
-        members = [row for row in groups.get(group, ()) if first is None or row["replicate"] < first]
-        counts = {"n": len(members), "failed": sum(row["status"] in FAILURES for row in members)}
+        members = groups.get(group, results.rows[:0])
+        if first is not None:
+            members = members.chosen(members.column("replicate") < first)
+        counts = {"n": len(members), "failed": int(members.failures.sum())}
         for name in dict.fromkeys(names):
             measure, argument = requested(name), name.partition(":")[2]
             found: Iterable[Found]
@@ -135,16 +137,21 @@ def parameter_unit(name: str, names: Sequence[str]) -> str:
     return Units().of_submodel(name) if re.fullmatch(r"g\d+_[ab]\d+", name) else "-"
 
 
-def _of_estimates(measure: Measure, rows: Sequence[Mapping[str, Any]], statuses: Sequence[str]) -> Iterator[Found]:
+def _of_estimates(measure: Measure, rows: Rows, statuses: Sequence[str]) -> Iterator[Found]:
     """A measure of what an estimate has one of."""
     if measure.source == "status":
-        found = np.array([row["status"] for row in rows])
+        found = rows.column("status")
         for status in statuses:
-            yield status, measure.compute(found == status), measure.unit, 0
+            yield status, measure.compute(found == status.encode()), measure.unit, 0
         return
-    known = [row[measure.source] for row in rows if row.get(measure.source) is not None]
-    values: Array = np.array(known, dtype=bool if measure.source == "converged" else float)
+    values: Array
+    if measure.source == "converged":
+        values = np.zeros(0, dtype=bool) if rows.converged is None else rows.converged  # type: ignore[assignment]
+    else:
+        values = rows.column(measure.source) if rows.has(measure.source) else np.zeros(0)
+        values = values[np.isfinite(values)]
+    lacking = len(rows) - len(values)
     if measure.source == "fresh_fit_percent":
         # Where there is no model, it fits infinitely badly.
-        values = np.append(values, np.full(len(rows) - len(known), -np.inf))
-    yield None, measure.compute(values), measure.unit, len(rows) - len(known)
+        values = np.append(values, np.full(lacking, -np.inf))
+    yield None, measure.compute(values), measure.unit, lacking

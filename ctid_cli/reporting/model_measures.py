@@ -14,6 +14,7 @@ from ctid_cli.models.distances import h2_distance, hinf_distance, response_dista
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
 from ctid_cli.reporting.parameter_errors import ParameterEstimates
+from ctid_cli.storage.stored import Rows
 
 Distance = Callable[[TransferFunction, TransferFunction], float]
 
@@ -40,18 +41,17 @@ def distance_of(name: str, argument: str) -> Distance:
     return {"h2": h2_distance, "hinf": hinf_distance}[name]
 
 
-def distances(system: TransferFunction, rows: Sequence[Mapping[str, Any]], distance: Distance) -> Array:
+def distances(system: TransferFunction, rows: Rows, distance: Distance) -> Array:
     """Distances of the estimates [%]; where there is no model, it is infinitely far."""
-    return np.array([100.0 * distance(system, _model(row)) if row["denominator"] else np.inf for row in rows])
+    models = rows.only("numerator", "denominator", "delay")
+    return np.array([100.0 * distance(system, _model(row)) if row["denominator"] else np.inf for row in models])
 
 
 def _model(row: Mapping[str, Any]) -> TransferFunction:
     return TransferFunction(row["numerator"], row["denominator"], max(row["delay"] or 0.0, 0.0))
 
 
-def pole_estimates(
-    estimates: ParameterEstimates, system: TransferFunction, rows: Sequence[Mapping[str, Any]]
-) -> ParameterEstimates:
+def pole_estimates(estimates: ParameterEstimates, system: TransferFunction, rows: Rows) -> ParameterEstimates:
     """Poles in the place of parameters, each with the true one that it goes with [rad/s].
 
     ``pole_1`` ..., fastest first; of two complex ones ``pole_1_real`` and ``pole_1_imag``. Of a model with another
@@ -62,7 +62,7 @@ def pole_estimates(
     names: list[str] = []
     for number, k in enumerate(upper, start=1):
         names += [f"pole_{number}_real", f"pole_{number}_imag"] if true[k].imag else [f"pole_{number}"]
-    values = np.array([_numbers(_matched(true, row["denominator"]), true, upper) for row in rows])
+    values = np.array([_numbers(_matched(true, a), true, upper) for a in rows.values("denominator")])
     return replace(
         estimates,
         names=tuple(names),

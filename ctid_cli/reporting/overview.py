@@ -6,7 +6,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ctid_cli.reporting.estimate import as_object
 from ctid_cli.reporting.layout import Table, number, picked, rate
 from ctid_cli.reporting.precision_words import precision_table
 from ctid_cli.reporting.results import out_option
@@ -16,21 +15,19 @@ from ctid_cli.storage.store import ExperimentStatus
 
 #: Failed estimates that the text lists.
 LISTED = 10
+#: Columns that the text says something of.
+OF_STATUS = ("id", "estimator", "replicate", "start", "status", "message")
 
 
 def status_object(
     status: ExperimentStatus,
-    estimates: Sequence[Mapping[str, Any]] | None = None,
     precision: Sequence[CellPrecision] = (),
 ) -> dict[str, Any]:
-    """Progress of an experiment for ``ctid status --json``."""
+    """Progress of an experiment for ``ctid status --json``, without its estimates."""
     content = asdict(status) | {"folder": str(status.folder), "todo": status.todo}
     before, after = ("estimator", "cell"), ("planned", "done", "todo", "failed")
     content["groups"] = [{**picked(group, before), **group.swept, **picked(group, after)} for group in status.groups]
-    if estimates is None:
-        return content
-    cells = {"precision": [asdict(cell) for cell in precision]} if precision else {}
-    return content | cells | {"estimates": [as_object(row) for row in estimates]}
+    return content | ({"precision": [asdict(cell) for cell in precision]} if precision else {})
 
 
 def overview_text(found: Sequence[ExperimentStatus]) -> str:
@@ -76,13 +73,20 @@ def status_text(
 
 def _outcomes(estimates: Sequence[Mapping[str, Any]]) -> list[str]:
     """How often each status came, and the first failures."""
-    outcomes = Counter((str(row["status"]), sentence_of(row)) for row in estimates).most_common()
-    lines = [f"{n} {name}" + ("" if name in FAILURES else f": {text}") for (name, text), n in outcomes]
-    failures = [row for row in estimates if row["status"] in FAILURES]
-    for row in failures[:LISTED]:
+    outcomes: Counter[tuple[str, str]] = Counter()
+    failures: list[Mapping[str, Any]] = []
+    failed = 0
+    for row in estimates:
+        outcomes[str(row["status"]), sentence_of(row)] += 1
+        if row["status"] in FAILURES:
+            failed += 1
+            if len(failures) < LISTED:
+                failures.append(row)
+    lines = [f"{n} {name}" + ("" if name in FAILURES else f": {text}") for (name, text), n in outcomes.most_common()]
+    for row in failures:
         place = f"{row['estimator']}, replicate {row['replicate']}, start {row['start']}"
         lines.append(f"  {row['id']}  {place}: {sentence_of(row)}")
-    return [*lines, f"  and {len(failures) - LISTED} more"] if len(failures) > LISTED else lines
+    return [*lines, f"  and {failed - LISTED} more"] if failed > LISTED else lines
 
 
 def sentence_of(row: Mapping[str, Any]) -> str:

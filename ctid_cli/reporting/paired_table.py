@@ -10,7 +10,7 @@ Keys of a row
   the first on those where only the second does.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +25,8 @@ from ctid_cli.reporting.percentages import Row, labelled_groups, settings_of
 from ctid_cli.reporting.results import Group, Results, out_option
 from ctid_cli.reporting.table_blocks import setting_text, setting_title
 from ctid_cli.reporting.tables import notes_of
-from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.manifest import true_values
+from ctid_cli.storage.stored import Rows
 from ctid_cli.text import did_you_mean
 
 #: Fewer common data sets than these say nothing.
@@ -66,7 +66,7 @@ def compare_estimators(results: Results, names: str, out: Path) -> Report:
 
 def paired_rows(results: Results, first: str, second: str) -> list[Row]:
     """Differences of two estimators of an experiment."""
-    members = {group: {row["replicate"]: row for row in rows} for group, rows in results.groups().items()}
+    members = results.groups()
     simulated = any(map(true_values, results.manifest["data_cells"]))
     estimates = {one.group: one for one in estimates_by_group(results)} if simulated else {}
     labels = {group: row for group, row in labelled_groups(results) if group in members}
@@ -82,7 +82,8 @@ def paired_rows(results: Results, first: str, second: str) -> list[Row]:
             shared = labels[other if one.start == "none" else one]
             shared = {key: value for key, value in shared.items() if key not in ("method", *options)}
             shared |= {"first": _named(one, options), "second": _named(other, options)}
-            found = [*_percentages(members[one], members[other]), *_times(members[one], members[other])]
+            common = _common(members[one], members[other])
+            found = [*_percentages(*common), *_times(*common)]
             if one in estimates:
                 found[1:1] = _errors(estimates[one], estimates[other])
             rows += [shared | row for row in found]
@@ -99,23 +100,25 @@ def _named(group: Group, options: Sequence[str]) -> str:
     return ", ".join([group.estimator, *(f"{key} {number(value)}" for key, value in own if value is not None)])
 
 
-def _percentages(one: Mapping[int, Row], other: Mapping[int, Row]) -> Iterator[Row]:
+def _common(one: Rows, other: Rows) -> tuple[Rows, Rows]:
+    """The estimates of both on the data sets that both have, by replicate."""
+    sides = (one.column("replicate"), other.column("replicate"))
+    _, *places = np.intersect1d(*sides, return_indices=True)
+    return one.chosen(places[0]), other.chosen(places[1])
+
+
+def _percentages(one: Rows, other: Rows) -> Iterator[Row]:
     """How often each succeeds; without a rule an estimate succeeds that does not fail."""
-    common = sorted(one.keys() & other.keys())
-    if len(common) < FEWEST:
+    if len(one) < FEWEST:
         return
-    hits = np.array([[_succeeds(side[k]) for side in (one, other)] for k in common])
-    only_first, only_second = hits[:, 0] & ~hits[:, 1], ~hits[:, 0] & hits[:, 1]
+    hits = [~side.failures if side.converged is None else side.converged for side in (one, other)]
+    only_first, only_second = hits[0] & ~hits[1], ~hits[0] & hits[1]
     counts = int(only_first.sum()), int(only_second.sum())
     yield {
-        **_row("percent", None, "%", len(common), percent_difference(*counts, len(common))),
+        **_row("percent", None, "%", len(one), percent_difference(*counts, len(one))),
         **dict(zip(("only_first", "only_second"), counts, strict=True)),
-        "failed_ids": [one[k]["id"] for k, lost in zip(common, only_second, strict=True) if lost],
+        "failed_ids": one.chosen(only_second).values("id"),
     }
-
-
-def _succeeds(row: Row) -> bool:
-    return row["status"] not in FAILURES if row["converged"] is None else bool(row["converged"])
 
 
 def _errors(one: ParameterEstimates, other: ParameterEstimates) -> Iterator[Row]:
@@ -135,12 +138,12 @@ def _errors(one: ParameterEstimates, other: ParameterEstimates) -> Iterator[Row]
             yield _row("rmse", name, parameter_unit(name, one.names), errors.shape[1], difference)
 
 
-def _times(one: Mapping[int, Row], other: Mapping[int, Row]) -> Iterator[Row]:
+def _times(one: Rows, other: Rows) -> Iterator[Row]:
     """Median processor times."""
-    pairs = [(one[k].get("cpu_seconds"), other[k].get("cpu_seconds")) for k in sorted(one.keys() & other.keys())]
-    known = np.array([pair for pair in pairs if None not in pair], dtype=float).reshape(-1, 2)
-    if len(known) >= FEWEST:
-        yield _row("cpu", None, "s", len(known), bootstrap_difference(_median, *known.T))
+    known = np.array([side.column("cpu_seconds") for side in (one, other)])
+    known = known[:, np.isfinite(known).all(axis=0)]
+    if known.shape[1] >= FEWEST:
+        yield _row("cpu", None, "s", known.shape[1], bootstrap_difference(_median, *known))
 
 
 def _root_of_mean(squares: Array) -> Array:

@@ -37,13 +37,11 @@ from ctid_cli.running.cells import Plan
 from ctid_cli.running.plan import build_plan
 from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.specification.load import spec_from_canonical
-from ctid_cli.storage.columns import FAILURES
-from ctid_cli.storage.manifest import found_values, true_values
+from ctid_cli.storage.manifest import true_values
+from ctid_cli.storage.stored import Rows
 
 #: Errors of one parameter over the data sets of one cell.
 ParameterErrors = SimpleNamespace
-#: Estimated values and standard errors of one estimate by name.
-Pair = tuple[dict[str, float | None], dict[str, float | None]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,40 +207,43 @@ def estimates_by_group(results: Results) -> list[ParameterEstimates]:
     groups = results.groups()
     cells = {cell["hash"]: cell for cell in results.manifest["data_cells"]}
     truths = {name: true_values(cell) for name, cell in cells.items()}
-    found = {group: [found_values(row, truths[group.cell]) for row in rows] for group, rows in groups.items()}
-    pooled: dict[tuple[Any, ...], list[Pair]] = {}
-    for group, pairs in found.items():
-        pooled.setdefault((group.estimator, group.options), []).extend(pairs)
-    given = {part for part, pairs in pooled.items() if _is_given(pairs)}
+    found = {group: rows.found(tuple(truths[group.cell])) for group, rows in groups.items()}
+    delays: dict[tuple[Any, ...], list[Array]] = {}
+    for group, (values, errors) in found.items():
+        names = list(truths[group.cell])
+        if "delay" in names:
+            k = names.index("delay")
+            delays.setdefault((group.estimator, group.options), []).append(np.array([values[:, k], errors[:, k]]))
+    given = {part for part, parts in delays.items() if _is_given(np.hstack(parts))}
     estimates = []
     for group, rows in groups.items():
-        true = dict(truths[group.cell])
-        if (group.estimator, group.options) in given:
-            true.pop("delay", None)
-        estimates.append(_estimates(results, cells[group.cell], group, rows, true, found[group]))
+        true = truths[group.cell]
+        kept = [name != "delay" or (group.estimator, group.options) not in given for name in true]
+        known = {name: value for (name, value), keep in zip(true.items(), kept, strict=True) if keep}
+        values, errors = (side[:, kept] for side in found.pop(group))
+        estimates.append(_estimates(results, cells[group.cell], group, rows, known, values, errors))
     return estimates
 
 
-def _is_given(pairs: list[Pair]) -> bool:
-    """Whether a delay is no estimate: the same in all data sets, and without a standard error."""
-    delays = {values.get("delay") for values, _ in pairs} - {None}
-    return len(delays) <= 1 and all(errors.get("delay") is None for _, errors in pairs)
+def _is_given(delays: Array) -> bool:
+    """Whether a delay is no estimate: the same in all data sets, and without a standard error, shape (2, n)."""
+    values, errors = delays
+    known = values[np.isfinite(values)]
+    return bool(np.isnan(errors).all() and (known == known[:1]).all())
 
 
 def _estimates(
     results: Results,
     cell: Mapping[str, Any],
     group: Group,
-    rows: list[Any],
+    rows: Rows,
     true: Mapping[str, float],
-    pairs: list[Pair],
+    values: Array,
+    errors: Array,
 ) -> ParameterEstimates:
     """What an estimator found in a data cell."""
-    values, errors = (
-        np.array([[side[name] for name in true] for side in sides], dtype=float) for sides in zip(*pairs, strict=True)
-    )
     values[~monte_carlo.complete(values)] = np.nan
-    failures = np.array([row["status"] in FAILURES for row in rows])
+    failures = rows.failures
     options = dict(zip(results.swept("estimators"), group.options, strict=True))
     swept = {name: value for name, value in cell["swept"].items() if name != "samples"}
     return ParameterEstimates(
@@ -255,8 +256,8 @@ def _estimates(
         values=values,
         standard_errors=errors,
         failures=failures,
-        unconverged=np.array([row["status"] != "CONVERGED" for row in rows]) & ~failures,
-        replicates=tuple(row["replicate"] for row in rows),
+        unconverged=(rows.column("status") != b"CONVERGED") & ~failures,
+        replicates=tuple(rows.column("replicate").tolist()),
     )
 
 

@@ -23,6 +23,8 @@ from ctid_cli.reporting.study import Place, Study, StudyTable
 from ctid_cli.simulation.frequency_measures import base_name, measure_names
 from ctid_cli.storage.columns import reserved_names
 from ctid_cli.storage.manifest import is_of_signal
+from ctid_cli.storage.packing import CLOCKS
+from ctid_cli.storage.summary import counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -86,15 +88,14 @@ def experiment_rows(
     results: Results, table: int | str | None = None, fields: Mapping[str, str] | None = None
 ) -> list[Row]:
     """Cells of one experiment."""
-    across = results.swept("estimators")
-    counted = {
-        Group(row.pop("cell"), row.pop("estimator"), tuple(map(row.pop, across)), row.pop("start")): row
-        for row in results.summaries(["cell", "estimator", *across, "start"])
+    counts = {
+        group: counted(rows.failures, rows.converged, {clock: rows.column(clock) for clock in CLOCKS})
+        for group, rows in results.groups().items()
     }
     measured = _measured(results)
     lacking = dict.fromkeys(itertools.chain(*measured.values()))
     return [
-        labels | NOTHING | counted.get(group, {}) | measured.get(group, lacking)
+        labels | NOTHING | counts.get(group, {}) | measured.get(group, lacking)
         for group, labels in labelled_groups(results, table, fields)
     ]
 
@@ -177,7 +178,7 @@ def _measured(results: Results) -> dict[Group, dict[str, float | None]]:
 
     if not is_of_signal(results.manifest):
         return {}
-    groups = {group: [row["measures"] or {} for row in rows] for group, rows in results.groups().items()}
+    groups = {group: [one or {} for one in rows.values("measures")] for group, rows in results.groups().items()}
     names = measure_names(one for rows in groups.values() for one in rows)
     return {group: _together(pd.DataFrame(rows, columns=names).astype(float)) for group, rows in groups.items()}
 

@@ -2,18 +2,20 @@
 
 import json
 import shlex
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from ctid_cli.arrays import IndexArray
 from ctid_cli.errors import UsageError
-from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.folder import experiment_folders
 from ctid_cli.storage.manifest import Manifest
-from ctid_cli.storage.store import Stored, read_stored
-from ctid_cli.storage.summary import summarise
+from ctid_cli.storage.store import read_stored
+from ctid_cli.storage.stored import Rows, Stored
 from ctid_cli.text import did_you_mean
 
 
@@ -51,14 +53,14 @@ class Results:
         return spec
 
     @cached_property
-    def rows(self) -> list[dict[str, Any]]:
-        """Stored estimates of the plan."""
-        return self.stored.rows()
+    def rows(self) -> Rows:
+        """Stored estimates of the plan, made when they are asked for."""
+        return self.stored.every()
 
     @property
     def failed(self) -> int:
         """How many estimates ended in an error."""
-        return sum(row["status"] in FAILURES for row in self.rows)
+        return int(self.stored.failures().sum())
 
     @property
     def sampling(self) -> str | None:
@@ -70,28 +72,22 @@ class Results:
         """Names of the fields swept over ``data_cells`` or ``estimators``."""
         return list(dict.fromkeys(name for item in self.manifest[part] for name in item["swept"]))
 
-    def groups(self) -> dict[Group, list[dict[str, Any]]]:
+    def groups(self) -> dict[Group, Rows]:
         """Stored estimates by data cell, estimator and start."""
         return self._groups
 
     @cached_property
-    def _groups(self) -> dict[Group, list[dict[str, Any]]]:
-        across = self.swept("estimators")
-        found: dict[Group, list[dict[str, Any]]] = {}
-        for row in self.rows:
-            group = Group(row["cell"], row["estimator"], tuple(row.get(name) for name in across), row["start"])
-            found.setdefault(group, []).append(row)
-        return found
-
-    def summaries(self, by: Sequence[str]) -> list[dict[str, Any]]:
-        """Counts and percentages in groups, as plain Python."""
-        import pandas as pd
-
-        frame = pd.DataFrame(self.rows, columns=[*by, "status", "converged", "seconds", "cpu_seconds"])
-        types = {"converged": "boolean", "seconds": "float64", "cpu_seconds": "float64"}
-        counted = summarise(frame.astype(types), by).astype(object)
-        found: list[Any] = counted.where(counted.notna(), None).to_dict("records")
-        return found
+    def _groups(self) -> dict[Group, Rows]:
+        across, starts = self.swept("estimators"), self.stored.column("start")
+        found: dict[Group, list[IndexArray]] = {}
+        for block in self.stored.blocks:
+            options = tuple(block.estimator["swept"].get(name) for name in across)
+            own = starts[block.first : block.last]
+            first = {start: int(np.argmax(own == start)) for start in set(own.tolist())}
+            for start in sorted(first, key=lambda start: first[start]):
+                group = Group(block.cell["hash"], block.estimator["name"], options, start.decode())
+                found.setdefault(group, []).append(np.flatnonzero(own == start) + block.first)
+        return {group: Rows(self.stored, np.concatenate(places)) for group, places in found.items()}
 
 
 def out_option(out: Path) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ctid_cli.inference.precision import Replications, Until, decide
 from ctid_cli.running.cells import Plan
-from ctid_cli.storage.journal import Journal
+from ctid_cli.storage.journal_reader import JournalReader
 from ctid_cli.storage.manifest import Key, Manifest, found_values, true_values
 from ctid_cli.storage.summary import is_converged
 
@@ -59,14 +59,14 @@ def cell_precisions(manifest: Manifest, found: Found) -> tuple[CellPrecision, ..
     return () if section is None else tuple(_cell(manifest, cell, section, found) for cell in manifest["data_cells"])
 
 
-def stored_precisions(manifest: Manifest, log: Journal) -> tuple[CellPrecision, ...]:
+def stored_precisions(manifest: Manifest, log: JournalReader) -> tuple[CellPrecision, ...]:
     """The same from what a journal holds."""
     if _asked(manifest) is None:
         return ()
     return cell_precisions(manifest, {key: entry.result for key, entry in log.entries().items()})
 
 
-def as_needed(plan: Plan, log: Journal) -> Plan:
+def as_needed(plan: Plan, log: JournalReader) -> Plan:
     """The plan with as many data sets as are known to be needed."""
     cells = stored_precisions(plan.manifest(), log)
     return plan.with_replicates([cell.needed for cell in cells]) if cells else plan

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 from ctid_cli.storage.manifest import Key, Manifest
 
@@ -28,6 +28,34 @@ class DataCell:
     def dataset(self, replicate: int) -> Any:
         """One data set."""
         return self.source.dataset(replicate)
+
+
+class DataCells(Sequence[DataCell]):
+    """The data cells of a plan; very many of them are made when they are asked for."""
+
+    #: So many are made at once, so that what is wrong with any of them is said at once.
+    FEW = 1000
+
+    def __init__(self, count: int, make: Callable[[int], DataCell]) -> None:
+        self._make = make
+        self._made: list[DataCell | None] = [None] * count
+        for number in range(count if count <= self.FEW else 1):
+            self._made[number] = make(number)
+
+    def __len__(self) -> int:
+        return len(self._made)
+
+    @overload
+    def __getitem__(self, item: int) -> DataCell: ...
+    @overload
+    def __getitem__(self, item: slice) -> list[DataCell]: ...
+    def __getitem__(self, item: int | slice) -> DataCell | list[DataCell]:
+        if isinstance(item, slice):
+            return [self[k] for k in range(*item.indices(len(self)))]
+        found = self._made[item]
+        if found is None:
+            found = self._made[item] = self._make(item % len(self))
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +83,7 @@ class Plan:
     """All data sets and estimates of an experiment."""
 
     spec: Spec
-    data_cells: tuple[DataCell, ...]
+    data_cells: Sequence[DataCell]
     estimators: tuple[EstimatorCell, ...]
     starts: tuple[StartPoint, ...]
     #: Number of data sets of each data cell.

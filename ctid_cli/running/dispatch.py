@@ -66,7 +66,7 @@ class Unable:
 Event = Computed | Died | GivenUp | Slow | Unable | None
 
 
-def run_jobs(jobs: Sequence[Job], executor: Executor, stopping: Callable[[], bool]) -> Iterator[Event]:
+def run_jobs(jobs: Iterable[Job], executor: Executor, stopping: Callable[[], bool]) -> Iterator[Event]:
     """Run jobs; None comes now and then."""
     return _Dispatch(jobs, executor, stopping).run()
 
@@ -90,7 +90,7 @@ class _Work:
 
 
 class _Dispatch:
-    def __init__(self, jobs: Sequence[Job], executor: Executor, stopping: Callable[[], bool]) -> None:
+    def __init__(self, jobs: Iterable[Job], executor: Executor, stopping: Callable[[], bool]) -> None:
         self._executor, self._stopping = executor, stopping
         self._waiting = JobQueue(jobs)
         #: What is left of lost jobs; single estimates to be tried alone, and when all else is done.

@@ -6,6 +6,7 @@ estimate is reported as done after the journal has it safely.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -14,7 +15,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,11 +33,14 @@ from ctid_cli.running.own_check import check_components
 from ctid_cli.running.pool import LokyPool
 from ctid_cli.running.retry import Stock, take_stock
 from ctid_cli.running.stopping import MACHINE, TOO_MANY_FAILURES, StopAt, StopRequest
+from ctid_cli.running.todo import Todo
 from ctid_cli.storage import folder as place
-from ctid_cli.storage import journal
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.identity import Origin, are_mixed
-from ctid_cli.storage.manifest import Key, Outcome, Slot, assemble, slots
+from ctid_cli.storage.journal import Journal, open_journal
+from ctid_cli.storage.journal_reader import FILE_NAME
+from ctid_cli.storage.manifest import Key, Outcome, Slot, assemble
+from ctid_cli.storage.planned import PlannedKeys
 from ctid_cli.storage.provenance import canonical_text, now, session_info
 from ctid_cli.storage.store import seal
 
@@ -125,8 +129,8 @@ def run_experiment(
         raise UsageError("limits.cpu_seconds and limits.memory_mb need Linux; use wall_seconds, which works everywhere")
     with StopRequest(stop) as stopping, ExitStack() as stack:
         begun_with, stock = _look(plan, folder, origins, retry, fresh=fresh, allow_mixed=allow_mixed)
-        todo = _jobs(begun_with, stock.kept)
-        if todo:
+        todo = Todo(begun_with, stock)
+        if todo.data_sets:
             on_event(events.KernelsCompiling())
             on_event(events.KernelsCompiled(warm() if warm else _compile_kernels(plan)))
             if not check_components(plan, limits, stopping, lambda text: on_event(events.Warned(text))):
@@ -138,7 +142,7 @@ def run_experiment(
         # Another run may have come between.
         place.check_free(folder, plan.manifest(), origins, allow_mixed=allow_mixed)
         with place.saying_what_is_safe(folder):
-            log = journal.open_journal(folder / journal.FILE_NAME)
+            log = open_journal(folder / FILE_NAME)
         stack.callback(log.close)
         workers = jobs or usable_processors()
         computing = executor(limits) if executor else LokyPool(workers, limits)
@@ -167,7 +171,7 @@ class _Run:
         self,
         plan: Plan,
         folder: Path,
-        log: journal.Journal,
+        log: Journal,
         stock: Stock,
         origins: Mapping[str, Origin],
         on_event: events.OnEvent,
@@ -175,8 +179,8 @@ class _Run:
     ) -> None:
         self.plan, self.folder, self.log, self.origins = plan, folder, log, origins
         self.on_event, self.executor = on_event, executor
-        #: What was stored when the run began, and what of it is still to be computed again.
-        self.stock, self.again = stock, set(stock.again)
+        #: What is stored, which grows.
+        self.stock = stock
         self.computed = self.done = self.total = self.failures = self.given_up = 0
         self.hindrance = ""
         self.culprits: tuple[str, ...] = ()
@@ -187,12 +191,18 @@ class _Run:
     def _lay_out(self) -> None:
         """Where the estimates of the plan belong, and what there is to compute."""
         self.manifest = self.plan.manifest()
-        self.slots: dict[Key, list[Slot]] = defaultdict(list)
-        for slot in slots(self.manifest):
-            self.slots[slot.key].append(slot)
-        self.ready = _ready(self.plan, self.folder, self.stock)
-        self.jobs = _jobs(self.plan, self.log.keys() - self.again)
-        self.total += len(self.jobs)
+        self.planned = PlannedKeys(self.manifest)
+        self.cells: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
+        self.estimators: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
+        for parts, known in ((self.manifest["data_cells"], self.cells), (self.manifest["estimators"], self.estimators)):
+            for part in parts:
+                known[part["hash"]].append(part)
+        ready = _ready(self.plan, self.folder, self.stock)
+        # What this run has computed by now was not there when it began.
+        estimates, reused = ready.estimates + self.computed, ready.reused - self.computed
+        self.ready = replace(ready, estimates=estimates, reused=reused)
+        self.todo = Todo(self.plan, self.stock)
+        self.total += self.todo.data_sets
 
     def start(self, circumstances: dict[str, Any]) -> None:
         spec = self.plan.spec
@@ -220,12 +230,12 @@ class _Run:
         return True
 
     def compute(self, stopping: StopRequest) -> None:
-        self.unfinished = {(job.cell.hash, job.replicate): len(job.wanted) for job in self.jobs}
+        self.unfinished: dict[tuple[str, int], int] = {}
         batch: list[Outcome] = []
         since = time.monotonic()
         told = False
         try:
-            for item in run_jobs(self.jobs, self.executor, stopping):
+            for item in run_jobs(self._handed_out(), self.executor, stopping):
                 if stopping() and not told:
                     told = True
                     self.on_event(events.Stopping(stopping.reason or ""))
@@ -247,6 +257,18 @@ class _Run:
             self.executor.stop()
             raise
 
+    def _handed_out(self) -> Iterator[Job]:
+        for job in self.todo.jobs():
+            self.unfinished[job.cell.hash, job.replicate] = len(job.wanted)
+            yield job
+
+    def _slots(self, key: Key) -> Iterator[Slot]:
+        """Where an estimate belongs: two names of the same estimator share it."""
+        for estimator in self.estimators[key.estimator_hash]:
+            for cell in self.cells[key.data_hash]:
+                if key.start in estimator["starts"] and key.replicate < cell["replicates"]:
+                    yield Slot(key, cell, estimator)
+
     def _note(self, item: Died | GivenUp | Slow | Unable, stopping: StopRequest) -> None:
         """Take note of what is not a result."""
         match item:
@@ -265,21 +287,24 @@ class _Run:
                 stopping.ask(MACHINE)
 
     def _name(self, key: Key) -> str:
-        return str(self.slots[key][0].estimator["name"])
+        return str(next(self._slots(key)).estimator["name"])
 
     def _commit(self, batch: Sequence[Outcome]) -> None:
         self.log.add(batch, self.session)
-        self.again.difference_update(outcome.key for outcome in batch)
+        for outcome in batch:
+            self.stock.note(outcome.key, outcome.result["status"])
         self.failures += sum(outcome.result["status"] in FAILURES for outcome in batch)
         for data_set, found in groupby(batch, key=lambda outcome: outcome.key[:2]):
             outcomes = list(found)
             self.unfinished[data_set] -= len(outcomes)
-            self.done += self.unfinished[data_set] == 0
+            if not self.unfinished[data_set]:
+                del self.unfinished[data_set]
+                self.done += 1
             self.computed += len(outcomes)
             rows = tuple(
                 assemble(slot, self.manifest, outcome.result, outcome.seconds, outcome.cpu_seconds)
                 for outcome in outcomes
-                for slot in self.slots[outcome.key]
+                for slot in self._slots(outcome.key)
             )
             self.on_event(events.EstimatesDone(self.done, self.total, rows))
         self._announce()
@@ -289,13 +314,17 @@ class _Run:
 
     def finish(self, reason: str | None, moved: Path | None, begun: float) -> RunSummary:
         self.on_event(events.Sealed(self.folder / place.SEALED, *seal(self.folder, self.log)))
-        statuses = self.log.statuses()
-        failed = sum(statuses.get(key) in FAILURES for key in self.slots)
+        failed = self.planned.count_in(self.stock.failed)
         missing = self.ready.estimates - self.computed
         reason = reason or (MACHINE if self.given_up else None)
         stopped, ended = now(), "finished" if not missing else reason or "unfinished"
         self.log.end(self.session, stopped, ended)
-        counts = {"planned": len(self.slots), "reused": self.ready.reused, "computed": self.computed, "failed": failed}
+        counts = {
+            "planned": len(self.planned),
+            "reused": self.ready.reused,
+            "computed": self.computed,
+            "failed": failed,
+        }
         about = {"session": self.session, "started": self.started, "stopped": stopped, "reason": ended, **counts}
         text = json.dumps(about | self.info, indent=2, ensure_ascii=False) + "\n"
         name = f"{place.PROVENANCE}/{self.session:04d}-{self.started.replace(':', '').replace('-', '')}.json"
@@ -325,7 +354,7 @@ def preview(
 ) -> events.PlanReady:
     """What a run would do, without doing or writing anything."""
     needed, stock = _look(plan, folder, current_origins(plan), retry, fresh=fresh, allow_mixed=allow_mixed)
-    if stock.keys:
+    if len(stock.keys):
         return _ready(needed, folder, stock)
     # Of a million data sets, counting is quicker than naming.
     counts = (needed.data_sets, needed.data_sets * needed.distinct_each, 0, 0)
@@ -334,10 +363,11 @@ def preview(
 
 def _ready(plan: Plan, folder: Path, stock: Stock) -> events.PlanReady:
     """What there is to do, in numbers."""
-    planned = {slot.key for slot in slots(plan.manifest())}
-    reused = len(planned & stock.kept)
-    counts = (len(_jobs(plan, stock.kept)), len(planned) - reused, reused, len(stock.keys - planned))
-    again, at_most = len(planned & stock.again), _monte_carlo(plan).get("at_most")
+    planned = PlannedKeys(plan.manifest())
+    stored, again = planned.count_in(stock.keys), planned.count_in(stock.again)
+    reused = stored - again
+    counts = (Todo(plan, stock).data_sets, len(planned) - reused, reused, len(stock.keys) - stored)
+    at_most = _monte_carlo(plan).get("at_most")
     return events.PlanReady(plan.experiment, folder, *counts, at_most=at_most, again=again)
 
 
@@ -361,34 +391,16 @@ def _look(
             return as_needed(plan, log), take_stock(log, retry, Limits.of(plan.spec.canonical()))
 
 
-def _jobs(plan: Plan, stored: Collection[Key]) -> list[Job]:
-    """The data sets of which estimates are missing, in the order of the plan."""
-    seed = _monte_carlo(plan).get("seed")
-    terms = plan.terms
-    jobs = []
-    for task in plan.tasks():
-        wanted = {}
-        for key, estimator, start in plan.keys(task):
-            # Two names for the same estimator share their estimates.
-            if key not in stored and key not in wanted:
-                wanted[key] = (key, estimator, start)
-        if wanted:
-            jobs.append(Job(plan.data_cells[task.cell], task.replicate, seed, tuple(wanted.values()), terms))
-    return jobs
-
-
 def _monte_carlo(plan: Plan) -> dict[str, Any]:
     return plan.spec.canonical().get("monte_carlo") or {}
 
 
-def _check_first_records(jobs: list[Job]) -> None:
+def _check_first_records(todo: Todo) -> None:
     """Refuse a plan whose first data sets no estimator can use, before anything is written.
 
     One record in a thousand that cannot be used is a result; the very first one is a mistake in the specification.
     """
-    for job in jobs:
-        if job.replicate:
-            continue
+    for job in itertools.takewhile(lambda job: not job.replicate, todo.jobs()):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")

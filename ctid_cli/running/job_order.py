@@ -1,7 +1,6 @@
 """In which order the data sets of a run are computed, so that no worker is left waiting at its end."""
 
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import groupby
 
@@ -17,21 +16,22 @@ class JobQueue:
     estimators, which are spread more evenly than whole data sets.
     """
 
-    def __init__(self, jobs: Sequence[Job]) -> None:
-        self._rounds = deque(list(group) for _, group in groupby(jobs, key=lambda job: job.replicate))
+    def __init__(self, jobs: Iterable[Job]) -> None:
+        self._rounds = (list(group) for _, group in groupby(jobs, key=lambda job: job.replicate))
         self._seconds: dict[tuple[str, str], float] = {}
+        #: The jobs of the present replicate and of the next one; those of others are not made yet.
+        self._round, self._next = next(self._rounds, []), next(self._rounds, [])
         self._split_last()
 
     def __bool__(self) -> bool:
-        return bool(self._rounds)
+        return bool(self._round)
 
     def pop(self) -> Job:
         """The next job."""
-        first = self._rounds[0]
-        job = max(first, key=self._expected)
-        first.remove(job)
-        if not first:
-            self._rounds.popleft()
+        job = max(self._round, key=self._expected)
+        self._round.remove(job)
+        if not self._round:
+            self._round, self._next = self._next, next(self._rounds, [])
             self._split_last()
         return job
 
@@ -44,9 +44,9 @@ class JobQueue:
         return sum(self._seconds.get((key.data_hash, key.estimator_hash), float("inf")) for key, _, _ in job.wanted)
 
     def _split_last(self) -> None:
-        if len(self._rounds) == 1:
-            self._rounds[0] = [
+        if not self._next:
+            self._round = [
                 replace(job, wanted=tuple(wanted))
-                for job in self._rounds[0]
+                for job in self._round
                 for _, wanted in groupby(job.wanted, key=lambda one: one[0].estimator_hash)
             ]

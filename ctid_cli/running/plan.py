@@ -1,7 +1,6 @@
 """From a specification to the data sets and estimates that it asks for."""
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import UsageError
 from ctid_cli.kinds import KINDS
-from ctid_cli.running.cells import DataCell, EstimatorCell, Plan, starts_of
+from ctid_cli.running.cells import DataCell, DataCells, EstimatorCell, Plan, starts_of
 from ctid_cli.signals.recorder import Recorder
 from ctid_cli.simulation.dataset import SimulatedSource, Source, located
 from ctid_cli.simulation.frequency_measures import Measuring
@@ -53,12 +52,17 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
     return Plan(spec, _data_cells(spec, parts, names), estimators, starts, (first,) * cells, spec_hash)
 
 
-def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[KeyPath, str]) -> tuple[DataCell, ...]:
+def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[KeyPath, str]) -> DataCells:
     seed = None if spec.monte_carlo is None else spec.monte_carlo.seed
     # Absolute, because worker processes may have been started in another working directory.
     folder = spec.folder.resolve()
-    cells = []
-    for point in itertools.product(*parts.values()):
+    ways = [list(found) for found in parts.values()]
+
+    def make(number: int) -> DataCell:
+        point: list[Variant] = []
+        for found in reversed(ways):
+            number, k = divmod(number, len(found))
+            point.insert(0, found[k])
         chosen = dict(zip(parts, point, strict=True))
         options = {name: variant.options for name, variant in chosen.items()}
         content: dict[str, Any] = {name: _without_place(variant.values) for name, variant in chosen.items()}
@@ -87,8 +91,9 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
             # Any seed will do where nothing is random.
             source = _simulated_source(options, seed or 0, folder, fresh=fresh)
         swept = {names[name, *path]: value for name, v in chosen.items() for path, value in v.swept.items()}
-        cells.append(DataCell(content, content_hash(content), swept, source))
-    return tuple(cells)
+        return DataCell(content, content_hash(content), swept, source)
+
+    return DataCells(math.prod(map(len, ways)), make)
 
 
 def _simulated_source(options: Mapping[str, Any], seed: int, folder: Path, *, fresh: bool) -> SimulatedSource:

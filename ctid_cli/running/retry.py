@@ -1,35 +1,46 @@
-"""Which stored failures are computed once more."""
+"""Which stored estimates stay as they are, and which failures are computed once more."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Container
+from dataclasses import dataclass, field
 
 from ctid_cli.running.limits import Limits
-from ctid_cli.storage.journal import Journal
+from ctid_cli.storage.columns import FAILURES
+from ctid_cli.storage.journal_reader import JournalReader
 from ctid_cli.storage.manifest import Key
+from ctid_cli.storage.planned import KeySet
 
 
 @dataclass(frozen=True)
-class Stock:
-    """The estimates that a journal holds."""
+class Stock(Container[Key]):
+    """The estimates that a journal holds; in it are those that stay as they are."""
 
-    keys: frozenset[Key] = frozenset()
-    #: Failures among them that are to be computed once more.
-    again: frozenset[Key] = frozenset()
+    keys: KeySet = field(default_factory=KeySet)
+    #: Failures among them, and those of these that are to be computed once more.
+    failed: KeySet = field(default_factory=KeySet)
+    again: KeySet = field(default_factory=KeySet)
 
-    @property
-    def kept(self) -> frozenset[Key]:
-        """Those that stay as they are."""
-        return self.keys - self.again
+    def __contains__(self, key: object) -> bool:
+        return key in self.keys and key not in self.again
+
+    def note(self, key: Key, status: str) -> None:
+        """Note that an estimate was stored."""
+        self.keys.add(key)
+        self.again.discard(key)
+        (self.failed.add if status in FAILURES else self.failed.discard)(key)
 
 
-def take_stock(log: Journal, retry: Collection[str], limits: Limits) -> Stock:
+def take_stock(log: JournalReader, retry: Collection[str], limits: Limits) -> Stock:
     """What a journal holds, where failures of some statuses are unwanted, and those that a limit no longer explains."""
-    failures, again = log.failures(), set()
-    if failures:
-        before = {session["session"]: Limits.of(session) for session in log.sessions()}
-        again = {
-            key for key, status, session in failures if status in retry or limits.rose_since(before[session], status)
-        }
-    return Stock(frozenset(log.keys()), frozenset(again))
+    stock, before = Stock(), {session["session"]: Limits.of(session) for session in log.sessions()}
+
+    def heed(key: Key, status: str, session: int) -> None:
+        stock.keys.add(key)
+        if status in FAILURES:
+            stock.failed.add(key)
+            if status in retry or limits.rose_since(before[session], status):
+                stock.again.add(key)
+
+    log.stock(heed)
+    return stock

@@ -28,7 +28,7 @@ from ctid_cli.specification.yaml_source import KeyPath
 #: Samples, or clock periods of the input, of the longest record; ten times this would not fit in memory.
 MAX_SAMPLES = 10_000_000
 #: Data cells times estimators with each of their settings that an experiment may have.
-MAX_SETTINGS = 100_000
+MAX_SETTINGS = 1_000_000
 #: Combinations that are tried when a specification is checked, of sections whose faults show only together.
 MAX_TRIALS = 64
 

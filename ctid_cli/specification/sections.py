@@ -32,7 +32,7 @@ from ctid_cli.specification.option_docs import option_docs
 from ctid_cli.specification.yaml_source import KeyPath
 
 #: Combinations that one section may sweep, and data cells that one experiment may hold.
-MAX_COMBINATIONS = 10_000
+MAX_COMBINATIONS = 100_000
 
 AnySection = TypeVar("AnySection", bound="Section")
 #: A complaint, and the swept values that it is about.

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from ctid_cli.errors import DamageError, RefusedError, StorageError
-from ctid_cli.storage import journal
 from ctid_cli.storage.identity import Origin
+from ctid_cli.storage.journal_reader import FILE_NAME, JournalReader, read_journal
 from ctid_cli.storage.manifest import Manifest
 
 SPEC = "spec.yaml"
@@ -150,10 +150,10 @@ def announce(folder: Path, experiment: str, started: str, done: int, total: int)
 def check_free(folder: Path, manifest: Manifest, origins: Mapping[str, Origin], *, allow_mixed: bool) -> None:
     """Refuse a folder, whose lock this process holds, if this run must not add to its results."""
     experiment = manifest["experiment"]
-    with saying_what_is_safe(folder), journal.read_journal(folder / journal.FILE_NAME) as log:
+    with saying_what_is_safe(folder), read_journal(folder / FILE_NAME) as log:
         if log is None:
             if (folder / SEALED).exists():
-                why = f"{SEALED} without the {journal.FILE_NAME} it was made from, so nothing can be added to it"
+                why = f"{SEALED} without the {FILE_NAME} it was made from, so nothing can be added to it"
                 raise RefusedError(f"{folder} holds {why}; {_ELSEWHERE}")
             return
         log.check()
@@ -185,7 +185,7 @@ def origin_differences(one: Origin, other: Origin) -> list[tuple[str, str | None
 
 
 @contextmanager
-def reading_journal(folder: Path) -> Iterator[journal.Journal | None]:
+def reading_journal(folder: Path) -> Iterator[JournalReader | None]:
     """Read the folder's journal, while a run writes to it or not; if it is damaged, say what is safe."""
     with saying_what_is_safe(folder), ExitStack() as stack:
         deadline = time.monotonic() + PATIENCE
@@ -205,8 +205,8 @@ class _NotYetError(Exception):
 
 
 @contextmanager
-def _open_to_read(folder: Path) -> Iterator[journal.Journal | None]:
-    path = folder / journal.FILE_NAME
+def _open_to_read(folder: Path) -> Iterator[JournalReader | None]:
+    path = folder / FILE_NAME
     with ExitStack() as stack:
         try:
             stack.enter_context(lock(folder, shared=True, patience=0.0))
@@ -214,7 +214,7 @@ def _open_to_read(folder: Path) -> Iterator[journal.Journal | None]:
         except InUseError:
             live = True
         try:
-            log = stack.enter_context(journal.read_journal(path, live=live))
+            log = stack.enter_context(read_journal(path, live=live))
         except DamageError:
             raise
         except StorageError as error:
@@ -237,14 +237,14 @@ def saying_what_is_safe(folder: Path) -> Iterator[None]:
 
 def what_is_safe(folder: Path) -> str:
     """A sentence about the results that can still be read although the journal cannot."""
-    from ctid_cli.storage.sealed import read_sealed
+    from ctid_cli.storage.sealed import open_sealed
 
     advice = "'ctid verify' says what else can be read, 'ctid repair' saves it into a new folder."
     try:
-        results = read_sealed(folder / SEALED)
+        found = open_sealed(folder / SEALED)
     except (StorageError, RefusedError):
         return f"There is no intact {SEALED} either. {advice}"
-    count = len(results.results)
+    count = found.table.count
     return f"{SEALED} is intact and holds {count} estimates of the last finished or interrupted run. {advice}"
 
 
@@ -275,7 +275,7 @@ def experiment_folders(results: Path) -> list[Path]:
     found = []
     for path, folders, files in os.walk(results):
         folders[:] = sorted(name for name in folders if not _ASIDE.search(name))
-        if journal.FILE_NAME in files or SEALED in files:
+        if FILE_NAME in files or SEALED in files:
             folders[:] = [name for name in folders if name != PROVENANCE]
             found.append(Path(path))
     return sorted(found)

@@ -93,8 +93,13 @@ def assemble(
     slot: Slot, manifest: Manifest, result: Mapping[str, Any], seconds: float | None, cpu_seconds: float | None
 ) -> dict[str, Any]:
     """An estimate row."""
-    values = {
-        **result,
+    values = {**result, **plan_values(slot, manifest), "seconds": seconds, "cpu_seconds": cpu_seconds}
+    return {column.name: values.get(column.name) for column in row_columns(manifest)} | slot.swept
+
+
+def plan_values(slot: Slot, manifest: Manifest) -> dict[str, Any]:
+    """What the plan says of an estimate, apart from swept fields."""
+    return {
         "id": slot.key.id,
         "experiment": manifest["experiment"],
         "estimator": slot.estimator["name"],
@@ -103,10 +108,7 @@ def assemble(
         "replicate": slot.key.replicate,
         "start": slot.key.start,
         "initial_delay": manifest["starts"].get(slot.key.start),
-        "seconds": seconds,
-        "cpu_seconds": cpu_seconds,
     }
-    return {column.name: values.get(column.name) for column in row_columns(manifest)} | slot.swept
 
 
 def row_columns(manifest: Manifest) -> list[columns.Column]:

@@ -17,8 +17,9 @@ from typing import Any
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import RefusedError, StorageError, UsageError
 from ctid_cli.storage import folder as place
-from ctid_cli.storage import journal
 from ctid_cli.storage.identity import Origin, are_mixed
+from ctid_cli.storage.journal import Journal, open_journal
+from ctid_cli.storage.journal_reader import FILE_NAME, Entry, JournalReader
 from ctid_cli.storage.manifest import Key, Manifest, Outcome, shard_of, slots, whole
 from ctid_cli.storage.shards import Shard, owner, ranges
 from ctid_cli.storage.store import seal
@@ -37,7 +38,7 @@ class Source:
 
     folder: Path
     manifest: Manifest
-    entries: Mapping[Key, journal.Entry]
+    entries: Mapping[Key, Entry]
     sessions: Sequence[Mapping[str, Any]]
 
     @property
@@ -67,7 +68,7 @@ def find_sources(paths: Iterable[Path]) -> list[Path]:
     """The folders that are meant: of experiments as they are given, of all shards below others."""
     found: dict[Path, Path] = {}
     for path in paths:
-        if (path / journal.FILE_NAME).exists():
+        if (path / FILE_NAME).exists():
             inside = [path]
         else:
             inside = [folder for folder in place.experiment_folders(path) if _SHARD.search(folder.name)]
@@ -78,10 +79,10 @@ def find_sources(paths: Iterable[Path]) -> list[Path]:
 
 
 @contextmanager
-def _reading(folder: Path) -> Iterator[journal.Journal]:
+def _reading(folder: Path) -> Iterator[JournalReader]:
     with place.lock(folder, shared=True), place.reading_journal(folder) as log:
         if log is None:
-            raise UsageError(f"there is no {journal.FILE_NAME} with results in {folder}, which a merge reads")
+            raise UsageError(f"there is no {FILE_NAME} with results in {folder}, which a merge reads")
         yield log
 
 
@@ -125,7 +126,7 @@ def merge(sources: Iterable[Source], target: Path, *, allow_mixed: bool = False,
         raise RefusedError(f"{plan['experiment']}: {'; '.join(missing)}. --partial merges what there is")
     with _writing(target):
         target.mkdir(parents=True, exist_ok=True)
-    with place.lock(target), closing(journal.open_journal(target / journal.FILE_NAME)) as log:
+    with place.lock(target), closing(open_journal(target / FILE_NAME)) as log:
         if known != planned & log.keys():
             raise place.InUseError(f"{target} was changed by another process just now; run the command again")
         with _writing(target):
@@ -188,9 +189,9 @@ def _check_origins(sources: Sequence[Source]) -> None:
             seen.setdefault(estimator, (origin, source.folder))
 
 
-def _new_entries(present: Sequence[Source], read: Sequence[Source]) -> dict[Key, tuple[Source, journal.Entry]]:
+def _new_entries(present: Sequence[Source], read: Sequence[Source]) -> dict[Key, tuple[Source, Entry]]:
     """What is to be stored, and where it comes from."""
-    found: dict[Key, tuple[Source, journal.Entry]] = {}
+    found: dict[Key, tuple[Source, Entry]] = {}
     for source in (*present, *read):
         for key, entry in source.entries.items():
             other, stored = found.setdefault(key, (source, entry))
@@ -207,7 +208,7 @@ def _new_entries(present: Sequence[Source], read: Sequence[Source]) -> dict[Key,
     return {key: value for key, value in found.items() if id(value[0]) not in ours}
 
 
-def _rank(found: tuple[Source, journal.Entry]) -> tuple[bool, list[float], str]:
+def _rank(found: tuple[Source, Entry]) -> tuple[bool, list[float], str]:
     """Which of two is better, where one exceeded a limit: a result, or else what had the higher limits."""
     source, entry = found
     session = next((one for one in source.sessions if one["session"] == entry.session), {})
@@ -245,7 +246,7 @@ def _shards(numbers: Iterable[int], of: int) -> str:
     return f"{'shard' if text.isdigit() else 'shards'} {text} of {of}"
 
 
-def _take_over(source: Source, entries: Mapping[Key, journal.Entry], plan: Manifest, log: journal.Journal) -> None:
+def _take_over(source: Source, entries: Mapping[Key, Entry], plan: Manifest, log: Journal) -> None:
     """Store estimates of a folder, run by run, with what is known of the runs that computed them."""
     for run in source.sessions:
         own = {key: entry for key, entry in entries.items() if entry.session == run["session"]}
@@ -259,7 +260,7 @@ def _take_over(source: Source, entries: Mapping[Key, journal.Entry], plan: Manif
                 _copy_provenance(source.folder, run["session"], log, number)
 
 
-def _copy_provenance(source: Path, session: int, log: journal.Journal, number: int) -> None:
+def _copy_provenance(source: Path, session: int, log: Journal, number: int) -> None:
     """Keep what is known of a run, under its new number."""
     (log.path.parent / place.PROVENANCE).mkdir(exist_ok=True)
     # One that was killed has left nothing but its line in the journal.

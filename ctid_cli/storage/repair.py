@@ -15,15 +15,16 @@ from typing import Any
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import CtidError, RefusedError, StorageError
 from ctid_cli.storage import folder as place
-from ctid_cli.storage import journal
 from ctid_cli.storage.carving import Value, carved_records
 from ctid_cli.storage.folder import CANONICAL, PROVENANCE, SEALED, SPEC, TIMINGS
 from ctid_cli.storage.foreign import read_json, require_manifest
 from ctid_cli.storage.identity import Origin
-from ctid_cli.storage.journal import Row, row_digest
+from ctid_cli.storage.journal import open_journal
+from ctid_cli.storage.journal_reader import FILE_NAME, Row, read_journal, row_digest
 from ctid_cli.storage.manifest import Key, Manifest, Slot, shard_of, slots
 from ctid_cli.storage.provenance import canonical_text, now
-from ctid_cli.storage.store import Stored, read_sealed_alone, seal
+from ctid_cli.storage.store import read_sealed_alone, seal
+from ctid_cli.storage.stored import Stored
 
 
 @dataclass
@@ -61,11 +62,11 @@ class Repair:
 def salvage(folder: Path) -> Salvage:
     """All that is intact in a folder."""
     found = Salvage()
-    with suppress(CtidError), journal.read_journal(folder / journal.FILE_NAME) as log:
+    with suppress(CtidError), read_journal(folder / FILE_NAME) as log:
         # Of several plans among the pages, this is the latest.
         found.manifest = None if log is None else log.manifest()
-    if (folder / journal.FILE_NAME).exists():
-        for record in carved_records(folder / journal.FILE_NAME):
+    if (folder / FILE_NAME).exists():
+        for record in carved_records(folder / FILE_NAME):
             _sort(record, found)
     # An estimate whose origin is lost cannot be compared with others.
     found.rows = {key: row for key, row in found.rows.items() if row.origin in found.origins}
@@ -136,9 +137,7 @@ def repair(folder: Path, results: Path) -> Repair:
         found = salvage(folder)
         if found.manifest is None or not found.rows:
             lost = "what was planned" if found.manifest is None else "a single estimate"
-            raise StorageError(
-                f"nothing of {folder} can be saved: neither {journal.FILE_NAME} nor {SEALED} tells {lost}"
-            )
+            raise StorageError(f"nothing of {folder} can be saved: neither {FILE_NAME} nor {SEALED} tells {lost}")
         shard, name = shard_of(found.manifest), found.manifest["experiment"]
         target = results / (shard.folder(name) if shard else name)
         if target.exists():
@@ -172,7 +171,7 @@ def _write(found: Salvage, manifest: Manifest, folder: Path, target: Path) -> No
             if hashlib.sha256(data).hexdigest() in found.files[name]:
                 texts[name] = data
     (target / PROVENANCE).mkdir()
-    log = journal.open_journal(target / journal.FILE_NAME)
+    log = open_journal(target / FILE_NAME)
     try:
         log.restore(manifest, found.origins, sessions, found.rows.values())
         for name, data in texts.items():

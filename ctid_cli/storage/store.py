@@ -2,85 +2,38 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
-from collections.abc import Iterator, Mapping
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
-from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ctid_cli.errors import StorageError, UsageError
-from ctid_cli.storage import columns, journal
+from ctid_cli.errors import CtidError, StorageError, UsageError
+from ctid_cli.storage import columns
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.folder import SEALED, TIMINGS, InUseError
-from ctid_cli.storage.identity import Origin, are_mixed, gathered
-from ctid_cli.storage.manifest import (
-    Key,
-    Manifest,
-    Slot,
-    assemble,
-    is_of_signal,
-    row_columns,
-    shard_of,
-    slots,
-    swept_names,
-    true_values,
-)
+from ctid_cli.storage.identity import Origin, are_mixed
+from ctid_cli.storage.journal import Journal
+from ctid_cli.storage.journal_reader import FILE_NAME, JournalReader
+from ctid_cli.storage.manifest import Manifest, Slot, is_of_signal, row_columns, shard_of, slots, swept_names
+from ctid_cli.storage.packing import Packed, PackedTable, decoded, keys
+from ctid_cli.storage.pieces import Pieces
+from ctid_cli.storage.planned import PlannedKeys, planned_parts
 from ctid_cli.storage.provenance import as_text
-from ctid_cli.storage.summary import is_converged
-from ctid_cli.written_files import write_file
+from ctid_cli.storage.stored import Stored, first_with
+from ctid_cli.storage.timings import TimedTable, times_table
+from ctid_cli.written_files import replace_file
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from ctid_cli.storage.sealed import SealedRuns
-
-
-#: Columns of the table of times.
-CLOCKS = ("seconds", "cpu_seconds")
-
-
-@dataclass(frozen=True)
-class Stored:
-    """The stored estimates of one plan."""
-
-    manifest: Manifest
-    origins: tuple[Origin, ...]
-    results: Mapping[Key, dict[str, Any]]
-    #: Time that each took [s], by key, and processor time.
-    seconds: Mapping[Key, float | None]
-    cpu_seconds: Mapping[Key, float | None] = field(default_factory=dict)
-
-    @property
-    def mixed(self) -> bool:
-        """Whether several versions of the code, or platforms, computed what is compared here."""
-        return are_mixed(self.origins)
-
-    def slots(self) -> list[Slot]:
-        """Places of the stored estimates, in the order of the sealed file."""
-        return [slot for slot in slots(self.manifest) if slot.key in self.results]
-
-    def row(self, slot: Slot) -> dict[str, Any]:
-        """The estimate row of one place, with ``true_delay`` and ``converged``."""
-        times = (self.seconds.get(slot.key), self.cpu_seconds.get(slot.key))
-        row = assemble(slot, self.manifest, self.results[slot.key], *times)
-        true = self._truths[slot.key.data_hash]
-        converged = is_converged(row, self.manifest["success"], true)
-        return row | {"converged": converged, "true_delay": true.get("delay")}
-
-    @cached_property
-    def _truths(self) -> dict[str, dict[str, float]]:
-        """True values by name of every data cell."""
-        return {cell["hash"]: true_values(cell) for cell in self.manifest["data_cells"]}
-
-    def rows(self) -> list[dict[str, Any]]:
-        """All estimate rows, in the order of the sealed file."""
-        return [self.row(slot) for slot in self.slots()]
+#: A data cell and an estimator by their hashes.
+Part = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -89,12 +42,20 @@ class FoundEstimate:
 
     folder: Path
     stored: Stored
-    slot: Slot
+    #: Its place in the order of the sealed file.
+    place: int
 
     @cached_property
     def row(self) -> dict[str, Any]:
         """Its row."""
-        return self.stored.row(self.slot)
+        return self.stored.every()[self.place]
+
+    @cached_property
+    def slot(self) -> Slot:
+        """What it is of."""
+        (key,) = keys(self.stored.table, self.place, self.place + 1)
+        block = next(block for block in self.stored.blocks if block.first <= self.place < block.last)
+        return Slot(key, block.cell, block.estimator)
 
 
 @dataclass(frozen=True)
@@ -134,21 +95,21 @@ class ExperimentStatus(Progress):
     shard: tuple[int, int] | None = None
 
 
-def seal(folder: Path, log: journal.Journal) -> tuple[int, str]:
+def seal(folder: Path, log: Journal) -> tuple[int, str]:
     """Write the estimates of the journal's plan to the sealed file, and their times to a table.
 
     Returns the number of estimates and the checksum of the file.
     """
-    from ctid_cli.storage.sealed import seal_image, verify_sealed
+    from ctid_cli.storage.sealed import verify_sealed, write_sealed
 
-    manifest, entries = log.manifest(), log.entries()
-    stored = _planned(manifest, entries)
-    image, checksum, count = seal_image(manifest, stored.origins, stored.results)
-    times = _times_table({key: entries[key] for key in stored.results})
-    target, safe = folder / SEALED, f"all {len(entries)} estimates are safe in {log.path}"
+    present = _sealed_before(folder, log)
+    if present is not None:
+        return present
+    target, safe = folder / SEALED, f"all {log.count()} estimates are safe in {log.path}"
+    origins, table = _planned(log, folder)
     try:
-        log.write_beside(TIMINGS, times)
-        write_file(target, image)
+        log.write_beside(TIMINGS, times_table(table))
+        checksum = replace_file(target, lambda path: write_sealed(log.manifest(), origins, table, path))
     except OSError as error:
         log.require_in_place()
         reason = f"{target} could not be written ({error.strerror or error})"
@@ -156,7 +117,21 @@ def seal(folder: Path, log: journal.Journal) -> tuple[int, str]:
     if verify_sealed(target) != checksum:
         raise StorageError(f"{target} reads back otherwise than it was written; {safe}")
     log.mark_sealed(checksum)
-    return count, checksum
+    return table.count, checksum
+
+
+def _sealed_before(folder: Path, log: JournalReader) -> tuple[int, str] | None:
+    """What the journal was sealed to, if it and its times are there as they were written and nothing came after."""
+    from ctid_cli.storage.sealed import open_sealed
+
+    if log.sealed() is None:
+        return None
+    try:
+        runs = open_sealed(folder / SEALED, fully=True)
+    except CtidError:
+        return None
+    times = hashlib.sha256(_times_of(folder)).hexdigest() in log.files().get(TIMINGS, ())
+    return (runs.table.count, runs.checksum) if runs.has_head and times and runs.checksum == log.sealed() else None
 
 
 def read_stored(folder: Path) -> Stored:
@@ -164,36 +139,40 @@ def read_stored(folder: Path) -> Stored:
     with _reading(folder) as log:
         if log is None:
             return read_sealed_alone(folder)
+        if not log.is_large:
+            log.check()
         if log.sealed() is not None and (folder / SEALED).exists():
-            stored, checksum = _read_sealed_beside(folder, log)
-            # Another file, however intact, is not what this journal was sealed to.
-            if checksum == log.sealed():
+            stored = _read_sealed_beside(folder, log)
+            if stored is not None:
                 return stored
-        return _planned(log.manifest(), log.entries())
+        log.check()
+        return Stored.of(log.manifest(), *_planned(log))
 
 
 @contextmanager
-def _reading(folder: Path) -> Iterator[journal.Journal | None]:
+def _reading(folder: Path) -> Iterator[JournalReader | None]:
     """The journal of an experiment, checked, also during a run; None where there is the sealed file only."""
     with place.reading_journal(folder) as log:
         # There is a journal without a plan where the run was killed before it had planned anything.
-        if log is not None:
-            log.check()
-        elif not (folder / SEALED).exists():
+        if log is None and not (folder / SEALED).exists():
             raise UsageError(f"there are no results in {folder}; 'ctid run' writes them")
         yield log
 
 
-def _planned(manifest: Manifest, entries: Mapping[Key, journal.Entry]) -> Stored:
-    """What a plan asks for, out of all that a journal holds."""
-    planned = {slot.key: entries[slot.key] for slot in slots(manifest) if slot.key in entries}
-    return Stored(
-        manifest,
-        gathered((key.estimator_hash, entry.origin) for key, entry in planned.items()),
-        {key: entry.result for key, entry in planned.items()},
-        {key: entry.seconds for key, entry in planned.items()},
-        {key: entry.cpu_seconds for key, entry in planned.items()},
-    )
+def _planned(log: JournalReader, folder: Path | None = None) -> tuple[tuple[Origin, ...], PackedTable]:
+    """What a plan asks for, out of all that a journal holds, every row of which is compared with its checksum."""
+    manifest, made = log.manifest(), set()
+    log.require_all()
+
+    def rows() -> Iterator[Packed]:
+        for slot in slots(manifest):
+            row = log.row(slot.key)
+            if row is not None:
+                made.add((slot.key.estimator_hash, row.origin))
+                yield Packed(slot, json.loads(row.result), row.seconds, row.cpu_seconds, row.session)
+
+    table = PackedTable(manifest, rows(), Pieces(folder))
+    return log.origins_of(made), table
 
 
 def read_tracks(folder: Path) -> dict[str, dict[str, Any]]:
@@ -201,34 +180,37 @@ def read_tracks(folder: Path) -> dict[str, dict[str, Any]]:
     from ctid_cli.simulation.frequency_measures import unpack_track
     from ctid_cli.storage.sealed import read_sealed_tracks
 
-    stored = read_stored(folder)
-    packed = {key.id: result["track"] for key, result in stored.results.items() if result.get("track") is not None}
-    if packed:
-        return {name: unpack_track(track) for name, track in packed.items()}
-    return read_sealed_tracks(folder / SEALED) if (folder / SEALED).exists() else {}
+    table = read_stored(folder).table
+    if isinstance(table, PackedTable):
+        return {name: unpack_track(track) for name, track in table.tracks.items()}
+    return read_sealed_tracks(folder / SEALED)
 
 
 def read_sealed_alone(folder: Path) -> Stored:
     """The estimates in the sealed file, whatever else there is."""
-    from ctid_cli.storage.sealed import read_sealed
+    from ctid_cli.storage.sealed import open_sealed
 
-    return _with_times(read_sealed(folder / SEALED), _times_of(folder))
+    runs = open_sealed(folder / SEALED)
+    table = TimedTable(runs.table, _times_of(folder))
+    return Stored.of(runs.manifest, runs.origins, table)
 
 
-def _read_sealed_beside(folder: Path, log: journal.Journal) -> tuple[Stored, str]:
-    """The sealed file of a journal, with its times if they are what was written, and its checksum."""
-    from ctid_cli.storage.sealed import read_sealed
+def _read_sealed_beside(folder: Path, log: JournalReader) -> Stored | None:
+    """The sealed file of a journal, with its times if they are what was written; None for that of another one."""
+    from ctid_cli.storage.sealed import open_sealed
 
     try:
-        runs = read_sealed(folder / SEALED)
+        runs = open_sealed(folder / SEALED)
     except StorageError as error:
-        advice = f"{journal.FILE_NAME} holds all estimates: 'ctid run' with the same specification seals them again"
+        advice = f"{FILE_NAME} holds all estimates: 'ctid run' with the same specification seals them again"
         raise StorageError(f"{error}; {advice}") from error
+    # Another file, however intact, is not what this journal was sealed to.
+    if runs.checksum != log.sealed():
+        return None
     times, noted = _times_of(folder), log.files().get(TIMINGS)
     if noted is not None and hashlib.sha256(times).hexdigest() not in noted:
-        entries = log.entries()
-        times = _times_table({key: entries[key] for key in runs.results})
-    return _with_times(runs, times), runs.checksum
+        return None
+    return Stored.of(runs.manifest, runs.origins, TimedTable(runs.table, times))
 
 
 def _times_of(folder: Path) -> bytes:
@@ -239,29 +221,6 @@ def _times_of(folder: Path) -> bytes:
         return b""
 
 
-def _with_times(runs: SealedRuns, table: bytes) -> Stored:
-    times = _read_times(table)
-    columns_of_times = ({key: times.get((key.id, name)) for key in runs.results} for name in CLOCKS)
-    return Stored(runs.manifest, runs.origins, runs.results, *columns_of_times)
-
-
-def _times_table(entries: Mapping[Key, journal.Entry]) -> bytes:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(("id", *CLOCKS, "session"))
-    for key, entry in entries.items():
-        table.writerow((key.id, entry.seconds, entry.cpu_seconds, entry.session))
-    return text.getvalue().encode()
-
-
-def _read_times(table: bytes) -> dict[tuple[str, str], float]:
-    try:
-        rows = list(csv.DictReader(io.StringIO(table.decode())))
-        return {(row["id"], name): float(row[name]) for row in rows for name in CLOCKS if row.get(name)}
-    except (ValueError, KeyError, csv.Error):
-        return {}
-
-
 def load_estimates(folder: Path) -> pd.DataFrame:
     """Estimates of the latest plan of an experiment as a table."""
     return estimates_table(read_stored(folder))
@@ -269,14 +228,18 @@ def load_estimates(folder: Path) -> pd.DataFrame:
 
 def estimates_table(stored: Stored) -> pd.DataFrame:
     """Stored estimates as a table, with the units of its columns."""
+    return frame_of(stored, stored.rows())
+
+
+def frame_of(stored: Stored, rows: Sequence[Mapping[str, Any]], swept: dict[str, Any] | None = None) -> pd.DataFrame:
+    """Some of them as a table; types of swept fields are given where not all estimates are there to tell them."""
     import pandas as pd
 
-    rows = stored.rows()
     # Where there is no system, the columns of one would be empty.
     left_out = "systems" if is_of_signal(stored.manifest) else ""
     own = {column.name: column.dtype for column in row_columns(stored.manifest) if column.of != left_out}
     compared = {c.name: c.dtype for c in columns.COLUMNS if c.source == "truth" and c.of != left_out}
-    types = own | dict.fromkeys(swept_names(stored.manifest)) | compared
+    types: dict[str, Any] = own | (swept or dict.fromkeys(swept_names(stored.manifest))) | compared
     frame = pd.DataFrame({name: pd.Series([row.get(name) for row in rows], dtype=of) for name, of in types.items()})
     frame.attrs["mixed"] = stored.mixed
     frame.attrs["units"] = {
@@ -295,9 +258,9 @@ def find_estimate(results: Path, prefix: str) -> FoundEstimate:
         except InUseError as error:
             in_use = f"; it may come later: {error}"
             continue
-        for slot in stored.slots():
-            if slot.key.id.startswith(prefix) and slot.key.id not in matches:
-                matches[slot.key.id] = FoundEstimate(folder, stored, slot)
+        for number in first_with(stored.table, prefix):
+            (name,) = decoded(stored.table.read("id", number, number + 1))
+            matches.setdefault(name, FoundEstimate(folder, stored, number))
     if not matches:
         raise UsageError(f"no id in {results} begins with {prefix!r}{in_use}; 'ctid export' lists all ids")
     if len(matches) > 1:
@@ -318,18 +281,30 @@ def experiment_status(folder: Path) -> ExperimentStatus:
     try:
         with _reading(folder) as log:
             if log is not None:
-                statuses, manifest = log.statuses(), log.manifest()
-                left_aside = len(statuses.keys() - {slot.key for slot in slots(manifest)})
-                running = _running(folder) if log.live else None
-                return _status(folder, manifest, statuses, left_aside, are_mixed(log.origins()), running)
+                log.check()
+                manifest, running = log.manifest(), _running(folder) if log.live else None
+                done: Counter[Part] = Counter()
+                failed: Counter[Part] = Counter()
+                planned, aside = PlannedKeys(manifest), 0
+                for key, status in log.statuses():
+                    if key not in planned:
+                        aside += 1
+                        continue
+                    done[key.data_hash, key.estimator_hash] += 1
+                    failed[key.data_hash, key.estimator_hash] += status in columns.FAILURES
+                return _status(folder, manifest, done, failed, aside, are_mixed(log.origins()), running)
     except InUseError:
         # A run that is just beginning has nothing to read yet.
         running = _running(folder)
         name = str(running.get("experiment") or folder.name)
         return ExperimentStatus(0, 0, 0, name, folder, None, False, running, ())
     stored = read_sealed_alone(folder)
-    statuses = {key: str(result["status"]) for key, result in stored.results.items()}
-    return _status(folder, stored.manifest, statuses, None, stored.mixed, None)
+    done, failed = Counter(), Counter()
+    for block in stored.blocks:
+        part = (block.cell["hash"], block.estimator["hash"])
+        done[part] = block.last - block.first
+        failed[part] = int(stored.failures(slice(block.first, block.last)).sum())
+    return _status(folder, stored.manifest, done, failed, None, stored.mixed, None)
 
 
 def _running(folder: Path) -> dict[str, Any]:
@@ -351,20 +326,18 @@ def _running(folder: Path) -> dict[str, Any]:
 def _status(
     folder: Path,
     manifest: Manifest,
-    statuses: Mapping[Key, str],
+    done: Mapping[Part, int],
+    failed: Mapping[Part, int],
     left_aside: int | None,
     mixed: bool,
     running: dict[str, Any] | None,
 ) -> ExperimentStatus:
     groups = []
-    for _, members in groupby(slots(manifest), lambda slot: (id(slot.estimator), slot.key.data_hash)):
-        wanted = list(members)
-        found = [statuses[slot.key] for slot in wanted if slot.key in statuses]
-        failed = sum(status in columns.FAILURES for status in found)
-        slot = wanted[0]
-        counts = (len(wanted), len(found), failed)
-        groups.append(GroupStatus(*counts, slot.estimator["name"], slot.key.data_hash, slot.swept))
+    for estimator, cell, planned in planned_parts(manifest):
+        part = (cell["hash"], estimator["hash"])
+        counts = (planned, done.get(part, 0), failed.get(part, 0))
+        groups.append(GroupStatus(*counts, estimator["name"], cell["hash"], {**cell["swept"], **estimator["swept"]}))
     counts = tuple(sum(getattr(group, name) for group in groups) for name in ("planned", "done", "failed"))
-    name, found_groups, part = manifest["experiment"], tuple(groups), shard_of(manifest)
-    shard = None if part is None else (part.number, part.of)
+    name, found_groups, dealt = manifest["experiment"], tuple(groups), shard_of(manifest)
+    shard = None if dealt is None else (dealt.number, dealt.of)
     return ExperimentStatus(*counts, name, folder, left_aside, mixed, running, found_groups, shard)

@@ -18,6 +18,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.inference.monte_carlo import wilson_interval
 from ctid_cli.simulation.frequency_measures import is_settled
 from ctid_cli.storage import columns
@@ -29,46 +32,55 @@ if TYPE_CHECKING:
 
 def is_converged(row: Mapping[str, Any], success: Mapping[str, Any] | None, truth: Mapping[str, float]) -> bool | None:
     """Whether an estimate satisfies the success rule, from the true values by name."""
+    found = {name: _array(value) for name, value in found_values(row, truth)[0].items()}
+    failures = np.array([row["status"] in columns.FAILURES])
+    hits = judged(success, truth, failures, found, _array(row.get("fit_percent")), [row.get("measures")])
+    return None if hits is None else bool(hits[0])
+
+
+def _array(value: float | None) -> Array:
+    return np.array([value], dtype=np.float64)
+
+
+def judged(
+    success: Mapping[str, Any] | None,
+    truth: Mapping[str, float],
+    failures: BoolArray,
+    found: Mapping[str, Array],
+    fit_percent: Array,
+    measures: Sequence[Mapping[str, float | None] | None] | None,
+) -> BoolArray | None:
+    """Which estimates satisfy the success rule: from what they found by name, NaN where there is nothing."""
     rule = success or {}
-    conditions = []
+    conditions: list[BoolArray] = []
     if rule.get("delay_relative_error") is not None and "delay" in truth:
-        conditions.append(_near(row["delay"], truth["delay"], rule["delay_relative_error"]))
+        conditions.append(_near(found["delay"], truth["delay"], rule["delay_relative_error"]))
     others = truth.keys() - {"delay"}
     if rule.get("parameter_relative_error") is not None and others:
-        found, tolerance = found_values(row, truth)[0], rule["parameter_relative_error"]
-        conditions.append(all(_near(found[name], truth[name], tolerance) for name in others))
-    if rule.get("band") is not None:
-        conditions.append(is_settled(row.get("measures"), rule["band"], rule.get("by")))
+        conditions += [_near(found[name], truth[name], rule["parameter_relative_error"]) for name in others]
+    if rule.get("band") is not None and measures is not None:
+        conditions.append(np.array([is_settled(one, rule["band"], rule.get("by")) for one in measures], dtype=bool))
     if rule.get("fit_percent") is not None:
-        conditions.append(row["fit_percent"] is not None and row["fit_percent"] >= rule["fit_percent"])
-    if not conditions:
-        return None
-    return row["status"] not in columns.FAILURES and all(conditions)
+        conditions.append(fit_percent >= rule["fit_percent"])
+    return np.logical_and.reduce([~failures, *conditions]) if conditions else None
 
 
-def _near(value: float | None, true: float, tolerance: float) -> bool:
-    return value is not None and abs(value - true) <= tolerance * abs(true)
+def _near(values: Array, true: float, tolerance: float) -> BoolArray:
+    return np.abs(values - true) <= tolerance * abs(true)
 
 
-def summarise(estimates: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
-    """Count estimates in groups."""
-    import pandas as pd
-
-    keys = estimates[list(by)].astype(object).where(estimates[list(by)].notna(), None)
-    # Without anything to group by, all rows are one group.
-    numbers = keys.groupby(list(by) or (lambda _: 0), sort=False, dropna=False).ngroup().to_numpy()
-    rows = []
-    for number, group in estimates.groupby(numbers):
-        n, row = len(group), keys.iloc[int((numbers == number).argmax())].to_dict()
-        row |= {"n": n, "failed": int(group["status"].isin(columns.FAILURES).sum())}
-        row |= {f"median_{clock}": float(group[clock].median()) for clock in ("seconds", "cpu_seconds")}
-        if group["converged"].notna().all():
-            k = int(group["converged"].sum())
-            low, high = wilson_interval(k, n)
-            row |= {"converged": k, "percent": 100 * k / n, "low": 100 * low, "high": 100 * high}
-        rows.append(row)
-    types = dict.fromkeys(by, "object") | columns.COUNTS
-    return pd.DataFrame({name: pd.Series([row.get(name) for row in rows], dtype=kind) for name, kind in types.items()})
+def counted(failures: BoolArray, converged: BoolArray | None, clocks: Mapping[str, Array]) -> dict[str, Any]:
+    """Counts and percentages of a group of estimates, and the medians of their times."""
+    n = len(failures)
+    row: dict[str, Any] = dict.fromkeys(columns.COUNTS) | {"n": n, "failed": int(failures.sum())}
+    for clock, times in clocks.items():
+        known = times[np.isfinite(times)]
+        row[f"median_{clock}"] = float(np.median(known)) if known.size else None
+    if converged is not None:
+        k = int(converged.sum())
+        low, high = wilson_interval(k, n)
+        row |= {"converged": k, "percent": 100 * k / n, "low": 100 * low, "high": 100 * high}
+    return row
 
 
 def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:

@@ -1,6 +1,7 @@
 """Whether every stored byte of an experiment is what was written."""
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,11 +9,11 @@ from typing import Literal
 
 from ctid_cli.errors import CtidError, DamageError
 from ctid_cli.storage import folder as place
-from ctid_cli.storage import journal
 from ctid_cli.storage.folder import CANONICAL, PROVENANCE, RUNNING, SEALED, SPEC, TIMINGS
-from ctid_cli.storage.manifest import slots
+from ctid_cli.storage.journal_reader import FILE_NAME, JournalReader
+from ctid_cli.storage.planned import PlannedKeys
 from ctid_cli.storage.repair import salvage
-from ctid_cli.storage.sealed import read_sealed
+from ctid_cli.storage.sealed import open_sealed
 from ctid_cli.written_files import is_leftover
 
 State = Literal["intact", "damaged", "missing", "stale", "unchecked", "left over"]
@@ -62,34 +63,33 @@ def verify(folder: Path) -> Verification:
                 live = log.live
                 findings.append(_journal(log))
                 noted = _Noted(log.files(), log.sealed(), known=True)
-            elif (folder / journal.FILE_NAME).exists():
-                findings.append(
-                    Finding(journal.FILE_NAME, "intact", "a run was stopped before it had planned anything")
-                )
+            elif (folder / FILE_NAME).exists():
+                findings.append(Finding(FILE_NAME, "intact", "a run was stopped before it had planned anything"))
     except DamageError as error:
         # The cause is the damage without what is said about the other files.
-        findings = [Finding(journal.FILE_NAME, "damaged", f"{error.__cause__}. {_what_can_be_read(folder)}")]
+        findings = [Finding(FILE_NAME, "damaged", f"{error.__cause__}. {_what_can_be_read(folder)}")]
     findings += _sealed(folder, noted, has_journal=bool(findings))
     findings += _beside(folder, noted)
     return Verification(folder, (*findings, *([] if live else _left_over(folder))))
 
 
-def _journal(log: journal.Journal) -> Finding:
+def _journal(log: JournalReader) -> Finding:
     log.check(fully=True)
-    entries, sessions, manifest = log.entries(), log.sessions(), log.manifest()
-    planned = {slot.key for slot in slots(manifest)}
-    message = f"{len(planned & entries.keys())} of {len(planned)} estimates"
-    aside = len(entries.keys() - planned)
+    sessions, planned = log.sessions(), PlannedKeys(log.manifest())
+    # Reading compares each with its checksum.
+    there = Counter(row.key in planned for row in log.rows())
+    message = f"{there[True]} of {len(planned)} estimates"
+    aside = there[False]
     message += f", {aside} set aside" if aside else ""
     message += f", {len(sessions)} runs" if len(sessions) != 1 else ", 1 run"
-    return Finding(journal.FILE_NAME, "intact", message + (", one is going on" if log.live else ""))
+    return Finding(FILE_NAME, "intact", message + (", one is going on" if log.live else ""))
 
 
 def _what_can_be_read(folder: Path) -> str:
     found = salvage(folder)
     if found.manifest is None or not found.rows:
         return "Nothing of it can be read"
-    planned = len({slot.key for slot in slots(found.manifest)})
+    planned = len(PlannedKeys(found.manifest))
     missing = len({slot.key for slot in found.missing()})
     return f"{planned - missing} of {planned} estimates can be read; 'ctid repair' saves them into a new folder"
 
@@ -101,12 +101,12 @@ def _sealed(folder: Path, noted: _Noted, *, has_journal: bool) -> Iterator[Findi
             yield Finding(SEALED, "missing", "'ctid run' with the same specification writes it again")
         return
     try:
-        runs = read_sealed(path)
+        runs = open_sealed(path, fully=True)
     except CtidError as error:
         advice = "; 'ctid run' with the same specification writes it again" if noted.known else ""
         yield Finding(SEALED, "damaged", f"{error}{advice}")
         return
-    holds = f"{len(runs.results)} estimates"
+    holds = f"{runs.table.count} estimates"
     if runs.checksum == noted.sealed:
         yield Finding(SEALED, "intact", holds)
     elif noted.known:

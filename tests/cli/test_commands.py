@@ -190,3 +190,11 @@ def test_a_stopped_run_can_be_resumed(ctid, tiny, tmp_path, number, code):
 def test_the_schema_as_text(ctid):
     assert ctid("schema", "--text", "noise").stdout.startswith("noise: mapping; optional\n")
     assert "write: ctid schema --text noise" in ctid("schema", "noise", code=2).stderr
+
+
+def test_a_very_large_run_is_asked_about_first(ctid, tiny, tmp_path):
+    many = ("run", tiny, "--runs", 200_000, "--out", tmp_path / "many")
+    done = ctid(*many, code=2)
+    assert re.search(r"\d{6,} estimates to compute, about \d\.\d GB of disk", done.stderr)
+    assert "--yes" in done.stderr
+    assert not (tmp_path / "many").exists()

@@ -16,10 +16,12 @@ import pytest
 from ctid_cli.errors import RefusedError, UsageError
 from ctid_cli.running import events, remote
 from ctid_cli.running.dask_executor import DaskExecutor
-from ctid_cli.running.engine import _jobs, run_experiment
+from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.executor import Computed, Done, Lost, Message
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.pool import packed
+from ctid_cli.running.retry import Stock
+from ctid_cli.running.todo import Todo
 from ctid_cli.storage.merge import merge, read_source
 from ctid_cli.storage.store import load_estimates
 from tests.running.fakes import FakePlan, Toy
@@ -94,7 +96,7 @@ def test_what_is_finished_of_a_data_set_comes_before_the_rest(cluster: Any) -> N
     sleeps: Any = FakePlan(Toy(), Hostile("sleep", at=0, order=5), levels=(5,), runs=1)
     executor = DaskExecutor(sleeps, Limits(), cluster.scheduler_address, 2, print)
     try:
-        executor.submit(_jobs(sleeps, set())[0])
+        executor.submit(next(Todo(sleeps, Stock()).jobs()))
         messages: list[Message] = []
         deadline = time.monotonic() + 60
         while sum(len(message.outcomes) for message in messages if isinstance(message, Computed)) < 2:

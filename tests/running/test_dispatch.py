@@ -8,10 +8,12 @@ from typing import Any
 
 import pytest
 
-from ctid_cli.running import dispatch, engine
+from ctid_cli.running import dispatch
 from ctid_cli.running.dispatch import Died, GivenUp, Slow, Unable, run_jobs
 from ctid_cli.running.executor import Begun, Computed, Done, Hindered, Lost, Message
 from ctid_cli.running.job import Job
+from ctid_cli.running.retry import Stock
+from ctid_cli.running.todo import Todo
 from ctid_cli.storage.columns import no_result
 from ctid_cli.storage.manifest import Key, Outcome
 from tests.running.fakes import FakePlan
@@ -69,7 +71,7 @@ def run(executor: Any, runs: int = 3, stopping: Callable[[], bool] = lambda: Fal
     """Status of every estimate that became a result, and other events."""
     plan: Any = FakePlan(levels=(5,), runs=runs)
     found, others = {}, []
-    for event in run_jobs(engine._jobs(plan, set()), executor, stopping):
+    for event in run_jobs(Todo(plan, Stock()).jobs(), executor, stopping):
         if isinstance(event, Computed):
             for outcome in event.outcomes:
                 assert name(outcome.key) not in found, "every estimate is handed over once"

@@ -23,11 +23,14 @@ from ctid_cli.running.engine import RunSummary, preview, run_experiment
 from ctid_cli.running.job_order import JobQueue
 from ctid_cli.running.origins import current_origins
 from ctid_cli.running.plan import build_plan
+from ctid_cli.running.retry import Stock
 from ctid_cli.running.stopping import StopAt
+from ctid_cli.running.todo import Todo
 from ctid_cli.specification.load import load_spec
-from ctid_cli.storage import folder, journal
+from ctid_cli.storage import folder
 from ctid_cli.storage.columns import no_result
 from ctid_cli.storage.identity import Origin
+from ctid_cli.storage.journal_reader import read_journal
 from ctid_cli.storage.manifest import Key, Outcome, slots
 from ctid_cli.storage.store import experiment_status, load_estimates
 from tests.running import run_toys
@@ -83,7 +86,7 @@ def finish(process: subprocess.Popen[str], within: float = 300) -> tuple[list[st
 
 
 def stored_ids(place: Path) -> set[str]:
-    with folder.lock(place), journal.read_journal(place / "journal.sqlite") as log:
+    with folder.lock(place), read_journal(place / "journal.sqlite") as log:
         return set() if log is None else {key.id for key in log.entries()}
 
 
@@ -117,7 +120,7 @@ def test_sealed_bytes_do_not_depend_on_jobs_or_order(tmp_path: Path) -> None:
 
 def test_the_longest_of_a_replicate_comes_first_and_the_last_replicate_is_split() -> None:
     plan = FakePlan(runs=3, levels=(1, 2, 3))
-    queue = JobQueue(engine._jobs(plan, set()))  # type: ignore[arg-type]
+    queue = JobQueue(Todo(plan, Stock()).jobs())  # type: ignore[arg-type]
     taken: list[tuple[int, float, int]] = []
     while queue:
         job = queue.pop()

@@ -8,11 +8,12 @@ from typing import Any
 
 import pytest
 
-from ctid_cli.running.engine import _jobs
 from ctid_cli.running.executor import Begun, Computed, Done, Lost, Message
 from ctid_cli.running.job import Job
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.pool import LokyPool
+from ctid_cli.running.retry import Stock
+from ctid_cli.running.todo import Todo
 from tests.running.fakes import FakePlan, Toy
 from tests.running.hostile import Hostile
 
@@ -20,7 +21,7 @@ from tests.running.hostile import Hostile
 def jobs(toy: Toy, runs: int = 2) -> list[Job]:
     """Jobs of which the first one, replicate 0, does what the toy does there."""
     plan: Any = FakePlan(toy, levels=(5,), runs=runs)
-    return _jobs(plan, set())
+    return list(Todo(plan, Stock()).jobs())
 
 
 @pytest.fixture

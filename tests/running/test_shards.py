@@ -20,8 +20,8 @@ from ctid_cli.running.engine import preview, run_experiment
 from ctid_cli.running.plan import build_plan
 from ctid_cli.running.shard_plan import shard_plan
 from ctid_cli.specification.load import load_spec
-from ctid_cli.storage import journal
 from ctid_cli.storage.columns import failed
+from ctid_cli.storage.journal_reader import read_journal
 from ctid_cli.storage.manifest import slots
 from ctid_cli.storage.merge import Source, find_sources, merge, merge_all, read_source
 from ctid_cli.storage.shards import Shard
@@ -77,7 +77,7 @@ def test_shards_merged_in_any_order_are_one_run(whole: Path, parts: list[Path], 
 
 def test_rows_keep_their_times_and_the_runs_they_come_from(parts: list[Path], tmp_path: Path) -> None:
     joined(parts[::-1], tmp_path / "toys")
-    with journal.read_journal(tmp_path / "toys" / "journal.sqlite") as log:
+    with read_journal(tmp_path / "toys" / "journal.sqlite") as log:
         assert log is not None
         merged, sessions = log.entries(), log.sessions()
     for number, part in enumerate(parts, start=1):

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 from ctid_cli.errors import RefusedError, StorageError
 from ctid_cli.running.engine import RunSummary, run_experiment
-from ctid_cli.storage.journal import open_journal, read_journal
+from ctid_cli.storage.journal import open_journal
+from ctid_cli.storage.journal_reader import read_journal
 from ctid_cli.storage.repair import repair
 from ctid_cli.storage.store import load_estimates, read_stored
 from ctid_cli.storage.verify import verify

@@ -19,7 +19,8 @@ from ctid_cli.running.origins import current_origins
 from ctid_cli.storage.columns import failed, no_result
 from ctid_cli.storage.folder import experiment_folders
 from ctid_cli.storage.identity import origin_of
-from ctid_cli.storage.journal import open_journal, read_journal
+from ctid_cli.storage.journal import open_journal
+from ctid_cli.storage.journal_reader import read_journal
 from ctid_cli.storage.manifest import slots, true_values
 from ctid_cli.storage.sealed import USER_BLOCK, headed, read_sealed, seal_image
 from ctid_cli.storage.store import experiment_status, find_estimate, load_estimates, read_stored

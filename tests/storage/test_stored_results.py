@@ -16,7 +16,8 @@ from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import columns, manifest
-from ctid_cli.storage.journal import open_journal, read_journal
+from ctid_cli.storage.journal import open_journal
+from ctid_cli.storage.journal_reader import read_journal
 from ctid_cli.storage.sealed import read_sealed, seal_image
 from ctid_cli.storage.store import load_estimates, read_stored, read_tracks
 

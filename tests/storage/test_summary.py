@@ -8,7 +8,7 @@ import pytest
 
 from ctid_cli.inference.monte_carlo import wilson_interval
 from ctid_cli.storage.columns import parameter_names
-from ctid_cli.storage.summary import export_rows, is_converged, summarise
+from ctid_cli.storage.summary import counted, export_rows, is_converged
 
 
 def row(status: str = "CONVERGED", delay: float | None = 8.0, fit: float | None = 95.0) -> dict[str, Any]:
@@ -92,27 +92,16 @@ def frame() -> pd.DataFrame:
     )
 
 
-def test_summarise_keeps_the_order_and_counts_failures() -> None:
-    table = summarise(frame(), ["estimator", "initial_delay"])
-    assert table[["estimator", "initial_delay"]].to_numpy().tolist() == [["b", "random"], ["b", 3.0], ["a", None]]
-    assert table["n"].tolist() == [1, 2, 2]
-    assert table["failed"].tolist() == [0, 1, 1]
-    assert table["converged"].tolist() == [1, 1, 0]
-    assert table["percent"].tolist() == [100.0, 50.0, 0.0]
-    assert table["median_seconds"].tolist() == [1.0, 2.0, 5.0]
-    assert table["median_cpu_seconds"].tolist() == [0.5, 1.0, 2.5]
+def test_a_group_is_counted() -> None:
+    failures, times = np.array([False, True]), np.array([4.0, 6.0])
+    found = counted(failures, np.array([True, False]), {"seconds": times, "cpu_seconds": np.array([np.nan, 3.0])})
+    assert (found["n"], found["failed"], found["converged"], found["percent"]) == (2, 1, 1, 50.0)
+    assert (found["median_seconds"], found["median_cpu_seconds"]) == (5.0, 3.0)
     low, high = wilson_interval(1, 2)
-    assert table.loc[1, ["low", "high"]].tolist() == [100 * low, 100 * high]
-
-
-def test_summarise_without_groups_and_without_a_rule() -> None:
-    estimates = frame()
-    assert summarise(estimates, [])["n"].tolist() == [5]
-    estimates["converged"] = pd.Series([None] * 5, dtype="boolean")
-    table = summarise(estimates, ["estimator"])
-    assert table["converged"].isna().all()
-    assert table[["percent", "low", "high"]].isna().all(axis=None)
-    assert summarise(estimates.iloc[:0], ["estimator"]).empty
+    assert (found["low"], found["high"]) == (100 * low, 100 * high)
+    # Without a rule, and where no time is known.
+    found = counted(failures, None, {"seconds": np.full(2, np.nan)})
+    assert (found["n"], found["converged"], found["percent"], found["median_seconds"]) == (2, None, None, None)
 
 
 def test_export_has_a_column_for_every_coefficient() -> None:

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import ctid_cli
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.figures.experiment_plot import Kind, experiment_drawing, kinds_of, main_measure
@@ -24,6 +26,7 @@ from ctid_cli.reporting.tables import experiment_report, notes_of
 from ctid_cli.storage.folder import SPEC
 from ctid_cli.storage.manifest import true_values
 from ctid_cli.storage.provenance import public_sessions
+from ctid_cli.storage.stored import Rows
 
 #: What is measured of every simulated system, beside what the specification asks for.
 MEASURES = ("bias", "rmse", "coverage")
@@ -43,7 +46,7 @@ CAPTIONS: dict[Kind, str] = {
 
 def experiment_page(results: Results, out: Path) -> str:
     """The page as HTML."""
-    settings, rows = results.settings, results.rows
+    settings = results.settings
     sessions = public_sessions(results.folder)
     sizes = [cell["replicates"] for cell in results.manifest["data_cells"]]
     return written(
@@ -61,7 +64,7 @@ def experiment_page(results: Results, out: Path) -> str:
         reports=_tables(results),
         figures=list(_figures(results, out)),
         comparisons=list(_comparisons(results, out)),
-        outcomes=_outcomes(rows, out),
+        outcomes=_outcomes(results.rows, out),
         notes=notes_of(results, out),
         surprises=surprises(results),
         spec_hash=results.manifest["spec_hash"],
@@ -129,15 +132,15 @@ def _comparisons(results: Results, out: Path) -> Iterator[Report]:
             continue
 
 
-def _outcomes(rows: list[dict[str, Any]], out: Path) -> list[dict[str, Any]]:
+def _outcomes(rows: Rows, out: Path) -> list[dict[str, Any]]:
     """How the estimates ended that did not end well, with the command that shows one of them."""
     first: dict[tuple[str, str, str], str] = {}
     found: Counter[tuple[str, str, str]] = Counter()
-    for row in rows:
-        if row["status"] not in SUCCESSES:
-            how = (row["estimator"], row["status"], sentence_of(row))
-            found[how] += 1
-            first.setdefault(how, row["id"])
+    well = np.isin(rows.column("status"), [status.encode() for status in SUCCESSES])
+    for row in rows.chosen(~well).only("estimator", "status", "message", "id"):
+        how = (row["estimator"], row["status"], sentence_of(row))
+        found[how] += 1
+        first.setdefault(how, row["id"])
     return [
         {
             "estimator": how[0],

@@ -1,0 +1,380 @@
+"""Reading the journal: nothing is trusted before it is compared with its checksum."""
+
+import hashlib
+import json
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+from ctid_cli.errors import DamageError, StorageError
+from ctid_cli.storage.foreign import read_json, require_manifest
+from ctid_cli.storage.identity import Origin, gathered
+from ctid_cli.storage.manifest import Key, Manifest, refuse_newer
+
+FILE_NAME = "journal.sqlite"
+#: Raised by one whenever an older ctid could misread the file.
+FORMAT = 4
+#: Marks an SQLite file as a journal of ctid ("ctid" in ASCII).
+APPLICATION = 0x63746964
+
+#: More estimates than these are compared one by one only where they are read, and by `ctid verify`.
+LARGE = 100_000
+#: First format in which every row has a checksum over all of it.
+CHECKED = 4
+SEALED, TALLY = "sealed", "tally"
+#: Columns of the identity of an estimate.
+KEY = "data_hash, replicate, estimator_hash, start"
+#: In format 1 it is the run that has the origin.
+_WITH_RUNS = "estimates JOIN sessions ON session = number"
+#: What keeps SQLite from reading or writing a file that is in order; all else that it reports is damage.
+_HINDRANCES = ("READONLY", "CANTOPEN", "FULL", "IOERR", "PERM", "AUTH", "BUSY", "LOCKED", "NOMEM", "PROTOCOL")
+#: What damage can cause while it is read.
+ERRORS = (sqlite3.Error, ValueError, TypeError, KeyError, IndexError, OverflowError)
+#: How long a reader waits for a moment at which the file can be read [s].
+_READER_PATIENCE = 2.0
+
+
+class Row(NamedTuple):
+    """An estimate as it is stored."""
+
+    key: Key
+    result: str
+    checksum: str
+    seconds: float | None
+    cpu_seconds: float | None
+    session: int
+    origin: int
+
+    def is_intact(self) -> bool:
+        """Whether it is what was written; before format 4 times, runs and origins had no checksum."""
+        return self.checksum in (self.digest(), _text_digest("\n".join([*map(str, self.key), self.result])))
+
+    def digest(self) -> str:
+        """Checksum of all of it."""
+        return row_digest("estimates", *self.key, self.result, *self[3:])
+
+
+@dataclass
+class Tally:
+    """How many estimates there are, and all their checksums in one number, whatever their order."""
+
+    count: int = 0
+    mark: int = 0
+
+    def add(self, checksum: str) -> None:
+        """Count an estimate."""
+        self.count += 1
+        self.mark ^= int(checksum, 16)
+
+    def remove(self, checksum: str) -> None:
+        """Count one no more."""
+        self.count -= 1
+        self.mark ^= int(checksum, 16)
+
+    def __str__(self) -> str:
+        return f"{self.count} {self.mark:032x}"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A stored estimate."""
+
+    result: dict[str, Any]
+    #: Time it took, and processor time [s].
+    seconds: float | None
+    cpu_seconds: float | None
+    session: int
+    origin: Origin
+
+
+class JournalReader:
+    """An open journal, as far as it is read."""
+
+    def __init__(self, connection: sqlite3.Connection, path: Path, *, live: bool = False) -> None:
+        self._connection = connection
+        self.path = path
+        #: Whether a run is writing to it while it is read.
+        self.live = live
+        (self._format,) = connection.execute("PRAGMA user_version").fetchone()
+
+    def experiment(self) -> str:
+        """Name of the experiment."""
+        return str(self.manifest()["experiment"])
+
+    def manifest(self) -> Manifest:
+        """The plan of the latest run."""
+        with self._guard():
+            return require_manifest(read_json(self._meta("manifest") or ""))
+
+    def sealed(self) -> str | None:
+        """Checksum of the sealed file, or None if estimates came after it."""
+        return self._meta(SEALED)
+
+    def origins(self) -> tuple[Origin, ...]:
+        """Where the stored estimates come from."""
+        return gathered((estimator, origin) for _, estimator, origin in self.made())
+
+    def made(self) -> set[tuple[str, str, Origin]]:
+        """Data cells and estimators of the stored estimates, and where these come from."""
+        known = self._known_origins()
+        rows = self._rows(f"SELECT DISTINCT data_hash, estimator_hash, origin FROM {self._estimates}")
+        return {(data, estimator, known[origin]) for data, estimator, origin in rows}
+
+    @property
+    def _estimates(self) -> str:
+        return "estimates" if self._format > 1 else _WITH_RUNS
+
+    def _known_origins(self) -> dict[int, Origin]:
+        rows = self._checked("origins", "number, code_version, platform, packages")
+        with self._guard():
+            return {number: Origin.of(code, machine, json.loads(packages)) for number, code, machine, packages in rows}
+
+    def sessions(self) -> list[dict[str, Any]]:
+        """Every run that has written here, the oldest first."""
+        names = ("session", "started", "stopped", "reason")
+        rows = self._checked("sessions", "number, started, stopped, reason, info")
+        with self._guard():
+            return [dict(zip(names, values, strict=True)) | json.loads(info) for *values, info in rows]
+
+    def keys(self) -> set[Key]:
+        """Which estimates are stored."""
+        found = {Key(*row) for row in self._rows(f"SELECT {KEY} FROM estimates")}
+        self._require_count(len(found))
+        return found
+
+    def entries(self) -> dict[Key, Entry]:
+        """Every stored estimate."""
+        origins = self._known_origins()
+        with self._guard():
+            return {
+                row.key: Entry(json.loads(row.result), row.seconds, row.cpu_seconds, row.session, origins[row.origin])
+                for row in self.rows()
+            }
+
+    def rows(self) -> Iterator[Row]:
+        """Every stored estimate, compared with its checksum; at the end, all of them with their tally."""
+        tally = Tally()
+        for row in self.unchecked_rows():
+            tally.add(self._intact(row).checksum)
+            yield row
+        self._require(tally)
+
+    def _require(self, tally: Tally) -> None:
+        """Refuse estimates that are not all that were written."""
+        self._require_count(tally.count)
+        if self._meta(TALLY) not in (None, str(tally)):
+            raise DamageError(f"{self.path} is damaged: its estimates are not those that were written")
+
+    def unchecked_rows(self) -> Iterator[Row]:
+        """Every row of the table of estimates."""
+        with self._guard():
+            for row in self._connection.execute(self._selected):
+                yield Row(Key(*row[:4]), *row[4:])
+
+    @property
+    def _selected(self) -> str:
+        # A file that is only read keeps its format.
+        cpu = "cpu_seconds" if self._format > 2 else "NULL"
+        chosen = f"{KEY}, result, estimates.checksum, seconds, {cpu}, session, origin"
+        return f"SELECT {chosen} FROM {self._estimates}"
+
+    def _require_count(self, count: int) -> None:
+        stored = self._meta(TALLY)
+        # Before format 4 nobody counted.
+        if stored is None and self._format < CHECKED:
+            return
+        written = "an unknown number of" if stored is None else stored.split()[0]
+        if written != str(count):
+            raise DamageError(f"{self.path} is damaged: {written} estimates were written, {count} are there")
+
+    def check(self, *, fully: bool = False) -> None:
+        """Refuse a file that SQLite finds damaged; fully, compare indices with tables too."""
+        found = self._rows(f"PRAGMA {'integrity' if fully else 'quick'}_check(1)")
+        if found != [("ok",)]:
+            raise DamageError(f"{self.path} is damaged: {found[0][0] if found else 'no answer'}")
+
+    def files(self) -> dict[str, set[str]]:
+        """SHA-256 of everything that was ever written to the files beside the journal, by name."""
+        noted: dict[str, set[str]] = {}
+        for name, sha256 in self._checked("files", "name, sha256") if self._format >= CHECKED else ():
+            noted.setdefault(name, set()).add(sha256)
+        return noted
+
+    def _rows(self, query: str, *values: str) -> list[Any]:
+        with self._guard():
+            return self._connection.execute(query, values).fetchall()
+
+    def _checked(self, table: str, columns: str, where: str = "", *values: str) -> list[Any]:
+        """Rows of a table, compared with their checksums; it is read whole, so that ``columns`` are all but that."""
+        if self._format < CHECKED:
+            return self._rows(f"SELECT {columns} FROM {table} {where}", *values)
+        rows = self._rows(f"SELECT {columns}, checksum FROM {table} {where}", *values)
+        for *row, checksum in rows:
+            if row_digest(table, *row) != checksum:
+                raise DamageError(f"{self.path} is damaged: {table} {row[0]!r} has changed since it was written")
+        return [row for *row, _ in rows]
+
+    def _meta(self, name: str) -> str | None:
+        rows = self._checked("meta", "name, value", "WHERE name = ?", name)
+        return str(rows[0][1]) if rows else None
+
+    @contextmanager
+    def _guard(self, *, writing: bool = False) -> Iterator[None]:
+        try:
+            yield
+        except ERRORS as error:
+            refuse(self.path, error, writing=writing)
+
+    def count(self) -> int:
+        """How many estimates are stored."""
+        stored = self._meta(TALLY)
+        return int(stored.split()[0]) if stored is not None else int(self._rows("SELECT count(*) FROM estimates")[0][0])
+
+    @property
+    def is_large(self) -> bool:
+        """Whether it would take seconds to compare every estimate with its checksum."""
+        return self.count() > LARGE
+
+    def mean_seconds(self) -> float | None:
+        """Mean time of an estimate [s]; None where none is known."""
+        ((mean,),) = self._rows("SELECT avg(seconds) FROM estimates")
+        return None if mean is None else float(mean)
+
+    def row(self, key: Key) -> Row | None:
+        """One estimate as it is stored, compared with its checksum."""
+        where = " AND ".join(f"{name} = ?" for name in KEY.split(", "))
+        with self._guard():
+            found = self._connection.execute(f"{self._selected} WHERE {where}", key).fetchone()
+        return None if found is None else self._intact(Row(Key(*found[:4]), *found[4:]))
+
+    def _intact(self, row: Row) -> Row:
+        if not row.is_intact():
+            raise DamageError(f"{self.path} is damaged: estimate {row.key.id} has changed since it was written")
+        return row
+
+    def statuses(self) -> Iterator[tuple[Key, str]]:
+        """Status of every stored estimate."""
+        for row in self.rows():
+            with self._guard():
+                status = json.loads(row.result)["status"]
+            yield row.key, str(status)
+
+    def stock(self, heed: Callable[[Key, str, int], None]) -> None:
+        """Tell of every estimate its status and the run that it comes from, without taking its numbers apart.
+
+        What is told of is all that was written; whether each is as it was written is asked when it is read.
+        """
+        tally = Tally()
+        if self._format < CHECKED:
+            for row in self.rows():
+                heed(row.key, str(json.loads(row.result)["status"]), row.session)
+            return
+        with self._guard():
+            chosen = f"SELECT {KEY}, json_extract(result, '$.status'), session, checksum FROM estimates"
+            for *key, status, session, checksum in self._connection.execute(chosen):
+                tally.add(checksum)
+                heed(Key(*key), str(status), session)
+        self._require(tally)
+
+    def require_all(self) -> Tally:
+        """Refuse a file that lacks some of what was written, or of few estimates one in which any has changed.
+
+        Of many, single rows are compared when they are read.
+        """
+        tally = Tally()
+        if self._format < CHECKED or not self.is_large:
+            for row in self.rows():
+                tally.add(row.checksum)
+            return tally
+        with self._guard():
+            for (checksum,) in self._connection.execute("SELECT checksum FROM estimates"):
+                tally.add(checksum)
+        self._require(tally)
+        return tally
+
+    def origins_of(self, made: Iterable[tuple[str, int]]) -> tuple[Origin, ...]:
+        """The origins that estimators and numbers of origins mean."""
+        known = self._known_origins()
+        with self._guard():
+            return gathered((estimator, known[origin]) for estimator, origin in made)
+
+
+@contextmanager
+def read_journal(path: Path, *, live: bool = False) -> Iterator[JournalReader | None]:
+    """Open a journal for reading without touching its files, ``live`` while a run writes to it."""
+    if not path.exists():
+        yield None
+        return
+    with ExitStack() as stack:
+        try:
+            address = stack.enter_context(_readable(path, live=live))
+            connection = sqlite3.connect(address, uri=True, isolation_level=None, timeout=_READER_PATIENCE)
+            stack.callback(connection.close)
+            # All that is read from here on is of one moment.
+            connection.execute("BEGIN")
+            planned = connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone()
+            if planned:
+                format_of(connection, path)
+                planned = connection.execute("SELECT 1 FROM meta WHERE name = 'manifest'").fetchone()
+                if not planned and connection.execute("SELECT 1 FROM sessions").fetchone():
+                    raise DamageError(f"{path} is damaged: it holds no plan")
+            log = JournalReader(connection, path, live=live)
+        except (OSError, *ERRORS) as error:
+            refuse(path, error)
+        yield log if planned else None
+
+
+@contextmanager
+def _readable(path: Path, *, live: bool) -> Iterator[str]:
+    """An address at which SQLite reads a journal and changes nothing.
+
+    After a kill, acknowledged estimates stand in the write-ahead log beside the file. SQLite reads it in place if its
+    index is there, however stale; else a copy is read. A file that nobody writes to and that has no log needs no locks.
+    """
+    log, index = (path.with_name(f"{path.name}-{end}") for end in ("wal", "shm"))
+    if live or (index.exists() and log.exists()):
+        yield f"{path.resolve().as_uri()}?mode=ro&readonly_shm=1"
+    elif not log.exists() or not log.stat().st_size:
+        yield f"{path.resolve().as_uri()}?mode=ro&immutable=1"
+    else:
+        with tempfile.TemporaryDirectory(prefix="ctid-") as folder:
+            copy = Path(folder) / path.name
+            shutil.copyfile(path, copy)
+            shutil.copyfile(log, copy.with_name(log.name))
+            yield copy.as_uri()
+
+
+def refuse(path: Path, error: Exception, *, writing: bool = False) -> NoReturn:
+    """Say what keeps a journal from being read or written."""
+    name = getattr(error, "sqlite_errorname", "") or ""
+    reason = (error.strerror if isinstance(error, OSError) else None) or error
+    if writing and name not in ("SQLITE_CORRUPT", "SQLITE_NOTADB"):
+        safe = "all that was reported as done is safe in it"
+        raise StorageError(f"{path} could not be written ({reason}); {safe}") from error
+    if isinstance(error, OSError) or name.removeprefix("SQLITE_").startswith(_HINDRANCES):
+        raise StorageError(f"{path} cannot be read ({reason})") from error
+    raise DamageError(f"{path} is damaged or not a journal ({error})") from error
+
+
+def format_of(connection: sqlite3.Connection, path: Path) -> int:
+    """Format of a journal; other files, and newer formats, are refused."""
+    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    (written_by,) = connection.execute("PRAGMA user_version").fetchone()
+    if application != APPLICATION:
+        raise DamageError(f"{path} is an SQLite file, but not a journal of ctid")
+    refuse_newer(path, written_by, FORMAT)
+    return int(written_by)
+
+
+def row_digest(table: str, *values: object) -> str:
+    """Checksum of a row."""
+    return _text_digest(json.dumps([table, *values], default=repr))
+
+
+def _text_digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:32]

@@ -1,0 +1,93 @@
+"""``timings.csv``: how long each estimate took, in the order of the sealed file."""
+
+import csv
+import io
+from collections.abc import Mapping
+from functools import cached_property
+
+import numpy as np
+
+from ctid_cli.arrays import Array
+from ctid_cli.storage.packing import CLOCKS, PackedTable, decoded
+from ctid_cli.storage.pieces import AnyArray, Table, ranges
+
+#: Estimates whose times are looked up one by one before the whole file is taken apart.
+FEW = 10
+
+
+def times_table(table: PackedTable) -> bytes:
+    """The content of the file; estimates that two names share are in it once."""
+    content = io.BytesIO()
+    text = io.TextIOWrapper(content, encoding="utf-8", newline="", write_through=True)
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(("id", *CLOCKS, "session"))
+    seen: set[str] = set()
+    for start, stop in ranges(table.count):
+        times = ([None if t != t else t for t in table.read(clock, start, stop).tolist()] for clock in CLOCKS)
+        ids, sessions = decoded(table.read("id", start, stop)), table.read("session", start, stop).tolist()
+        for row in zip(ids, *times, sessions, strict=True):
+            if table.shares_estimates:
+                if row[0] in seen:
+                    continue
+                seen.add(row[0])
+            rows.writerow(row)
+    return content.getvalue()
+
+
+class TimedTable:
+    """A sealed table with the times that belong to it, read when they are asked for; NaN where they are not known."""
+
+    def __init__(self, table: Table, content: bytes) -> None:
+        self._table, self._content = table, content
+        self.count = table.count
+
+    def has(self, name: str) -> bool:
+        """Whether there is such an array."""
+        return name in CLOCKS or self._table.has(name)
+
+    def parts(self, name: str) -> list[str]:
+        """Names of the columns of an array that has several."""
+        return self._table.parts(name)
+
+    def read(self, name: str, start: int = 0, stop: int | None = None) -> AnyArray:
+        """Some rows of an array."""
+        if name not in CLOCKS:
+            return self._table.read(name, start, stop)
+        if stop is not None and stop - start <= FEW and "_times" not in self.__dict__:
+            ids = self._table.read("id", start, stop)
+            lines = [self._content.partition(b"\n")[0], *map(self._line, ids.tolist())]
+            return _times(b"\n".join(lines), ids)[name]
+        return self._times[name][start:stop]
+
+    @cached_property
+    def _times(self) -> Mapping[str, Array]:
+        return _times(self._content, self._table.read("id"))
+
+    def _line(self, name: bytes) -> bytes:
+        place = self._content.find(b"\n" + name + b",") + 1
+        return self._content[place : self._content.find(b"\n", place)] if place else b""
+
+
+def _times(content: bytes, ids: AnyArray) -> Mapping[str, Array]:
+    """Times of estimates in the order of their ids."""
+    nothing = {clock: np.full(len(ids), np.nan) for clock in CLOCKS}
+    try:
+        found: dict[str, list[str]] = {name: [] for name in ("id", *CLOCKS)}
+        lines = csv.reader(io.TextIOWrapper(io.BytesIO(content), encoding="utf-8"))
+        names = next(lines, [])
+        for line in lines:
+            if line:
+                for name, value in zip(names, line, strict=False):
+                    if name in found:
+                        found[name].append(value)
+        numbers = {
+            clock: np.array([float(value or "nan") for value in found[clock]]) for clock in CLOCKS if found[clock]
+        }
+        known = np.array(found["id"], dtype=np.bytes_ if found["id"] else "S1")
+        if known.shape == ids.shape and (known == ids).all():
+            return nothing | numbers
+        places = {name: k for k, name in enumerate(known.tolist())}
+        where = np.array([places.get(name, -1) for name in ids.tolist()], dtype=np.intp)
+        return nothing | {clock: np.where(where < 0, np.nan, values[where]) for clock, values in numbers.items()}
+    except (ValueError, IndexError, csv.Error):
+        return nothing
