@@ -191,7 +191,7 @@ def compare_fits(
     _refuse_overwriting([*files, on], [data, figure])
     content = csv_bytes(comparison_columns(found, models, measurement.record))
     write_files({data: content, figure: comparison_drawing(models, found, measurement).saved()})
-    head = f"{measurement.record.name}: {found[0].count} of {measurement.record.n_samples} samples used"
+    head = f"{measurement.record.name}: {measurement.record.n_samples} samples"
     answer(
         as_json,
         lambda: {**comparison_object(models, measurement, found), "written": [str(data), str(figure)]},

@@ -209,7 +209,7 @@ def comparison_object(
 def comparison_table(models: Sequence[NamedFit], found: Sequence[ModelOnRecord]) -> Table:
     """Models on a record, the best fit first."""
     units = models[0].units
-    header = ["model", "fit %", "R2", f"rms [{units.output}]", "white", "p", "independent of the input", "p"]
+    header = ["model", "samples", "fit %", "R2", f"rms [{units.output}]", "white", "p", "independent of the input", "p"]
     header += ["initial state", "offset"]
     rows = []
     for k in np.argsort([-one.fit_percent for one in found], kind="stable"):
@@ -219,8 +219,8 @@ def comparison_table(models: Sequence[NamedFit], found: Sequence[ModelOnRecord])
             verdicts = [_yes(test.white, test.whiteness_p_value), number(test.whiteness_p_value, 2)]
             verdicts += [_yes(test.uncorrelated, test.cross_p_value), number(test.cross_p_value, 2)]
         numbers = [percent(one.fit_percent, 10**6), number(one.r2, 5), number(one.rms, 4)]
-        rows.append([models[k].name, *numbers, *verdicts, one.initial_state, one.offset])
-    return Table(header, rows, "lrrrlrlrll")
+        rows.append([models[k].name, str(one.count), *numbers, *verdicts, one.initial_state, one.offset])
+    return Table(header, rows, "lrrrrlrlrll")
 
 
 def _yes(passed: bool, p_value: float) -> str:
