@@ -21,6 +21,15 @@ _PROJECTION = """\
   doi     = {10.1007/BF01932995},
 }"""
 
+_ADDITIVE = """\
+@article{gonzalez2025,
+  author  = {Gonz{\\'a}lez, R. A. and Classens, K. and Rojas, C. R. and Welsh, J. S. and Oomen, T.},
+  title   = {Identification of additive continuous-time systems in open and closed loop},
+  journal = {Automatica},
+  year    = {2025},
+  note    = {arXiv:2401.01263},
+}"""
+
 _ROBUST = """\
 @book{huber2009,
   author    = {Huber, P. J. and Ronchetti, E. M.},
@@ -55,7 +64,8 @@ _FREQUENCY = """\
 
 def bibtex(result: Identification) -> str:
     """Entries for a fit and for the frequency response that stands beside it."""
-    entries = [_CTID.format(version=ctid_cli.__version__), _PROJECTION]
+    method = _ADDITIVE if result.options.kind == "additive_srivc" else _PROJECTION
+    entries = [_CTID.format(version=ctid_cli.__version__), method]
     if result.fit.weighting is not None:
         entries.append(_ROBUST)
     if result.uncertainty.kind != "white":

@@ -5,6 +5,7 @@ import shlex
 from collections import Counter
 from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -145,3 +146,6 @@ def test_what_a_fit_used_is_cited(fitted):
     assert entries.count("{") == entries.count("}")
     keys = re.findall(r"^@\w+\{(\w+),$", entries, re.MULTILINE)
     assert keys == ["ctid", "kaufman1975", "pintelon2012"]
+    kind, squares = SimpleNamespace(kind="additive_srivc"), SimpleNamespace(weighting=None)
+    additive = SimpleNamespace(options=kind, fit=squares, uncertainty=fitted[0].uncertainty)
+    assert "{Gonz{\\'a}lez, R. A. and" in bibtex(additive)
