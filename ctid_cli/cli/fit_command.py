@@ -23,15 +23,20 @@ from ctid_cli.cli._progress import FitProgress
 from ctid_cli.cli.fit_structure import Asked, ModelForm, check_loop, delay_bounds, estimator_of, with_loop
 from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import InitialState, LossKind, Offset
+from ctid_cli.text import wrapped
 
 
 @guarded
 def fit(
     context: typer.Context,
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat), an experiment each.")],
-    poles: Annotated[int | None, typer.Option("--poles", help="Number of poles, 1 to 12; must be given.")] = None,
+    poles: Annotated[
+        int | None, typer.Option("--poles", help="Number of poles, 1 to 12; else by an order search.")
+    ] = None,
     zeros: Annotated[int | None, typer.Option("--zeros", help="Number of zeros, fewer than poles.")] = None,
-    delay: Annotated[str, typer.Option("--delay", metavar="LOW:HIGH|VALUE", help="Range or value [time unit].")] = "0",
+    delay: Annotated[
+        str | None, typer.Option("--delay", metavar="LOW:HIGH|VALUE", help="Range or value [time unit]; 0.")
+    ] = None,
     model: Annotated[ModelForm, typer.Option("--model", help="One fraction, or a sum of submodels.")] = "fraction",
     terms: Annotated[
         str | None, typer.Option("--terms", metavar="P/Z,P/Z,...", help="Poles/zeros of each submodel.")
@@ -76,19 +81,28 @@ def fit(
     from ctid_cli.signals.measurement import read_measurement
     from ctid_cli.storage.fit_file import fit_text
 
-    if poles is None and model == "fraction" and terms is None:
-        raise UsageError(f"--poles is missing; to see what the record allows and a first fit: ctid check {files[0]}")
     if bootstrap is not None and bootstrap < LEAST_DRAWS:
         raise UsageError(f"--bootstrap must be at least {LEAST_DRAWS} draws, for example 500; got {bootstrap}")
     check_loop(loop, reference, ignore_loop)
+    read = partial(read_measurement, time=time, input=input, output=output, hold=hold, reference=reference)
+    bounds = None if delay is None else delay_bounds(delay)
+    searched = ""
+    if poles is None and model == "fraction" and terms is None:
+        if loop is not None or fix or integrators or loss != "squares":
+            raise UsageError("--poles is missing: with --loop, --fix, --integrators or --loss it must be given")
+        from ctid_cli.reporting.order_proposal import propose_structure
+
+        first = [read(file, start=start, stop=stop) for file in files]
+        unit = common_units(first).time
+        proposal = propose_structure([item.record for item in first], zeros, bounds, initial_state, offset, unit)
+        poles, zeros, bounds, searched = proposal
     asked = Asked(
-        *(model, terms, poles, zeros, integrators, delay_bounds(delay), fix or (), initial_state, offset, loss, hold),
+        *(model, terms, poles, zeros, integrators, bounds or (0.0, 0.0), fix or (), initial_state, offset, loss, hold),
         loop=loop is not None and not ignore_loop,
     )
     options = estimator_of(asked)
     if asked.iterated and len(files) > 1:
         raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")
-    read = partial(read_measurement, time=time, input=input, output=output, hold=hold, reference=reference)
     measurements = [read(file, start=start, stop=stop) for file in files]
     other = None if validate is None else read(validate)
     if loop is not None:
@@ -111,5 +125,7 @@ def fit(
     if as_json:
         typer.echo(text)
     else:
+        if searched:
+            typer.echo(wrapped(searched) + "\n")
         typer.echo(identification_text(result, measurements, units))
         typer.echo(f"\nWritten: {', '.join(map(str, contents))}")

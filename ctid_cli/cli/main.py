@@ -13,6 +13,7 @@ from ctid_cli.cli.frf_command import frf
 from ctid_cli.cli.init_command import init
 from ctid_cli.cli.merge_command import merge
 from ctid_cli.cli.model_commands import model
+from ctid_cli.cli.order_command import order
 from ctid_cli.cli.result_commands import export, figure, report, show, status, table
 from ctid_cli.cli.storage_commands import repair, verify
 from ctid_cli.cli.study_command import study
@@ -52,7 +53,7 @@ def _root(
 
 app.command(cls=CheckCommand)(check)
 _RESULTS = (status, table, figure, report, show, export, verify, repair)
-for _command in (fit, frf, track, init, run, merge, *_RESULTS, validate, schema):
+for _command in (fit, order, frf, track, init, run, merge, *_RESULTS, validate, schema):
     app.command(cls=Command)(_command)
 app.add_typer(model, name="model")
 app.add_typer(study, name="study")

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
@@ -65,6 +66,15 @@ class MeasuredRecords:
     def bandwidth(self) -> float:
         """Highest frequency that matters in an output [rad/s]."""
         return max(output_bandwidth(record) for record in self.records)
+
+    def with_structure(self, structure: Structure) -> "MeasuredRecords":
+        """The same records for another model."""
+        other = copy(self)
+        other.structure = structure
+        other.layout = replace(self.layout, structure=structure)
+        for name in ("options", "problem"):
+            other.__dict__.pop(name, None)
+        return other
 
     @property
     def plain(self) -> bool:

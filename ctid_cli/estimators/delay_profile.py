@@ -270,10 +270,10 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
                     if known:
                         size = refinement.structure.size
                         best = with_known(refinement, known, [each.theta[:size] for each in minima], best)
-                    fit = _fit(refinement, best, profile, None, known)
+                    fit = fitted(refinement, best, profile, None, known)
                 else:
                     robust = robust_fit(refinement, self.loss, starts, self.nested)
-                    fit = _fit(refinement, robust.found, profile, robust)
+                    fit = fitted(refinement, robust.found, profile, robust)
                 uncertainty = fit.uncertainty(self.covariance, self.bootstrap_draws)
                 singular = fit.status is Status.CONVERGED and not np.isfinite(uncertainty.free_covariance).all()
                 status = Status.SINGULAR if singular else fit.status
@@ -281,14 +281,14 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
         raise DataError(Status.SINGULAR.value)
 
 
-def _fit(
+def fitted(
     refinement: Refinement,
     found: Optimum,
     profile: Profile | None,
     robust: RobustFit | None,
     known: Collection[int] = (),
 ) -> MeasuredFit:
-    """The result, but for its covariance."""
+    """The result of a refinement, but for its covariance."""
     measured = refinement.measured
     layout, theta = refinement.parameters(found)
     samples = samples_at(refinement, found.model, theta, None if robust is None else robust.losses)

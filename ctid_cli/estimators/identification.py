@@ -190,7 +190,7 @@ def identify(
         periodic=options.initial_state == "periodic",
     )
     squared_error = float(residuals @ residuals) if fit.weighting is None else fit.cost * fit.count
-    tests = _tests(options, linear, records, answer)
+    tests = tests_of(options, linear, records, answer)
     uncertainty = fit.uncertainty(covariance, bootstrap_draws, progress)
     matrix = uncertainty.covariance
     free, hessian = _free(linear)
@@ -205,7 +205,7 @@ def identify(
         interval = _delay_interval(laid_out, linear, uncertainty)
     judged = None
     if checked is not None and validation is not None:
-        judged = _validate(judging.applied(fit, options, checked), validation)
+        judged = validated(judging.applied(fit, options, checked), validation)
     found = Identification(
         options=replace(options, covariance=covariance, bootstrap_draws=bootstrap_draws),
         fit=fit,
@@ -247,7 +247,7 @@ def _warnings(found: Identification, look: SecondLook, hessian: Array, gains: di
 # --- residuals and uncertainty ----------------------------------------------------------------------
 
 
-def _tests(
+def tests_of(
     options: Options, fit: MeasuredFit, records: Sequence[Record], answer: AnswerTest
 ) -> tuple[ResidualTests, ...]:
     """Tests of each experiment, at levels that make a false alarm as likely as with one."""
@@ -384,7 +384,8 @@ def _estimates(
     return tuple(sorted(found.values(), key=lambda item: order.get(item.name[0], 3)))
 
 
-def _validate(applied: AppliedModel, record: Record) -> Validation:
+def validated(applied: AppliedModel, record: Record) -> Validation:
+    """What a model says of another record, in numbers."""
     y = record.y[applied.used[0]]
     simulated = y - applied.residuals[0]
     return Validation(record.name, record, applied, fit_percent(y, simulated), r_squared(y, simulated), y.size)

@@ -137,7 +137,7 @@ def _least(nest: Nest, poles: int, zeros: int, fewer_poles: bool) -> Optimum:
     least = best.local.squared_error
     ends = np.array(nest.ends(poles - lost, zeros))
     agree = int(np.count_nonzero(ends <= max(least, float(ends.min())) * (1 + SAME) + nest.descent(zeros).floor))
-    return _optimum(best, lost, ends.size, agree, nest)
+    return optimum(best, lost, ends.size, agree, nest)
 
 
 def problem_of(records: Sequence[FilterData], zeros: int, options: SearchOptions) -> Problem:
@@ -156,7 +156,7 @@ def _one_period(data: FilterData, period: float) -> FilterData:
     return data._replace(tu=data.tu[within].copy(), u=data.u[within].copy(), interval=0.0)
 
 
-def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Optimum:
+def optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Optimum:
     """The model in coefficients of polynomials."""
     point, projected = best.local.point, best.local.projected
     a = point.denominator

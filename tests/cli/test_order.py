@@ -1,0 +1,58 @@
+"""``ctid order``: from a file to a recommendation, or to one sentence."""
+
+import json
+
+import numpy as np
+import pytest
+
+from ctid_cli import HeldSignal, TransferFunction, simulate
+
+
+def write(file, gain, seed=0):
+    rng = np.random.default_rng(seed)
+    t = 0.1 * np.arange(500)
+    u = np.repeat(rng.choice([-1.0, 1.0], 100), 5)
+    y = gain * simulate(TransferFunction([2.0], [1.0, 1.0], 0.33), HeldSignal(t, u), t) + 0.1 * rng.standard_normal(500)
+    rows = (f"{a:.9g},{b:.9g},{c:.9g}" for a, b, c in zip(t, u, y, strict=True))
+    file.write_text("\n".join(["t [s],u [V],y [mm]", *rows]) + "\n", encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def record(tmp_path):
+    return write(tmp_path / "record.csv", 1.0)
+
+
+def test_recommendation_table_and_files(ctid, record, tmp_path):
+    out = tmp_path / "new"
+    other = write(tmp_path / "other.csv", 1.0, 1)
+    text = ctid("order", record, "--poles", "1:3", "--zeros", "0:1", "--validate", other, "--out", out).stdout
+    for part in ("record.csv: 500 samples, 5 structures", "Recommended: 1 pole, no zero.", "validation %", "--delay"):
+        assert part in text
+    content = json.loads((out / "order.json").read_text(encoding="utf-8"))
+    assert content["recommended"] == {"poles": 1, "zeros": 0}
+    assert len(content["orders"]) == 5
+    assert (out / "order.svg").read_bytes().startswith(b"<?xml")
+
+
+def test_noise_has_no_order(ctid, tmp_path):
+    record = write(tmp_path / "noise.csv", 0.0)
+    done = ctid("order", record, "--poles", "1:2", "--zeros", "0", "--delay", "0:1", "--json", "--out", tmp_path)
+    content = json.loads(done.stdout)
+    assert content["recommended"] is None
+    assert content["reason"].startswith("There is no model here")
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--poles", "0:2"], "--poles must be LOW:HIGH or one number, from 1 to 12"),
+        (["--zeros", "2:1"], "--zeros must be LOW:HIGH"),
+        (["--delay", "x"], "--delay must be LOW:HIGH"),
+        (["--poles", "2", "--zeros", "5"], "no structure has at least 5 zeros and at most 2 poles"),
+    ],
+)
+def test_what_cannot_be_is_refused(ctid, record, tmp_path, options, sentence):
+    done = ctid("order", record, *options, "--out", tmp_path / "new", code=2)
+    assert sentence in done.stderr
+    assert not (tmp_path / "new").exists()
