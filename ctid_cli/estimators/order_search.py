@@ -220,10 +220,11 @@ def search_orders(
     smaller model, and its parameter counts all the same.
     """
     search = _search(records, poles, zeros, delay_bounds, initial_state, offset, ends_early)
-    checked = None
+    checked: Refinement | None = None
     if validation is not None:
-        checked = laid_out_validation(search.options(poles[1], zeros[0]), validation)
-        assert isinstance(checked, Refinement)
+        laid_out = laid_out_validation(search.options(poles[1], 0), validation)
+        assert isinstance(laid_out, Refinement)
+        checked = laid_out
     orders = [search.judged(each, checked, validation) for each in search.ranked()]
     return search.result(orders)
 
