@@ -117,7 +117,18 @@ class OrderSearch:
         return self.best if self.answer.seen and better_than_none else None
 
     def of(self, poles: int, zeros: int) -> FittedOrder | None:
-        """The fit of a structure; None where it was not tried."""
+        """The fit of a structure.
+
+        Parameters
+        ----------
+        poles, zeros : int
+            Its numbers.
+
+        Returns
+        -------
+        FittedOrder or None
+            None where it was not tried.
+        """
         return next((each for each in self.orders if (each.options.poles, each.options.zeros) == (poles, zeros)), None)
 
     @property
