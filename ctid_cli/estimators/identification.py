@@ -15,6 +15,7 @@ from ctid_cli.estimators import judging
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.judging import Options
 from ctid_cli.estimators.measured_submodels import SubmodelsFit
+from ctid_cli.estimators.residual_causes import another_delay, another_order
 from ctid_cli.estimators.second_look import SecondLook, look_again
 from ctid_cli.estimators.second_look_words import of_second_look
 from ctid_cli.inference import criteria as criteria_of
@@ -223,16 +224,24 @@ def identify(
         records=tuple(records),
     )
     acting = [judging.acting(options, record) for record in records]
-    look = look_again(linear, acting, judging.other_hold(options, laid_out, linear, records))
+    tried = laid_out, linear, options
+    failed = answer.seen and not all(test.white and test.uncorrelated for test in tests)
+    look = look_again(
+        linear,
+        acting,
+        judging.other_hold(options, laid_out, linear, records),
+        another_order(*tried) if failed else None,
+        another_delay(*tried) if failed else None,
+    )
     gains = _gains(linear, judging.lowered(options, laid_out, linear))
-    return replace(found, warnings=tuple(_warnings(found, look, hessian, gains)))
+    return replace(found, warnings=tuple(dict.fromkeys(_warnings(found, look, hessian, gains))))
 
 
 def _warnings(found: Identification, look: SecondLook, hessian: Array, gains: dict[str, float]) -> Iterator[str]:
     """What the user should know, the worst first; of a model without an answer to the input only that it is none."""
     options, fit = found.options, found.fit
     yield from warnings.of_answer(found.answer, options)
-    yield from of_second_look(look, options, fit, found.tests, answered=found.answer.seen)
+    yield from of_second_look(look, options, fit, found.tests, gains, answered=found.answer.seen)
     if found.answer.seen:
         yield from warnings.of_status(fit, said=look.integrator > 0)
         yield from warnings.of_conditioning(fit, found.uncertainty.free_covariance, hessian)

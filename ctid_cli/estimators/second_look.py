@@ -8,6 +8,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.hold_comparison import OtherHold
+from ctid_cli.estimators.residual_causes import Clock, Richer, clock_evidence
 from ctid_cli.inference import faults
 from ctid_cli.inference.beside import SideBySide, constant, rest_of
 from ctid_cli.inference.input_dependence import InputDependence, input_dependence
@@ -50,12 +51,24 @@ class SecondLook:
     held: OtherHold | None
     #: Time constant of a pole too slow to be told from an integrator [s]; nan for none.
     integrator: float
+    #: Errors that go with the speed of the output.
+    clock: Clock
+    #: The fit with one more pole, and with a delay outside the range; None where that was not tried.
+    richer: Richer | None = None
+    elsewhere: Richer | None = None
 
 
-def look_again(fit: MeasuredFit, records: Sequence[Record], held: OtherHold | None) -> SecondLook:
+def look_again(
+    fit: MeasuredFit,
+    records: Sequence[Record],
+    held: OtherHold | None,
+    richer: Richer | None = None,
+    elsewhere: Richer | None = None,
+) -> SecondLook:
     """Look at the records, and at what the fit leaves of them."""
     looks = tuple(_look(record, fit, k) for k, record in enumerate(records))
-    return SecondLook(looks, held.fall if held else 0.0, held, _integrator(fit, records))
+    clock = clock_evidence(fit, records)
+    return SecondLook(looks, held.fall if held else 0.0, held, _integrator(fit, records), clock, richer, elsewhere)
 
 
 def _look(record: Record, fit: MeasuredFit, k: int) -> RecordLook:

@@ -1,9 +1,11 @@
 """What is odd about records and their fit, in sentences: the worst first, each with its evidence and what to do."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.hold_comparison import OtherHold
+from ctid_cli.estimators.identification_warnings import of_treatment
 from ctid_cli.estimators.judging import Options
 from ctid_cli.estimators.second_look import RecordLook, SecondLook
 from ctid_cli.inference.residuals import ResidualTests
@@ -23,32 +25,61 @@ TAKEN: dict[Hold, str] = {
 }
 #: Where more of the intervals are long the clock is irregular, and has no gaps.
 GAPS = 0.05
+#: Causes that are named, those of which the share is at least this fraction of the largest.
+MOST_NAMED, COMPARABLE = 3, 0.6
+#: Another delay, or one more pole, has to lower the cost by this fraction.
+ANOTHER = 0.05
+#: A simpler cause is named before one more pole that does so little better.
+SIMPLER = 0.9
+
+
+class Cause(NamedTuple):
+    """Something that residuals may fail their tests for."""
+
+    #: Share of the residuals' variance that it explains [-]; 0 where it was ruled out.
+    share: float
+    #: What was seen, and the command to try; or what was tried, where it was ruled out.
+    words: str
 
 
 def of_second_look(
-    look: SecondLook, options: Options, fit: MeasuredFit, tests: tuple[ResidualTests, ...], *, answered: bool
+    look: SecondLook,
+    options: Options,
+    fit: MeasuredFit,
+    tests: tuple[ResidualTests, ...],
+    gains: Mapping[str, float],
+    *,
+    answered: bool,
 ) -> list[str]:
     """Everything that should be said; nothing of a record and a model that fit each other.
 
     Where no answer to the input is seen there is nothing to say of the model.
     """
-    several = len(look.records) > 1
     words: list[str] = []
-    poor = _poorest_share(look, tests)
     for k, one in enumerate(look.records):
-        found = _of_record(one, look, options, fit, poor) if answered else _of_faults(one)
-        words += [f"Experiment {k + 1}: {sentence}" if several else sentence for sentence in found]
-    if not answered:
+        words += [_of_which(k, look) + sentence for sentence in _of_record(one)]
+    if not answered or any(one.growth_time > 0 for one in look.records):
         return words
-    diverges = any(one.growth_time > 0 for one in look.records)
-    if look.integrator > 0 and not diverges:
+    causes = list(_causes(look, options, fit, tests, gains))
+    named = sorted((cause for cause in causes if cause.share > 0), key=lambda cause: -cause.share)
+    words += [cause.words for cause in named[:MOST_NAMED] if cause.share >= COMPARABLE * named[0].share]
+    if look.integrator > 0:
         words.append(_of_integrator(look, options, fit))
-    if look.held is not None and poor <= look.other_hold and not any(_faulty(one) for one in look.records):
+    if look.held is not None and not look.other_hold and not named and not any(map(_faulty, look.records)):
         words += _of_hold(look, look.held)
+    out = [cause.words for cause in causes if not cause.share and cause.words]
+    failed = [test for test in tests if not (test.white and test.uncorrelated)]
+    if failed and out and not any(_faulty(one) for one in look.records):
+        words.append(f"Tested as causes of what the residuals show and ruled out: {'; '.join(out)}.")
     return words
 
 
-def _of_record(one: RecordLook, look: SecondLook, options: Options, fit: MeasuredFit, poor: float) -> Iterator[str]:
+def _of_which(k: int, look: SecondLook) -> str:
+    return f"Experiment {k + 1}: " if len(look.records) > 1 else ""
+
+
+def _of_record(one: RecordLook) -> Iterator[str]:
+    """What needs no model: an output that diverges, and faults of sensor and recorder."""
     if one.growth_time > 0:
         yield (
             f"The output diverges: it grows by a factor of e every {one.growth_time:.2g}, and the input does not. An "
@@ -57,19 +88,114 @@ def _of_record(one: RecordLook, look: SecondLook, options: Options, fit: Measure
         )
         return
     yield from _of_faults(one)
+
+
+# --- causes ------------------------------------------------------------------------------------------
+
+
+def _causes(
+    look: SecondLook,
+    options: Options,
+    fit: MeasuredFit,
+    tests: tuple[ResidualTests, ...],
+    gains: Mapping[str, float],
+) -> Iterator[Cause]:
+    """Every cause that was tried."""
+    correlated = len(tests) < len(look.records) or not all(test.uncorrelated for test in tests)
+    faulty = any(_faulty(one) for one in look.records)
+    yield _order(look, options, fit, correlated)
+    yield _delay(look, options, correlated and not faulty)
+    yield Cause(
+        0.0 if faulty else look.other_hold,
+        next(_of_hold(look, look.held)) if look.held and look.other_hold else "the hold",
+    )
+    offset = gains.get("offset", 0.0)
+    # An integrator, or a pole as slow as the record, makes both.
+    if options.offset == "none" and not look.integrator > 0:
+        yield Cause(offset, of_treatment({"offset": offset}, options)[0] if offset else "an offset")
+    for k, one in enumerate(look.records):
+        for cause in (_drift(one, look, offset), _feedback(one)):
+            yield cause._replace(words=_of_which(k, look) * (cause.share > 0 or k > 0) + cause.words)
+    yield _clock(look, faulty)
+
+
+def _order(look: SecondLook, options: Options, fit: MeasuredFit, correlated: bool) -> Cause:
+    poor = max(_poor_share(one) for one in look.records) if correlated else 0.0
+    richer = look.richer
+    if not poor:
+        if richer is None:
+            return Cause(0.0, "one more pole")
+        return Cause(0.0, f"one more pole ({_little(richer.fall)})" if richer.fall < ANOTHER else "")
+    found = f"About {100 * poor:.2g} % of the residuals' variance"
+    if fit.poles_at_infinity or options.poles == 12 or (richer is not None and richer.fall < ANOTHER):
+        return Cause(poor, f"{found} still follows the input, but more poles do not help: the system may be nonlinear.")
+    zeros = f" --zeros {richer.zeros}" if richer is not None and richer.zeros != options.zeros else ""
+    if richer is not None:
+        poor, found = richer.fall, f"{100 * richer.fall:.2g} % of the residuals' variance"
+    what = f"the structure is too poor (try --poles {options.poles + 1}{zeros})"
+    return Cause(SIMPLER * poor, f"{found} is what one more pole explains: {what}.")
+
+
+def _delay(look: SecondLook, options: Options, correlated: bool) -> Cause:
+    elsewhere, (low, high) = look.elsewhere, options.delay_bounds
+    if elsewhere is None:
+        return Cause(0.0, "")
+    if not correlated or elsewhere.fall < ANOTHER:
+        return Cause(0.0, f"another delay ({_little(elsewhere.fall)})" if elsewhere.fall < ANOTHER else "")
+    reach = f"{min(low, 0.5 * elsewhere.delay):.3g}:{max(high, 2.0 * elsewhere.delay):.3g}"
+    known = "was taken as known" if low == high else "was searched"
+    return Cause(
+        elsewhere.fall,
+        f"A delay of {elsewhere.delay:.3g} lowers the cost by {100 * elsewhere.fall:.2g} %, and {_range(low, high)} "
+        f"{known}: the range of the delay is wrong (try --delay {reach}).",
+    )
+
+
+def _little(fall: float) -> str:
+    """What does not lower the cost, or hardly."""
+    return f"lowers the cost by {100 * fall:.2g} %" if fall > 0 else "does not lower the cost"
+
+
+def _range(low: float, high: float) -> str:
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+
+
+def _drift(one: RecordLook, look: SecondLook, offset: float) -> Cause:
+    if not one.drift or look.integrator > 0:
+        return Cause(0.0, "drift" * (not look.integrator > 0))
+    power = one.drift**2 / 12.0
+    words = (
+        f"Beside the model, the output drifts by {abs(one.drift):.2g} standard deviations of the residuals over "
+        "the record. Remove the trend, or use a part without it (--from, --to)."
+    )
+    # It is seen beside a constant, and may have one of its own: then it is more than an offset.
+    return Cause(max(power / (1.0 + power), min(1.01 * offset, 1.0)), words)
+
+
+def _feedback(one: RecordLook) -> Cause:
     chance = _chance_of_feedback(one)
-    if chance < FED_BACK:
-        yield (
-            f"The input answers the output (p = {chance:.1g}), as in a closed loop, where noise biases the estimate. "
-            "Record the reference, and use --loop FILE --reference COLUMN; without a controller, look at the clock."
-        )
-    elif poor > look.other_hold and _poor_share(one):
-        yield _of_structure(one, options, fit)
-    if one.drift and not (look.integrator > 0 or poor):
-        yield (
-            f"Beside the model, the output drifts by {abs(one.drift):.2g} standard deviations of the residuals over "
-            "the record. Remove the trend, or use a part without it (--from, --to)."
-        )
+    if not chance < FED_BACK or one.dependence is None:
+        return Cause(0.0, "feedback")
+    words = (
+        f"The input answers the output (p = {chance:.1g}), as in a closed loop, where noise biases the estimate. "
+        "Record the reference, and use --loop FILE --reference COLUMN; without a controller, look at the clock."
+    )
+    return Cause(one.dependence.feedback_share, words)
+
+
+def _clock(look: SecondLook, faulty: bool) -> Cause:
+    clock = look.clock
+    if faulty or clock.share < ANOTHER:
+        return Cause(0.0, "the clock")
+    words = (
+        f"{100 * clock.share:.2g} % of the residuals' variance goes with the speed of the output (p = "
+        f"{clock.p_value:.1g}), as if the clock were wrong by about {clock.jitter:.2g}: look at the time stamps, and "
+        "give those of the recorder (--time COLUMN)."
+    )
+    return Cause(clock.share, words)
+
+
+# --- evidence ----------------------------------------------------------------------------------------
 
 
 def _of_faults(one: RecordLook) -> Iterator[str]:
@@ -119,24 +245,6 @@ def _poor_share(one: RecordLook) -> float:
     if found is None or _faulty(one) or not found.pole_p_value < TOO_POOR or found.pole_share < WORTH_A_POLE:
         return 0.0
     return found.pole_share
-
-
-def _poorest_share(look: SecondLook, tests: tuple[ResidualTests, ...]) -> float:
-    """The largest share of a record; 0 where the residuals pass the test that is printed."""
-    passed = len(tests) == len(look.records) and all(test.uncorrelated for test in tests)
-    return 0.0 if passed else max(_poor_share(one) for one in look.records)
-
-
-def _of_structure(one: RecordLook, options: Options, fit: MeasuredFit) -> str:
-    low, high = options.delay_bounds
-    report, found = one.examined.report, f"About {100 * _poor_share(one):.2g} % of the residuals' variance"
-    if low == high and report.delay_early > low and report.suggested_delay is not None:
-        first, last = report.suggested_delay
-        late = f"the output begins to answer {report.delay_early:.3g} or more after a change of the input"
-        return f"{found} still follows the input, and {late}: the delay is too short (try --delay {first:g}:{last:g})."
-    if fit.poles_at_infinity or options.poles == 12:
-        return f"{found} still follows the input, but more poles do not help: the system may be nonlinear."
-    return f"{found} is what one more pole may explain: the structure is too poor (try --poles {options.poles + 1})."
 
 
 def _of_hold(look: SecondLook, other: OtherHold) -> Iterator[str]:
