@@ -59,7 +59,8 @@ def replace_file(path: Path, write: Callable[[Path], Answer]) -> Answer:
     try:
         os.fsync(descriptor)
     finally:
-        os.close(descriptor)
+        with suppress(OSError):
+            os.close(descriptor)
     return answer
 
 

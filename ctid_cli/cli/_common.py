@@ -18,7 +18,7 @@ from typing import Annotated, Any, NoReturn, TypeVar, cast
 import typer
 from typer.core import TyperCommand
 
-from ctid_cli.errors import CtidError, SpecError, StorageError
+from ctid_cli.errors import CtidError, RefusedError, SpecError, StorageError, UsageError
 from ctid_cli.signals.treatment import Hold
 from ctid_cli.written_files import write_file
 
@@ -98,9 +98,19 @@ def answer(as_json: bool, content: Callable[[], object], text: Callable[[], str]
     typer.echo(json.dumps(content(), allow_nan=False) if as_json else text())
 
 
-def write_files(files: Mapping[Path, bytes | Iterable[bytes]]) -> None:
-    """Write files, and make the folders that they need."""
+def require_within(out: Path, *places: Path) -> None:
+    """Refuse to write where a link leads out of the results folder: who made the link is not who gave the command."""
+    for path in places:
+        real = Path(os.path.realpath(path))
+        if not real.is_relative_to(os.path.realpath(out)):
+            raise RefusedError(f"{path} leads to {real}, outside {out}, where nothing is written; remove the link")
+
+
+def write_files(files: Mapping[Path, bytes | Iterable[bytes]], within: Path | None = None) -> None:
+    """Write files, and make the folders that they need; within a folder, if its user did not name the files."""
     for path, content in files.items():
+        if within is not None:
+            require_within(within, path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_file(path, content)
@@ -129,6 +139,9 @@ def guarded(command: Function) -> Function:
         except (typer.Exit, typer.Abort, BrokenPipeError):
             raise
         except OSError as error:
+            if error.errno == errno.ENAMETOOLONG:
+                typer.echo(f"ctid: {str(error.filename)[:40]}...: the name is too long for a file", err=True)
+                raise typer.Exit(UsageError.exit_code) from None
             if error.errno not in _OF_THE_DISK and "temporary directory" not in str(error):
                 _report(error, kwargs.get("out"))
             where = f"{error.filename}: " if error.filename else ""

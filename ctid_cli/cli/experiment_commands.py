@@ -28,6 +28,7 @@ from ctid_cli.cli._common import (
     duration,
     guarded,
     printable,
+    require_within,
 )
 from ctid_cli.cli._progress import Reporter, json_lines
 from ctid_cli.errors import MachineError, Problem, SpecError, TooManyFailuresError, UsageError
@@ -156,6 +157,7 @@ def run(
     part = None if shard is None else Shard.read(shard)
     if part is not None:
         plans, folders = [shard_plan(plan, part) for plan in plans], [out / part.folder(p.experiment) for p in plans]
+    require_within(out, *folders)
     how: dict[str, Any] = {"fresh": fresh, "allow_mixed": allow_mixed, "retry": [kind.upper() for kind in retry or ()]}
     if dry_run:
         for plan, folder in zip(plans, folders, strict=True):

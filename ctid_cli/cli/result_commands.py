@@ -218,7 +218,7 @@ def figure(
     style = style or _format_of(file)
     for item in figures:
         path = out / item.place if file is None else file
-        write_files({path: item.svg(out)})
+        write_files({path: item.svg(out)}, out if file is None else None)
         typer.echo(path)
     for name in experiments:
         results = read_results(out, name)
@@ -227,7 +227,7 @@ def figure(
         words = [chosen, measure, *(parameters or "").split(",")]
         stem = "_".join(re.sub(r"[^\w.]+", "-", word) for word in words if word)
         path = results.folder / "figures" / f"{stem}.{style}" if file is None else file
-        write_files({path: drawing.saved(style)})
+        write_files({path: drawing.saved(style)}, out if file is None else None)
         typer.echo(path)
 
 
@@ -282,8 +282,8 @@ def report(
         hint = did_you_mean(name, [*known, *studies]) or "."
         wrong = f"{name!r} is neither an experiment with results in {out} nor a study{hint}"
         raise UsageError(f"{wrong} Known: {', '.join([*known, *studies])}")
-    path = path if file is None else file
-    write_files({path: page.encode()})
+    path, within = (path, out) if file is None else (file, None)
+    write_files({path: page.encode()}, within)
     typer.echo(path)
 
 

@@ -196,7 +196,8 @@ class _Output:
         series = np.column_stack([y, _drawn(noise, y.size, rng)])
         series -= series.mean(axis=0)
         # Each record weighs as its noise would: by the reciprocal of its variance.
-        series /= np.where(np.any(series, axis=0), series.std(axis=0), 1.0)
+        deviations = series.std(axis=0)
+        series /= np.where(deviations > 0.0, deviations, 1.0)
         return cls(signal, clock, t, noise, series, np.zeros_like(series), _filtered(series, noise))
 
     def beside_own(self, pole: complex, delays: Array, free_response: bool) -> Iterator[_BesideOwn]:

@@ -141,6 +141,7 @@ def run_experiment(
         stack.enter_context(place.lock(folder))
         # Another run may have come between.
         place.check_free(folder, plan.manifest(), origins, allow_mixed=allow_mixed)
+        place.clear(folder)
         with place.saying_what_is_safe(folder):
             log = open_journal(folder / FILE_NAME)
         stack.callback(log.close)
@@ -318,7 +319,6 @@ class _Run:
         missing = self.ready.estimates - self.computed
         reason = reason or (MACHINE if self.given_up else None)
         stopped, ended = now(), "finished" if not missing else reason or "unfinished"
-        self.log.end(self.session, stopped, ended)
         counts = {
             "planned": len(self.planned),
             "reused": self.ready.reused,
@@ -330,6 +330,8 @@ class _Run:
         name = f"{place.PROVENANCE}/{self.session:04d}-{self.started.replace(':', '').replace('-', '')}.json"
         with _writing(self.folder):
             self.log.write_beside(name, text.encode())
+        # The last of all: what a run has noted before and not written, it was killed before it could.
+        self.log.end(self.session, stopped, ended)
         return RunSummary(
             experiment=self.plan.experiment,
             folder=self.folder,

@@ -1,6 +1,6 @@
 """From a YAML file to a checked specification; everything that is wrong with it is reported at once."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +74,7 @@ def load_spec(
     spec._folder, spec._source = folder, source
     if too_many := too_many_cases(spec):
         raise SpecError([source.problem((), too_many)])
-    spec, about_files = _with_files(spec, anywhere=allow_outside or isinstance(given, Mapping))
+    spec, about_files = _with_files(spec, own=isinstance(given, Mapping), anywhere=allow_outside)
     broken = frozenset(str(where[0]) for where, _, _ in complaints if where)
     joint = joint_complaints(spec, broken, files_are_good=not about_files)
     complaints += [(where, message, False) for where, message in (*about_files, *joint)]
@@ -143,8 +143,24 @@ def _validated(tree: dict[str, Any]) -> tuple[Spec, list[Located]]:
     try:
         return Spec.model_validate(tree), []
     except ValidationError as error:
-        complaints = [explained(detail, {}) for detail in error.errors(include_url=False)]
-    good = {key: value for key, value in tree.items() if key in Spec.model_fields}
+        complaints = _complaints(error)
+    good = _without({key: value for key, value in tree.items() if key in Spec.model_fields}, complaints)
+    while True:
+        try:
+            return _Remainder.model_validate(good), complaints
+        except ValidationError as error:
+            # What is left may be wrong for want of what is not: two estimators the same without the loop, say.
+            less = _without(good, _complaints(error))
+            good = less if less != good else {}
+
+
+def _complaints(error: ValidationError) -> list[Located]:
+    return [explained(detail, {}) for detail in error.errors(include_url=False)]
+
+
+def _without(tree: dict[str, Any], complaints: Iterable[Located]) -> dict[str, Any]:
+    """A specification without the sections and estimators that are complained of."""
+    good = dict(tree)
     for path, _, _ in complaints:
         if path[:1] == ("estimators",) and len(path) > 1 and isinstance(good.get("estimators"), dict):
             good["estimators"] = {name: item for name, item in good["estimators"].items() if name != path[1]}
@@ -152,22 +168,28 @@ def _validated(tree: dict[str, Any]) -> tuple[Spec, list[Located]]:
             good.pop(str(path[0]), None)
     if not good.get("estimators"):
         good.pop("estimators", None)
-    return _Remainder.model_validate(good), complaints
+    return good
 
 
-def _with_files(spec: Spec, *, anywhere: bool) -> tuple[Spec, list[Complaint]]:
-    """The specification with the content hash of its file filled in, and what is wrong with the file."""
+def _with_files(spec: Spec, *, own: bool, anywhere: bool) -> tuple[Spec, list[Complaint]]:
+    """The specification with the content hash of its file filled in, and what is wrong with the file.
+
+    Nothing that a file outside the folder holds is repeated, unless the specification is the caller's own.
+    """
     place: tuple[str, ...]
     section: Any
     place, section = (("data",), spec.data) if spec.data is not None else spec.generator or ((), None)
     if not hasattr(section, "sha256") or section.own:
         return spec, []
     file = joined(spec.folder, section.file)
-    if not (anywhere or is_inside(file, spec.folder)):
+    open_to_all = own or is_inside(file, spec.folder)
+    if not (anywhere or open_to_all):
         ask = "if you trust the specification, repeat the command with --allow-outside (or CTID_ALLOW_OUTSIDE=1)"
         return spec, [((*place, "file"), f"lies outside the folder of the specification and is not read; {ask}")]
+    readable = False
     try:
         content = file_sha256(file)
+        readable = True
         if section.sha256 not in (None, content):
             return spec, [((*place, "sha256"), f"the SHA-256 of {file} is {content}; is it another file?")]
         spec = replaced(spec, (*place, "sha256"), content)
@@ -177,5 +199,7 @@ def _with_files(spec: Spec, *, anywhere: bool) -> tuple[Spec, list[Complaint]]:
             source = located(variants(section)[0].options, spec.folder)
             read_held_signal(source.file, time=source.time, input=source.input, hold=source.hold)
     except DataError as error:
-        return spec, [((*place, "file"), str(error))]
+        silent = f"{file} cannot be used; it lies outside the folder, so that nothing of it is repeated here"
+        said = str(error) if open_to_all or not readable else f"{silent}: 'ctid check' says what is wrong with it"
+        return spec, [((*place, "file"), said)]
     return spec, []

@@ -20,6 +20,7 @@ from ctid_cli.errors import DamageError, RefusedError, StorageError
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.journal_reader import FILE_NAME, JournalReader, read_journal
 from ctid_cli.storage.manifest import Manifest
+from ctid_cli.written_files import TAKEN, is_leftover
 
 SPEC = "spec.yaml"
 CANONICAL = "spec.canonical.json"
@@ -81,9 +82,20 @@ def lock(folder: Path, *, shared: bool = False, patience: float = PATIENCE) -> I
                 time.sleep(0.05)
             except OSError as error:
                 raise StorageError(_unlockable(folder, error)) from error
+        if not shared:
+            _refuse_links(folder)
         yield
     finally:
-        os.close(descriptor)
+        # It is closed whatever the system says, and nothing was written to it.
+        with suppress(OSError):
+            os.close(descriptor)
+
+
+def _refuse_links(folder: Path) -> None:
+    """Refuse to write through links to other places."""
+    for path in folder.iterdir():
+        if path.is_symlink() and (path.name in TAKEN or is_leftover(path.name)):
+            raise RefusedError(f"{path} is a link, and results are written into their folder alone; remove it")
 
 
 def _unlockable(folder: Path, error: OSError) -> str:
@@ -112,6 +124,15 @@ def _is_open(folder: Path, descriptor: int) -> bool:
         return os.path.samestat(os.stat(folder), os.fstat(descriptor))
     except OSError:
         return False
+
+
+def clear(folder: Path) -> None:
+    """Remove what killed runs have left half written; this process holds the lock, so that no other is at it."""
+    written = (SPEC, CANONICAL, SEALED, TIMINGS)
+    for path in (*folder.glob(".*"), *(folder / PROVENANCE).glob(".*")):
+        if is_leftover(path.name) and (path.parent != folder or path.name[1:].startswith(written)):
+            with suppress(OSError):
+                path.unlink()
 
 
 def retract(folder: Path) -> None:

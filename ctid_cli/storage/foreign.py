@@ -33,9 +33,11 @@ def require_manifest(found: Any) -> Manifest:
     if plan.get("seed") is not None:
         _count(plan, "seed")
     _text(plan, "spec_hash")
-    _mapping(plan.get("spec"), "the specification")
+    spec = _mapping(plan.get("spec"), "the specification")
     _require_shard(plan.get("shard", [1, 1]))
-    _require_success(plan.get("success"))
+    # A rule may be none, but it must be there.
+    _require_success(plan["success"])
+    _require_success(spec.get("success"))
     starts = _mapping(plan.get("starts"), "the starts")
     if not all(start is None or isinstance(start, str) or _is_number(start) for start in starts.values()):
         raise ValueError("a start is no number")

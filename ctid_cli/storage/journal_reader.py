@@ -37,6 +37,8 @@ _HINDRANCES = ("READONLY", "CANTOPEN", "FULL", "IOERR", "PERM", "AUTH", "BUSY", 
 ERRORS = (sqlite3.Error, ValueError, TypeError, KeyError, IndexError, OverflowError)
 #: How long a reader waits for a moment at which the file can be read [s].
 _READER_PATIENCE = 2.0
+#: Bytes at the beginning of a write-ahead log.
+_LOG_HEADER = 32
 
 
 class Row(NamedTuple):
@@ -337,9 +339,11 @@ def _readable(path: Path, *, live: bool) -> Iterator[str]:
     index is there, however stale; else a copy is read. A file that nobody writes to and that has no log needs no locks.
     """
     log, index = (path.with_name(f"{path.name}-{end}") for end in ("wal", "shm"))
-    if live or (index.exists() and log.exists()):
+    # A log that was only begun holds nothing, and SQLite does not get on with its index.
+    empty = not log.exists() or log.stat().st_size <= _LOG_HEADER
+    if live or (index.exists() and not empty):
         yield f"{path.resolve().as_uri()}?mode=ro&readonly_shm=1"
-    elif not log.exists() or not log.stat().st_size:
+    elif empty:
         yield f"{path.resolve().as_uri()}?mode=ro&immutable=1"
     else:
         with tempfile.TemporaryDirectory(prefix="ctid-") as folder:

@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 
 from ctid_cli.canonical import canonical_json
-from ctid_cli.errors import DataError, StorageError
+from ctid_cli.errors import CtidError, DataError, StorageError
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.signals.files import require_file
 from ctid_cli.signals.hdf5 import require_plain_tree
@@ -200,8 +200,10 @@ def _saying_where(path: Path) -> Iterator[None]:
         yield
     except DataError as error:
         raise StorageError(f"{path} cannot be read: {error}") from error
+    except CtidError:
+        raise
     # HDF5 reports damage as whatever exception the damaged part happens to cause.
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, UnicodeError, MemoryError) as error:
+    except Exception as error:
         raise StorageError(f"{path} cannot be read ({str(error)[:200]})") from error
 
 

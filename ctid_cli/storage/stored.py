@@ -103,7 +103,11 @@ class Stored:
     @cached_property
     def _truths(self) -> dict[str, dict[str, float]]:
         """True values by name of every data cell."""
-        return {cell["hash"]: true_values(cell) for cell in self.manifest["data_cells"]}
+        try:
+            return {cell["hash"]: true_values(cell) for cell in self.manifest["data_cells"]}
+        # Somebody else may have written the plan.
+        except (TypeError, ValueError, KeyError, AttributeError) as error:
+            raise StorageError(f"the plan of {self.manifest['experiment']} holds a system that is none") from error
 
     def failures(self, where: AnyArray | slice = slice(None)) -> BoolArray:
         """Which estimates are failures."""

@@ -1,6 +1,7 @@
 """Whether every stored byte of an experiment is what was written."""
 
 import hashlib
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -52,6 +53,14 @@ class _Noted:
     files: dict[str, set[str]]
     sealed: str | None = None
     known: bool = False
+    #: Runs that were killed, and whether the latest one was: a file may be noted and never have been written.
+    killed: frozenset[int] = frozenset()
+    lately: bool = False
+
+    def may_be_missing(self, name: str) -> bool:
+        """Whether a file need not be there although it is noted."""
+        number = re.match(rf"{PROVENANCE}/(\d+)-", name)
+        return int(number[1]) in self.killed if number else self.lately
 
 
 def verify(folder: Path) -> Verification:
@@ -62,7 +71,9 @@ def verify(folder: Path) -> Verification:
             if log is not None:
                 live = log.live
                 findings.append(_journal(log))
-                noted = _Noted(log.files(), log.sealed(), known=True)
+                killed = [session["stopped"] is None for session in log.sessions()]
+                numbers = frozenset(number for number, was in enumerate(killed, 1) if was)
+                noted = _Noted(log.files(), log.sealed(), True, numbers, not killed or killed[-1])
             elif (folder / FILE_NAME).exists():
                 findings.append(Finding(FILE_NAME, "intact", "a run was stopped before it had planned anything"))
     except DamageError as error:
@@ -123,7 +134,7 @@ def _beside(folder: Path, noted: _Noted) -> Iterator[Finding]:
         try:
             data = (folder / name).read_bytes()
         except FileNotFoundError:
-            if name in noted.files:
+            if name in noted.files and not noted.may_be_missing(name):
                 yield Finding(name, "missing", "a run has written it")
             continue
         except OSError as error:

@@ -23,7 +23,8 @@ class Whereabouts:
 
     def close(self) -> None:
         """Let go of the folder."""
-        os.close(self._descriptor)
+        with suppress(OSError):
+            os.close(self._descriptor)
 
     def _lost(self, path: Path) -> str:
         advice = "Nothing that was computed since is counted as stored. Bring it back to go on, or run anew"

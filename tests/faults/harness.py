@@ -5,6 +5,7 @@ import io
 import multiprocessing
 import os
 import resource
+import tempfile
 import traceback
 import warnings
 from collections.abc import Callable, Iterable
@@ -182,6 +183,7 @@ def faults(fuzzer: Fuzzer, kind: str, numbers: Iterable[int]) -> dict[int, str]:
 def _work(fuzzer: Fuzzer, kind: str, numbers: list[int], connection) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, resource.getrlimit(resource.RLIMIT_AS)[1]))
     os.chdir(fuzzer.folder)
+    tempfile.tempdir = str(fuzzer.folder)
     for number in numbers:
         connection.send(fault_of(fuzzer, kind, fuzzer.made(kind, number), number))
 

@@ -196,7 +196,7 @@ def results_file(rng: random.Random, good: bytes, reseal) -> bytes:
     with h5py.File(stream, "r+") as file:
         for _ in range(rng.randint(1, 3)):
             # What an earlier change has broken may stop a later one.
-            with contextlib.suppress(TypeError, ValueError, KeyError, OSError, RecursionError):
+            with contextlib.suppress(TypeError, ValueError, KeyError, OSError, RuntimeError, MemoryError):
                 (_change_plan if rng.random() < 0.5 else _change_column)(rng, file)
     return reseal(stream.getvalue())
 

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import shutil
 
 import h5py
 import numpy as np
@@ -10,13 +11,15 @@ import pytest
 from typer.testing import CliRunner
 
 from ctid_cli.cli.main import app
-from ctid_cli.errors import DataError, SpecError, StorageError, UsageError
+from ctid_cli.errors import DataError, RefusedError, SpecError, StorageError, UsageError
 from ctid_cli.signals.csv_file import read_csv_table
 from ctid_cli.signals.mat_file import read_mat_table
 from ctid_cli.signals.measurement import read_measurement
 from ctid_cli.signals.record import Record
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.sealed import read_sealed
+from tests.faults import trials
+from tests.faults.conftest import STORED, TINY
 from tests.faults.harness import asked, resealed
 
 MEASURED = """\
@@ -71,6 +74,19 @@ def test_what_the_system_says_of_a_process_is_not_repeated(inside):
         load_spec(file, allow_outside=True)
     assert "PATH" not in str(refused.value)
     assert "empty" in str(refused.value)
+
+
+def test_nothing_of_a_file_elsewhere_is_repeated(inside):
+    (inside.parent / "outside.csv").write_text("rooster:x:0,u,y\n0,1,secret\n1,2,3\n")
+    for content, own in (("rooster:x:0,u,y\n0,1,secret\n", True), (None, False)):
+        file = specification(inside, "record.csv" if own else "../outside.csv")
+        if content:
+            (inside / "record.csv").write_text(content)
+        with pytest.raises(SpecError) as refused:
+            load_spec(file, allow_outside=True)
+        assert ("rooster" in str(refused.value) or "secret" in str(refused.value)) == own
+    assert "'ctid check' says what is wrong" in str(refused.value)
+    assert asked("validate", inside / ("x" * 300)) == 2
 
 
 @pytest.mark.parametrize("name", ["/dev/zero", "/dev/stdin", "pipe.csv", "link.csv", "."])
@@ -215,3 +231,37 @@ def test_results_with_right_checksums_and_wrong_content(case, sealed_images, tmp
         return
     with pytest.raises(StorageError, match=r"cannot be read"):
         read_sealed(path)
+
+
+@pytest.mark.parametrize("name", ["journal.sqlite", "timings.csv", "spec.yaml", "provenance", "running.json.tmp"])
+def test_a_run_writes_through_no_link_that_lies_in_its_folder(name, tmp_path):
+    place, elsewhere = tmp_path / "toys", tmp_path / "elsewhere"
+    place.mkdir()
+    mine = "" if name == "journal.sqlite" else "mine"  # what is no journal is refused as that
+    elsewhere.write_text(mine)
+    (place / name).symlink_to(elsewhere)
+    with pytest.raises(RefusedError, match=r"is a link, and results are written into their folder alone"):
+        trials.run(place)
+    assert elsewhere.read_text() == mine
+    assert [path.name for path in place.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("name", ["figures", "report.html", "run"])
+def test_no_link_in_the_results_leads_out_of_them(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    elsewhere, place = tmp_path / "elsewhere", tmp_path / "results" / "tiny"
+    elsewhere.mkdir()
+    place.parent.mkdir()
+    if name == "run":
+        (tmp_path / "tiny.yaml").write_text(TINY)
+        place.symlink_to(elsewhere)
+    else:
+        shutil.copytree(STORED / "system", place)
+        (place / name).symlink_to(elsewhere)
+    experiment = "tiny.yaml" if name == "run" else json.loads((place / "spec.canonical.json").read_text())["experiment"]
+    (place.parent / experiment).exists() or name == "run" or place.rename(place.parent / experiment)
+    command = {"figures": "figure", "report.html": "report", "run": "run"}[name]
+    done = CliRunner().invoke(app, [command, experiment])
+    assert done.exit_code == RefusedError.exit_code, done.output
+    assert "leads to" in done.stderr
+    assert list(elsewhere.iterdir()) == []

@@ -168,6 +168,19 @@ def test_reading_after_a_kill_finds_everything_and_changes_nothing(tmp_path: Pat
     again.close()
 
 
+def test_a_run_that_was_killed_when_it_had_just_begun_its_log_goes_on(tmp_path: Path) -> None:
+    log = open_journal(tmp_path / "journal.sqlite")
+    log.close()
+    for name, content in {"wal": b"\x37\x7f\x06\x82" + bytes(28), "shm": bytes(32768)}.items():
+        (tmp_path / f"journal.sqlite-{name}").write_bytes(content)
+    with read_journal(tmp_path / "journal.sqlite") as read:
+        assert read is None
+    filled(tmp_path / "journal.sqlite").close()
+    with read_journal(tmp_path / "journal.sqlite") as read:
+        assert read is not None
+        assert len(read.entries()) == 3
+
+
 def test_an_estimate_that_is_added_again_takes_the_place_of_the_first(tmp_path: Path) -> None:
     log = filled(tmp_path / "journal.sqlite", count=2)
     log.add([outcome(1, 5.0), outcome(2)], 1)
