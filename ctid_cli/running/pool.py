@@ -11,6 +11,7 @@ import itertools
 import os
 import queue
 import re
+import signal
 import tempfile
 import threading
 import time
@@ -35,6 +36,8 @@ AHEAD = 1
 TICK = 0.05
 #: The most that counts between two looks [s]: this process may have been stopped meanwhile, and its workers too.
 LONGEST_LOOK = 1.0
+#: How long a process that is dying may take [s].
+LAST_BREATH = 10.0
 #: Idle workers end after this time [s].
 IDLE = 300.0
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA", "NUMEXPR")
@@ -153,7 +156,7 @@ class LokyPool:
                 return
             turn = worker.at_work
         self._lose(worker, turn)
-        self._messages.append(Lost(turn.job, *cause_of(error), turn.keys))
+        self._messages.append(Lost(turn.job, *cause_of(error, worker.exit_code), turn.keys))
 
     def _lose(self, worker: _Worker, culprit: _Turn) -> None:
         """End the process of a worker because of one of its jobs; no other is to blame."""
@@ -252,6 +255,7 @@ class _Worker:
 
     def __init__(self) -> None:
         self._executor: Any = None
+        self._process: Any = None
         #: Whether the process has done something.
         self.used = False
         self.turns: list[_Turn] = []
@@ -285,7 +289,17 @@ class _Worker:
         """Have a function called in the process."""
         if self._executor is None:
             self._executor = _executor()
-        return self._executor.submit(function, path, packed)
+        future = self._executor.submit(function, path, packed)
+        self._process = next(iter(list(self._executor._processes.values())), None)
+        return future
+
+    def exit_code(self) -> int | None:
+        """How the process ended, once it has; None if that is not known."""
+        if self._process is None:
+            return None
+        self._process.join(LAST_BREATH)
+        code: int | None = self._process.exitcode
+        return code
 
     def usage(self) -> Usage | None:
         """What the process uses."""
@@ -380,19 +394,24 @@ def _in_one_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {first}"
 
 
-def cause_of(error: BaseException) -> tuple[Cause, str]:
-    """Why a job was lost."""
+def cause_of(error: BaseException, exit_code: Callable[[], int | None] = lambda: None) -> tuple[Cause, str]:
+    """Why a job was lost; the exit code of its process is asked for where the error does not tell it."""
     if isinstance(error, BrokenExecutor):
-        return _ending(error)
+        return _ending(error, exit_code)
     short = shortage(error)
     return ("machine", short) if short else ("crash", _in_one_line(error))
 
 
-def _ending(error: BaseException) -> tuple[Cause, str]:
+def _ending(error: BaseException, exit_code: Callable[[], int | None] = lambda: None) -> tuple[Cause, str]:
     """How a process ended, in the words of loky's long explanation."""
     found = re.search(r"(SIG[A-Z0-9]+|EXIT|UNKNOWN)\((-?\d+)\)", str(error))
-    if found is None:
-        return "machine", _in_one_line(error)
-    name, number = found.groups()
+    if found is not None:
+        name, number = found.groups()
+    else:
+        # loky waits a quarter of a second for it, which a process with much memory may exceed.
+        code = exit_code()
+        if code is None:
+            return "machine", _in_one_line(error)
+        name, number = (signal.Signals(-code).name if code < 0 else "EXIT"), str(code)
     how = name if name.startswith("SIG") else f"exit code {number}"
     return ("machine" if name in _FROM_OUTSIDE else "crash"), how

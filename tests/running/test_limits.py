@@ -6,6 +6,7 @@ import resource
 import subprocess
 import sys
 import time
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from ctid_cli.running import events
 from ctid_cli.running.engine import RunSummary, preview, run_experiment
 from ctid_cli.running.hindrances import advice
 from ctid_cli.running.limits import Limits, usage
+from ctid_cli.running.pool import cause_of
 from ctid_cli.running.stopping import StopAt
 from ctid_cli.storage.store import load_estimates
 from tests.running.fakes import FakePlan, Toy
@@ -169,6 +171,15 @@ def test_a_process_that_leaves_each_time_is_its_estimators_failure(tmp_path: Pat
     assert failures(tmp_path) == {("toy1", 1, "none"): "CRASHED"}
     (message,) = messages(tmp_path)
     assert message == "the worker process died each time this was computed, the last time alone (exit code 3)"
+
+
+@pytest.mark.parametrize(
+    ("code", "ending"),
+    [(-11, ("crash", "SIGSEGV")), (3, ("crash", "exit code 3")), (-9, ("machine", "SIGKILL")), (None, ("machine", ""))],
+)
+def test_a_process_that_dies_slowly_is_asked_how(code: int | None, ending: tuple[str, str]) -> None:
+    cause, reason = cause_of(BrokenExecutor("A worker process terminated"), lambda: code)
+    assert (cause, reason if code else "") == ending
 
 
 def test_without_descriptors_nothing_is_stored_and_the_run_says_what_to_do(tmp_path: Path) -> None:
