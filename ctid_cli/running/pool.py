@@ -12,14 +12,12 @@ import os
 import queue
 import re
 import signal
-import tempfile
 import threading
 import time
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 from ctid_cli import own_code
@@ -29,6 +27,7 @@ from ctid_cli.running.limits import Limits, Usage, usage
 from ctid_cli.running.progress import ProgressReader
 from ctid_cli.running.worker import Mark, Received, call, compute, initialise
 from ctid_cli.storage.manifest import Key, Outcome
+from ctid_cli.temporary import TemporaryFolder
 
 #: Jobs that a worker has ready, beside the one it is at: it never waits for what is to be stored first.
 AHEAD = 1
@@ -54,7 +53,7 @@ class LokyPool:
         _make_room(64 + 8 * workers)
         self._workers = [_idle.pop() if _idle else _Worker() for _ in range(workers)]
         end_idle_workers()
-        self._folder = tempfile.TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True)
+        self._folder = TemporaryFolder()
         self._numbers = itertools.count()
         self._over: queue.SimpleQueue[tuple[_Worker, _Turn]] = queue.SimpleQueue()
         self._messages: list[Message] = []
@@ -85,7 +84,7 @@ class LokyPool:
             return
         if alone:
             worker.end()
-        turn = _Turn(job, alone, ProgressReader(Path(self._folder.name) / str(next(self._numbers))))
+        turn = _Turn(job, alone, ProgressReader(self._folder.path / str(next(self._numbers))))
         worker.turns.append(turn)
         try:
             turn.future = worker.start(compute, str(turn.reader.path), content)
@@ -234,7 +233,7 @@ class LokyPool:
             self.stop()
         _idle.extend(worker for worker in self._workers if worker.used)
         self._workers = []
-        self._folder.cleanup()
+        self._folder.close()
 
 
 class _Turn:

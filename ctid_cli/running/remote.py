@@ -11,7 +11,6 @@ import hashlib
 import multiprocessing
 import pickle
 import platform
-import tempfile
 import threading
 import time
 from collections.abc import Mapping
@@ -22,6 +21,7 @@ from ctid_cli.running.executor import Done, Lost, Message
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.pool import LokyPool
 from ctid_cli.storage.identity import Origin, origin_of
+from ctid_cli.temporary import TemporaryFolder
 
 #: How often a worker looks whether its job is still wanted, and tells what is finished of it [s].
 TICK, TELL = 0.1, 1.0
@@ -29,7 +29,7 @@ TICK, TELL = 0.1, 1.0
 _of_thread = threading.local()
 #: Files that were sent along, by the hash of their content.
 _files: dict[str, Path] = {}
-_folder: tempfile.TemporaryDirectory[str] | None = None
+_folder: TemporaryFolder | None = None
 
 
 def files_of(source: Any) -> dict[str, str]:
@@ -49,8 +49,8 @@ def identify(packed: bytes, contents: Mapping[str, bytes]) -> tuple[str, list[Or
     _, parts = pickle.loads(packed)
     for sha256, content in contents.items():
         if sha256 not in _files:
-            _folder = _folder or tempfile.TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True)
-            _files[sha256] = Path(_folder.name) / sha256
+            _folder = _folder or TemporaryFolder()
+            _files[sha256] = _folder.path / sha256
             _files[sha256].write_bytes(content)
     return platform.node(), [origin_of(source, estimator) for source, estimator in parts]
 

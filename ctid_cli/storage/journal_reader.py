@@ -4,7 +4,6 @@ import hashlib
 import json
 import shutil
 import sqlite3
-import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from ctid_cli.errors import DamageError, StorageError
 from ctid_cli.storage.foreign import read_json, require_manifest
 from ctid_cli.storage.identity import Origin, gathered
 from ctid_cli.storage.manifest import Key, Manifest, refuse_newer
+from ctid_cli.temporary import TemporaryFolder
 
 FILE_NAME = "journal.sqlite"
 #: Raised by one whenever an older ctid could misread the file.
@@ -346,8 +346,8 @@ def _readable(path: Path, *, live: bool) -> Iterator[str]:
     elif empty:
         yield f"{path.resolve().as_uri()}?mode=ro&immutable=1"
     else:
-        with tempfile.TemporaryDirectory(prefix="ctid-") as folder:
-            copy = Path(folder) / path.name
+        with TemporaryFolder() as folder:
+            copy = folder / path.name
             shutil.copyfile(path, copy)
             shutil.copyfile(log, copy.with_name(log.name))
             yield copy.as_uri()

@@ -7,7 +7,6 @@ are not in it. It is written beside the old one, column by column, synchronised,
 import hashlib
 import json
 import os
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -29,6 +28,7 @@ from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import Key, Manifest, refuse_newer, row_columns, slots, swept_names
 from ctid_cli.storage.packing import MISSING, Packed, PackedTable, decoded, keys, results, texts
 from ctid_cli.storage.pieces import ROWS, AnyArray, ranges
+from ctid_cli.temporary import TemporaryFolder
 
 #: Raised by one whenever an older ctid could misread the file.
 FORMAT = 1
@@ -69,8 +69,8 @@ def seal_image(
 ) -> tuple[bytes, str, int]:
     """The sealed file of few estimates as bytes, its checksum, and the number of estimates in it."""
     stored = [Packed(slot, results[slot.key]) for slot in slots(manifest) if slot.key in results]
-    with tempfile.TemporaryDirectory(prefix="ctid-") as folder:
-        path = Path(folder) / "runs.h5"
+    with TemporaryFolder() as folder:
+        path = folder / "runs.h5"
         checksum = write_sealed(manifest, origins, PackedTable(manifest, stored), path)
         return path.read_bytes(), checksum, len(stored)
 
