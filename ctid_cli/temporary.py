@@ -1,4 +1,4 @@
-"""Folders for as long as they are needed; the next process that needs one clears those of processes that were killed."""
+"""Folders for as long as they are needed; the next process that needs one clears those of killed processes."""
 
 import contextlib
 import fcntl

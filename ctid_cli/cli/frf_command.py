@@ -18,7 +18,7 @@ from ctid_cli.cli._common import (
     write_files,
 )
 from ctid_cli.errors import UsageError
-from ctid_cli.inference.frequency_response import ResponseMethod
+from ctid_cli.signals.treatment import ResponseMethod
 
 
 @guarded

@@ -135,7 +135,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         If an option is out of range.
     """
 
-    kind: ClassVar[str] = "measured_submodels"
+    kind: ClassVar[str] = AdditiveSrivc.kind
     loss: ClassVar[LossKind] = "squares"
 
     terms: tuple[Term, ...]

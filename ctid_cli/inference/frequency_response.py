@@ -19,8 +19,7 @@ from ctid_cli.signals.checks import require_choice, require_integer
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.regularity import REGULARITY
-
-ResponseMethod = Literal["auto", "periodic", "local-polynomial", "welch"]
+from ctid_cli.signals.treatment import ResponseMethod
 
 #: Up to this share of missing outputs is bridged by straight lines.
 MOST_MISSING = 0.05

@@ -329,6 +329,8 @@ def _executor() -> Any:
 
 #: Workers that another run has left behind.
 _idle: list[_Worker] = []
+#: Those of a parent: kept, since what ends with them would wait for threads that are not here.
+_not_ours: list[_Worker] = []
 
 
 def _end(workers: Sequence[_Worker]) -> None:
@@ -336,6 +338,15 @@ def _end(workers: Sequence[_Worker]) -> None:
     for thread in [worker.end() for worker in workers]:
         if thread is not None:
             thread.join()
+
+
+def _leave_to_parent() -> None:
+    """Forget the processes of the one that this was forked from: their threads are not here."""
+    _not_ours.extend(_idle)
+    _idle.clear()
+
+
+os.register_at_fork(after_in_child=_leave_to_parent)
 
 
 def end_idle_workers() -> None:

@@ -27,6 +27,7 @@ def test_recommendation_table_and_files(ctid, record, tmp_path):
     out = tmp_path / "new"
     other = write(tmp_path / "other.csv", 1.0, 1)
     text = ctid("order", record, "--poles", "1:3", "--zeros", "0:1", "--validate", other, "--out", out).stdout
+    text = " ".join(text.split())
     for part in ("record.csv: 500 samples, 5 structures", "Recommended: 1 pole, no zero.", "validation %", "--delay"):
         assert part in text
     content = json.loads((out / "order.json").read_text(encoding="utf-8"))

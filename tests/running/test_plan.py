@@ -165,8 +165,8 @@ def test_runs_of_the_command_line(plan_of):
 
 
 def test_too_many_cells(plan_of):
-    many = ",".join(str(k) for k in range(2, 150))
-    with pytest.raises(UsageError, match="21904 data cells"):
+    many = ",".join(str(k) for k in range(2, 400))
+    with pytest.raises(UsageError, match="158404 data cells"):
         plan_of(f"noise.snr_db=[{many}]", f"excitation.amplitude=[{many}]")
 
 

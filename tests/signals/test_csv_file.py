@@ -168,7 +168,7 @@ def test_missing_file_is_refused(tmp_path):
 
 def test_unknown_hold_and_offset_are_refused(write):
     path = write("t,u,y\n0,1,2\n")
-    with pytest.raises(ValueError, match="hold must be 'zoh' or 'foh', not 'cubic'"):
+    with pytest.raises(ValueError, match="hold must be 'zoh' or 'foh' or 'band-limited', not 'cubic'"):
         read_record(path, hold="cubic")
     with pytest.raises(ValueError, match="offset must be 'none' or 'remove', not 'yes'"):
         read_record(path, offset="yes")

@@ -249,7 +249,7 @@ def test_file_that_begins_late_is_zero_before_or_refused(input_file):
         (lambda: Step(0.0), "amplitude must not be zero"),
         (lambda: Step(float("inf")), "amplitude must be a finite number"),
         (lambda: Step(time=-1.0), "time must be zero or a positive number"),
-        (lambda: InputFile("a.csv", hold="cubic"), "hold must be 'zoh' or 'foh', not 'cubic'"),
+        (lambda: InputFile("a.csv", hold="cubic"), "hold must be 'zoh' or 'foh' or 'band-limited', not 'cubic'"),
         (lambda: InputFile("a.csv", time="u"), "time and input must be two columns; both are 'u'"),
     ],
 )
