@@ -64,14 +64,14 @@ def test_what_takes_too_long_is_ended_and_all_else_is_stored(tmp_path: Path) -> 
 def test_processor_time_and_memory_are_limited_too(tmp_path: Path) -> None:
     hostile = [Hostile("hang in preparation", at=1, order=5), Toy(order=6), Hostile("grow", at=2, order=8)]
     hostile += [Toy(order=9), Hostile("ask for too much", at=0, order=7)]
-    run(toys(*hostile, limits={"cpu_seconds": 1, "memory_mb": 300}), tmp_path)
+    run(toys(*hostile, limits={"cpu_seconds": 3, "memory_mb": 300}), tmp_path)
     assert failures(tmp_path) == {
         ("toy1", 1, "none"): "TIMEOUT",
         ("toy3", 2, "none"): "MEMORY",
         ("toy5", 0, "none"): "MEMORY",
     }
     assert messages(tmp_path) == {
-        "not finished after 1 s of processor time (limits.cpu_seconds)",
+        "not finished after 3 s of processor time (limits.cpu_seconds)",
         "needed more than 300 MB (limits.memory_mb)",
     }
 
