@@ -21,6 +21,8 @@ from ctid_cli.inference.residuals import all_white
 RANK = 1e-9
 #: Parts of each record that are left out in turn.
 BLOCKS = 10
+#: A block that gives a larger share of what is known of a direction has it for itself.
+OWN = 0.9
 
 
 def shared_noise(residuals: Sequence[Array]) -> NoiseModel:
@@ -48,8 +50,8 @@ def innovations_count(residuals: Sequence[Array], noise: NoiseModel) -> int:
 def cross_validated_errors(residuals: Sequence[Array], psi: Sequence[Array]) -> tuple[Array, ...]:
     """Output errors of each tenth of each record with the parameters of the fit to all the rest, linearised.
 
-    Without block B, ``e_B + Q_B (I - Q_B'Q_B)^-1 Q_B' e_B``, Q an orthonormal basis of the sensitivities; NaN where the
-    rest does not determine the parameters.
+    Without block B, ``e_B + Q_B (I - Q_B'Q_B)^-1 Q_B' e_B``, Q an orthonormal basis of the sensitivities. Directions
+    that hardly anything but the block itself determines, such as the state before it, are taken from it.
     """
     basis = _orthonormal(np.concatenate(psi))
     splits = np.cumsum([e.size for e in residuals])[:-1]
@@ -57,11 +59,9 @@ def cross_validated_errors(residuals: Sequence[Array], psi: Sequence[Array]) -> 
     for e, q in zip(residuals, np.split(basis, splits), strict=True):
         parts = []
         for rows in np.array_split(np.arange(e.size), BLOCKS):
-            left = np.eye(q.shape[1]) - q[rows].T @ q[rows]
-            if np.linalg.cond(left) > 1 / RANK:
-                parts.append(np.full(rows.size, np.nan))
-            else:
-                parts.append(e[rows] + q[rows] @ np.linalg.solve(left, q[rows].T @ e[rows]))
+            own, directions = np.linalg.eigh(q[rows].T @ q[rows])
+            told = q[rows] @ directions[:, own < OWN]
+            parts.append(e[rows] + told @ ((told.T @ e[rows]) / (1.0 - own[own < OWN])))
         found.append(np.concatenate(parts))
     return tuple(found)
 

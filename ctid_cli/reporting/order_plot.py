@@ -39,7 +39,8 @@ def order_drawing(found: OrderSearch, title: str) -> Drawing:
         for axes in (error, criterion):
             axes.set_xlabel("poles")
             axes.set_xticks(sorted({each.options.poles for each in by_size}))
-        criterion.legend(loc="upper right")
+        handles, labels = criterion.get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
         error.set_title(plain(title), loc="left")
 
-    return Drawing(7.5, 3.4, draw)
+    return Drawing(7.5, 3.7, draw)
