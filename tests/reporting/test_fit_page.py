@@ -4,7 +4,6 @@ import re
 import shlex
 from collections import Counter
 from dataclasses import replace
-from html.parser import HTMLParser
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,10 +17,10 @@ from ctid_cli.reporting.identification_report import identification_object
 from ctid_cli.reporting.pages.fit_page import fit_page
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.storage.fit_file import fit_text, read_fit
+from tests.reporting.parsed_page import Page
 
 HOSTILE = "<script>alert(1)</script>&$x_{$\"'"
 SYSTEM = TransferFunction([3.0], [1.0, 1.2, 4.0], 0.73)
-VOID = {"meta", "link", "br", "img", "input", "hr"}
 
 
 def measurement(seed, name, n=400, noise=0.1):
@@ -51,31 +50,6 @@ def page_of(result, measured, other, folder):
     )
     stored = read_fit(path)
     return fit_page(result, measured, other, stored.content), fit_page(stored.result, measured, other, stored.content)
-
-
-class Page(HTMLParser):
-    def __init__(self, text):
-        super().__init__()
-        self.open, self.tags, self.attributes, self.text = [], Counter(), [], ""
-        self.feed(text)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag, attrs):
-        self.tags[tag] += 1
-        self.attributes += attrs
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags[tag] += 1
-        self.attributes += attrs
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        self.text += data
 
 
 def test_a_page_says_all_and_needs_nothing_but_itself(fitted, tmp_path):

@@ -2,7 +2,6 @@
 
 import re
 from collections import Counter
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
@@ -12,36 +11,9 @@ from ctid_cli.reporting.pages.experiment_page import experiment_page
 from ctid_cli.reporting.pages.page import ROWS, inline, report_of
 from ctid_cli.reporting.pages.question import equation, parts, polynomial
 from ctid_cli.storage.folder import SPEC
+from tests.reporting.parsed_page import Page
 
 HOSTILE = "<script>alert(1)</script> & \"quotes\" 'too' --> {{ 7 * 7 }} {% include 'x' %}"
-VOID = {"meta", "link", "br", "img", "input", "hr"}
-
-
-class Page(HTMLParser):
-    """What a page holds; refuses tags that are not closed in order."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.open, self.tags, self.attributes, self.text = [], Counter(), [], ""
-        self.feed(text)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag, attrs):
-        self.tags[tag] += 1
-        self.attributes += attrs
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags[tag] += 1
-        self.attributes += attrs
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        self.text += data
 
 
 @pytest.fixture
