@@ -94,12 +94,16 @@ class PlannedKeys(Container[Key]):
 
     def count_in(self, keys: KeySet) -> int:
         """How many of some estimates are asked for."""
-        return sum(
-            sum(flags) if self._shard is None else sum(self._has(data, k) for k, there in enumerate(flags) if there)
-            for data, estimator, start, flags in keys.groups()
-            if start in self._starts.get(estimator, ())
-            for flags in [flags[: max((count for _, count in self._places.get(data, ())), default=0)]]
-        )
+        found = 0
+        for data, estimator, start, flags in keys.groups():
+            if start not in self._starts.get(estimator, ()):
+                continue
+            there = flags[: max((count for _, count in self._places.get(data, ())), default=0)]
+            if self._shard is None:
+                found += sum(there)
+            else:
+                found += sum(self._has(data, replicate) for replicate, flag in enumerate(there) if flag)
+        return found
 
     def __len__(self) -> int:
         most = {name: max(count for _, count in places) for name, places in self._places.items()}
