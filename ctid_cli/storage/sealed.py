@@ -25,10 +25,9 @@ from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, unpack_track
 from ctid_cli.storage import columns
 from ctid_cli.storage.foreign import read_json, require_manifest
 from ctid_cli.storage.identity import Origin
-from ctid_cli.storage.manifest import Key, Manifest, refuse_newer, row_columns, slots, swept_names
-from ctid_cli.storage.packing import MISSING, Packed, PackedTable, decoded, keys, results, texts
+from ctid_cli.storage.manifest import Manifest, refuse_newer, row_columns, slots, swept_names
+from ctid_cli.storage.packing import MISSING, PackedTable, decoded, texts
 from ctid_cli.storage.pieces import ROWS, AnyArray, ranges
-from ctid_cli.temporary import TemporaryFolder
 
 #: Raised by one whenever an older ctid could misread the file.
 FORMAT = 1
@@ -38,16 +37,6 @@ USER_BLOCK = 512
 #: How a file without a user block begins, as older versions wrote them.
 _SIGNATURE = b"\x89HDF"
 _PACKING: dict[str, Any] = {"compression": "gzip", "shuffle": True}
-
-
-@dataclass(frozen=True)
-class SealedRuns:
-    """Content of a sealed file."""
-
-    manifest: Manifest
-    origins: tuple[Origin, ...]
-    results: Mapping[Key, dict[str, Any]]
-    checksum: str
 
 
 def write_sealed(manifest: Manifest, origins: Sequence[Origin], table: PackedTable, path: Path) -> str:
@@ -62,17 +51,6 @@ def write_sealed(manifest: Manifest, origins: Sequence[Origin], table: PackedTab
         written.flush()
         os.fsync(written.fileno())
     return checksum
-
-
-def seal_image(
-    manifest: Manifest, origins: Sequence[Origin], results: Mapping[Key, dict[str, Any]]
-) -> tuple[bytes, str, int]:
-    """The sealed file of few estimates as bytes, its checksum, and the number of estimates in it."""
-    stored = [Packed(slot, results[slot.key]) for slot in slots(manifest) if slot.key in results]
-    with TemporaryFolder() as folder:
-        path = folder / "runs.h5"
-        checksum = write_sealed(manifest, origins, PackedTable(manifest, stored), path)
-        return path.read_bytes(), checksum, len(stored)
 
 
 def _write_all(file: h5py.File, manifest: Manifest, origins: Sequence[Origin], table: PackedTable) -> str:
@@ -92,11 +70,6 @@ def _write_all(file: h5py.File, manifest: Manifest, origins: Sequence[Origin], t
     file.attrs["checksum"] = checksum
     file.flush()
     return checksum
-
-
-def headed(image: bytes) -> bytes:
-    """HDF5 data behind their user block."""
-    return _head(hashlib.sha256(image).hexdigest()) + image
 
 
 def _head(sha256: str) -> bytes:
@@ -153,16 +126,6 @@ def open_sealed(path: Path, *, fully: bool = False) -> OpenSealed:
         manifest = require_manifest(read_json(bytes(file["manifest"][()]).decode("utf-8")))
         origins = tuple(Origin.of(**entry) for entry in read_json(str(file.attrs["origins"])))
         return OpenSealed(manifest, origins, SealedTable(file, path), checksum, has_head)
-
-
-def read_sealed(path: Path) -> SealedRuns:
-    """Read all of a sealed file, and compare it with its checksums."""
-    found = open_sealed(path, fully=True)
-    rows: dict[Key, dict[str, Any]] = {}
-    with _saying_where(path):
-        for start, stop in ranges(found.table.count):
-            rows |= zip(keys(found.table, start, stop), results(found.table, start, stop), strict=True)
-    return SealedRuns(found.manifest, found.origins, rows, found.checksum)
 
 
 def read_sealed_tracks(path: Path) -> dict[str, dict[str, np.ndarray[Any, Any]]]:

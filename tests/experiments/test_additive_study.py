@@ -10,11 +10,11 @@ from ctid_cli.reporting.parameter_errors import parameter_errors
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
-from ctid_cli.storage.sealed import seal_image
 from ctid_cli.studies.catalogue import StudyResults, find_study, read_study
 from ctid_cli.studies.claim import claims_table
 from ctid_cli.studies.publishing import evaluate, published_texts
 from tests.reporting.ideal_results import ideal_results
+from tests.storage.sealed_images import seal_image
 
 STUDY = find_study("additive")
 measures, claims = STUDY.module("measures"), STUDY.module("claims")

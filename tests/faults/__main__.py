@@ -7,12 +7,12 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from ctid_cli.storage.sealed import read_sealed, seal_image
 from tests.faults import damage, process_faults, storage_faults
 from tests.faults.conftest import STORED, TINY
 from tests.faults.counts import Count, table
 from tests.faults.harness import Fuzzer, faults
 from tests.faults.test_faults import KINDS
+from tests.storage.sealed_images import read_sealed, seal_image
 
 #: Trials of the full form.
 INPUTS, STORAGE, DAMAGES = 20_000, 2_600, 360

@@ -23,7 +23,7 @@ success:     {delay_relative_error: 0.2}
 @pytest.fixture(scope="session")
 def sealed_images():
     """Sealed files of a system, of a sum of submodels and of a signal."""
-    from ctid_cli.storage.sealed import read_sealed, seal_image
+    from tests.storage.sealed_images import read_sealed, seal_image
 
     images = []
     for folder in sorted(STORED.iterdir()):

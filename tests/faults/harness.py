@@ -18,9 +18,9 @@ from ctid_cli.cli.main import app
 from ctid_cli.errors import CtidError
 from ctid_cli.signals.measurement import read_measurement
 from ctid_cli.signals.sampled_signal import read_sampled_signal
-from ctid_cli.storage.sealed import headed
 from ctid_cli.storage.store import read_stored
 from tests.faults import mutations
+from tests.storage.sealed_images import headed
 
 #: Seconds after which an input counts as one that hangs, and memory that a process may have.
 PATIENCE, MEMORY = 60.0, 4 << 30

@@ -17,10 +17,10 @@ from ctid_cli.signals.mat_file import read_mat_table
 from ctid_cli.signals.measurement import read_measurement
 from ctid_cli.signals.record import Record
 from ctid_cli.specification.load import load_spec
-from ctid_cli.storage.sealed import read_sealed
 from tests.faults import trials
 from tests.faults.conftest import STORED, TINY
 from tests.faults.harness import asked, resealed
+from tests.storage.sealed_images import read_sealed
 
 MEASURED = """\
 experiment: measured

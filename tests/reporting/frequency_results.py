@@ -2,9 +2,9 @@
 
 from ctid_cli.running.job import Job
 from ctid_cli.storage.identity import Origin
-from ctid_cli.storage.sealed import seal_image
 from ctid_cli.studies.catalogue import find_study
 from tests.running.fakes import outcomes_of
+from tests.storage.sealed_images import seal_image
 
 STUDY = find_study("finite-time-frequency")
 

@@ -207,7 +207,7 @@ def test_ratios_that_make_no_sense_are_refused(plan, tmp_path):
 
 def test_results_on_disk_give_the_same_errors(plan, tmp_path):
     from ctid_cli.reporting.results import read_results
-    from ctid_cli.storage.sealed import seal_image
+    from tests.storage.sealed_images import seal_image
 
     results = ideal_results(plan, tmp_path)
     folder = tmp_path / "two-modes"

@@ -22,10 +22,11 @@ from ctid_cli.storage.identity import origin_of
 from ctid_cli.storage.journal import open_journal
 from ctid_cli.storage.journal_reader import read_journal
 from ctid_cli.storage.manifest import slots, true_values
-from ctid_cli.storage.sealed import USER_BLOCK, headed, read_sealed, seal_image
+from ctid_cli.storage.sealed import USER_BLOCK
 from ctid_cli.storage.store import experiment_status, find_estimate, load_estimates, read_stored
 from ctid_cli.storage.summary import export_rows
 from tests.running.fakes import FakePlan, Toy
+from tests.storage.sealed_images import headed, read_sealed, seal_image
 
 PLAN = FakePlan(Toy("raise", at=1), Toy(order=3))
 CLOCKS = ["seconds", "cpu_seconds"]

@@ -18,8 +18,8 @@ from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import columns, manifest
 from ctid_cli.storage.journal import open_journal
 from ctid_cli.storage.journal_reader import read_journal
-from ctid_cli.storage.sealed import read_sealed, seal_image
 from ctid_cli.storage.store import load_estimates, read_stored, read_tracks
+from tests.storage.sealed_images import read_sealed, seal_image
 
 STORED = Path(__file__).parent / "stored"
 NAMES = ("system", "sum", "signal")
