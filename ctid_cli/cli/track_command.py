@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import typer
 
-from ctid_cli.cli._common import From, Json, TimeColumn, To, answer, guarded, write_files
+from ctid_cli.cli._common import From, Json, TimeColumn, To, answer, given_command, guarded, write_files
 from ctid_cli.cli._progress import RecordProgress
 from ctid_cli.errors import UsageError
 from ctid_cli.kinds import KINDS
 
 if TYPE_CHECKING:
+    from ctid_cli.frequency.record_track import Procedure, RecordTrack
     from ctid_cli.signals.sampled_signal import SampledSignal
 
     Method = str
@@ -23,8 +24,9 @@ else:
 
 @guarded
 def track(
+    context: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="SIGNAL", help="Recorded signal (.csv, .mat, .wav).")],
-    tones: Annotated[int, typer.Option("--tones", help="Number of sinusoids, 1 to 8: the strongest ones.")],
+    tones: Annotated[str, typer.Option("--tones", metavar="N", help="Number of sinusoids, or auto.")] = "auto",
     method: Annotated[Method, typer.Option("--method", help="How the frequencies are estimated.")] = "automatic",
     time: TimeColumn = None,
     signal: Annotated[str | None, typer.Option("--signal", metavar="NAME", help="Column or channel to use.")] = None,
@@ -37,47 +39,97 @@ def track(
         typer.Option("--every", metavar="SECONDS", help="One row every so often; about 1000 if not given."),
     ] = None,
     window: Annotated[float | None, typer.Option("--window", metavar="SECONDS", help="Length of the windows.")] = None,
+    accuracy: Annotated[
+        float | None,
+        typer.Option(
+            "--accuracy",
+            metavar="HZ",
+            help="Rows with a larger standard error are not valid; .001 of the tone's frequency if not given.",
+        ),
+    ] = None,
     as_json: Json = False,
     style: Annotated[Literal["csv", "h5"], typer.Option("--format", help="Form of the track.")] = "csv",
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the track and its figure.")] = Path("."),
 ) -> None:
     """Follow the frequencies of a recorded sum of sinusoids.
 
-    Prints the frequency of each tone, how far it moves, and for how much of the time it can be trusted; writes the
-    frequencies and amplitudes over time to track.csv (or track.h5) and track.svg. All the rest is chosen from the
-    record, and said.
+    Prints the frequency of each tone, how well it is known, how far it moves, and for how much of the time it can be
+    trusted; writes everything over time to track.csv (or track.h5), track.svg and track.json, which ctid report makes
+    a page of. All the rest is chosen from the record, and said.
     """
-    from ctid_cli.frequency.automatic import choose_settings
-    from ctid_cli.frequency.record_track import track_record
+    from ctid_cli.reporting.track_columns import track_bytes, track_table
     from ctid_cli.reporting.track_plot import track_drawing
-    from ctid_cli.reporting.track_report import track_bytes, track_object, track_table, track_text
-    from ctid_cli.signals.sampled_signal import read_sampled_signal
+    from ctid_cli.reporting.track_report import track_object, track_text
+    from ctid_cli.storage.track_file import Reading, track_file_text
 
-    data, figure = out / f"track.{style}", out / "track.svg"
-    if any(file.exists() and written.exists() and file.samefile(written) for written in (data, figure)):
+    data, figure, result = out / f"track.{style}", out / "track.svg", out / "track.json"
+    if any(file.exists() and written.exists() and file.samefile(written) for written in (data, figure, result)):
         raise UsageError(f"{file} would be overwritten by the track; write it elsewhere (--out DIR)")
-    given = _interval(interval, rate)
+    reading = Reading(time, signal, _interval(interval, rate), start, stop)
     for name, value in (("--from", start), ("--to", stop)):
         if value is not None and not math.isfinite(value):
             raise UsageError(f"{name} must be an instant, not {value:g}")
     for name, value in (("--every", every), ("--window", window)):
         if value is not None and not 0 < value < math.inf:
             raise UsageError(f"{name} must be a positive number of seconds, not {value:g}")
-    record = _in_seconds(read_sampled_signal(file, time=time, signal=signal, interval=given, start=start, stop=stop))
-    kind = None if method == "automatic" else method
-    try:
-        settings = choose_settings(record.samples, record.interval, tones, method=kind, window=window)
-        with RecordProgress(file.name) as tell:
-            found = track_record(record.samples, record.interval, settings, every=every, on_progress=tell)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
-    drawn = track_drawing(found, record.start, record.unit, f"{file.name}: {settings.estimator.kind}").saved()
-    write_files({data: track_bytes(track_table(found, record.start), style, record.unit), figure: drawn})
+    if accuracy is not None and not 0 < accuracy < math.inf:
+        raise UsageError(f"--accuracy must be a positive number of hertz, not {accuracy:g}")
+    record = reading.read(file)
+    asked = Asked(_tones(tones), None if method == "automatic" else method, every, window, accuracy)
+    found, procedure = _follow(record, asked)
+    if accuracy is not None and not found.states_errors:
+        what = f"the method {procedure.method} states no standard errors to compare with --accuracy"
+        raise UsageError(f"{what}; leave --accuracy or --method out")
+    found = found.of_accuracy(accuracy)
+    files = [data, figure, result]
+    content = track_object(record, procedure, found, accuracy)
+    drawn = track_drawing(found, record.start, record.unit, f"{file.name}: {procedure.method}").saved()
+    text = track_file_text(found, content, file, reading, out, given_command(context))
+    table = track_bytes(track_table(found, record.start), style, record.unit)
+    write_files({data: table, figure: drawn, result: text.encode() + b"\n"})
     answer(
         as_json,
-        lambda: track_object(record, settings, found, [data, figure]),
-        lambda: f"{track_text(record, settings, found)}\n\nWritten: {data}, {figure}",
+        lambda: content | {"written": [str(each) for each in files]},
+        lambda: f"{track_text(record, procedure, found, accuracy)}\n\nWritten: {', '.join(map(str, files))}",
     )
+
+
+class Asked(NamedTuple):
+    """What a track is asked for; None where it is to be chosen."""
+
+    tones: int | None
+    method: str | None
+    every: float | None
+    window: float | None
+    accuracy: float | None
+
+
+def _follow(record: SampledSignal, asked: Asked) -> tuple[RecordTrack, Procedure]:
+    """The track of a record, and how it was found."""
+    from ctid_cli.frequency.automatic import choose_settings
+    from ctid_cli.frequency.estimator_rows import procedure_of, track_record
+
+    if asked.tones is None:
+        raise UsageError("--tones is missing: the number of sinusoids, such as --tones 2")
+    samples, interval = record.samples, record.interval
+    try:
+        settings = choose_settings(samples, interval, asked.tones, method=asked.method, window=asked.window)
+        with RecordProgress(record.file) as tell:
+            found = track_record(samples, interval, settings, every=asked.every, on_progress=tell)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    return found, procedure_of(settings, interval)
+
+
+def _tones(text: str) -> int | None:
+    """The number of tones; None to have it chosen."""
+    from ctid_cli.frequency.record_track import MOST_ASKED
+
+    if text == "auto":
+        return None
+    if not text.isdecimal():
+        raise UsageError(f"--tones must be a number from 0 to {MOST_ASKED}, or auto, not {text!r}")
+    return int(text)
 
 
 def _interval(interval: float | None, rate: float | None) -> float | None:
@@ -87,13 +139,3 @@ def _interval(interval: float | None, rate: float | None) -> float | None:
         if value is not None and not (0 < value < math.inf and 1.0 / value < math.inf):
             raise UsageError(f"{name} must be a positive number, not {value:g}")
     return interval if rate is None else 1.0 / rate
-
-
-def _in_seconds(record: SampledSignal) -> SampledSignal:
-    from ctid_cli.reporting.estimate import SECONDS
-
-    unit = record.time_unit or "s"
-    if unit not in SECONDS:
-        unknown = f"{record.file}: the unit of time, {unit!r}, is not known, so there is no frequency in Hz"
-        raise UsageError(f"{unknown}; give the clock with --interval SECONDS or --rate HERTZ")
-    return record.rescaled(SECONDS[unit], "s")

@@ -1,99 +1,112 @@
-"""Frequencies over time of a recorded signal, by any of the estimators."""
+"""What is known of the tones of a recorded signal over time, whichever method found it."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ctid_cli.arrays import Array
-from ctid_cli.frequency.automatic import Settings
+from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.errors import DataError
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.tracking import FrequencyTrack
-from ctid_cli.frequency.windows import WindowEstimate, amplitudes_of, estimate_window, wanted_tones
 
-#: Rows of a track if nobody says how many.
-USUAL_ROWS = 1000
-#: Windows overlap by half if nobody says otherwise, and by more where they would be fewer than this.
-OVERLAP = 0.5
-FEWEST_WINDOWS = 100
-#: A window whose middle part, this fraction of it, is missing says nothing of its instant.
-MIDDLE = 0.1
-#: Samples that an online estimator takes between two reports of progress.
-PIECE = 50_000
+#: A tone is accurate if its standard error is at most this share of its frequency, unless another limit is given.
+USUAL_ACCURACY = 0.001
+#: Most tones that can be asked for.
+MOST_ASKED = 20
+
+
+class MissingLine(NamedTuple):
+    """A line that the tones of a record leave over."""
+
+    #: Frequency [rad/s].
+    omega: float
+    #: Share of the rows in which it was left over.
+    share: float
+    #: Amplitude where it was left over, a median [signal unit].
+    amplitude: float
+
+
+class Procedure(NamedTuple):
+    """How a track was found."""
+
+    method: str
+    #: Whether each row knows only the samples before it.
+    online: bool
+    #: What was chosen, and why: one sentence for each choice.
+    reasons: tuple[str, ...]
+    warnings: tuple[str, ...]
+    #: Plain numbers and words, for programs.
+    settings: dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
-class RecordTrack(FrequencyTrack):
-    """Frequencies, at the newest sample of an online estimate or in the middle of a window, with amplitudes."""
+class RecordTrack:
+    """Tones over time: a column is one tone from first to last, NaN where it is not there or where nothing is known.
 
-    #: Amplitudes [signal unit]; NaN where they are not determined, shape (N, n).
+    All arrays but ``t`` are of shape (N, n); the frequencies of a row need not ascend.
+    """
+
+    #: Instants since the first sample [s], shape (N,).
+    t: Array
+    #: Frequencies and their standard errors [rad/s].
+    omega: Array
+    error: Array
+    #: Amplitudes and their standard errors [signal unit].
     amplitudes: Array
+    amplitude_error: Array
+    #: Phase at the instant of the row, of ``amplitude sin(phase)`` [rad].
+    phase: Array
+    #: Logarithmic growth of the amplitude [1/s]; negative where it decays.
+    growth: Array
+    #: Rate of change of the frequency [rad/s^2].
+    rate: Array
+    #: Length of the stretch of signal that the row is read from [s].
+    window: Array
+    #: Bit fields of :class:`~ctid_cli.frequency.flags.Flag`.
+    flags: NDArray[np.uint16]
     #: Time from one row to the next [s].
     every: float
+    #: Lines that are left over, the strongest first.
+    missing: tuple[MissingLine, ...] = ()
 
+    def __post_init__(self) -> None:
+        if self.t.ndim != 1 or self.omega.ndim != 2 or self.omega.shape[0] != self.t.size:
+            raise DataError(f"a track of {self.t.shape} instants has frequencies of shape {self.omega.shape}")
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray) and item.name != "t" and value.shape != self.omega.shape:
+                raise DataError(f"{item.name} of a track is of shape {value.shape}, not {self.omega.shape}")
 
-def track_record(
-    samples: Array,
-    interval: float,
-    settings: Settings,
-    *,
-    every: float | None = None,
-    on_progress: Callable[[int, int], None] | None = None,
-) -> RecordTrack:
-    """Follow the frequencies of a recorded signal."""
-    thinned = settings.decimation.apply(samples, settings.offset)
-    thin = settings.interval
-    wanted_step = samples.size * interval / USUAL_ROWS
-    if every is not None:
-        wanted_step = every
-    elif not settings.estimator.online:
-        wanted_step = max(wanted_step, min(OVERLAP * settings.window_seconds, thinned.size * thin / FEWEST_WINDOWS))
-    step = max(1, round(min(wanted_step / thin, float(thinned.size))))
-    follow = _online if settings.estimator.online else _windows
-    rows = [
-        (place, found, amplitudes_of(part, thin, found.omega, found.everything))
-        for place, found, part in follow(thinned, settings, step, on_progress or (lambda done, total: None))
-    ]
-    omega = np.array([found.omega for _, found, _ in rows])
-    flags = np.array([int(found.flags) for _, found, _ in rows], np.uint16)
-    uncertainty = np.array([found.uncertainty for _, found, _ in rows])
-    with np.errstate(invalid="ignore"):
-        gain = settings.decimation.gain(omega.ravel(), interval).reshape(omega.shape)
-        amplitudes = np.where(gain > 0.0, np.array([row[2] for row in rows]) / np.where(gain > 0.0, gain, 1.0), np.nan)
-    # The middle of the filter lies before its newest sample; an online estimate is that of the newest sample.
-    t = np.array([place for place, _, _ in rows]) * thin + settings.lag * interval
-    if settings.estimator.online:
-        t += settings.lag * interval
-    return RecordTrack(t, omega, flags, uncertainty, amplitudes, step * thin)
+    @classmethod
+    def of(cls, t: Array, omega: Array, flags: NDArray[np.uint16], every: float, **known: Any) -> RecordTrack:
+        """A track of which not everything is known; flags of shape (N,) are those of all tones of their row."""
+        names = ("error", "amplitudes", "amplitude_error", "phase", "growth", "rate", "window")
+        parts: dict[str, Any] = {name: np.asarray(known.pop(name, np.full(omega.shape, np.nan))) for name in names}
+        each = np.broadcast_to(flags if flags.ndim == 2 else flags[:, None], omega.shape).astype(np.uint16)
+        return cls(t=t, omega=omega, flags=each, every=every, **parts, **known)
 
+    @property
+    def valid(self) -> BoolArray:
+        """Where no flag is set, shape (N, n)."""
+        return np.asarray(self.flags == 0)
 
-_Follow = Iterator[tuple[float, WindowEstimate, Array]]
+    @property
+    def there(self) -> BoolArray:
+        """Where a tone is there or may be, shape (N, n)."""
+        return np.asarray((self.flags & int(Flag.ABSENT)) == 0)
 
+    @property
+    def states_errors(self) -> bool:
+        """Whether any standard error of a frequency is known, or there is none to be known."""
+        return not self.omega.size or bool(np.isfinite(self.error).any())
 
-def _windows(thinned: Array, settings: Settings, step: int, tell: Callable[[int, int], None]) -> _Follow:
-    """Middle of each window, what is estimated, and the samples that its amplitudes are found from."""
-    length, total = settings.window, thinned.size
-    middle = max(1, int(MIDDLE * length))
-    for first in range(0, total - length + 1, step):
-        part = thinned[first : first + length]
-        found = estimate_window(settings.estimator, part, settings.interval, settings.expected, settings.tones)
-        if not np.isfinite(part[(length - middle) // 2 :][:middle]).any():
-            found = replace(found, flags=found.flags | Flag.GAP)
-        yield first + 0.5 * (length - 1), found, part
-        tell(first + length, total)
-    tell(total, total)
-
-
-def _online(thinned: Array, settings: Settings, step: int, tell: Callable[[int, int], None]) -> _Follow:
-    """Every so many samples what is estimated, and the samples that its amplitudes are found from."""
-    tracker = settings.estimator.start(settings.interval)
-    for first in range(0, thinned.size, PIECE):
-        track = tracker.run(thinned[first : first + PIECE], fft=True)
-        last = first + track.flags.size
-        for place in range(first + (-first - 1) % step, last, step):
-            found = wanted_tones(track[place - first], settings.expected, settings.tones)
-            begin = max(0, place + 1 - settings.window)
-            if found.flags & (Flag.STARTING | Flag.GAP | Flag.CHANGED):
-                begin = place + 1
-            yield float(place), found, thinned[begin : place + 1]
-        tell(last, thinned.size)
+    def of_accuracy(self, accuracy: float | None) -> RecordTrack:
+        """The same, not valid where a standard error exceeds the accuracy [Hz], by default a share of the frequency."""
+        limit = USUAL_ACCURACY * np.abs(self.omega) if accuracy is None else np.asarray(2.0 * np.pi * accuracy)
+        with np.errstate(invalid="ignore"):
+            coarse = self.error > limit
+        kept = self.flags & np.uint16(~int(Flag.INACCURATE) & 0xFFFF)
+        return replace(self, flags=np.where(coarse, kept | np.uint16(Flag.INACCURATE), kept).astype(np.uint16))

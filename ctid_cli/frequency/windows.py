@@ -80,13 +80,17 @@ def belonging(found: Array, expected: Array, wanted: int) -> IndexArray:
     return np.asarray(linear_sum_assignment(cost)[1][:wanted])
 
 
-def amplitudes_of(samples: Array, interval: float, omega: Array, everything: Array) -> Array:
-    """Amplitudes of sinusoids of known frequencies in a window."""
+def sinusoids_of(
+    samples: Array, interval: float, omega: Array, everything: Array, instant: float
+) -> tuple[Array, Array]:
+    """Amplitudes of sinusoids of known frequencies in a window, and their phases at an instant [s] of it."""
     frequencies = np.unique(everything[everything > 0])
+    unknown = np.full(omega.size, np.nan)
     if not np.isfinite(omega).all() or not np.isin(omega, frequencies).all():
-        return np.full(omega.size, np.nan)
+        return unknown, unknown
     try:
         fit = fit_sinusoids(samples, interval, frequencies)
     except DataError:
-        return np.full(omega.size, np.nan)
-    return np.asarray(fit.amplitudes[np.searchsorted(frequencies, omega)])
+        return unknown, unknown
+    places = np.searchsorted(frequencies, omega)
+    return fit.amplitudes[places], np.angle(np.exp(1j * (fit.phases[places] + omega * instant)))

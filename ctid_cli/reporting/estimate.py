@@ -9,23 +9,13 @@ from typing import Any
 from ctid_cli.canonical import plain
 from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.reporting.layout import Table, number
+from ctid_cli.signals.sampled_signal import SECONDS
 
 #: Keys that every estimate carries in machine-readable output, in this order.
 ESTIMATE_KEYS = (
     *("id", "experiment", "estimator", "cell", "replicate", "start", "status"),
     *("delay", "numerator", "denominator", "standard_errors", "cost", "fit_percent", "iterations", "seconds"),
 )
-
-#: Seconds in a unit of time, by the labels that files use.
-SECONDS = {
-    **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
-    **dict.fromkeys(("ms", "millisecond", "milliseconds"), 1e-3),
-    **dict.fromkeys(("us", "µs", "μs", "microsecond", "microseconds"), 1e-6),
-    **dict.fromkeys(("ns", "nanosecond", "nanoseconds"), 1e-9),
-    **dict.fromkeys(("min", "minute", "minutes"), 60.0),
-    **dict.fromkeys(("h", "hr", "hour", "hours"), 3600.0),
-    **dict.fromkeys(("d", "day", "days"), 86400.0),
-}
 
 
 @dataclass(frozen=True)

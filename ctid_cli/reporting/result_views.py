@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, get_args
 
+import numpy as np
+
 from ctid_cli.errors import UsageError
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.frequency.record_track import RecordTrack
@@ -16,7 +18,9 @@ from ctid_cli.reporting.figures.style import Picture, require_kind
 from ctid_cli.reporting.identification_report import derived_block, derived_of, parameters_of
 from ctid_cli.reporting.layout import Report, Table, number
 from ctid_cli.reporting.measures import parameter_unit
-from ctid_cli.reporting.track_report import invalid_rows, tones_block, track_table
+from ctid_cli.reporting.track_columns import flag_words
+from ctid_cli.reporting.track_report import tones_block
+from ctid_cli.reporting.track_summary import invalid_rows
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import warning_lines
 
@@ -75,8 +79,8 @@ def to_frame(result: Fit | Identification | FrequencyTrack | ExperimentResults) 
     -------
     pandas.DataFrame
         Of a fit one row for each parameter: ``estimate``, ``standard_error``, ``relative_percent``, ``low``, ``high``,
-        ``unit``, ``status``; of a track one row for each instant, with the columns of ``track.csv``; of an experiment
-        one row for each estimate, what ``ctid export`` writes.
+        ``unit``, ``status``; of a track one row for each instant ``t``, with ``omega_1`` ..., ``frequency_1_hz`` ...,
+        ``valid`` and ``flags``, in words; of an experiment one row for each estimate, what ``ctid export`` writes.
 
     Raises
     ------
@@ -86,7 +90,7 @@ def to_frame(result: Fit | Identification | FrequencyTrack | ExperimentResults) 
     import pandas as pd
 
     if isinstance(result, FrequencyTrack):
-        return pd.DataFrame(track_table(result, 0.0)).set_index("t")
+        return _frame_of_track(result)
     if isinstance(result, Fit | Identification):
         return pd.DataFrame([parameter_object(item) for item in _parameters(result)]).set_index("name")
     return _of_experiment(result).estimates
@@ -103,10 +107,9 @@ def plot(result: Identification | FrequencyTrack | ExperimentResults, kind: str 
     kind : str, optional
         Which figure. Of an identification ``"all"`` (the default) or one part of it: ``"overlay"`` of the measured and
         the simulated output, ``"residuals"``, ``"correlation"`` of these with themselves and with the input,
-        ``"profile"`` of the cost over the delay. Of a track ``"tones"`` (the default): ``"frequencies"`` and, where it
-        has them, ``"amplitudes"``. Of an experiment ``"measure"``, ``"box"``, ``"errors"``, ``"delays"`` or
-        ``"convergence"``, by default what tells most;
-        its method ``figure`` has more options.
+        ``"profile"`` of the cost over the delay. Of a track ``"tones"``, the default, or ``"frequencies"``: the same.
+        Of an experiment ``"measure"``, ``"box"``, ``"errors"``, ``"delays"`` or ``"convergence"``, by default what
+        tells most; its method ``figure`` has more options.
 
     Returns
     -------
@@ -124,10 +127,8 @@ def plot(result: Identification | FrequencyTrack | ExperimentResults, kind: str 
         shown: Any = kind
         return identification_plot.identification_drawing(result, measured, Units(), shown).picture()
     if isinstance(result, FrequencyTrack):
-        known = get_args(track_plot.Kind)
-        require_kind(kind, known if isinstance(result, RecordTrack) else known[:2])
-        shown = kind
-        return track_plot.track_drawing(result, 0.0, None, "frequencies", shown).picture()
+        require_kind(kind, get_args(track_plot.Kind)[:2])
+        return track_plot.track_drawing(_with_columns(result), 0.0, None, "frequencies").picture()
     if isinstance(result, Fit):
         what = f"a single {type(result).__name__} does not hold the record that it would be drawn with"
         raise UsageError(f"{what}; plot(identify(DelayProfile(...), [record])) does")
@@ -137,8 +138,8 @@ def plot(result: Identification | FrequencyTrack | ExperimentResults, kind: str 
 def _report(result: Any) -> Report:
     """What is said of a result."""
     if isinstance(result, FrequencyTrack):
-        found = [warning for part in invalid_rows(result) for warning in part]
-        return Report([tones_block(result, None), warning_lines(found)[1:]])
+        track = _with_columns(result)
+        return Report([tones_block(track), warning_lines(invalid_rows(track))[1:]])
     if not isinstance(result, Fit | Identification):
         return _of_experiment(result).report
     fit = result.fit if isinstance(result, Identification) else result
@@ -149,6 +150,22 @@ def _report(result: Any) -> Report:
     if isinstance(result, Identification):
         blocks.append([*warning_lines(result.warnings)[1:]])
     return Report(blocks)
+
+
+def _with_columns(track: FrequencyTrack) -> RecordTrack:
+    """A track as those of records are."""
+    every = float(track.t[1] - track.t[0]) if track.t.size > 1 else 0.0
+    return RecordTrack.of(track.t, track.omega, track.flags, every)
+
+
+def _frame_of_track(track: FrequencyTrack) -> pd.DataFrame:
+    import pandas as pd
+
+    tones = range(track.omega.shape[1])
+    columns: dict[str, Any] = {"t": track.t, **{f"omega_{k + 1}": track.omega[:, k] for k in tones}}
+    columns |= {f"frequency_{k + 1}_hz": track.omega[:, k] / (2.0 * np.pi) for k in tones}
+    columns |= {"valid": track.valid, "flags": [flag_words(int(flags)) for flags in track.flags]}
+    return pd.DataFrame(columns).set_index("t")
 
 
 def _of_experiment(result: Any) -> ExperimentResults:

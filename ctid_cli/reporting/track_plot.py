@@ -8,8 +8,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.frequency.record_track import RecordTrack
-from ctid_cli.frequency.tracking import FrequencyTrack
-from ctid_cli.reporting.figures.style import BAND, Drawing, ramp, spread
+from ctid_cli.reporting.figures.style import BAND, Drawing, plain, ramp, spread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,51 +25,48 @@ MARGIN = 0.35
 LOGARITHMIC = 10.0
 
 
-def track_drawing(
-    track: FrequencyTrack, start: float, unit: str | None, title: str, kind: Kind | None = None
-) -> Drawing:
+def track_drawing(track: RecordTrack, start: float, unit: str | None, title: str, kind: Kind | None = None) -> Drawing:
     """A figure of a track: of all that it holds where no kind is given."""
-    t, styles = start + track.t, ramp(track.omega.shape[1])
-    panels = track.omega.shape[1] if track.omega.shape[1] <= MOST_PANELS else 1
+    t, styles = start + track.t, ramp(track.omega.shape[1])[: track.omega.shape[1]]
+    panels = min(max(len(styles), 1), MOST_PANELS) if len(styles) <= MOST_PANELS else 1
     upper = 1.15 * panels if panels > 1 else 2.6
+    alone = kind if np.isfinite(track.amplitudes).any() or kind == "amplitudes" else "frequencies"
 
     def draw(figure: Figure) -> None:
-        if not isinstance(track, RecordTrack) or kind == "frequencies":
+        if alone == "frequencies":
             _draw_all_frequencies(figure, figure.add_gridspec(panels, 1), track, t, styles)
             figure.axes[-1].tick_params(labelbottom=True)
             figure.axes[-1].set_xlabel("t [s]")
             figure.axes[-1].margins(x=0.0)
-        elif kind == "amplitudes":
+        elif alone == "amplitudes":
             _draw_amplitudes(figure.add_subplot(), track, t, unit, styles)
         else:
             ratios = [1.0] * panels + [1.5] if panels > 1 else [2.2, 1.4]
             grid = figure.add_gridspec(panels + 1, 1, height_ratios=ratios)
             first = _draw_all_frequencies(figure, grid, track, t, styles)
             _draw_amplitudes(figure.add_subplot(grid[-1], sharex=first), track, t, unit, styles)
-        figure.axes[0].set_title(title, loc="left")
+        figure.axes[0].set_title(plain(title), loc="left")
 
     heights = {"frequencies": 1.1 + upper, "amplitudes": 3.2}
-    alone = "frequencies" if not isinstance(track, RecordTrack) else kind
     return Drawing(7.2, heights.get(alone or "tones", 2.8 + upper), draw)
 
 
-def _draw_all_frequencies(
-    figure: Figure, grid: Any, track: FrequencyTrack, t: Array, styles: list[dict[str, Any]]
-) -> Any:
+def _draw_all_frequencies(figure: Figure, grid: Any, track: RecordTrack, t: Array, styles: list[dict[str, Any]]) -> Any:
     """Draw the tones into the first places of a grid, and return the first panel."""
     tones = len(styles)
-    panels = tones if tones <= MOST_PANELS else 1
+    panels = tones if 0 < tones <= MOST_PANELS else 1
+    # The highest tone on top, as on a sheet of music; a tone that is never valid lies lowest.
+    order = np.argsort([_middle(track, k) for k in range(tones)])[::-1]
     first: Any = None
     for row in range(panels):
-        # The highest tone on top, as on a sheet of music.
-        mine = [tones - 1 - row] if panels > 1 or tones == 1 else list(range(tones))
+        mine = [int(order[row])] if panels > 1 or tones == 1 else list(range(tones))
         axes = figure.add_subplot(grid[row], sharex=first)
         first = first or axes
         _draw_frequencies(axes, track, t, [(k, styles[k]) for k in mine])
         if panels > 1:
             place: dict[str, Any] = {"xycoords": "axes fraction", "ha": "right", "va": "top", "fontsize": 8}
-            axes.annotate(f"tone {tones - row}", (0.995, 0.92), **place)
-        _shade(axes, t, track.valid)
+            axes.annotate(f"tone {mine[0] + 1}", (0.995, 0.92), **place)
+        _shade(axes, t, np.all(~track.valid[:, mine], axis=1))
     if panels > 1:
         figure.supylabel("frequency [Hz]", fontsize=9)
     else:
@@ -78,20 +74,38 @@ def _draw_all_frequencies(
     return first
 
 
-def _draw_frequencies(axes: Any, track: FrequencyTrack, t: Array, lines: list[tuple[int, dict[str, Any]]]) -> None:
-    frequencies, valid = track.omega / (2.0 * np.pi), track.valid
+def _middle(track: RecordTrack, k: int) -> float:
+    omega = track.omega[:, k]
+    omega = omega[track.valid[:, k]] if track.valid[:, k].any() else omega[np.isfinite(omega)]
+    return float(np.median(omega)) if omega.size else 0.0
+
+
+def _draw_frequencies(axes: Any, track: RecordTrack, t: Array, lines: list[tuple[int, dict[str, Any]]]) -> None:
+    frequencies = track.omega / (2.0 * np.pi)
     for k, style in lines:
+        valid = track.valid[:, k]
         axes.plot(t, np.where(valid, np.nan, frequencies[:, k]), color=style["color"], linewidth=0.4, alpha=0.6)
+        draw_band(axes, t, frequencies[:, k], track.error[:, k] / (2.0 * np.pi), valid, style["color"])
         _line(axes, t, np.where(valid, frequencies[:, k], np.nan), {**style, "linestyle": "-"})
-    _limit(axes, frequencies[:, [k for k, _ in lines]], valid)
+    which = [k for k, _ in lines]
+    _limit(axes, frequencies[:, which], track.valid[:, which])
     axes.tick_params(labelbottom=False)
     axes.ticklabel_format(axis="y", useOffset=False)
+
+
+def draw_band(axes: Any, t: Array, values: Array, errors: Array, valid: BoolArray, color: str) -> None:
+    """A band of one standard error, where it is known."""
+    known = valid & np.isfinite(errors)
+    if known.any():
+        low, high = np.where(known, values - errors, np.nan), np.where(known, values + errors, np.nan)
+        axes.fill_between(t, low, high, color=color, alpha=0.25, linewidth=0.0)
 
 
 def _draw_amplitudes(axes: Any, track: RecordTrack, t: Array, unit: str | None, styles: list[dict[str, Any]]) -> None:
     ends = []
     for k, style in enumerate(styles):
-        values = np.where(track.valid, track.amplitudes[:, k], np.nan)
+        values = np.where(track.valid[:, k], track.amplitudes[:, k], np.nan)
+        draw_band(axes, t, values, track.amplitude_error[:, k], track.valid[:, k], style["color"])
         _line(axes, t, values, style)
         finite = values[np.isfinite(values)]
         ends.append(float(finite[-1]) if finite.size else np.nan)
@@ -99,13 +113,14 @@ def _draw_amplitudes(axes: Any, track: RecordTrack, t: Array, unit: str | None, 
     seen = seen[np.isfinite(seen) & (seen > 0)]
     if seen.size and np.percentile(seen, 95) > LOGARITHMIC * np.percentile(seen, 5):
         axes.set_yscale("log")
+        axes.set_ylim(bottom=0.5 * float(seen.min()))
     elif seen.size:
         axes.set_ylim(bottom=0.0)
-    axes.set(xlabel="t [s]", ylabel=f"amplitude [{unit}]" if unit else "amplitude")
+    axes.set(xlabel="t [s]", ylabel=f"amplitude [{plain(unit)}]" if unit else "amplitude")
     axes.margins(x=0.0)
     if t.size > 1:
         axes.set_xlim(t[0], t[-1])
-    _shade(axes, t, track.valid)
+    _shade(axes, t, np.all(~track.valid, axis=1))
     if len(ends) > 1:
         _label_ends(axes, np.array(ends))
 
@@ -129,12 +144,12 @@ def _limit(axes: Any, frequencies: Array, valid: BoolArray) -> None:
     axes.set_ylim(low - room, high + room)
 
 
-def _shade(axes: Any, t: Array, valid: BoolArray) -> None:
-    """Grey bands where no row is valid."""
-    if t.size < 2 or valid.all():
+def _shade(axes: Any, t: Array, grey: Any) -> None:
+    """Grey bands where nothing that is drawn is valid."""
+    if t.size < 2 or not grey.any():
         return
     half = 0.5 * float(t[1] - t[0])
-    steps = np.diff(np.concatenate(([0], (~valid).astype(np.int8), [0])))
+    steps = np.diff(np.concatenate(([0], grey.astype(np.int8), [0])))
     for a, b in zip(np.flatnonzero(steps == 1), np.flatnonzero(steps == -1), strict=True):
         axes.axvspan(t[a] - half, t[b - 1] + half, color=BAND, linewidth=0.0, zorder=0)
 

@@ -29,6 +29,18 @@ CLOCK_TOLERANCE = 0.01
 MOST_FILLED = 20
 
 
+#: Seconds in a unit of time, by the labels that files use.
+SECONDS = {
+    **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
+    **dict.fromkeys(("ms", "millisecond", "milliseconds"), 1e-3),
+    **dict.fromkeys(("us", "µs", "μs", "microsecond", "microseconds"), 1e-6),
+    **dict.fromkeys(("ns", "nanosecond", "nanoseconds"), 1e-9),
+    **dict.fromkeys(("min", "minute", "minutes"), 60.0),
+    **dict.fromkeys(("h", "hr", "hour", "hours"), 3600.0),
+    **dict.fromkeys(("d", "day", "days"), 86400.0),
+}
+
+
 @dataclass(frozen=True, eq=False)
 class SampledSignal:
     """A signal on a regular clock and what is known of the file that it comes from."""
@@ -51,9 +63,14 @@ class SampledSignal:
         """Number of missing samples."""
         return int(np.count_nonzero(~np.isfinite(self.samples)))
 
-    def rescaled(self, factor: float, unit: str) -> SampledSignal:
-        """The same signal in another unit of time."""
-        return replace(self, interval=factor * self.interval, start=factor * self.start, time_unit=unit)
+    def in_seconds(self) -> SampledSignal:
+        """The same signal with its times in seconds."""
+        unit = self.time_unit or "s"
+        if unit not in SECONDS:
+            unknown = f"{self.file}: the unit of time, {unit!r}, is not known, so there is no frequency in Hz"
+            raise DataError(f"{unknown}; give the clock with --interval SECONDS or --rate HERTZ")
+        factor = SECONDS[unit]
+        return replace(self, interval=factor * self.interval, start=factor * self.start, time_unit="s")
 
 
 def read_sampled_signal(

@@ -5,33 +5,36 @@ fit as it is in Python. What belongs to single samples is left out: it is comput
 for.
 """
 
-import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NoReturn, get_args
+from typing import Any, get_args
 
 import numpy as np
 
-import ctid_cli
-from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.estimators import judging
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.inference.loss import Weighting
 from ctid_cli.models.controller import DiscreteController
-from ctid_cli.signals.files import require_file
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.measurement import ROLES, Measurement, read_measurement
 from ctid_cli.signals.record import Loop, Record
-from ctid_cli.simulation.dataset import file_sha256
 from ctid_cli.storage.exact import decoded, encoded
+from ctid_cli.storage.result_file import (
+    ResultKind,
+    Source,
+    content_of,
+    path_and_sum,
+    refuse,
+    require,
+    result_text,
+    texts,
+)
 
-KIND, FORMAT = "ctid fit", 1
-#: Bytes of the largest file that is read; ten thousand draws of a bootstrap need less.
-MAX_BYTES = 200_000_000
+FIT = ResultKind("ctid fit", 1, "fit", "ctid fit", "fit again")
 #: A path, as the caller gives it.
 AnyPath = str | os.PathLike[str]
 
@@ -48,26 +51,22 @@ def fit_text(
     command: str | None = None,
 ) -> str:
     """The file's text: what is said of a fit, the fit itself, and its records, seen from the folder that it lies in."""
-    whole = {"kind": KIND, "format": FORMAT, "ctid": ctid_cli.__version__, "command": command, **content}
+    whole = dict(content)
     whole["records"] = [
         {**said, **_source(item, folder)} for said, item in zip(content["records"], measurements, strict=True)
     ]
     if validation is not None:
         whole["validation"] = {**content["validation"], **_source(validation, folder)}
     whole["result"] = encoded(result)
-    text = json.dumps(whole, allow_nan=False)
-    return json.dumps(whole | {"checksum": content_hash(json.loads(text))}, allow_nan=False)
+    return result_text(FIT, whole, command)
 
 
 def _source(measurement: Measurement, folder: Path) -> dict[str, Any]:
     """Where a record lies and how it was read; of one that is no file its samples."""
     if measurement.path is None:
         return {"path": None, "series": encoded(measurement.record)}
-    path, home = Path(os.path.abspath(measurement.path)), Path(os.path.abspath(folder))
-    below = path.is_relative_to(home)
     return {
-        "path": path.relative_to(home).as_posix() if below else str(path),
-        "sha256": file_sha256(str(path)),
+        **path_and_sum(measurement.path, folder),
         "columns": {"time": measurement.time, "input": measurement.input, "output": measurement.output},
         "hold": measurement.record.input.hold,
         "from": measurement.start,
@@ -88,21 +87,8 @@ def _loop(measurement: Measurement) -> dict[str, Any]:
 # --- reading ---------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class RecordSource:
+class RecordSource(Source):
     """A record as ``fit.json`` names it."""
-
-    #: The file that names it, and the record's own as it was called then.
-    owner: str
-    name: str
-    content: Mapping[str, Any]
-    #: Where it is now, if it moved.
-    moved: str | None = None
-
-    @property
-    def place(self) -> str:
-        """Where the record is looked for."""
-        return self.moved or str(Path(os.path.abspath(self.owner)).parent / str(self.content["path"]))
 
     def read(self) -> Measurement:
         """The record, as it was read for the fit."""
@@ -121,15 +107,6 @@ class RecordSource:
             closed = Loop(found.reference_values, controller, loop["enters"])
             found = replace(found, record=replace(found.record, loop=closed))
         return replace(found, record=replace(found.record, name=self.name))
-
-    def require_same(self) -> None:
-        """Refuse another file than the fit is of."""
-        if self.moved is None and not Path(self.place).exists():
-            cure = "say where it is now: --record FILE"
-            raise DataError(f"{self.owner}: its record {self.place} does not exist; {cure}")
-        if file_sha256(self.place) != self.content["sha256"]:
-            what = f"{self.place} is not the file that the fit is of (its SHA-256 is another)"
-            raise DataError(f"{self.owner}: {what}; name that one with --record FILE, or fit again")
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +197,7 @@ def read_fit(
 ) -> StoredFit:
     """The file with everything in it; :func:`load_fit` says the rest."""
     file = os.fspath(path)
-    content = _content(file)
+    content = content_of(file, FIT)
     moved = [] if record is None else [record] if isinstance(record, str | os.PathLike) else list(record)
     try:
         result = decoded(content["result"], Identification)
@@ -231,14 +208,14 @@ def read_fit(
         places: list[str | None] = [os.fspath(each) for each in moved]
         places = places or [None] * len(listed)
         sources = tuple(
-            RecordSource(file, str(each["file"]), each, place) for each, place in zip(listed, places, strict=True)
+            RecordSource(FIT, file, str(each["file"]), each, place) for each, place in zip(listed, places, strict=True)
         )
         judged = content["validation"]
         other = judged and RecordSource(
-            file, str(judged["file"]), judged, None if validation is None else os.fspath(validation)
+            FIT, file, str(judged["file"]), judged, None if validation is None else os.fspath(validation)
         )
     except (KeyError, TypeError, IndexError, AttributeError, ValueError, DataError, OverflowError) as error:
-        _refuse(file, f"is damaged ({str(error)[:200]})")
+        refuse(file, FIT, f"is damaged ({str(error)[:200]})")
     if validation is not None and other is None:
         raise UsageError(f"{file} has no validation record, so that none can be elsewhere")
     for source in (*sources, *([other] if other else [])):
@@ -254,63 +231,14 @@ def read_fit(
     return stored
 
 
-def _content(file: str) -> dict[str, Any]:
-    """What the file says, if it is a fit as it was written."""
-    require_file(file)
-    if (size := os.stat(file).st_size) > MAX_BYTES:
-        raise DataError(f"{file}: {size} bytes are too many for a fit; at most {MAX_BYTES} are read")
-    try:
-        content = json.loads(Path(file).read_text(encoding="utf-8"), parse_constant=_no_constant)
-    except OSError as error:
-        raise DataError(f"{file}: the file cannot be read: {error.strerror or error}") from None
-    except (ValueError, RecursionError) as error:
-        _refuse(file, f"is no JSON, or damaged ({str(error)[:200]})")
-    if not isinstance(content, dict) or content.get("kind") != KIND:
-        _refuse(file, _what_else(content))
-    if not isinstance(content.get("format"), int) or content["format"] > FORMAT:
-        written = f"was written by a newer ctid ({str(content.get('ctid'))[:20]}): its format is "
-        _refuse(file, f"{written}{str(content.get('format'))[:20]}, and this one reads up to {FORMAT}")
-    if content.get("checksum") != content_hash({key: item for key, item in content.items() if key != "checksum"}):
-        _refuse(file, "is damaged, or was changed after it was written: its checksum is that of other content")
-    return content
-
-
 def _require_sources(content: Mapping[str, Any]) -> None:
     """Refuse a file that does not say of its records what is needed to read them."""
-    _require("units", list(content["units"]) == ["time", "input", "output"] and _texts(content["units"].values()))
-    _require("command", content["command"] is None or isinstance(content["command"], str))
+    require("units", list(content["units"]) == ["time", "input", "output"] and texts(content["units"].values()))
+    require("command", content["command"] is None or isinstance(content["command"], str))
     for each in (*content["records"], *([content["validation"]] if content["validation"] else [])):
         if each["path"] is not None:
-            _require("path", _texts([each["path"], each["sha256"]]))
-            _require("columns", _texts(each["columns"][role] for role in ROLES))
-            _require("hold", each["hold"] in get_args(Hold))
+            require("path", texts([each["path"], each["sha256"]]))
+            require("columns", texts(each["columns"][role] for role in ROLES))
+            require("hold", each["hold"] in get_args(Hold))
             ends = [each[word] for word in ("from", "to")]
-            _require("from and to", all(end is None or isinstance(end, int | float) for end in ends))
-
-
-def _texts(values: Iterable[Any]) -> bool:
-    return all(isinstance(value, str) for value in values)
-
-
-def _require(what: str, right: bool) -> None:
-    if not right:
-        raise DataError(f"its {what}")
-
-
-def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no JSON number")
-
-
-def _what_else(content: Any) -> str:
-    """What a file is that is no fit."""
-    if not isinstance(content, dict):
-        return "is no fit"
-    if isinstance(content.get("kind"), str):
-        return f"is no fit but of kind {content['kind'][:40]!r}"
-    if "parameters" in content and "residual_tests" in content:
-        return "is a fit of an older ctid, which cannot be read back"
-    return "is another kind of result than a fit"
-
-
-def _refuse(file: str, what: str) -> NoReturn:
-    raise DataError(f"{file} {what}; ctid fit writes such a file")
+            require("from and to", all(end is None or isinstance(end, int | float) for end in ends))

@@ -40,7 +40,7 @@ def test_table_track_and_figure(ctid, record, tmp_path):
     for part in ("record.csv: 3000 samples", "frequency [Hz]", "Strongest tones", "Windows of", "track.svg"):
         assert part in text
     frame = pd.read_csv(out / "track.csv")
-    valid = frame[frame["valid"] == 1]
+    valid = frame[frame["valid_1"] == 1]
     assert valid["frequency_1_hz"].median() == pytest.approx(12.0, abs=0.02)
     assert valid["omega_2"].median() == pytest.approx(2 * np.pi * 19.0, rel=1e-3)
     assert valid["amplitude_1"].median() == pytest.approx(1.5, rel=0.02)
@@ -56,7 +56,7 @@ def test_json_and_hdf5(ctid, record, tmp_path):
     assert content["method"] == "restarting_least_squares"
     assert [tone["frequency_hz"] for tone in content["tones"]] == pytest.approx([12.0, 19.0], abs=0.05)
     assert content["every"] == pytest.approx(0.05, rel=0.1)
-    assert content["written"] == [str(out / "track.h5"), str(out / "track.svg")]
+    assert content["written"] == [str(out / name) for name in ("track.h5", "track.svg", "track.json")]
     assert (out / "track.h5").is_file()
     assert json.loads(ctid("track", record, *options).stdout) == content
 
@@ -94,8 +94,8 @@ def test_missing_samples_are_flagged(ctid, tmp_path):
     frame = pd.read_csv(tmp_path / "track.csv")
     inside = frame[(frame["t"] > T[1100]) & (frame["t"] < T[1300])]
     assert len(inside)
-    assert (inside["valid"] == 0).all()
-    assert inside["flags"].str.contains("gap").all()
+    assert (inside["valid_1"] == 0).all()
+    assert inside["flags_1"].str.contains("gap").all()
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_many_single_samples_may_be_missing(ctid, tmp_path):
     assert content["method"] == "nonlinear_least_squares"
 
 
-@pytest.mark.parametrize("name", ["track.csv", "track.svg"])
+@pytest.mark.parametrize("name", ["track.csv", "track.svg", "track.json"])
 def test_the_record_is_not_overwritten(ctid, tmp_path, name):
     file = write(tmp_path / name, T, signal())
     before = file.read_bytes()

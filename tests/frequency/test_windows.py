@@ -7,7 +7,7 @@ from ctid_cli.frequency.esprit import Esprit
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.nonlinear_least_squares import NonlinearLeastSquares
 from ctid_cli.frequency.tracking import FrequencyEstimate
-from ctid_cli.frequency.windows import amplitudes_of, belonging, estimate_window, wanted_tones
+from ctid_cli.frequency.windows import belonging, estimate_window, sinusoids_of, wanted_tones
 
 T = 0.05 * np.arange(300)
 Y = np.sin(2.0 * T) + 0.5 * np.sin(3.1 * T + 1.0) + 0.2 * np.sin(7.0 * T)
@@ -18,7 +18,9 @@ def test_wanted_tones_are_kept_whatever_their_order():
     assert found.omega == pytest.approx([2.0, 7.0], abs=1e-9)
     assert found.everything == pytest.approx([2.0, 3.1, 7.0], abs=1e-9)
     assert found.flags == 0
-    assert amplitudes_of(Y, 0.05, found.omega, found.everything) == pytest.approx([1.0, 0.2], abs=1e-6)
+    amplitudes, phases = sinusoids_of(Y, 0.05, found.omega, found.everything, 10.0)
+    assert amplitudes == pytest.approx([1.0, 0.2], abs=1e-6)
+    assert np.sin(phases) == pytest.approx(np.sin([20.0, 70.0]), abs=1e-6)
 
 
 def test_a_tone_that_nobody_wants_spoils_nothing():
@@ -55,7 +57,7 @@ def test_nothing_to_estimate():
     found = estimate_window(Esprit(tones=2), np.sin(T[:6]), 0.05, np.array([1.0, 2.0]), 2)
     assert found.flags == Flag.UNDETERMINED
     assert np.isnan(found.omega).all()
-    assert np.isnan(amplitudes_of(Y, 0.05, found.omega, found.everything)).all()
+    assert np.isnan(sinusoids_of(Y, 0.05, found.omega, found.everything, 0.0)).all()
 
 
 def test_belonging_prefers_the_nearest_in_ratio():

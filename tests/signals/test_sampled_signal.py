@@ -34,7 +34,7 @@ def test_named_columns_and_units(tmp_path):
     signal = read_sampled_signal(file, time="clock", signal="right")
     assert signal.samples == pytest.approx(2 * Y)
     assert (signal.time_unit, signal.unit, signal.time) == ("ms", "mV", "clock [ms]")
-    assert signal.rescaled(1e-3, "s").interval == pytest.approx(1e-3)
+    assert signal.in_seconds().interval == pytest.approx(1e-3)
     with pytest.raises(DataError, match="'middle'"):
         read_sampled_signal(file, time="clock", signal="middle")
     with pytest.raises(DataError, match="both"):

@@ -192,7 +192,7 @@ def test_rubbish_is_refused(text, tmp_path):
 
 
 def test_too_large_a_file_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("ctid_cli.storage.fit_file.MAX_BYTES", 10)
+    monkeypatch.setattr("ctid_cli.storage.result_file.MAX_BYTES", 10)
     (tmp_path / "fit.json").write_text("{}" + " " * 20, encoding="utf-8")
     with pytest.raises(DataError, match="22 bytes are too many for a fit; at most 10 are read"):
         read_fit(tmp_path / "fit.json")

@@ -1,0 +1,114 @@
+"""``track.json``: a track without loss, where its record lies and how it was read, and how it is read again.
+
+The file has what ``ctid track --json`` prints; beside it ``record``, where the signal is, and ``result``, the track as
+it is in Python. The samples are read from the record when they are asked for.
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ctid_cli.errors import DataError
+from ctid_cli.frequency.record_track import RecordTrack
+from ctid_cli.signals.sampled_signal import SampledSignal, read_sampled_signal
+from ctid_cli.storage.exact import decoded, encoded
+from ctid_cli.storage.result_file import (
+    ResultKind,
+    Source,
+    content_of,
+    path_and_sum,
+    refuse,
+    require,
+    result_text,
+    texts,
+)
+
+TRACK = ResultKind("ctid track", 1, "track", "ctid track", "track again")
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a signal was read from its file: what ``ctid track`` was given, before units of time are converted."""
+
+    time: str | None = None
+    signal: str | None = None
+    #: Sampling interval that replaces the times of the file [s].
+    interval: float | None = None
+    start: float | None = None
+    stop: float | None = None
+
+    def read(self, path: str | os.PathLike[str]) -> SampledSignal:
+        """The signal, with its times in seconds."""
+        return read_sampled_signal(path, **asdict(self)).in_seconds()
+
+
+def track_file_text(
+    track: RecordTrack, content: Mapping[str, Any], record: Path, reading: Reading, folder: Path, command: str | None
+) -> str:
+    """The file's text: what is said of a track, its record as seen from the folder of the file, and its rows."""
+    source = {
+        **path_and_sum(record, folder),
+        "columns": {"time": reading.time, "signal": reading.signal},
+        "interval": reading.interval,
+        "from": reading.start,
+        "to": reading.stop,
+    }
+    return result_text(TRACK, {**content, "record": source, "result": encoded(track)}, command)
+
+
+class SignalSource(Source):
+    """A record as ``track.json`` names it."""
+
+    def read(self) -> SampledSignal:
+        """The record, as it was read for the track."""
+        self.require_same()
+        content = self.content
+        columns = content["columns"]
+        reading = Reading(
+            *(columns["time"], columns["signal"]),
+            interval=content["interval"],
+            start=content["from"],
+            stop=content["to"],
+        )
+        return replace(reading.read(self.place), file=self.name)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredTrack:
+    """A ``track.json``, with the record that it names."""
+
+    path: Path
+    #: What the file says, as in the documentation of machine-readable output.
+    content: Mapping[str, Any]
+    track: RecordTrack
+    source: SignalSource
+
+
+def read_track(path: str | os.PathLike[str], record: str | os.PathLike[str] | None = None) -> StoredTrack:
+    """The file with everything in it; its record may have moved."""
+    file = os.fspath(path)
+    content = content_of(file, TRACK)
+    try:
+        track = decoded(content["result"], RecordTrack)
+        _require_said(content)
+        moved = None if record is None else os.fspath(record)
+        source = SignalSource(TRACK, file, str(content["file"]), content["record"], moved)
+    except (KeyError, TypeError, IndexError, AttributeError, ValueError, DataError, OverflowError) as error:
+        refuse(file, TRACK, f"is damaged ({str(error)[:200]})")
+    return StoredTrack(Path(file), content, track, source)
+
+
+def _require_said(content: Mapping[str, Any]) -> None:
+    """Refuse a file that does not say what is needed to show it."""
+    record = content["record"]
+    require("path", texts([record["path"], record["sha256"], content["file"], content["method"]]))
+    require("columns", all(each is None or isinstance(each, str) for each in record["columns"].values()))
+    require("unit", content["unit"] is None or isinstance(content["unit"], str))
+    require("command", content["command"] is None or isinstance(content["command"], str))
+    numbers = [record["interval"], record["from"], record["to"], content["accuracy_hz"]]
+    require("clock", all(each is None or isinstance(each, int | float) for each in numbers))
+    require("start", isinstance(content["start"], int | float))
+    for key in ("warnings", "notes", "chosen"):
+        require(key, isinstance(content[key], list) and texts(content[key]))
