@@ -1,60 +1,60 @@
-"""All campaigns in full, and the table of what they brought about: ``make faults``.
+"""All campaigns, and the table of what they brought about: ``make faults``.
 
-The shares scale with the number of fuzzed inputs, of which 20,000 are the full form.
+What was tried is kept in a folder, so that a later call goes on where an earlier one was stopped.
 """
 
 import argparse
-import tempfile
+import sys
+from collections.abc import Iterator
 from pathlib import Path
+from time import monotonic
 
-from tests.faults import damage, process_faults, storage_faults
-from tests.faults.conftest import STORED, TINY
-from tests.faults.counts import Count, table
-from tests.faults.harness import Fuzzer, faults
-from tests.faults.test_faults import KINDS
-from tests.storage.sealed_images import read_sealed, seal_image
+from tests.faults.campaigns import CAMPAIGNS, ROOT, Campaign
+from tests.faults.record import Record, published, refusal
 
-#: Trials of the full form.
-INPUTS, STORAGE, DAMAGES = 20_000, 2_600, 360
+PUBLISHED = ROOT / "results" / "published" / "faults"
 
 
-def fuzzed(inputs: int, begin: int) -> list[Count]:
-    """Counts of the kinds of inputs that nobody meant to write."""
-    counts = []
-    images = []
-    for folder in sorted(STORED.iterdir()):
-        runs = read_sealed(folder / "runs.h5")
-        images.append(seal_image(runs.manifest, runs.origins, runs.results)[0])
-    with tempfile.TemporaryDirectory(prefix="fuzz-") as place:
-        fuzzer = Fuzzer(Path(place), images, TINY, commands_every=50)
-        for kind, share in KINDS.items():
-            count = Count(f"fuzzed input: {kind}")
-            numbers = range(int(begin * share), int((begin + inputs) * share))
-            found = faults(fuzzer, kind, numbers)
-            for number in numbers:
-                text = found.get(number, "")
-                count.add([("hang" if text.startswith("hangs") else "traceback", text)] if text else [], number)
-            counts.append(count)
-    return counts
+def numbers(record: Record, campaign: Campaign, share: float, again: bool, until: float) -> Iterator[int]:
+    """What of a campaign is to be tried, as long as there is time."""
+    wanted = record.failed(campaign) if again else record.missing(campaign, round(share * campaign.trials))
+    for number in wanted:
+        if monotonic() > until:
+            return
+        yield number
 
 
 def main() -> int:
-    """Run all campaigns; prints the table."""
+    """Run campaigns; prints the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--share", type=float, default=1.0, help="of the full form")
-    parser.add_argument("--begin", type=int, default=0, help="go on with others: so many inputs are left out")
+    parser.add_argument("--folder", type=Path, default=ROOT / "build" / "faults", help="where trials are kept")
+    parser.add_argument("--share", type=float, default=1.0, help="how much of the full form; 2: others after it")
+    parser.add_argument("--only", default="", help="campaigns, by comma")
+    parser.add_argument("--again", action="store_true", help="repeat the trials that brought about what must not be")
+    parser.add_argument("--minutes", type=float, default=1e6, help="stop after this time; call it again to go on")
+    parser.add_argument("--publish", action="store_true", help="write what came of it to results/published")
     options = parser.parse_args()
-    share, first = options.share, options.begin
-    later = round(first / INPUTS * STORAGE)
-    with tempfile.TemporaryDirectory(prefix="faults-") as folder:
-        counts = storage_faults.run_under(Path(folder), round(share * STORAGE), later)
-    counts += process_faults.campaign(share, first)
-    counts += damage.campaign(round(share * DAMAGES), first)
-    counts += fuzzed(round(share * INPUTS), first)
-    print(table(counts))
-    for count in counts:
-        print("\n".join(count.examples))
-    return 0 if all(count.is_good for count in counts) else 1
+    until = monotonic() + 60 * options.minutes
+    names = options.only.split(",") if options.only else [campaign.name for campaign in CAMPAIGNS]
+    record = Record(options.folder)
+    record.begin()
+    for campaign in CAMPAIGNS:
+        if campaign.name not in names:
+            continue
+        chosen = numbers(record, campaign, options.share, options.again, until)
+        for tried, trial in enumerate(campaign.tried(chosen), 1):
+            record.add(campaign, trial)
+            if trial.found or tried % 100 == 0:
+                print(trial if trial.found else f"{campaign.name}: {tried} tried", file=sys.stderr, flush=True)
+    texts = record.texts()
+    published(options.folder, texts)
+    print(texts["faults.md"])
+    if options.publish:
+        if why := refusal(record):
+            print(f"nothing is published: {why}", file=sys.stderr)
+            return 2
+        published(PUBLISHED, texts)
+    return 0 if all(count.is_good for count in record.counts()) else 1
 
 
 if __name__ == "__main__":

@@ -23,13 +23,9 @@ success:     {delay_relative_error: 0.2}
 @pytest.fixture(scope="session")
 def sealed_images():
     """Sealed files of a system, of a sum of submodels and of a signal."""
-    from tests.storage.sealed_images import read_sealed, seal_image
+    from tests.faults.fuzz import images
 
-    images = []
-    for folder in sorted(STORED.iterdir()):
-        runs = read_sealed(folder / "runs.h5")
-        images.append(seal_image(runs.manifest, runs.origins, runs.results)[0])
-    return images
+    return images()
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -17,6 +16,22 @@ BAD = {
 }
 
 
+@dataclass(frozen=True)
+class Trial:
+    """A trial, and what it brought about: keys of BAD, and sentences."""
+
+    kind: str
+    number: int
+    name: str
+    found: Sequence[tuple[str, str]] = ()
+    #: Of a run that gets several.
+    faults: int = 1
+
+    def __str__(self) -> str:
+        texts = "\n".join(f"{what}: {text[-1500:]}" for what, text in self.found)
+        return f"{self.kind}, number {self.number} ({self.name}): {texts or 'nothing'}"
+
+
 @dataclass
 class Count:
     """Trials of one kind of fault, and what came of them."""
@@ -24,17 +39,12 @@ class Count:
     kind: str
     trials: int = 0
     bad: dict[str, int] = field(default_factory=lambda: dict.fromkeys(BAD, 0))
-    #: Of each kind of misfortune the first few, in words.
-    examples: list[str] = field(default_factory=list)
 
-    def add(self, found: Sequence[tuple[str, str]], trial: object) -> None:
-        """Count a trial, and what it brought about: a key of BAD, and a sentence."""
-        self.trials += 1
-        for name, text in found:
+    def add(self, trial: Trial) -> None:
+        """Count a trial."""
+        self.trials += trial.faults
+        for name, _ in trial.found:
             self.bad[name] += 1
-            if self.bad[name] <= 5:
-                self.examples.append(f"{name} ({trial}): {text[-1500:]}")
-                print(f"{self.kind}: {self.examples[-1]}", file=sys.stderr, flush=True)
 
     @property
     def is_good(self) -> bool:
@@ -42,9 +52,16 @@ class Count:
         return not any(self.bad.values())
 
 
+def counted(trials: Iterable[Trial]) -> list[Count]:
+    """Counts of all kinds, in the order in which these come."""
+    counts: dict[str, Count] = {}
+    for trial in trials:
+        counts.setdefault(trial.kind, Count(trial.kind)).add(trial)
+    return list(counts.values())
+
+
 def table(counts: Iterable[Count]) -> str:
     """Counts as a table in Markdown, with a line of sums."""
-    counts = list(counts)
     rows = [[count.kind, count.trials, *(count.bad[name] for name in BAD)] for count in counts]
     rows.append(["**all**", *(sum(int(row[k]) for row in rows) for k in range(1, len(BAD) + 2))])
     lines = [["fault", "trials", *BAD.values()], [":--", *["--:"] * (len(BAD) + 1)], *rows]

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import random
 import shutil
-import sys
 import tempfile
-import traceback
-from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
-from time import monotonic
 
 from ctid_cli.errors import CtidError
 from ctid_cli.storage.repair import repair
 from ctid_cli.storage.store import load_estimates
 from ctid_cli.storage.verify import verify
-from tests.faults.counts import Count
+from tests.faults.campaigns import serve
+from tests.faults.counts import Trial
 from tests.faults.storage_faults import Scene, scenes
-from tests.faults.trials import Found, Place, Reference, apart, hasten, run
+from tests.faults.trials import Found, Place, Reference, apart_found, hasten, run
 
 FILES = ("journal.sqlite", "runs.h5", "journal.sqlite-wal", "spec.canonical.json", "timings.csv", "spec.yaml")
+DAMAGES = ("bits flipped", "sector zeroed", "cut short")
 SECTOR = 512
 
 
@@ -44,17 +40,21 @@ def damaged(rng: random.Random, data: bytes, how: str) -> bytes:
 class Damages:
     """Trials on copies of the folders of a sealed and of a killed run."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self) -> None:
         hasten()
-        self.rng, self.place = random.Random(seed), Place()
+        self.place = Place()
         kept = self.place.top / "kept"
         self.reference = Reference(kept / "reference")
         _, killed, sealed, *_ = scenes(kept)
         self.scenes: list[tuple[Scene, int]] = [(one, len(load_estimates(one.before))) for one in (killed, sealed)]  # type: ignore[arg-type]
 
-    def trial(self, name: str, how: str) -> Found:
+    def trial(self, number: int) -> Trial:
         """One damaged file."""
-        scene, count = self.scenes[0 if name.endswith("-wal") else self.rng.randrange(2)]
+        name, how = FILES[number // len(DAMAGES) % len(FILES)], DAMAGES[number % len(DAMAGES)]
+        return Trial(how, number, name, self._tried(name, how, random.Random(number)))
+
+    def _tried(self, name: str, how: str, rng: random.Random) -> Found:
+        scene, count = self.scenes[0 if name.endswith("-wal") else rng.randrange(2)]
         folder = scene.set(self.place)
         path = folder / name
         if not path.exists():
@@ -62,16 +62,11 @@ class Damages:
             folder = scene.set(self.place)
             path = folder / name
         before = path.read_bytes()
-        after = damaged(self.rng, before, how)
+        after = damaged(rng, before, how)
         path.write_bytes(after)
 
-        def work(say: Callable[[str], object]) -> None:
-            say(json.dumps(self._looked_at(folder, name, count, after != before)).replace(" ", "\0"))
-
-        said, wrong = apart(work)
         return [
-            *wrong,
-            *(tuple(entry) for entry in json.loads(" ".join(said).replace("\0", " ") or "[]")),
+            *apart_found(lambda: self._looked_at(folder, name, count, after != before)),
             *self.place.left(),
         ]
 
@@ -107,24 +102,9 @@ class Damages:
                 shutil.rmtree(folder, ignore_errors=True)
 
 
-def campaign(at_most: int, seed: int = 0, seconds: float = 1e9) -> list[Count]:
-    """Counts of all kinds of damage to all files."""
-    until, damages, counts = monotonic() + seconds, Damages(seed), dict[str, Count]()
+if __name__ == "__main__":
+    damages = Damages()
     try:
-        for number in range(at_most):
-            name, how = FILES[number // 3 % len(FILES)], ("bits flipped", "sector zeroed", "cut short")[number % 3]
-            count = counts.setdefault(how, Count(how))
-            count.add(damages.trial(name, how), f"{name}, number {number}")
-            if monotonic() > until:
-                break
-    except Exception:
-        print(traceback.format_exc(), file=sys.stderr)
-        raise
+        serve(damages.trial)
     finally:
         damages.place.close()
-    return list(counts.values())
-
-
-if __name__ == "__main__":
-    some, first, limit = sys.argv[1:]
-    print(json.dumps([asdict(count) for count in campaign(int(some), int(first), float(limit))]))

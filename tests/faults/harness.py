@@ -10,6 +10,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Self
 
 import h5py
 from typer.testing import CliRunner
@@ -153,39 +154,63 @@ def resealed(image: bytes) -> bytes:
     return headed(stream.getvalue())
 
 
-def faults(fuzzer: Fuzzer, kind: str, numbers: Iterable[int]) -> dict[int, str]:
-    """What inputs bring about that none may; a process that hangs or dies is replaced."""
-    left, found = list(numbers), {}
-    context = multiprocessing.get_context("fork")
-    while left:
-        ours, theirs = context.Pipe(duplex=False)
-        worker = context.Process(target=_work, args=(fuzzer, kind, left, theirs))
-        worker.start()
-        theirs.close()
+class Watched:
+    """Inputs tried one after the other in a process that is replaced when it hangs or dies."""
+
+    def __init__(self, fuzzer: Fuzzer, kind: str) -> None:
+        self._fuzzer, self._kind = fuzzer, kind
+        self._worker: multiprocessing.process.BaseProcess | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *details: object) -> None:
+        if self._worker is not None:
+            self._worker.kill()
+            self._worker.join()
+
+    def tried(self, number: int) -> str:
+        """What an input brings about that none may; empty if nothing."""
+        if self._worker is None:
+            context = multiprocessing.get_context("fork")
+            self._pipe, theirs = context.Pipe()
+            self._worker = context.Process(target=_work, args=(self._fuzzer, self._kind, theirs))
+            self._worker.start()
+            theirs.close()
+        self._pipe.send(number)
         try:
-            while left:
-                if not ours.poll(PATIENCE):
-                    found[left.pop(0)] = f"hangs for {PATIENCE:g} s"
-                    break
-                fault = ours.recv()
-                number = left.pop(0)
-                if fault:
-                    found[number] = fault
-        except EOFError:
-            worker.join()
-            found[left.pop(0)] = f"the process died ({worker.exitcode})"
-        finally:
-            worker.kill()
-            worker.join()
-    return found
+            if self._pipe.poll(PATIENCE):
+                return self._pipe.recv()
+            text = f"hangs for {PATIENCE:g} s"
+        except (EOFError, ConnectionError):
+            self._worker.join()
+            text = f"the process died ({self._worker.exitcode})"
+        self._worker.kill()
+        self._worker.join()
+        self._worker = None
+        return text
 
 
-def _work(fuzzer: Fuzzer, kind: str, numbers: list[int], connection) -> None:
+def faults(fuzzer: Fuzzer, kind: str, numbers: Iterable[int]) -> dict[int, str]:
+    """What inputs bring about that none may."""
+    with Watched(fuzzer, kind) as watched:
+        found = {number: watched.tried(number) for number in numbers}
+    return {number: text for number, text in found.items() if text}
+
+
+def _work(fuzzer: Fuzzer, kind: str, connection) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, resource.getrlimit(resource.RLIMIT_AS)[1]))
     os.chdir(fuzzer.folder)
     tempfile.tempdir = str(fuzzer.folder)
-    for number in numbers:
-        connection.send(fault_of(fuzzer, kind, fuzzer.made(kind, number), number))
+    with contextlib.suppress(EOFError):
+        while True:
+            number = connection.recv()
+            try:
+                data = fuzzer.made(kind, number)
+            except Exception:
+                connection.send(f"the input cannot be made: {traceback.format_exc()}")
+            else:
+                connection.send(fault_of(fuzzer, kind, data, number))
 
 
 def fault_of(fuzzer: Fuzzer, kind: str, data: bytes, number: int = 0) -> str:

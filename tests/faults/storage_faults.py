@@ -1,28 +1,24 @@
 """Faults at storage calls: the process is killed before, inside or after each, or the call fails, once or from then on.
 
-Run as a program of its own, under a library that sees every call: ``run_under`` starts it.
+Run as a program of its own, under a library that sees every call: interpose.c.
 """
 
 from __future__ import annotations
 
 import ctypes
 import hashlib
-import json
 import os
 import random
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from time import monotonic
 
 from ctid_cli.storage.store import load_estimates
-from tests.faults.counts import Count
-from tests.faults.trials import Found, Place, Reference, apart, errors_of, hasten, plan, run
+from tests.faults.campaigns import serve
+from tests.faults.counts import Trial
+from tests.faults.trials import Found, Place, Reference, apart, apart_found, errors_of, hasten, plan, run
 
-ROOT = Path(__file__).resolve().parents[2]
 #: The kinds of calls and faults of interpose.c, in its order.
 CALLS = (
     *("open to read", "open to write", "read", "write", "sync", "rename", "unlink", "truncate", "mkdir", "chmod"),
@@ -171,20 +167,14 @@ def trial(scene: Scene, fault: Fault, place: Place, reference: Reference, truth:
     if not is_run and said and " ".join(said) != truth:
         wrong.append(("wrong", "something else was read"))
 
-    def judge(say: Callable[[str], object]) -> None:
-        found = reference.judge(folder, said if is_run else (), thoroughly=killed)
-        say(json.dumps(found).replace(" ", "\0"))
-
-    judged, also = apart(judge)
-    return [*wrong, *also, *(tuple(entry) for entry in json.loads(" ".join(judged).replace("\0", " ") or "[]"))]
+    judged = apart_found(lambda: reference.judge(folder, said if is_run else (), thoroughly=killed))
+    return [*wrong, *judged]
 
 
-def campaign(at_most: int, begin: int, seconds: float) -> list[Count]:
-    """Counts of all kinds of faults: trials drawn from all of them, from one on, so many or for so long."""
-    until = monotonic() + seconds
+def trials() -> None:
+    """Answer numbers with trials, drawn from all faults at all calls of all scenes."""
     hasten()
     place = Place()
-    counts: dict[str, Count] = {}
     try:
         kept = place.top / "kept"
         reference = Reference(kept / "reference")
@@ -194,19 +184,18 @@ def campaign(at_most: int, begin: int, seconds: float) -> list[Count]:
             if scene.name.startswith("reading"):
                 said, _ = apart(lambda say, scene=scene: scene.act(scene.set(place), say))  # type: ignore[misc]
                 truth = " ".join(said)
-            calls = scene.calls(place)
-            cases += [(scene, fault, truth) for fault in faults_of(calls)]
-        for scene, fault, truth in _drawn(cases)[begin : begin + at_most]:
-            count = counts.setdefault(fault.name, Count(fault.name))
-            name = f"{scene.name}, call {fault.at}, {os.strerror(fault.error)}"
-            count.add(trial(scene, fault, place, reference, truth), name)
-            if sum(count.trials for count in counts.values()) % 100 == 99:
-                print(f"{sum(count.trials for count in counts.values()) + 1} trials", file=sys.stderr, flush=True)
-            if monotonic() > until:
-                break
+            cases += [(scene, fault, truth) for fault in faults_of(scene.calls(place))]
+        cases = _drawn(cases)
+
+        def tried(number: int) -> Trial:
+            scene, fault, truth = cases[number]
+            error = f", {os.strerror(fault.error)}" if fault.error else ""
+            name = f"{scene.name}, call {fault.at}{error}"
+            return Trial(fault.name, number, name, trial(scene, fault, place, reference, truth))
+
+        serve(tried)
     finally:
         place.close()
-    return sorted(counts.values(), key=lambda count: count.kind)
 
 
 def _drawn(cases: list[tuple[Scene, Fault, str]]) -> list[tuple[Scene, Fault, str]]:
@@ -222,17 +211,5 @@ def _drawn(cases: list[tuple[Scene, Fault, str]]) -> list[tuple[Scene, Fault, st
     return sorted(cases, key=turn)
 
 
-def run_under(folder: Path, at_most: int, begin: int = 0, seconds: float = 1e9) -> list[Count]:
-    """Run the campaign in a process that the library is loaded into."""
-    library = folder / "interpose.so"
-    source = Path(__file__).with_name("interpose.c")
-    subprocess.run(["cc", "-shared", "-fPIC", "-O1", "-o", library, source, "-ldl"], check=True)
-    command = [sys.executable, "-m", "tests.faults.storage_faults", str(at_most), str(begin), str(seconds)]
-    environment = os.environ | {"LD_PRELOAD": str(library)}
-    done = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True, check=True)
-    return [Count(**entry) for entry in json.loads(done.stdout.splitlines()[-1])]
-
-
 if __name__ == "__main__":
-    some, first, limit = sys.argv[1:]
-    print(json.dumps([asdict(count) for count in campaign(int(some), int(first), float(limit))]))
+    trials()

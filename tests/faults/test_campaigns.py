@@ -1,55 +1,92 @@
 """Nothing that is acknowledged is lost, nothing is read wrongly: short forms of the campaigns of ``make faults``."""
 
+import json
 import shutil
 import sys
 
 import pytest
 
-from ctid_cli.storage.store import load_estimates
-from tests.faults import damage, process_faults, storage_faults
-from tests.faults.counts import Count, table
-from tests.running.fakes import FakePlan, Toy
-from tests.running.hostile import Hostile
-from tests.running.test_limits import run
+from tests.faults.campaigns import CAMPAIGNS, Campaign, named
+from tests.faults.counts import Trial, counted, table
+from tests.faults.process_faults import KINDS, TURNS
+from tests.faults.record import Record, refusal
 
 
-def require_good(counts):
-    assert sum(count.trials for count in counts) > 0
-    assert all(count.is_good for count in counts), table(counts) + "\n".join(e for one in counts for e in one.examples)
+def require_good(name, numbers):
+    trials = list(named(name).tried(iter(numbers)))
+    assert [trial.number for trial in trials] == list(numbers)
+    assert not any(trial.found for trial in trials), "\n".join(str(trial) for trial in trials if trial.found)
 
 
 @pytest.mark.skipif(sys.platform != "linux" or shutil.which("cc") is None, reason="needs a C compiler and LD_PRELOAD")
-def test_faults_at_storage_calls(tmp_path):
-    require_good(storage_faults.run_under(tmp_path, 12))
+def test_faults_at_storage_calls():
+    require_good("storage", range(12))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 def test_faults_of_processes():
-    require_good(process_faults.campaign(0.03, quick=True))
+    require_good("processes", [TURNS.index((kind, turn)) for kind in list(KINDS)[:4] for turn in range(2)])
 
 
 def test_damaged_files():
-    require_good(damage.campaign(12))
+    require_good("damage", range(12))
 
 
-def test_the_bad_are_named_and_all_others_are_stored(tmp_path):
-    hostile = [Hostile("leave", at=1, order=5), Hostile("loop", at=0, order=6), Hostile("grow", at=2, order=7)]
-    plan = FakePlan(Toy(), *hostile, Toy(order=4), levels=(5,), runs=3, limits={"cpu_seconds": 4, "memory_mb": 300})
-    summary = run(plan, tmp_path)
-    frame = load_estimates(tmp_path)
-    bad = frame[frame["status"] != "CONVERGED"]
-    assert (summary.missing, summary.failed) == (0, 4)
-    assert {(row.estimator, row.replicate, row.status) for row in bad.itertuples()} == {
-        ("toy1", 1, "CRASHED"),
-        ("toy2", 0, "TIMEOUT"),
-        ("toy3", 2, "MEMORY"),
-    }
+def test_an_input_is_tried_like_any_other():
+    require_good("csv", range(3))
 
 
 def test_a_count_of_what_must_not_happen():
-    count = Count("a fault")
-    count.add([], "first")
-    count.add([("lost", "one"), ("left", "a file")], "second")
-    assert not count.is_good
-    assert count.examples == ["lost (second): one", "left (second): a file"]
-    assert "| a fault | 2 | 1 | 0 | 0 | 0 | 0 | 1 |" in table([count])
+    trials = [
+        Trial("a fault", 0, "first"),
+        Trial("a fault", 1, "second", [("lost", "one"), ("left", "a file")], faults=3),
+        Trial("another", 0, "third"),
+    ]
+    counts = counted(trials)
+    assert [count.is_good for count in counts] == [False, True]
+    assert "| a fault | 4 | 1 | 0 | 0 | 0 | 0 | 1 |" in table(counts)
+    assert "| **all** | 5 | 1 | 0 | 0 | 0 | 0 | 1 |" in table(counts)
+
+
+def test_a_trial_that_ends_its_process_counts_and_the_next_goes_on(tmp_path):
+    (tmp_path / "deadly.py").write_text(
+        "import os\n"
+        "from tests.faults.campaigns import serve\n"
+        "from tests.faults.counts import Trial\n"
+        "serve(lambda number: os._exit(3) if number == 1 else Trial('a', number, 'b'))\n"
+    )
+    campaign = Campaign("deadly", "deadly", 3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(tmp_path))
+        trials = list(campaign.tried(iter(range(3))))
+        assert [(trial.number, len(trial.found)) for trial in trials] == [(0, 0), (1, 1), (2, 0)]
+        assert trials[1].found == [("traceback", "the process of the campaign ended with 3")]
+        with pytest.raises(RuntimeError, match="does not begin"):
+            list(Campaign("none", "tests.faults.nothing", 1).tried(iter([0])))
+
+
+def test_a_record_goes_on_where_it_was_and_says_what_was_repeated(tmp_path):
+    campaign = named("damage")
+    record = Record(tmp_path)
+    record.begin()
+    for number in (0, 2):
+        record.add(campaign, Trial("cut short", number, "runs.h5", [("wrong", "5 of 6")] if number else []))
+    with (tmp_path / "trials.jsonl").open("a") as file:
+        file.write('{"campaign": "damage", "trial": {"kind": "cut')  # the power went off
+    record = Record(tmp_path)
+    assert list(record.missing(campaign, 4)) == [1, 3]
+    assert list(record.failed(campaign)) == [2]
+    assert "repeated" not in record.texts()["faults.md"]
+    record.begin()
+    record.add(campaign, Trial("cut short", 2, "runs.h5"))
+    texts = Record(tmp_path).texts()
+    assert "| cut short | 2 | 0 | 0 | 0 | 0 | 0 | 0 |" in texts["faults.md"]
+    assert "| cut short | 2 (runs.h5) | wrong: 5 of 6 | nothing, " in texts["faults.md"]
+    assert texts["faults.csv"].splitlines()[1] == "cut short,2,0,0,0,0,0,0,0,1,0,0,0,0"
+    assert [one["trials"] for one in json.loads(texts["environment.json"])["sittings"]] == [2, 1]
+    assert refusal(record) == "not all trials of the full form were made"
+
+
+def test_the_full_form_has_what_was_asked_for():
+    assert sum(campaign.trials for campaign in CAMPAIGNS if campaign.module.endswith(".fuzz")) == 20_000
+    assert len(TURNS) == named("processes").trials

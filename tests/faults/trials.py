@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import multiprocessing
 import numbers
 import os
@@ -190,6 +191,13 @@ class Started:
 def apart(work: Callable[[Callable[[str], object]], None]) -> tuple[list[str], Found]:
     """What work said in a process of its own, whatever became of that, and what must not have become of it."""
     return Started(work).end()
+
+
+def apart_found(judge: Callable[[], Found]) -> Found:
+    """What was found wrong in a process of its own, and what must not have become of that."""
+    said, wrong = apart(lambda say: say(json.dumps(judge()).replace(" ", "\0")))
+    entries = json.loads(" ".join(said).replace("\0", " ") or "[]")
+    return [*wrong, *((what, text) for what, text in entries)]
 
 
 def _work(work: Callable[[Callable[[str], object]], None], connection: Connection) -> None:
