@@ -239,33 +239,39 @@ def _format_of(file: Path | None) -> Literal["svg", "png", "pdf"]:
 @guarded
 def report(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="Fit (fit.json), experiment (quickstart) or study (additive).")
+        str,
+        typer.Argument(
+            metavar="NAME", help="Fit (fit.json), track (track.json), experiment (quickstart) or study (additive)."
+        ),
     ],
     out: Out = Path("results"),
     file: Annotated[
         Path | None,
         typer.Option(
-            "--file", metavar="FILE", help="Where the page goes; OUT/<experiment>/report.html or fit.html by default."
+            "--file",
+            metavar="FILE",
+            help="Where the page goes; OUT/<experiment>/report.html, fit.html or track.html by default.",
         ),
     ] = None,
     record: Annotated[
-        list[Path] | None, typer.Option("--record", metavar="FILE", help="Of a fit: where its record is now.")
+        list[Path] | None, typer.Option("--record", metavar="FILE", help="Of a fit or track: where its record is now.")
     ] = None,
     validate: Annotated[
         Path | None, typer.Option("--validate", metavar="FILE", help="Of a fit: where its validation record is now.")
     ] = None,
 ) -> None:
-    """Write a page about a fit, an experiment or a study, to read, print or send.
+    """Write a page about a fit, a track, an experiment or a study, to read, print or send.
 
     One HTML file that opens anywhere and loads nothing. Of a fit: data, model, what it does, its residuals, and what to
-    know before using it. Of an experiment or study: the question, tables, figures, differences of the estimators on the
-    same data sets, what went wrong and the commands that show it, how all of it was computed. And how to cite it.
+    know before using it. Of a track: the signal, its spectrogram, its tones, and the spectrum of what these leave. Of
+    an experiment or study: the question, tables, figures, differences of the estimators on the same data sets, what
+    went wrong and the commands that show it, how all of it was computed. And how to cite it.
     """
     if Path(name).suffix.lower() == ".json" or Path(name).is_file():
-        _report_fit(Path(name), record, validate, file)
+        _report_file(Path(name), record, validate, file)
         return
     if record or validate:
-        raise UsageError("--record and --validate go with a fit, such as: ctid report fit.json --record FILE")
+        raise UsageError("--record and --validate go with a file, such as: ctid report fit.json --record FILE")
     from ctid_cli.reporting.pages.experiment_page import experiment_page
     from ctid_cli.reporting.results import experiments_in, read_results
     from ctid_cli.studies.catalogue import all_studies
@@ -287,12 +293,33 @@ def report(
     typer.echo(path)
 
 
-def _report_fit(path: Path, record: list[Path] | None, validate: Path | None, file: Path | None) -> None:
+def _report_file(path: Path, record: list[Path] | None, validate: Path | None, file: Path | None) -> None:
+    from ctid_cli.storage.fit_file import FIT
+    from ctid_cli.storage.result_file import kind_in
+    from ctid_cli.storage.track_file import TRACK
+
+    is_track = kind_in(str(path), FIT) == TRACK.kind
+    page = _page_of_track(path, record, validate) if is_track else _page_of_fit(path, record, validate)
+    place = path.with_suffix(".html") if file is None else file
+    write_files({place: page.encode()})
+    typer.echo(place)
+
+
+def _page_of_fit(path: Path, record: list[Path] | None, validate: Path | None) -> str:
     from ctid_cli.reporting.pages.fit_page import fit_page
     from ctid_cli.storage.fit_file import read_fit
 
     stored = read_fit(path, record, validate)
-    page = fit_page(stored.result, stored.measurements, stored.validation, stored.content)
-    place = path.with_suffix(".html") if file is None else file
-    write_files({place: page.encode()})
-    typer.echo(place)
+    return fit_page(stored.result, stored.measurements, stored.validation, stored.content)
+
+
+def _page_of_track(path: Path, record: list[Path] | None, validate: Path | None) -> str:
+    from ctid_cli.reporting.pages.track_page import track_page
+    from ctid_cli.storage.track_file import read_track
+
+    if validate:
+        raise UsageError(f"{path} is a track, which has no validation record; leave --validate out")
+    if record and len(record) > 1:
+        raise UsageError(f"{path} is of one record; --record names {len(record)}")
+    stored = read_track(path, record[0] if record else None)
+    return track_page(stored.track, stored.source.read(), stored.content)

@@ -25,7 +25,7 @@ else:
 @guarded
 def track(
     context: typer.Context,
-    file: Annotated[Path, typer.Argument(metavar="SIGNAL", help="Recorded signal (.csv, .mat, .wav).")],
+    file: Annotated[Path, typer.Argument(metavar="SIGNAL", help="Recorded signal (.csv, .mat, .wav, .flac).")],
     tones: Annotated[str, typer.Option("--tones", metavar="N", help="Number of sinusoids, or auto.")] = "auto",
     method: Annotated[Method, typer.Option("--method", help="How the frequencies are estimated.")] = "automatic",
     time: TimeColumn = None,
@@ -127,7 +127,7 @@ def _tones(text: str) -> int | None:
 
     if text == "auto":
         return None
-    if not text.isdecimal():
+    if not text.isdecimal() or int(text) > MOST_ASKED:
         raise UsageError(f"--tones must be a number from 0 to {MOST_ASKED}, or auto, not {text!r}")
     return int(text)
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import os
-import warnings
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import LONGEST, require_positive, require_scale, require_steps
-from ctid_cli.signals.files import require_file
 from ctid_cli.signals.measurement import USUAL_NAMES, no_sample, read_table
+from ctid_cli.signals.sound import is_sound, read_sound
 from ctid_cli.signals.table import Table, listing, refuse_nameless, refuse_one_column, split_header
 
 #: Names by which the signal is recognised when nobody says which column it is, the most telling first.
@@ -21,8 +19,6 @@ SIGNAL_NAMES = (
     *("y", "signal", "output", "value", "values", "x"),
     *("amplitude", "data", "audio", "sound", "wave", "voltage"),
 )
-#: How the names of sound files end.
-SOUND_EXTENSIONS = (".wav", ".wave")
 #: An instant may lie so many sampling intervals beside the grid.
 CLOCK_TOLERANCE = 0.01
 #: A record with more samples missing between its lines than this many times those it has is not on one grid.
@@ -86,12 +82,12 @@ def read_sampled_signal(
     if interval is not None:
         require_positive("interval", interval, "s")
     notes: list[str] = []
-    if Path(path).suffix.lower() in SOUND_EXTENSIONS:
-        table, rate, note = _read_sound(path)
+    if is_sound(path):
+        table, rate, note = read_sound(path)
         interval = 1.0 / rate if interval is None else interval
         notes.append(note)
     else:
-        sources = "comma-separated text (.csv), MATLAB vectors (.mat) or sound (.wav)"
+        sources = "comma-separated text (.csv), MATLAB vectors (.mat) or sound (.wav, .flac)"
         table = read_table(path, f"a signal is read from {sources}")
     times, column, more = _columns(table, time, signal, interval is not None)
     notes += more
@@ -201,38 +197,3 @@ def _window(
         window = (-np.inf if start is None else start, np.inf if stop is None else stop)
         raise no_sample(table, *window, first, first + (count - 1) * interval, unit)
     return low, high
-
-
-def _read_sound(path: str | os.PathLike[str]) -> tuple[Table, float, str]:
-    from scipy.io import wavfile
-
-    file = require_file(path)
-    try:
-        with warnings.catch_warnings():
-            # Chunks with titles and the like are no concern of the samples.
-            warnings.simplefilter("ignore", wavfile.WavFileWarning)
-            rate, data = wavfile.read(path)
-    except OSError as error:
-        raise DataError(f"{file}: cannot be read: {error.strerror or error}") from None
-    except Exception:  # the reader meets damaged files with whatever its parser stumbles over
-        raise DataError(f"{file}: this is not a WAV file of plain samples, or a damaged one") from None
-    channels = np.asarray(data).reshape(len(data), -1)
-    if channels.size == 0 or rate <= 0:
-        raise DataError(f"{file}: the file holds no samples")
-    names = tuple(f"channel {k + 1}" for k in range(channels.shape[1]))
-
-    def convert(name: str) -> Array:
-        # Whole numbers become fractions of full scale; those of eight bits are not signed.
-        kind, scaled = channels.dtype, channels[:, names.index(name)].astype(np.float64)
-        if kind == np.uint8:
-            scaled -= 128.0
-            scaled /= 128.0
-        elif kind.kind == "i":
-            scaled /= float(np.iinfo(kind).max) + 1.0
-        return scaled
-
-    note = f"Sound of {rate} Hz; amplitudes are fractions of full scale."
-    if len(names) > 1:
-        note += f" The first of {len(names)} channels is used unless --signal names another."
-    table = Table(file, names, convert, None, "channel")
-    return table, float(rate), note

@@ -175,3 +175,33 @@ def test_an_online_method_that_finds_nothing_says_what_to_try(ctid, tmp_path):
 def test_an_unknown_unit_of_time(ctid, tmp_path):
     file = write(tmp_path / "a.csv", T, signal(), "t [fortnights],y")
     assert "fortnights" in ctid("track", file, "--tones", 1, code=2).stderr
+
+
+def test_a_page_is_made_of_a_track_and_its_record(ctid, record, tmp_path):
+    out = tmp_path / "new"
+    ctid("track", record, "--tones", 2, "--out", out)
+    assert ctid("report", out / "track.json").stdout == f"{out / 'track.html'}\n"
+    text = (out / "track.html").read_text(encoding="utf-8")
+    assert "Tones of record.csv" in text
+    assert "ctid track record.csv --tones 2" in text
+    assert str(tmp_path) not in text
+    elsewhere = record.rename(tmp_path / "elsewhere.csv")
+    assert "--record FILE" in ctid("report", out / "track.json", code=2).stderr
+    ctid("report", out / "track.json", "--record", elsewhere)
+    assert "no validation record" in ctid("report", out / "track.json", "--validate", elsewhere, code=2).stderr
+    assert "of one record" in ctid("report", out / "track.json", *(2 * ["--record", elsewhere]), code=2).stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--tones", "many"), "--tones must be a number from 0 to 20, or auto, not 'many'"),
+        (("--tones", -1), "--tones must be a number from 0 to 20"),
+        (("--tones", 21), "--tones must be a number from 0 to 20"),
+        (("--tones", 2, "--accuracy", 0), "--accuracy must be a positive number of hertz"),
+        (("--tones", 2, "--method", "esprit", "--accuracy", 0.1), "esprit states no standard errors"),
+    ],
+)
+def test_what_cannot_be_asked_for(ctid, record, tmp_path, options, message):
+    assert message in ctid("track", record, *options, "--out", tmp_path / "out", code=2).stderr
+    assert not (tmp_path / "out").exists()

@@ -1,9 +1,7 @@
 """The page of one fit: what was measured, the model, what it does, and whether to believe it."""
 
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import PurePath
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +12,6 @@ from ctid_cli.estimators.identification import Identification, costs_about_delay
 from ctid_cli.inference.frequency_response import FrequencyResponse, estimate_frequency_response
 from ctid_cli.reporting.citations import bibtex
 from ctid_cli.reporting.estimate import Units, parameter_table
-from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.fit_drawings import (
     bode_drawing,
     delay_drawing,
@@ -33,7 +30,7 @@ from ctid_cli.reporting.identification_report import (
     record_line,
 )
 from ctid_cli.reporting.layout import Report, Table, count, number
-from ctid_cli.reporting.pages.page import inline, written
+from ctid_cli.reporting.pages.page import Chapter, figure, shown, shown_command, written
 from ctid_cli.reporting.pages.question import Fraction, polynomial
 from ctid_cli.signals.measurement import Measurement
 
@@ -41,15 +38,6 @@ from ctid_cli.signals.measurement import Measurement
 DIGITS = 5
 #: Frequencies at which a model is drawn.
 POINTS = 500
-
-
-class Chapter(NamedTuple):
-    """Figures of one thing, and what to know of them."""
-
-    name: str
-    title: str
-    figures: Sequence[Mapping[str, Any]]
-    notes: Sequence[str] = ()
 
 
 def fit_page(
@@ -71,9 +59,9 @@ def fit_page(
         equation=_equation(result),
         model=_model(result, units),
         chapters=chapters,
-        titles=[(chapter.name, chapter.title) for chapter in chapters],
+        titles=[("model", "Model"), *((chapter.name, chapter.title) for chapter in chapters)],
         provenance=_provenance(content),
-        command=shlex.join(map(_shown, shlex.split(content["command"] or ""))),
+        command=shown_command(content["command"]),
         bibtex=bibtex(result),
     )
 
@@ -126,15 +114,10 @@ def _provenance(content: Mapping[str, Any]) -> Report:
             rows.append([label, "its samples are in the file of the fit"])
         else:
             window = [f"{word} {each[word]}" for word in ("from", "to") if each[word] is not None]
-            rows.append([label, ", ".join([_shown(str(each["path"])), f"hold {each['hold']}", *window])])
+            rows.append([label, ", ".join([shown(str(each["path"])), f"hold {each['hold']}", *window])])
             rows.append(["its SHA-256", str(each["sha256"])])
     rows.append(["checksum of the fit", str(content.get("checksum", ""))])
     return Report([[Table(["", ""], rows, "ll")]])
-
-
-def _shown(word: str) -> str:
-    """A page is sent to others: nothing in it names a folder of this machine."""
-    return PurePath(word).name if PurePath(word).is_absolute() else word
 
 
 # --- figures ---------------------------------------------------------------------------------------
@@ -146,24 +129,24 @@ def _chapters(
     more = len(measurements) - MOST_DRAWN
     notes = [f"{more} more experiments are not drawn."] if more > 0 else []
     overlay = [
-        _figure(identification_drawing(result, measurements, units, "overlay"), "overlay", "Measured and simulated")
+        figure(identification_drawing(result, measurements, units, "overlay"), "overlay", "Measured and simulated")
     ]
     judged = result.validation
     if judged is not None and validation is not None:
         caption = f"The same on {judged.name}, from which nothing was estimated but the initial state and the offset"
-        overlay.append(_figure(validation_drawing(judged, validation, units), "validation", caption))
+        overlay.append(figure(validation_drawing(judged, validation, units), "validation", caption))
     yield Chapter("output", "Output", overlay, notes)
-    figures = [_figure(identification_drawing(result, measurements, units, "residuals"), "residuals", "What is left")]
+    figures = [figure(identification_drawing(result, measurements, units, "residuals"), "residuals", "What is left")]
     if result.tests:
         drawing = identification_drawing(result, measurements, units, "correlation")
-        figures.append(_figure(drawing, "correlation", "Their correlation with themselves and with the input"))
+        figures.append(figure(drawing, "correlation", "Their correlation with themselves and with the input"))
     yield Chapter("residuals", "Residuals", figures, [test.sentence for test in result.tests])
     yield _responses(result, measurements, units)
     yield Chapter(
         "poles",
         "Poles",
         [
-            _figure(
+            figure(
                 poles_drawing(result.poles(), result.fit.model.zeros, units),
                 "poles",
                 "Poles with their regions, and zeros",
@@ -173,7 +156,7 @@ def _chapters(
     if result.fit.profile is not None:
         near = costs_about_delay(result)
         caption = "The search over the whole range" + (", and the cost about the estimate" if near else "")
-        yield Chapter("delay", "Delay", [_figure(delay_drawing(result, near, units), "delay", caption)])
+        yield Chapter("delay", "Delay", [figure(delay_drawing(result, near, units), "delay", caption)])
 
 
 def _responses(result: Identification, measurements: Sequence[Measurement], units: Units) -> Chapter:
@@ -187,10 +170,8 @@ def _responses(result: Identification, measurements: Sequence[Measurement], unit
         notes.append(f"The record gives no frequency response without a model: {error}.")
     band = result.frequency_response(None if found is None else _frequencies(result, found))
     figures = [
-        _figure(bode_drawing(band, found, units), "bode", "Frequency response, with pointwise 95 % bands"),
-        _figure(
-            step_drawing(result.step_response(), units), "step", "Response to a unit step, with its pointwise band"
-        ),
+        figure(bode_drawing(band, found, units), "bode", "Frequency response, with pointwise 95 % bands"),
+        figure(step_drawing(result.step_response(), units), "step", "Response to a unit step, with its pointwise band"),
     ]
     return Chapter("responses", "Responses", figures, notes)
 
@@ -200,7 +181,3 @@ def _frequencies(result: Identification, found: FrequencyResponse) -> Array:
     own = result.frequency_response().frequencies
     low, high = min(own[0], found.frequencies[0]), max(own[-1], found.frequencies[-1])
     return np.geomspace(low, high, POINTS)
-
-
-def _figure(drawing: Drawing, name: str, caption: str) -> dict[str, Any]:
-    return {"svg": inline(drawing.laid_out_once(), name), "caption": caption, "command": ""}

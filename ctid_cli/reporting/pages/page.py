@@ -1,10 +1,13 @@
 """How a page is put together: a template filled with reports and figures, with every text of others escaped."""
 
 import re
+import shlex
+from collections.abc import Mapping, Sequence
 from functools import cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.layout import Report, Table
 
 if TYPE_CHECKING:
@@ -57,6 +60,30 @@ def inline(svg: bytes, name: str) -> "Markup":
     width = re.search(r'<svg [^>]*?width="([\d.]+)pt"', drawn)
     scale = f' style="max-width: {float(width[1]) * REM_PER_POINT:.4g}rem"' if width else ""
     return Markup(drawn.replace("<svg ", f'<svg role="img"{scale} ', 1))
+
+
+class Chapter(NamedTuple):
+    """Figures of one thing, and what to know of them."""
+
+    name: str
+    title: str
+    figures: Sequence[Mapping[str, Any]]
+    notes: Sequence[str] = ()
+
+
+def figure(drawing: Drawing, name: str, caption: str) -> dict[str, Any]:
+    """A drawing with what it shows."""
+    return {"svg": inline(drawing.laid_out_once(), name), "caption": caption, "command": ""}
+
+
+def shown(word: str) -> str:
+    """A page is sent to others: nothing in it names a folder of this machine."""
+    return PurePath(word).name if PurePath(word).is_absolute() else word
+
+
+def shown_command(command: str | None) -> str:
+    """A command without folders of this machine."""
+    return shlex.join(map(shown, shlex.split(command or "")))
 
 
 def report_of(markdown: str) -> Report:

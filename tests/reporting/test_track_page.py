@@ -1,0 +1,89 @@
+"""The page of a track: complete in itself, and safe whatever names files and columns have."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.record_track import MissingLine, Procedure, RecordTrack
+from ctid_cli.reporting.pages.track_page import track_page
+from ctid_cli.reporting.track_report import track_object
+from ctid_cli.reporting.track_residual import spectra_of
+from ctid_cli.signals.sampled_signal import SampledSignal
+from tests.reporting.parsed_page import Page
+
+HOSTILE = "<script>alert(1)</script>&$x_{$\"'"
+T = 0.002 * np.arange(3000)
+ROWS = 0.1 + 0.05 * np.arange(116)
+SOURCE = {"path": "/far/away/" + HOSTILE, "sha256": "0" * 64, "interval": None, "from": 1.0, "to": None}
+
+
+def signal(name=HOSTILE):
+    rng = np.random.default_rng(0)
+    y = 2.0 * np.sin(2 * np.pi * 12.0 * T) + 0.1 * np.sin(2 * np.pi * 19.0 * T) + 0.01 * rng.standard_normal(T.size)
+    return SampledSignal(y, 0.002, 5.0, name, name, "t", "s", name, (name,))
+
+
+def track(**known):
+    shape = (ROWS.size, 1)
+    phase = (2 * np.pi * 12.0 * ROWS)[:, None]
+    flags = np.zeros(ROWS.size, np.uint16)
+    flags[:20] = int(Flag.LINE_LEFT)
+    lines = (MissingLine(2 * np.pi * 19.0, 0.9, 0.1),)
+    parts = {"error": np.full(shape, 0.01), "amplitudes": np.full(shape, 2.0), "window": np.full(shape, 0.2)}
+    parts |= {"phase": phase, "missing": lines} | known
+    return RecordTrack.of(ROWS, np.full(shape, 2 * np.pi * 12.0), flags, 0.05, **parts)
+
+
+def page_of(followed, name=HOSTILE):
+    procedure = Procedure("esprit", False, (f"A reason, {name}.",), (), {})
+    content = track_object(signal(name), procedure, followed)
+    source = SOURCE | {"columns": {"time": None, "signal": name}}
+    content |= {"ctid": "1", "command": "ctid track /far/away.csv", "checksum": "x", "record": source}
+    return track_page(followed, signal(name), content)
+
+
+def test_a_page_says_all_and_needs_nothing_but_itself():
+    text = page_of(track())
+    page = Page(text)
+    for title in ("Before using it", "Data", "Tones", "Signal", "What the tones leave", "Provenance", "How to cite"):
+        assert title in page.text
+    assert page.tags["svg"] == 3
+    assert page.tags["script"] == page.tags["link"] == page.tags["img"] == page.tags["iframe"] == 0
+    places = [value for name, value in page.attributes if name in ("href", "xlink:href", "src", "action")]
+    assert all(value.startswith(("#", "data:image/png;base64,")) for value in places)
+    names = Counter(value for name, value in page.attributes if name == "id")
+    assert max(names.values()) == 1
+    assert not [name for name, _ in page.attributes if name.startswith("on")]
+    assert page.text.count(HOSTILE) >= 4  # title, line of the record, note, reason
+    assert "/far" not in text
+    assert "ctid track away.csv" in page.text
+    for words in (
+        "19 Hz (amplitude 0.1",
+        "--tones 2",
+        "std. error",
+        "line that is missing",
+        "@article{roy1989",
+        "17.2 %",
+    ):
+        assert words in text
+    assert len(text) < 2_000_000
+    assert text == page_of(track())
+
+
+def test_a_record_without_tones_and_one_of_unknown_phases_have_pages_too():
+    nothing = RecordTrack.of(ROWS, np.empty((ROWS.size, 0)), np.zeros(ROWS.size, np.uint16), 0.05)
+    assert "No tone was found" in page_of(nothing, "a.csv")
+    unknown = page_of(track(phase=np.full((ROWS.size, 1), np.nan)), "a.csv")
+    assert "Nowhere are all tones known" in unknown
+
+
+def test_what_is_left_is_the_line_that_is_missing():
+    spectra = spectra_of(signal(), track())
+    peak = spectra.hertz[np.argmax(spectra.residual)]
+    assert peak == pytest.approx(19.0, abs=0.2)
+    assert spectra.residual.max() == pytest.approx(0.1, rel=0.02)
+    assert spectra.signal.max() == pytest.approx(2.0, rel=0.02)
+    assert spectra.residual_rms == pytest.approx(np.hypot(0.1 / np.sqrt(2), 0.01), rel=0.03)
+    assert spectra.known > 0.95
