@@ -40,11 +40,13 @@ def check(
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 7 if there is a PROBLEM.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Say what a measured record is worth, before any model.
+    """Say what a measured record is worth, and which model to begin with.
 
     Sampling, gaps, excitation, offsets, trends, bandwidth against the clock, and a hint of the delay: what is wrong
-    with these data, in words, the worst first. Columns are found by their usual names (t, u, y) unless named.
+    with these data, in words, the worst first; then a structure to begin with, by a short search of at most four poles.
+    Columns are found by their usual names (t, u, y) unless named.
     """
+    from ctid_cli.reporting.order_proposal import proposed_by_check
     from ctid_cli.reporting.record_findings import check_record_quality
     from ctid_cli.reporting.record_report import record_object, record_text
     from ctid_cli.signals.measurement import read_measurement
@@ -52,7 +54,8 @@ def check(
     found = read_measurement(file, time=time, input=input, output=output, hold=hold, start=start, stop=stop)
     units = found.time_unit or "s", found.input_unit or "", found.output_unit or ""
     report = check_record_quality(found.record, *units)
-    answer(as_json, lambda: record_object(found, report), lambda: record_text(found, report))
+    proposal = proposed_by_check(found.record, report)
+    answer(as_json, lambda: record_object(found, report, proposal), lambda: record_text(found, report, proposal))
     if strict and report.worst == "problem":
         raise MismatchError(f"{file}: no model can be identified from this record as it is")
 

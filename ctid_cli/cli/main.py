@@ -1,5 +1,6 @@
 """The ``ctid`` command: registers one function per command and nothing else."""
 
+import os
 from typing import Annotated
 
 import typer
@@ -61,6 +62,8 @@ app.add_typer(study, name="study")
 
 def main() -> None:
     """Entry point of the ``ctid`` command."""
+    # The matrices are small: threads for one product would only wait for each other. NumPy is not loaded yet.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     app(prog_name="ctid")
 
 

@@ -149,7 +149,8 @@ class OrderSearch:
         if more:
             what, least = min(more, key=lambda pair: rise(pair[1]))
             fall = 100 * (1 - least.fit.cost / best.fit.cost)
-            gain = f"would lower the squared error by {fall:.2g} %, which is no more than it fits of the noise"
+            of_which = "but that of the whitened residuals by" if self.noise.order else "which is"
+            gain = f"would lower the squared error by {fall:.2g} %, {of_which} no more than it fits of the noise"
             if least.fit.poles_at_infinity or fall < LEAST_FALL:
                 gain = "would not lower the squared error"
             words.append(f"{what} ({least.name}) {gain}: BIC is {rise(least):.3g} higher")
@@ -248,9 +249,15 @@ def recommend_order(
     *,
     initial_state: InitialState = "rest",
     offset: Offset = "none",
+    answer: AnswerTest | None = None,
 ) -> OrderSearch:
-    """The same without what is only looked at: no tests, no cross-validation, and no more poles than needed."""
+    """The same without what is only looked at: no tests, no cross-validation, and no more poles than needed.
+
+    ``answer`` says whether the outputs answer to the inputs, where that is known already.
+    """
     search = _search(records, poles, zeros, delay_bounds, initial_state, offset, True)
+    if answer is not None:
+        search.answer = answer
     return search.result(search.ranked())
 
 

@@ -9,6 +9,7 @@ from typing import Any
 from ctid_cli.canonical import plain
 from ctid_cli.inference.record_check import RecordReport
 from ctid_cli.reporting.layout import count, number
+from ctid_cli.reporting.order_proposal import Proposal
 from ctid_cli.signals.measurement import ROLES, USUAL_NAMES, Measurement
 from ctid_cli.signals.table import split_header
 from ctid_cli.text import wrapped
@@ -17,17 +18,20 @@ from ctid_cli.text import wrapped
 LABELS = {"problem": "PROBLEM", "warning": "warning", "note": "note", "ok": "ok"}
 
 
-def record_object(measurement: Measurement, report: RecordReport) -> dict[str, Any]:
+def record_object(measurement: Measurement, report: RecordReport, proposal: Proposal | None) -> dict[str, Any]:
     """A report as JSON-able content."""
     content = asdict(report)
     columns = {
         role: {"column": getattr(measurement, role), "unit": getattr(measurement, f"{role}_unit")} for role in ROLES
     }
     head = {"file": content.pop("name"), "columns": columns, "notes": measurement.notes, "worst": report.worst}
-    return dict(plain({**head, **content}))
+    proposed = None
+    if proposal is not None:
+        proposed = {"poles": proposal.poles, "zeros": proposal.zeros, "reason": proposal.sentence}
+    return dict(plain({**head, **content, "proposed": proposed}))
 
 
-def record_text(measurement: Measurement, report: RecordReport) -> str:
+def record_text(measurement: Measurement, report: RecordReport, proposal: Proposal | None) -> str:
     """A report for people."""
     columns = ", ".join(f"{role} {getattr(measurement, role)!r}" for role in ROLES)
     duration = f"{number(report.duration)} {measurement.time_unit or 's'}"
@@ -39,8 +43,10 @@ def record_text(measurement: Measurement, report: RecordReport) -> str:
         first = f"{LABELS[finding.level].ljust(labels)}  {finding.topic.ljust(topics)}  "
         parts.append(wrapped(finding.sentence, first, " " * len(first)))
     parts += ["", *_numbers(measurement, report)]
+    if proposal is not None:
+        parts += ["", wrapped(proposal.sentence)]
     if report.worst != "problem":
-        parts += ["", "next: " + _next_command(measurement, report)]
+        parts += ["", "next: " + _next_command(measurement, report, proposal)]
     return "\n".join(parts)
 
 
@@ -84,16 +90,18 @@ def _numbers(measurement: Measurement, r: RecordReport) -> list[str]:
     ]
 
 
-def _next_command(measurement: Measurement, report: RecordReport) -> str:
-    """The fit that the findings suggest."""
+def _next_command(measurement: Measurement, report: RecordReport, proposal: Proposal | None) -> str:
+    """The fit that findings and proposal suggest."""
     words = ["ctid", "fit", report.name]
     for role in ROLES:
         name = split_header(getattr(measurement, role))[0]
         if name.lower() not in USUAL_NAMES[role][:2] and Path(report.name).suffix.lower() != ".mat":
             words += [f"--{role}", name]
-    words += ["--poles", "1", "--zeros", "0"]
-    if report.suggested_delay is not None:
-        words += ["--delay", "{:g}:{:g}".format(*report.suggested_delay)]
+    poles, zeros = (1, 0) if proposal is None else (proposal.poles, proposal.zeros)
+    words += ["--poles", str(poles), "--zeros", str(zeros)]
+    bounds = report.suggested_delay if proposal is None else proposal.delay_bounds
+    if bounds is not None:
+        words += ["--delay", "{:g}:{:g}".format(*bounds)]
     if measurement.record.input.hold != "zoh":
         words += ["--hold", measurement.record.input.hold]
     for option, instant in (("--from", measurement.start), ("--to", measurement.stop)):

@@ -60,6 +60,29 @@ def test_the_command_to_go_on_with_can_be_run(ctid, rig, tmp_path):
     assert "--time" not in command
 
 
+def test_a_structure_is_proposed_with_its_reason(ctid, rig):
+    done = ctid("check", rig, *NAMED)
+    assert "--poles 1 --zeros 0 " in done.stdout.splitlines()[-1]
+    said = " ".join(done.stdout.split())
+    assert re.search(r"Proposed: 1 pole, no zero, by a short search\. A further \w+ \(2/[01]\) would", said)
+    assert "It is a proposal: ctid order looks closer." in said
+
+
+def test_a_part_of_a_long_record_is_enough(ctid, tmp_path):
+    rng = np.random.default_rng(1)
+    t = 0.1 * np.arange(6000)
+    # At rest for long, then two modes: what is first in the file tells nothing.
+    u = np.where(t < 200, 0.0, np.repeat(rng.choice([-1.0, 1.0], 1200), 5))
+    y = simulate(TransferFunction([6, 1.6, 14], [1, 0.8, 10.12, 2.4, 9]), HeldSignal(t, u), t)
+    path = tmp_path / "long.csv"
+    noisy = y + 0.1 * rng.standard_normal(t.size)
+    path.write_text("t,u,y\n" + "".join(f"{a:.1f},{b:g},{c:.6f}\n" for a, b, c in zip(t, u, noisy, strict=True)))
+    content = json.loads(ctid("check", path, "--json").stdout)
+    assert (content["proposed"]["poles"], content["proposed"]["zeros"]) == (4, 2)
+    assert "of the 6000 samples" in content["proposed"]["reason"]
+    assert "ctid order tries more poles" in content["proposed"]["reason"]
+
+
 def test_json_holds_the_same(ctid, rig):
     content = json.loads(ctid("check", rig, *NAMED, "--json").stdout)
     assert content["file"] == str(rig)
@@ -95,6 +118,7 @@ def test_a_record_that_shows_nothing(ctid, tmp_path):
     assert lines[1] == "No model can be identified from this record as it is: 1 problem."
     assert lines[3].startswith("PROBLEM  input   ")
     assert not lines[-1].startswith("next:")
+    assert not any(line.startswith("Proposed") for line in lines)
     strict = ctid("check", path, "--strict", code=7)
     assert strict.stdout.splitlines() == lines
     assert strict.stderr.count("\n") == 1

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ctid_cli.arrays import Array
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.filtering.filter_data import FilterData
 
@@ -29,15 +30,16 @@ def liveliest_parts(records: Sequence[FilterData], latest: float) -> list[slice]
         return None
     # What comes before the latest delay tells nothing.
     sizes = [PART // len(records) + int(latest * data.t.size / (data.t[-1] - data.t[0])) for data in records]
-    return [_liveliest(data, size) for data, size in zip(records, sizes, strict=True)]
+    return [liveliest(data.u, data.y, size) for data, size in zip(records, sizes, strict=True)]
 
 
-def _liveliest(data: FilterData, size: int) -> slice:
-    if data.t.size <= size:
+def liveliest(u: Array, y: Array, size: int) -> slice:
+    """So many samples around which the input moves and the output varies most."""
+    if y.size <= size:
         return slice(None)
-    moves, spread = np.abs(np.diff(data.u, append=data.u[-1])), np.abs(data.y - data.y.mean())
+    moves, spread = np.abs(np.diff(u, append=u[-1])), np.abs(y - y.mean())
     life = np.cumsum(moves / max(moves.mean(), 1e-300) + spread / max(spread.mean(), 1e-300))
-    begins = np.arange(0, data.t.size - size + 1, size // 4)
+    begins = np.arange(0, y.size - size + 1, size // 4)
     begin = int(begins[np.argmax(life[begins + size - 1] - life[begins])])
     return slice(begin, begin + size)
 
