@@ -89,16 +89,18 @@ def test_the_page_of_a_fit_is_that_of_its_file(ctid, fitted):
 def test_what_is_no_fit_has_no_page(ctid, fitted):
     before = sorted(fitted.iterdir())
     (fitted / "track.json").write_text('{"kind": "ctid track"}', encoding="utf-8")
+    (fitted / "frf.json").write_text('{"kind": "ctid frf"}', encoding="utf-8")
     cases = {
-        (fitted / "track.json",): "is no fit but of kind 'ctid track'",
+        (fitted / "track.json",): "ctid track writes such a file",
+        (fitted / "frf.json",): "is no fit but of kind 'ctid frf'",
         (fitted / "none.json",): "none.json: does not exist",
         (fitted / "record.csv",): "is no JSON, or damaged",
         (fitted / "fit.json", "--record", fitted / "fit.json"): "is not the file that the fit is of",
         (fitted / "fit.json", "--validate", fitted / "record.csv"): "has no validation record",
-        ("quickstart", "--record", fitted / "record.csv"): "--record and --validate go with a fit",
+        ("quickstart", "--record", fitted / "record.csv"): "--record and --validate go with a file",
     }
     for arguments, sentence in cases.items():
         stderr = ctid("report", *arguments, code=2).stderr
         assert sentence in stderr
         assert stderr.count("\n") == 1
-    assert sorted(path for path in fitted.iterdir() if path.name != "track.json") == before
+    assert sorted(path for path in fitted.iterdir() if path.stem not in ("track", "frf")) == before
