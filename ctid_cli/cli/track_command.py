@@ -114,7 +114,7 @@ def _follow(record: SampledSignal, asked: Asked) -> tuple[RecordTrack, Procedure
     samples, interval = record.samples, record.interval
     try:
         settings = choose_settings(samples, interval, asked.tones, method=asked.method, window=asked.window)
-        with RecordProgress(record.file) as tell:
+        with RecordProgress(Path(record.file).name) as tell:
             found = track_record(samples, interval, settings, every=asked.every, on_progress=tell)
     except ValueError as error:
         raise UsageError(str(error)) from None
