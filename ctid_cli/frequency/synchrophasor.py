@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctid_cli.arrays import Array, BoolArray, ComplexArray
+from ctid_cli.arrays import Array, BoolArray, ComplexArray, IntArray
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.inputs import LARGEST_SAMPLE
@@ -22,8 +22,6 @@ from ctid_cli.signals.checks import require_finite, require_positive
 
 #: Samples that a cycle must have at least.
 FEWEST_SAMPLES = 12
-#: The phasor that the model leaves in a valid row is at most this fraction of the tone's.
-LARGEST_ERROR = 0.01
 #: A tone this much smaller than the largest sample is none.
 SMALLEST_TONE = 1e-6
 #: What makes a row invalid, in words for the user.
@@ -33,7 +31,7 @@ SYNCHROPHASOR_REASONS = {
     Flag.OUT_OF_BOUNDS: "The frequency is outside the range of the class, where the standard says nothing of errors.",
     Flag.CHANGED: (
         "Within the window the signal is no single tone that changes smoothly: a step, another tone between the "
-        "harmonics, or noise may move the phasor by more than 1 %."
+        "harmonics, or noise may move the phasor by 1 % and more."
     ),
 }
 #: Positive sequence of three phases: the second lags by a third of a cycle.
@@ -59,8 +57,7 @@ class SynchrophasorTrack:
     rocof : ndarray, shape (N,)
         Rate of change of the frequency [Hz/s].
     error : ndarray, shape (N,)
-        What the model leaves within the window, as a phasor before and one after the instant: the larger one over the
-        tone's [%].
+        The largest phasor that the model leaves anywhere within the window, over the tone's [%].
     flags : ndarray of int, shape (N,)
         Why a row is not valid, bits of :class:`Flag`: 0 where it is.
     nominal : int
@@ -161,7 +158,8 @@ def measure_synchrophasors(
     if interval * nominal > 1.0 / FEWEST_SAMPLES:
         few = f"{1.0 / (interval * nominal):.3g} samples to a cycle of {nominal} Hz are too few"
         raise DataError(f"{few}: {FEWEST_SAMPLES} are needed, a sampling rate of {FEWEST_SAMPLES * nominal} Hz")
-    half = longest_half_window(filters, nominal, performance_class, reporting_rate)
+    checking = _checking_filters(filters, nominal, performance_class)
+    half = longest_half_window(checking, nominal, performance_class, reporting_rate)
     end = start + (values.shape[0] - 1) * interval
     # A report at the very end of the record may lie outside by rounding alone.
     slack = 1e-6 * interval
@@ -172,6 +170,14 @@ def measure_synchrophasors(
         raise DataError(f"{short}: there is no reporting instant with all of its window within the record")
     t = np.arange(first, last + 1) / reporting_rate
     return measure_at(values, interval, start, t, nominal, performance_class, reporting_rate)
+
+
+def _checking_filters(
+    filters: SynchrophasorFilters, nominal: int, performance_class: PerformanceClass
+) -> SynchrophasorFilters:
+    """Filters that say whether a row is valid: never shorter than those of class P at the nominal rate."""
+    usual = design_filters(nominal, performance_class, nominal)
+    return usual if performance_class == "P" and filters.half_cycles < usual.half_cycles else filters
 
 
 def longest_half_window(
@@ -192,21 +198,20 @@ def measure_at(
 ) -> SynchrophasorTrack:
     """Synchrophasors at any instants [s] of samples of shape (N, C)."""
     filters = design_filters(nominal, performance_class, reporting_rate)
+    checking = _checking_filters(filters, nominal, performance_class)
     furthest = frequency_range(performance_class, reporting_rate)
-    weights = _POSITIVE_SEQUENCE if values.shape[1] == 3 else np.ones(1, np.complex128)
-    found, frequency, rocof, left, wrong = measure_phasors(
-        np.ascontiguousarray(values),
-        (t - start) / interval,
-        1.0 / interval,
-        float(nominal),
-        furthest,
-        filters.tables,
-        filters.half_cycles,
-        POINTS,
-        filters.check_cycles,
-        filters.curved,
-        weights.astype(np.complex128),
-    )
+    weights: ComplexArray = np.asarray(_POSITIVE_SEQUENCE if values.shape[1] == 3 else [1.0], np.complex128)
+    values, places = np.ascontiguousarray(values), (t - start) / interval
+
+    def measure(kernels: SynchrophasorFilters) -> tuple[ComplexArray, Array, Array, Array, IntArray]:
+        clock, tables = (1.0 / interval, float(nominal), furthest), (kernels.tables, kernels.half_cycles, POINTS)
+        return measure_phasors(values, places, *clock, *tables, kernels.checks, kernels.curved, weights)
+
+    found, frequency, rocof, left, wrong = measure(filters)
+    if checking is not filters:
+        # Two cycles leave next to nothing to check: what four cycles say counts as well.
+        slower, *_, left, wrong = measure(checking)
+        left = np.maximum(left, np.abs((slower - found) @ weights) / np.abs(found @ weights))
     # Turned back by whole cycles first: the fraction of f0 t keeps its digits, however late the instant.
     phases = found * np.exp(-2j * np.pi * np.mod(nominal * t, 1.0))[:, None] / math.sqrt(2.0)
     phasor = phases @ weights
@@ -216,7 +221,7 @@ def measure_at(
         flags |= np.where((wrong == 2) | (np.abs(phasor) < SMALLEST_TONE * size), int(Flag.UNDETERMINED), 0)
         # Rounding may put a tone at the very end of the range beyond it.
         flags |= np.where(np.abs(frequency - nominal) > furthest + 1e-3, int(Flag.OUT_OF_BOUNDS), 0)
-        flags |= np.where(left > LARGEST_ERROR, int(Flag.CHANGED), 0)
+        flags |= np.where(left > checking.largest_left, int(Flag.CHANGED), 0)
     return SynchrophasorTrack(
         t=t,
         phasor=phasor,

@@ -36,8 +36,10 @@ class SynchrophasorFilters:
     tables: Array
     #: Half the length of the tables [cycles].
     half_cycles: float
-    #: The check looks so far before and after the instant [cycles].
-    check_cycles: float
+    #: Where the check looks, against the instant [cycles].
+    checks: Array
+    #: The largest phasor that the model may leave there, as a fraction of the tone's.
+    largest_left: float
     #: Whether the phasor is corrected for its curvature within its kernel.
     curved: bool
 
@@ -73,11 +75,12 @@ def _protection(fast: bool) -> SynchrophasorFilters:
     if fast:
         # All within 0.95 cycles: 2/F_s is one cycle.
         tables = [phasor, *_derivatives(_bump(0.45)), _running_mean(_impulse())]
-        return _tabulated(tables, check=0.45, curved=False)
+        return _tabulated(tables, np.linspace(-0.45, 0.45, 3), 0.01, curved=False)
     # Derivatives of the running mean of a running mean, 1.85 cycles long on both sides: harmonics are double zeros.
     bump = _bump(0.85)
     first, second = _difference(_running_mean(bump)), _difference(_difference(bump))
-    return _tabulated([phasor, first, second, phasor], check=0.9, curved=False)
+    tables = [phasor, first, second, _running_mean(_impulse())]
+    return _tabulated(tables, np.linspace(-1.35, 1.35, 7), 0.01, curved=False)
 
 
 def _measurement(nominal: int, reporting_rate: int) -> SynchrophasorFilters:
@@ -86,7 +89,8 @@ def _measurement(nominal: int, reporting_rate: int) -> SynchrophasorFilters:
     low_pass = _windowed_sinc(half - 0.5, cutoff)
     check = _windowed_sinc(0.65 * half - 0.5, cutoff)
     tables = [_running_mean(low_pass), *_derivatives(low_pass), _running_mean(check)]
-    return _tabulated(tables, check=0.35 * half, curved=True)
+    # The fastest modulations pass these filters better than they suit the model.
+    return _tabulated(tables, 0.35 * half * np.linspace(-1.0, 1.0, 3), 0.02, curved=True)
 
 
 def _grid(half: float) -> Array:
@@ -130,7 +134,7 @@ def _derivatives(kernel: Array) -> tuple[Array, Array]:
     return _difference(kernel), _difference(slope)
 
 
-def _tabulated(tables: list[Array], check: float, curved: bool) -> SynchrophasorFilters:
+def _tabulated(tables: list[Array], checks: Array, largest_left: float, curved: bool) -> SynchrophasorFilters:
     length = max(table.size for table in tables)
     # A zero at both ends, so that interpolation needs no exception.
     stacked = np.array([np.pad(table, (length - table.size) // 2 + 1) for table in tables])
@@ -141,4 +145,4 @@ def _tabulated(tables: list[Array], check: float, curved: bool) -> Synchrophasor
     stacked *= POINTS
     laid_out = np.ascontiguousarray(stacked.T)
     laid_out.setflags(write=False)
-    return SynchrophasorFilters(laid_out, float(u[-1]), check, curved)
+    return SynchrophasorFilters(laid_out, float(u[-1]), checks, largest_left, curved)

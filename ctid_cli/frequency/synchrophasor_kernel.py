@@ -98,22 +98,22 @@ def _left_over(
     tables: Array,
     half: float,
     points: int,
-    check: float,
+    checks: Array,
     found: ComplexArray,
     weights: ComplexArray,
 ) -> float:
-    """Largest phasor of what the model leaves, before or after the instant."""
+    """Largest phasor of what the model leaves, at instants around its own."""
     count, channels = samples.shape
     largest = 0.0
     step = np.exp(-2j * np.pi * cycles)
-    for side in (-1.0, 1.0):
-        # Around another instant, with a shorter kernel: within the window all the same.
-        first, end = _reach(place + side * check / cycles, half - check, cycles, count)
+    for away in checks:
+        # Around other instants, with a shorter kernel: within the window all the same.
+        first, end = _reach(place + away / cycles, half - abs(away), cycles, count)
         turn = np.exp(-2j * np.pi * (first - place) * cycles)
         total, weight = 0.0j, 0.0
         for k in range(first, end):
             u = (k - place) * cycles
-            at = (u - side * check + half) * points
+            at = (u - away + half) * points
             cell = min(max(int(at), 0), tables.shape[0] - 2)
             h = tables[cell, 3] + (at - cell) * (tables[cell + 1, 3] - tables[cell, 3])
             left = 0.0j
@@ -137,7 +137,7 @@ def measure_phasors(
     tables: Array,
     half: float,
     points: int,
-    check: float,
+    checks: Array,
     curved: bool,
     weights: ComplexArray,
 ) -> tuple[ComplexArray, Array, Array, Array, IntArray]:
@@ -177,6 +177,6 @@ def measure_phasors(
         frequency[row] = estimate
         # The phase is the argument of p: its second derivative is Im(p2/p0) - 2 Re(p1/p0) Im(p1/p0), per cycle squared.
         rocof[row] = ((p[2] / p[0]).imag - 2.0 * slope.real * slope.imag) * centre * centre / (2.0 * np.pi)
-        rest = _left_over(samples, places[row], cycles, tables, half, points, check, found, weights)
+        rest = _left_over(samples, places[row], cycles, tables, half, points, checks, found, weights)
         left[row] = rest / abs(p[0])
     return phasors, frequency, rocof, left, wrong
