@@ -27,9 +27,9 @@ SMALLEST_TONE = 1e-6
 #: What makes a row invalid, in words for the user.
 SYNCHROPHASOR_REASONS = {
     Flag.GAP: "A sample within the window is missing or not finite.",
-    Flag.UNDETERMINED: "There is no tone near the nominal frequency.",
+    Flag.ABSENT: "There is no tone near the nominal frequency.",
     Flag.OUT_OF_BOUNDS: "The frequency is outside the range of the class, where the standard says nothing of errors.",
-    Flag.CHANGED: (
+    Flag.CHANGE: (
         "Within the window the signal is no single tone that changes smoothly: a step, another tone between the "
         "harmonics, or noise may move the phasor by 1 % and more."
     ),
@@ -218,10 +218,10 @@ def measure_at(
     size = float(np.nanmax(np.abs(values)))
     with np.errstate(invalid="ignore"):
         flags = np.where(wrong == 1, int(Flag.GAP), 0)
-        flags |= np.where((wrong == 2) | (np.abs(phasor) < SMALLEST_TONE * size), int(Flag.UNDETERMINED), 0)
+        flags |= np.where((wrong == 2) | (np.abs(phasor) < SMALLEST_TONE * size), int(Flag.ABSENT), 0)
         # Rounding may put a tone at the very end of the range beyond it.
         flags |= np.where(np.abs(frequency - nominal) > furthest + 1e-3, int(Flag.OUT_OF_BOUNDS), 0)
-        flags |= np.where(left > checking.largest_left, int(Flag.CHANGED), 0)
+        flags |= np.where(left > checking.largest_left, int(Flag.CHANGE), 0)
     return SynchrophasorTrack(
         t=t,
         phasor=phasor,

@@ -56,8 +56,8 @@ def require_synchrophasor(nominal: int, performance_class: str, reporting_rate: 
     require_choice("performance_class", performance_class, ("P", "M"))
     rates = REPORTING_RATES[nominal]
     if reporting_rate not in rates:
-        allowed = f"at {nominal} Hz it is {listed(rates)}"
-        raise OptionError("reporting_rate", f"reporting_rate cannot be {reporting_rate:g} per second: {allowed}.")
+        allowed = f"at {nominal} Hz the standard has {listed(rates)}"
+        raise OptionError("reporting_rate", f"{reporting_rate:g} reports a second cannot be had: {allowed}.")
 
 
 @lru_cache(maxsize=32)

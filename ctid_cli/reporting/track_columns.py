@@ -1,6 +1,5 @@
 """The file of a track: its columns, and their bytes."""
 
-import io
 from typing import Any
 
 import numpy as np
@@ -8,6 +7,7 @@ from numpy.typing import NDArray
 
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.record_track import RecordTrack
+from ctid_cli.reporting.column_file import columns_bytes
 
 #: Units of the columns of a tone, but for those of the signal's own unit.
 UNITS = {
@@ -49,25 +49,7 @@ def track_table(track: RecordTrack, start: float) -> dict[str, NDArray[Any]]:
 
 def track_bytes(table: dict[str, NDArray[Any]], style: str, unit: str | None = None) -> bytes:
     """The file of a track."""
-    if style == "csv":
-        import pandas as pd
-
-        marks = {name: int for name, values in table.items() if values.dtype == bool}
-        frame = pd.DataFrame(table).replace([np.inf, -np.inf], np.nan).astype(marks)
-        return frame.to_csv(index=False, float_format="%.12g", lineterminator="\n").encode()
-    import h5py
-
-    file = io.BytesIO()
-    with h5py.File(file, "w", track_order=True) as store:
-        for name, values in table.items():
-            if values.dtype == object:
-                store.create_dataset(name, data=[str(value) for value in values], dtype=h5py.string_dtype())
-                continue
-            column = store.create_dataset(name, data=values)
-            column_unit = _unit_of(name, unit)
-            if column_unit is not None:
-                column.attrs["unit"] = column_unit
-    return file.getvalue()
+    return columns_bytes(table, style, {name: _unit_of(name, unit) for name in table})
 
 
 def _unit_of(name: str, unit: str | None) -> str | None:
