@@ -162,7 +162,10 @@ def measure_phasors(
                 p[i] = 0.0
                 for c in range(channels):
                     p[i] += weights[c] * found[i, c]
-            slope = p[1] / p[0] if p[0] != 0.0 else np.nan + 0.0j
+            # Where there is no tone its phasor is zero, and what is divided by it no number.
+            power = p[0].real ** 2 + p[0].imag ** 2
+            reciprocal = np.conj(p[0]) * (1.0 / power if power > 0.0 else np.nan)
+            slope = p[1] * reciprocal
             estimate = centre * (1.0 + slope.imag / (2.0 * np.pi))
             if not np.isfinite(estimate):
                 break
@@ -176,7 +179,7 @@ def measure_phasors(
         phasors[row] = found[0]
         frequency[row] = estimate
         # The phase is the argument of p: its second derivative is Im(p2/p0) - 2 Re(p1/p0) Im(p1/p0), per cycle squared.
-        rocof[row] = ((p[2] / p[0]).imag - 2.0 * slope.real * slope.imag) * centre * centre / (2.0 * np.pi)
+        rocof[row] = ((p[2] * reciprocal).imag - 2.0 * slope.real * slope.imag) * centre * centre / (2.0 * np.pi)
         rest = _left_over(samples, places[row], cycles, tables, half, points, checks, found, weights)
-        left[row] = rest / abs(p[0])
+        left[row] = rest * abs(reciprocal)
     return phasors, frequency, rocof, left, wrong
