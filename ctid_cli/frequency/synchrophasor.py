@@ -43,7 +43,7 @@ _POSITIVE_SEQUENCE = np.array([1.0, _TURN, _TURN**2]) / 3.0
 class SynchrophasorTrack:
     """Synchrophasors at the reporting instants, rows of one or three phases.
 
-    Attributes
+    Parameters
     ----------
     t : ndarray, shape (N,)
         Reporting instants: whole multiples of ``1/reporting_rate`` on the record's clock [s].

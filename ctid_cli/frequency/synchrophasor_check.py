@@ -37,12 +37,20 @@ STEP_PHASES = (0.0, 0.25 * np.pi, 0.5 * np.pi)
 
 @dataclass(frozen=True)
 class CheckedLimit:
-    """The worst of a test beside its limit."""
+    """The worst of a test beside its limit.
+
+    Parameters
+    ----------
+    limit : Limit
+        The limit.
+    worst : float
+        Largest error, in the unit of the quantity.
+    condition : str
+        Condition of the test under which it was found.
+    """
 
     limit: Limit
-    #: Largest error, in the unit of the quantity.
     worst: float
-    #: Condition of the test under which it was found.
     condition: str
 
     @property
@@ -55,7 +63,7 @@ class CheckedLimit:
 class SynchrophasorCheck:
     """Worst errors of all tests of the standard, with their limits.
 
-    Attributes
+    Parameters
     ----------
     nominal : int
         Nominal frequency [Hz].

@@ -14,13 +14,24 @@ _FIRST, _AMENDED = "IEEE C37.118.1-2011", "IEEE C37.118.1a-2014"
 
 @dataclass(frozen=True)
 class Limit:
-    """One limit."""
+    """One limit of the standard.
 
-    #: Test that it belongs to: a key of :data:`TESTS`.
+    Parameters
+    ----------
+    test : str
+        Test that it belongs to, such as ``"signal_frequency"``.
+    quantity : str
+        What is limited: ``"tve"``, the total vector error [%]; ``"fe"``, the frequency error [Hz]; ``"rfe"``, the error
+        of the rate of change of frequency [Hz/s]; their response times ``"tve_response"``, ``"fe_response"`` and
+        ``"rfe_response"`` [s]; ``"delay"`` [s], ``"overshoot"`` [% of the step], ``"latency"`` [s].
+    largest : float or None
+        Largest allowed value; None where the standard has none.
+    source : str
+        Where the standard says so.
+    """
+
     test: str
-    #: What is limited: a key of :data:`QUANTITIES`.
     quantity: str
-    #: Largest allowed value, in the unit of the quantity; None where the standard has none.
     largest: float | None
     source: str
 
