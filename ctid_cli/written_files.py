@@ -14,6 +14,8 @@ TAKEN = (
     *("journal.sqlite", "journal.sqlite-wal", "journal.sqlite-shm", "journal.sqlite-journal", "runs.h5", "spec.yaml"),
     *("spec.canonical.json", "timings.csv", "provenance", "running.json", "figures", "report.html"),
 )
+#: What the name of an experiment matches; parts of it are folders.
+EXPERIMENT = r"(?!.*\.\.)(?=.{1,200}\Z)[A-Za-z0-9][A-Za-z0-9._-]*(?:/[A-Za-z0-9][A-Za-z0-9._-]*)*"
 #: Names of devices on Windows, with any ending.
 _DEVICES = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)", re.IGNORECASE)
 _SHARD = re.compile(r"\.shard-\d+-of-\d+$")

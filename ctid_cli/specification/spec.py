@@ -29,10 +29,10 @@ from ctid_cli.specification.signal_sections import AnySamplingSection, Disturban
 from ctid_cli.specification.start_sections import StartsSection
 from ctid_cli.specification.system_sections import AnySystemSection
 from ctid_cli.specification.yaml_source import KeyPath, YamlSource, path_text
-from ctid_cli.written_files import why_unusable
+from ctid_cli.written_files import EXPERIMENT, why_unusable
 
 _EXPERIMENT = matching(
-    r"(?!.*\.\.)(?=.{1,200}\Z)[A-Za-z0-9][A-Za-z0-9._-]*(?:/[A-Za-z0-9][A-Za-z0-9._-]*)*",
+    EXPERIMENT,
     "use letters, digits, '-', '_' and '.', with '/' between parts, no '..', 200 characters at most",
 )
 _NAME = matching("[A-Za-z0-9_-]{1,60}", "a name has letters, digits, '-' and '_', at most 60 of them")

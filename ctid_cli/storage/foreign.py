@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any, NoReturn
 
 from ctid_cli.storage.manifest import Manifest
+from ctid_cli.written_files import EXPERIMENT
 
 #: Estimates that one file may plan.
 MAX_ESTIMATES = 100_000_000
@@ -27,7 +28,7 @@ def require_manifest(found: Any) -> Manifest:
     """The plan in a file, if it has the form of one; a ValueError says what has not."""
     plan = _mapping(found, "the plan")
     name = _text(plan, "experiment")
-    if not re.fullmatch(r"[\w.-]+(?:/[\w.-]+)*", name) or ".." in name or len(name) > MAX_NAME:
+    if not re.fullmatch(EXPERIMENT, name):
         raise ValueError("its experiment has a name that none may have")
     _count(plan, "runs")
     if plan.get("seed") is not None:

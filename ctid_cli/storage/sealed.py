@@ -4,9 +4,13 @@ The bytes of the file depend on the results alone: rows are in the order of the 
 are not in it. It is written beside the old one, column by column, synchronised, renamed, read back and compared.
 """
 
+import errno
 import hashlib
 import json
 import os
+import re
+import sys
+import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -41,7 +45,7 @@ _PACKING: dict[str, Any] = {"compression": "gzip", "shuffle": True}
 
 def write_sealed(manifest: Manifest, origins: Sequence[Origin], table: PackedTable, path: Path) -> str:
     """Write the sealed file of some estimates; returns the checksum of its content."""
-    with h5py.File(path, "w", userblock_size=USER_BLOCK) as file:
+    with _minding_the_disk(), h5py.File(path, "w", userblock_size=USER_BLOCK) as file:
         checksum = _write_all(file, manifest, origins, table)
     with path.open("r+b") as written:
         written.seek(USER_BLOCK)
@@ -51,6 +55,36 @@ def write_sealed(manifest: Manifest, origins: Sequence[Origin], table: PackedTab
         written.flush()
         os.fsync(written.fileno())
     return checksum
+
+
+@contextmanager
+def _minding_the_disk() -> Iterator[None]:
+    """Raise what the system said of a disk that is full or read-only; HDF5 says it in other ways as well.
+
+    Closing the file fails a second time, without an OSError, and every object that goes out of use prints a traceback.
+    """
+    hooks, failed = (sys.excepthook, sys.unraisablehook), None
+    try:
+        sys.excepthook, sys.unraisablehook = lambda *error: None, lambda error: None
+        yield
+    except (OSError, RuntimeError) as error:
+        failed = _of_the_disk(error)
+        while error is not None:
+            traceback.clear_frames(error.__traceback__)
+            error = error.__context__  # type: ignore[assignment]
+    finally:
+        sys.excepthook, sys.unraisablehook = hooks
+    if failed is not None:
+        raise failed
+
+
+def _of_the_disk(error: BaseException | None) -> OSError:
+    last = error
+    while error is not None:
+        if found := re.search(r"errno = (\d+), error message = '(.*?)'", str(error)):
+            return OSError(int(found[1]), found[2])
+        error = error.__context__
+    return OSError(errno.EIO, str(last))
 
 
 def _write_all(file: h5py.File, manifest: Manifest, origins: Sequence[Origin], table: PackedTable) -> str:

@@ -46,6 +46,8 @@ def main() -> int:
             record.add(campaign, trial)
             if trial.found or tried % 100 == 0:
                 print(trial if trial.found else f"{campaign.name}: {tried} tried", file=sys.stderr, flush=True)
+    # Other sittings may have added to it.
+    record = Record(options.folder)
     texts = record.texts()
     published(options.folder, texts)
     print(texts["faults.md"])

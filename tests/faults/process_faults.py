@@ -78,11 +78,12 @@ class Trials:
         asked = subprocess.run(["ps", "-o", "pid=,args=", "--ppid", str(parent)], capture_output=True, text=True)
         return [int(line.split()[0]) for line in asked.stdout.splitlines() if "popen_loky" in line]
 
-    def pooled(self, jobs: int, toys: Any = None) -> Started:
+    def pooled(self, jobs: int, toys: Any = None, first: Callable[[], object] = lambda: None) -> Started:
         """A run with worker processes."""
         folder = self.place.empty()
 
         def work(say: Say) -> None:
+            first()
             try:
                 run(folder, say, toys or self.slow.plan, executor=None, jobs=jobs)
             finally:
@@ -157,16 +158,14 @@ class Trials:
         what, room = self.rng.choice(
             [(resource.RLIMIT_NOFILE, self.rng.randrange(8, 40)), (resource.RLIMIT_AS, self.rng.randrange(1, 40) << 26)]
         )
-        folder = self.place.empty()
 
-        def work(say: Say) -> None:
+        def be_limited() -> None:
             # What is there counts too.
             before = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
             most = room if what == resource.RLIMIT_NOFILE else before + room
             resource.setrlimit(what, (most, most))
-            run(folder, say, self.slow.plan, executor=None, jobs=1)
 
-        said, wrong = Started(work).end()
+        said, wrong = self.pooled(1, first=be_limited).end()
         name = f"{room} files" if what == resource.RLIMIT_NOFILE else f"{room >> 20} MB"
         return name, 1, [*wrong, *self.judged(self.slow, said)]
 

@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 from ctid_cli.storage.identity import numeric_platform, package_versions
 from ctid_cli.storage.provenance import git_commit, now
@@ -29,8 +30,9 @@ class Record:
         self._path = folder / "trials.jsonl"
         #: By campaign and number; at first, and at last with the sitting.
         self.first: dict[tuple[str, int], Trial] = {}
-        self.last: dict[tuple[str, int], tuple[Trial, int]] = {}
-        self.sittings: list[dict[str, Any]] = []
+        self.last: dict[tuple[str, int], tuple[Trial, str]] = {}
+        #: Several may go on at once, each with campaigns of its own.
+        self.sittings: dict[str, dict[str, Any]] = {}
         text = self._path.read_text(encoding="utf-8") if self._path.exists() else ""
         # A line that was cut off with its sitting is no trial.
         for line in text.splitlines():
@@ -42,14 +44,15 @@ class Record:
 
     def _take(self, entry: dict[str, Any]) -> None:
         if "commit" in entry:
-            self.sittings.append(entry | {"trials": 0})
+            self.sittings[entry["sitting"]] = entry | {"trials": 0}
             return
         trial = Trial(**entry["trial"])
         key = (entry["campaign"], trial.number)
         self.first.setdefault(key, trial)
-        self.last[key] = trial, len(self.sittings) - 1
-        self.sittings[-1]["trials"] += 1
-        self.sittings[-1]["stopped"] = entry["at"]
+        sitting = entry["sitting"]
+        self.last[key] = trial, sitting
+        self.sittings[sitting]["trials"] += 1
+        self.sittings[sitting]["stopped"] = entry["at"]
 
     def _write(self, entry: dict[str, Any]) -> None:
         self._file.write(json.dumps(entry) + "\n")
@@ -59,6 +62,7 @@ class Record:
     def begin(self) -> None:
         """Note who tries from now on."""
         entry = {
+            "sitting": uuid4().hex[:12],
             "commit": present_commit(),
             "started": now(),
             "system": f"{platform.system()} {platform.release()}",
@@ -67,10 +71,11 @@ class Record:
             "packages": {"python": platform.python_version(), **package_versions()},
         }
         self._write(entry)
+        self._own = entry["sitting"]
 
     def add(self, campaign: Campaign, trial: Trial) -> None:
         """Keep a trial."""
-        self._write({"campaign": campaign.name, "at": now(), "trial": asdict(trial)})
+        self._write({"campaign": campaign.name, "sitting": self._own, "at": now(), "trial": asdict(trial)})
 
     def missing(self, campaign: Campaign, at_most: int) -> Iterator[int]:
         """Numbers of a campaign that were not tried, below a limit."""
@@ -116,7 +121,7 @@ class Record:
             "| commit | trials | begun | ended | machine |",
             "| :-- | --: | :-- | :-- | :-- |",
         ]
-        for one in self.sittings:
+        for one in self.sittings.values():
             if one["trials"]:
                 commit = one["commit"][:12] + ("" if one["commit"].isalnum() else " with changes")
                 machine = f"{one['system']}, {one['processors']} processors, {one['numeric_platform']}"
@@ -142,7 +147,7 @@ class Record:
         return stream.getvalue()
 
     def _environment(self) -> str:
-        return json.dumps({"sittings": [one for one in self.sittings if one["trials"]]}, indent=2) + "\n"
+        return json.dumps({"sittings": [one for one in self.sittings.values() if one["trials"]]}, indent=2) + "\n"
 
 
 def _said(trial: Trial) -> str:
@@ -164,7 +169,7 @@ def refusal(record: Record) -> str:
     """Why this cannot be published; empty if it can."""
     if not record.is_complete():
         return "not all trials of the full form were made"
-    if any(not sitting["commit"].isalnum() for sitting in record.sittings if sitting["trials"]):
+    if any(not sitting["commit"].isalnum() for sitting in record.sittings.values() if sitting["trials"]):
         return "some trials were made of files that were not committed"
     return ""
 

@@ -19,7 +19,7 @@ from ctid_cli.signals.record import Record
 from ctid_cli.specification.load import load_spec
 from tests.faults import trials
 from tests.faults.conftest import STORED, TINY
-from tests.faults.harness import asked, resealed
+from tests.faults.harness import COMMANDS, asked, resealed
 from tests.storage.sealed_images import read_sealed
 
 MEASURED = """\
@@ -87,6 +87,16 @@ def test_nothing_of_a_file_elsewhere_is_repeated(inside):
         assert ("rooster" in str(refused.value) or "secret" in str(refused.value)) == own
     assert "'ctid check' says what is wrong" in str(refused.value)
     assert asked("validate", inside / ("x" * 300)) == 2
+
+
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name != "schema"])
+def test_a_name_that_no_file_can_have(command, inside, monkeypatch):
+    monkeypatch.chdir(inside)
+    name = "9" * 500
+    options = {"fit": ["--poles", "1", "--zeros", "0"], "track": ["--tones", "1"]}.get(command, [])
+    assert asked(*command.split(), name, *options) == 2
+    if "--out" in COMMANDS[command] and command != "run --dry-run":
+        assert asked(*command.split(), "tiny", "--out", name) in (2, 3)
 
 
 @pytest.mark.parametrize("name", ["/dev/zero", "/dev/stdin", "pipe.csv", "link.csv", "."])

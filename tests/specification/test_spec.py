@@ -11,6 +11,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+import ctid_cli
 from ctid_cli.canonical import canonical_json, content_hash
 from ctid_cli.errors import SpecError, UsageError
 from ctid_cli.kinds import KINDS, classes
@@ -261,6 +262,13 @@ def test_two_names_for_one_estimator(tmp_path):
     (problem,) = problems(tmp_path, changed(SIMULATED, ("starts:", two + "starts:")))
     assert (problem.line, problem.column, problem.key) == (16, 3, "estimators.two")
     assert "the same settings as 'one'" in problem.message
+
+
+def test_what_is_the_same_only_for_want_of_a_section_is_no_mistake(tmp_path):
+    text = (Path(ctid_cli.__file__).parent / "templates" / "closed-loop.yaml").read_text()
+    # Without the loop the two estimators would have the same settings; and there is no loop without sampling.
+    wrong = changed(text, ("noise:\n", "noise:\n  snr: 3\n"), ("  kind: regular\n", "  kind: regulr\n"))
+    assert [problem.key for problem in problems(tmp_path, wrong)] == ["sampling.kind", "noise.snr"]
 
 
 def test_excitation_and_sampling_are_tried_together(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import os
 from pathlib import Path
 from typing import NoReturn
 
@@ -11,6 +12,7 @@ import pytest
 
 from ctid_cli.errors import StorageError
 from ctid_cli.storage import folder
+from ctid_cli.storage.whereabouts import Whereabouts
 
 
 def test_a_network_file_system_is_named_with_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,3 +38,22 @@ def test_the_file_system_is_that_of_the_nearest_mount(tmp_path: Path) -> None:
         "tmpfs",
     ]
     assert folder.file_system(Path("/"), tmp_path / "none") == ""
+
+
+def test_a_close_that_is_interrupted_has_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    close, closed = os.close, list[int]()
+
+    def interrupted(descriptor: int) -> NoReturn:
+        close(descriptor)
+        closed.append(descriptor)
+        raise InterruptedError(errno.EINTR, "Interrupted system call")
+
+    whereabouts = Whereabouts(tmp_path / "file")
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "close", interrupted)
+        with folder.lock(tmp_path):
+            pass
+        whereabouts.close()
+    assert len(closed) == 2
+    with folder.lock(tmp_path):
+        pass

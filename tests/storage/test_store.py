@@ -295,3 +295,36 @@ def test_a_read_only_folder_can_be_read(place: Path) -> None:
         assert experiment_status(place).done == 36
     finally:
         place.chmod(0o755)
+
+
+#: Seals in processes that may write files of some sizes only, as on disks with so much room.
+SEALING = """
+import os, resource, signal, sys
+from pathlib import Path
+from ctid_cli.storage import sealed
+from ctid_cli.storage.packing import Packed, PackedTable
+from ctid_cli.storage.manifest import slots
+from tests.storage.sealed_images import read_sealed
+
+runs = read_sealed(Path(sys.argv[1]))
+table = PackedTable(runs.manifest, [Packed(slot, runs.results[slot.key]) for slot in slots(runs.manifest)])
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+for size in range(1000, 40000, 3000):
+    if not os.fork():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+        try:
+            sealed.write_sealed(runs.manifest, runs.origins, table, Path(sys.argv[2]))
+        except OSError as error:
+            print(error.strerror, flush=True)
+        sys.exit()
+    os.wait()
+"""
+
+
+def test_hdf5_says_of_a_full_disk_that_it_is_full_and_nothing_else(tmp_path):
+    stored = Path(__file__).parent / "stored" / "system" / "runs.h5"
+    command = [sys.executable, "-c", SEALING, str(stored), str(tmp_path / "runs.h5")]
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
+    assert done.stderr == ""
+    assert set(done.stdout.splitlines()) == {"File too large"}
+    assert len(done.stdout.splitlines()) > 5
