@@ -6,8 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-import numpy as np
-
 from ctid_cli.cli._common import answer, write_files
 from ctid_cli.errors import UsageError
 
@@ -50,6 +48,8 @@ def track_mains(
     as_json: bool,
 ) -> None:
     """Measure synchrophasors of one signal, or of three that are named with commas between them."""
+    import numpy as np
+
     from ctid_cli.frequency.synchrophasor import measure_synchrophasors
     from ctid_cli.reporting import synchrophasor_report as report
     from ctid_cli.reporting.synchrophasor_plot import synchrophasor_drawing
