@@ -132,10 +132,11 @@ def check_pmu(
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 7 if a limit is exceeded.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Test the synchrophasors of ctid track --pmu as IEEE C37.118.1 and IEC/IEEE 60255-118-1 ask.
+    """Test the synchrophasors of ctid track --pmu as the standard asks.
 
-    Makes the signals of the standard from their formulas (off-nominal frequency, harmonics, interference, modulation,
-    ramps, steps) and prints the worst errors beside the limits of the class. The first line says PASS or NOT PASSED.
+    Makes the signals of IEEE C37.118.1 and IEC/IEEE 60255-118-1 from their formulas (off-nominal frequency, harmonics,
+    interference, modulation, ramps, steps) and prints the worst errors beside the limits of the class. The first line
+    says PASS or NOT PASSED; the exit code is 0 either way unless --strict is given.
     """
     from ctid_cli.frequency.synchrophasor_check import check_synchrophasors
     from ctid_cli.reporting.synchrophasor_check_report import check_csv, check_object, check_text

@@ -34,9 +34,9 @@ SYNCHROPHASOR_REASONS = {
         "harmonics, or noise may move the phasor by 1 % and more."
     ),
 }
-#: Positive sequence of three phases: the second lags by a third of a cycle.
-_TURN = np.exp(2j * np.pi / 3.0)
-_POSITIVE_SEQUENCE = np.array([1.0, _TURN, _TURN**2]) / 3.0
+#: Makes of three phases their positive sequence, in which the second lags by a third of a cycle; its conjugate makes
+#: the negative one.
+POSITIVE_SEQUENCE = np.exp(2j * np.pi * np.arange(3) / 3.0) / 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +200,7 @@ def measure_at(
     filters = design_filters(nominal, performance_class, reporting_rate)
     checking = _checking_filters(filters, nominal, performance_class)
     furthest = frequency_range(performance_class, reporting_rate)
-    weights: ComplexArray = np.asarray(_POSITIVE_SEQUENCE if values.shape[1] == 3 else [1.0], np.complex128)
+    weights: ComplexArray = np.asarray(POSITIVE_SEQUENCE if values.shape[1] == 3 else [1.0], np.complex128)
     values, places = np.ascontiguousarray(values), (t - start) / interval
 
     def measure(kernels: SynchrophasorFilters) -> tuple[ComplexArray, Array, Array, Array, IntArray]:

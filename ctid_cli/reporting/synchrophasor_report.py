@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ctid_cli.arrays import Array
 from ctid_cli.canonical import plain
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.synchrophasor import SYNCHROPHASOR_REASONS, SynchrophasorTrack
+from ctid_cli.frequency.synchrophasor import POSITIVE_SEQUENCE, SYNCHROPHASOR_REASONS, SynchrophasorTrack
 from ctid_cli.reporting.column_file import columns_bytes
 from ctid_cli.reporting.layout import Report, Table, count, number
 from ctid_cli.reporting.track_columns import flag_words
@@ -133,9 +133,20 @@ def _choices(signals: list[SampledSignal], track: SynchrophasorTrack) -> list[st
 
 def _warnings(track: SynchrophasorTrack) -> list[str]:
     share = float(track.valid.mean())
-    found = []
+    found = _order_of_phases(track)
     if share < MOSTLY_VALID:
-        found = [f"{100.0 * (1.0 - share):.3g} % of the rows are not valid." if share else "No row is valid."]
+        found.append(f"{100.0 * (1.0 - share):.3g} % of the rows are not valid." if share else "No row is valid.")
     shares = {flag: float(np.mean((track.flags & int(flag)) != 0)) for flag in SYNCHROPHASOR_REASONS}
     reasons = sorted((flag for flag in shares if shares[flag] > 0.0), key=lambda flag: -shares[flag])
     return [*found, *(f"{100.0 * shares[flag]:.3g} %: {SYNCHROPHASOR_REASONS[Flag(flag)]}" for flag in reasons)]
+
+
+def _order_of_phases(track: SynchrophasorTrack) -> list[str]:
+    """A warning where two of three phases were probably exchanged."""
+    known = track.phases[np.isfinite(track.phases).all(axis=1)]
+    if known.shape[1] != 3 or not known.size:
+        return []
+    positive, negative = (float(np.median(np.abs(known @ w))) for w in (POSITIVE_SEQUENCE, POSITIVE_SEQUENCE.conj()))
+    if negative <= positive:
+        return []
+    return ["The negative sequence is the larger one: exchange two of the names of --signal if their order is wrong."]

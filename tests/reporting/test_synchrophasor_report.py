@@ -68,6 +68,12 @@ def test_text_says_what_the_numbers_are_and_why_rows_are_not_valid():
     assert "positive sequence, 'va' leading" in synchrophasor_text(THREE, measured(*THREE))
 
 
+def test_exchanged_phases_are_named():
+    exchanged = [THREE[0], THREE[2], THREE[1]]
+    assert "exchange two of the names" in synchrophasor_text(exchanged, measured(*exchanged))
+    assert "exchange" not in synchrophasor_text(THREE, measured(*THREE))
+
+
 def test_object_holds_ranges_over_the_valid_rows():
     stepping = signal(step=0.5)
     found = measured(stepping)
