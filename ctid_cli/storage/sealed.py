@@ -61,30 +61,38 @@ def write_sealed(manifest: Manifest, origins: Sequence[Origin], table: PackedTab
 def _minding_the_disk() -> Iterator[None]:
     """Raise what the system said of a disk that is full or read-only; HDF5 says it in other ways as well.
 
-    Closing the file fails a second time, without an OSError, and every object that goes out of use prints a traceback.
+    Closing the file fails a second time, without an OSError. What fails while an object goes out of use, a part of a
+    column say, is only printed, and all goes on without that part: here it is an error like any other.
     """
-    hooks, failed = (sys.excepthook, sys.unraisablehook), None
+    hooks, failures = (sys.excepthook, sys.unraisablehook), list[BaseException | None]()
     try:
-        sys.excepthook, sys.unraisablehook = lambda *error: None, lambda error: None
+        # Both are called for the same failure; h5py prints it twice.
+        sys.excepthook, sys.unraisablehook = lambda *error: None, lambda error: failures.append(error.exc_value)
         yield
     except (OSError, RuntimeError) as error:
-        failed = _of_the_disk(error)
-        while error is not None:
-            traceback.clear_frames(error.__traceback__)
-            error = error.__context__  # type: ignore[assignment]
+        failures.append(error)
+        _let_go(error)
     finally:
         sys.excepthook, sys.unraisablehook = hooks
-    if failed is not None:
-        raise failed
+    if failures:
+        raise _of_the_disk(failures)
 
 
-def _of_the_disk(error: BaseException | None) -> OSError:
-    last = error
+def _let_go(error: BaseException | None) -> None:
+    """Have the objects of a file go out of use now that are kept by the frames of an error."""
     while error is not None:
-        if found := re.search(r"errno = (\d+), error message = '(.*?)'", str(error)):
-            return OSError(int(found[1]), found[2])
+        traceback.clear_frames(error.__traceback__)
         error = error.__context__
-    return OSError(errno.EIO, str(last))
+
+
+def _of_the_disk(failures: Sequence[BaseException | None]) -> OSError:
+    for failure in failures:
+        error = failure
+        while error is not None:
+            if found := re.search(r"errno = (\d+), error message = '(.*?)'", str(error)):
+                return OSError(int(found[1]), found[2])
+            error = error.__context__
+    return OSError(errno.EIO, str(failures[0]))
 
 
 def _write_all(file: h5py.File, manifest: Manifest, origins: Sequence[Origin], table: PackedTable) -> str:

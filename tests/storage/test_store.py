@@ -297,7 +297,7 @@ def test_a_read_only_folder_can_be_read(place: Path) -> None:
         place.chmod(0o755)
 
 
-#: Seals in processes that may write files of some sizes only, as on disks with so much room.
+#: Seals in processes that may write files of some sizes only, and in ones that may write nothing of one column.
 SEALING = """
 import os, resource, signal, sys
 from pathlib import Path
@@ -309,11 +309,28 @@ from tests.storage.sealed_images import read_sealed
 runs = read_sealed(Path(sys.argv[1]))
 table = PackedTable(runs.manifest, [Packed(slot, runs.results[slot.key]) for slot in slots(runs.manifest)])
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-for size in range(1000, 40000, 3000):
+write_column, columns = sealed._write_column, []
+
+def allow(size):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+
+def writing(group, column, table, number):
+    columns.append(column)
+    if len(columns) == number:
+        allow(0)
+    write_column(group, column, table)
+    if len(columns) == number:
+        allow(resource.RLIM_INFINITY)
+
+for number in range(13):
     if not os.fork():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+        if sys.argv[3] == "room":
+            allow(1000 + 3000 * number)
+        else:
+            sealed._write_column = lambda *given: writing(*given, 1 + 3 * number)
         try:
             sealed.write_sealed(runs.manifest, runs.origins, table, Path(sys.argv[2]))
+            print("written" if 1 + 3 * number <= len(columns) else "no such column", flush=True)
         except OSError as error:
             print(error.strerror, flush=True)
         sys.exit()
@@ -321,10 +338,12 @@ for size in range(1000, 40000, 3000):
 """
 
 
-def test_hdf5_says_of_a_full_disk_that_it_is_full_and_nothing_else(tmp_path):
+@pytest.mark.parametrize("what", ["room", "column"])
+def test_what_hdf5_cannot_write_is_an_error_and_nothing_else(what, tmp_path):
     stored = Path(__file__).parent / "stored" / "system" / "runs.h5"
-    command = [sys.executable, "-c", SEALING, str(stored), str(tmp_path / "runs.h5")]
+    command = [sys.executable, "-c", SEALING, str(stored), str(tmp_path / "runs.h5"), what]
     done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
     assert done.stderr == ""
-    assert set(done.stdout.splitlines()) == {"File too large"}
-    assert len(done.stdout.splitlines()) > 5
+    said = done.stdout.splitlines()
+    assert set(said) - {"no such column"} == {"File too large"}
+    assert said.count("File too large") > 5
