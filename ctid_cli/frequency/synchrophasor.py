@@ -19,6 +19,7 @@ from ctid_cli.frequency.synchrophasor_filters import (
 )
 from ctid_cli.frequency.synchrophasor_kernel import measure_phasors
 from ctid_cli.signals.checks import require_finite, require_positive
+from ctid_cli.text import ShownAsTable
 
 #: Samples that a cycle must have at least.
 FEWEST_SAMPLES = 12
@@ -40,7 +41,7 @@ POSITIVE_SEQUENCE = np.exp(2j * np.pi * np.arange(3) / 3.0) / 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class SynchrophasorTrack:
+class SynchrophasorTrack(ShownAsTable):
     """Synchrophasors at the reporting instants, rows of one or three phases.
 
     Parameters

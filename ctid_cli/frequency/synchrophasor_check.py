@@ -21,6 +21,7 @@ from ctid_cli.frequency.synchrophasor_limits import (
 )
 from ctid_cli.frequency.synchrophasor_signals import TestSignal
 from ctid_cli.signals.checks import require_positive
+from ctid_cli.text import ShownAsTable
 
 #: Samples of a nominal cycle if nobody says otherwise: the 50th harmonic is not folded.
 USUAL_SAMPLES = 128
@@ -60,7 +61,7 @@ class CheckedLimit:
 
 
 @dataclass(frozen=True)
-class SynchrophasorCheck:
+class SynchrophasorCheck(ShownAsTable):
     """Worst errors of all tests of the standard, with their limits.
 
     Parameters

@@ -57,7 +57,7 @@ def check_csv(check: SynchrophasorCheck) -> bytes:
     return file.getvalue().encode()
 
 
-def check_table(check: SynchrophasorCheck) -> Table:
+def _table(check: SynchrophasorCheck) -> Table:
     """The worst of every test beside its limit; what has none has a dash."""
     cells, before = [], ""
     for row in check.rows:
@@ -70,7 +70,7 @@ def check_table(check: SynchrophasorCheck) -> Table:
     return Table(["test", "quantity", "worst", "limit", "source", "worst at"], cells, "llrrll")
 
 
-def check_text(check: SynchrophasorCheck) -> str:
+def check_report(check: SynchrophasorCheck) -> Report:
     """A check for people."""
     failed = sum(not row.passed for row in check.rows)
     limited = sum(row.limit.largest is not None for row in check.rows)
@@ -85,4 +85,4 @@ def check_text(check: SynchrophasorCheck) -> str:
         "leaving to keeping the limit of a steady signal for good; a dash: no limit."
     )
     tables = "Table 3 is that of IEEE C37.118.1-2011, the others are those of its amendment IEEE C37.118.1a-2014."
-    return Report([[verdict, clock], [check_table(check), foot, tables]]).draw()
+    return Report([[verdict, clock], [_table(check), foot, tables]])

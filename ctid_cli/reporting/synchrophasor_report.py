@@ -80,7 +80,7 @@ def synchrophasor_object(signals: list[SampledSignal], track: SynchrophasorTrack
         "rows": int(track.t.size),
         "valid_percent": 100.0 * float(track.valid.mean()),
         **_summary(track),
-        "warnings": _warnings(track),
+        "warnings": synchrophasor_warnings(track),
         "notes": list(first.notes) if len(signals) == 1 else [],
         "chosen": _choices(signals, track),
         "written": [str(file) for file in files],
@@ -98,19 +98,22 @@ def synchrophasor_text(signals: list[SampledSignal], track: SynchrophasorTrack) 
     if len(signals) == 1:
         lines += [wrapped(note, "  ") for note in first.notes]
     lines += [wrapped(f"- {choice}", hanging="  ") for choice in _choices(signals, track)]
-    unit = f" [{first.unit}]" if first.unit else ""
+    blocks = Report([synchrophasor_block(track, first.unit)]).draw()
+    return "\n".join([*lines, "", blocks, *warning_lines(synchrophasor_warnings(track))])
+
+
+def synchrophasor_block(track: SynchrophasorTrack, unit: str | None = None) -> list[str | Table]:
+    """A table of what was measured, and what its numbers are."""
     names = {
         "frequency_hz": "frequency [Hz]",
         "rocof_hz_per_s": "ROCOF [Hz/s]",
-        "magnitude": f"magnitude, rms{unit}",
+        "magnitude": f"magnitude, rms [{unit}]" if unit else "magnitude, rms",
         "error_percent": "left by the model [%]",
     }
     cells = [[names[name], *(number(value, 7) for value in row.values())] for name, row in _summary(track).items()]
-    rows = (
-        f"{count(int(track.valid.sum()), 'valid row')} of {track.t.size}, one every {1.0 / track.reporting_rate:.4g} s"
-    )
-    table: list[str | Table] = [Table(["", "median", "lowest", "highest"], cells, "lrrr"), f"Over {rows}."]
-    return "\n".join([*lines, "", Report([table]).draw(), *warning_lines(_warnings(track))])
+    rows = f"{count(int(track.valid.sum()), 'valid row')} of {track.t.size}"
+    every = f"one every {1.0 / track.reporting_rate:.4g} s"
+    return [Table(["", "median", "lowest", "highest"], cells, "lrrr"), f"Over {rows}, {every}."]
 
 
 def _choices(signals: list[SampledSignal], track: SynchrophasorTrack) -> list[str]:
@@ -131,7 +134,8 @@ def _choices(signals: list[SampledSignal], track: SynchrophasorTrack) -> list[st
     return [f"{sentence}." for sentence in sentences]
 
 
-def _warnings(track: SynchrophasorTrack) -> list[str]:
+def synchrophasor_warnings(track: SynchrophasorTrack) -> list[str]:
+    """What a reader must know before believing the numbers."""
     share = float(track.valid.mean())
     found = _order_of_phases(track)
     if share < MOSTLY_VALID:

@@ -11,7 +11,8 @@ from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.synchrophasor import measure_synchrophasors
 from ctid_cli.frequency.synchrophasor_check import CheckedLimit, SynchrophasorCheck
 from ctid_cli.frequency.synchrophasor_limits import limits_of
-from ctid_cli.reporting.synchrophasor_check_report import check_csv, check_object, check_text
+from ctid_cli.reporting.result_views import plot, summary, to_frame
+from ctid_cli.reporting.synchrophasor_check_report import check_csv, check_object, check_report
 from ctid_cli.reporting.synchrophasor_plot import synchrophasor_drawing
 from ctid_cli.reporting.synchrophasor_report import (
     synchrophasor_bytes,
@@ -106,11 +107,13 @@ def checked(worst):
 
 def test_the_verdict_comes_first():
     passed, failed = checked(0.5), checked(1.5)
-    assert check_text(passed).startswith("PASS: class M at 60 Hz, 60 reports a second: all 29 limits are kept.")
-    assert check_text(failed).startswith("NOT PASSED: class M at 60 Hz, 60 reports a second: 29 of 29 limits")
-    assert " !" not in check_text(passed)
-    assert check_text(failed).count(" ! ") == 29
-    assert max(map(len, check_text(failed).splitlines())) <= 100
+    assert (
+        check_report(passed).draw().startswith("PASS: class M at 60 Hz, 60 reports a second: all 29 limits are kept.")
+    )
+    assert check_report(failed).draw().startswith("NOT PASSED: class M at 60 Hz, 60 reports a second: 29 of 29 limits")
+    assert " !" not in check_report(passed).draw()
+    assert check_report(failed).draw().count(" ! ") == 29
+    assert max(map(len, check_report(failed).draw().splitlines())) <= 100
     assert (check_object(passed)["passed"], check_object(failed)["passed"]) == (True, False)
 
 
@@ -121,3 +124,16 @@ def test_every_limit_has_its_source_in_the_file():
     unlimited = [row for row in rows if not row["limit"]]
     assert {row["quantity"] for row in unlimited} == {"rfe"}
     assert {row["passed"] for row in rows} == {"True"}
+
+
+def test_the_same_from_python():
+    found = measured(signal(step=0.5))
+    assert summary(found).splitlines()[0].split() == ["median", "lowest", "highest"]
+    assert "% of the rows are not valid" in summary(found)
+    assert found._repr_html_().count("<tr>") == 5
+    frame = to_frame(found)
+    assert frame.index.name == "t"
+    assert frame["frequency_hz"].to_numpy() == pytest.approx(found.frequency, nan_ok=True)
+    assert plot(found).startswith(b"<?xml")
+    assert summary(checked(0.5)) == check_report(checked(0.5)).draw()
+    assert to_frame(checked(0.5)).shape == (len(limits_of(60, "M", 60)), 8)
