@@ -20,7 +20,7 @@ from ctid_cli.reporting.tables import experiment_report, notes_of
 from ctid_cli.running import engine, events
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
-from ctid_cli.storage.planned import planned_parts
+from ctid_cli.storage.manifest import planned_count
 from ctid_cli.storage.store import estimates_table, read_stored
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class ExperimentResults(Results):
     """
 
     def __repr__(self) -> str:
-        planned, stored = sum(count for *_, count in planned_parts(self.manifest)), len(self.rows)
+        planned, stored = planned_count(self.manifest), len(self.rows)
         estimators = ", ".join(dict.fromkeys(part["name"] for part in self.manifest["estimators"]))
         head = f"{self.experiment}: {stored} of {planned} estimates by {estimators}, {self.failed} failed"
         return f"{head}\n  in {count(len(self.manifest['data_cells']), 'data cell')}, {self.folder}"

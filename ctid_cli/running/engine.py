@@ -128,8 +128,8 @@ def run_experiment(
     if limits.of_processes and not WATCHES_PROCESSES:
         raise UsageError("limits.cpu_seconds and limits.memory_mb need Linux; use wall_seconds, which works everywhere")
     with StopRequest(stop) as stopping, ExitStack() as stack:
-        begun_with, stock = _look(plan, folder, origins, retry, fresh=fresh, allow_mixed=allow_mixed)
-        todo = Todo(begun_with, stock)
+        found = _look(plan, folder, origins, retry, fresh=fresh, allow_mixed=allow_mixed)
+        todo = Todo(found.plan, found.stock)
         if todo.data_sets:
             on_event(events.KernelsCompiling())
             on_event(events.KernelsCompiled(warm() if warm else _compile_kernels(plan)))
@@ -140,7 +140,7 @@ def run_experiment(
             folder.mkdir(parents=True, exist_ok=True)
         stack.enter_context(place.lock(folder))
         # Another run may have come between.
-        place.check_free(folder, plan.manifest(), origins, allow_mixed=allow_mixed)
+        place.check_free(folder, plan.manifest(), origins, allow_mixed=allow_mixed, known=found.state)
         place.clear(folder)
         with place.saying_what_is_safe(folder):
             log = open_journal(folder / FILE_NAME)
@@ -148,8 +148,9 @@ def run_experiment(
         workers = jobs or usable_processors()
         computing = executor(limits) if executor else LokyPool(workers, limits)
         stack.callback(computing.close)
-        stock = take_stock(log, retry, limits)
-        run = _Run(as_needed(plan, log), folder, log, stock, origins, on_event, computing)
+        if found.state is None or log.state() != found.state:
+            found = _Found(as_needed(plan, log), take_stock(log, retry, limits))
+        run = _Run(found.plan, folder, log, found.stock, origins, on_event, computing)
         stack.callback(run.cleanup)
         run.start({"jobs": workers, "limits": asdict(limits)})
         run.compute(stopping)
@@ -355,9 +356,10 @@ def preview(
     plan: Plan, folder: Path, *, fresh: bool = False, allow_mixed: bool = False, retry: Collection[str] = ()
 ) -> events.PlanReady:
     """What a run would do, without doing or writing anything."""
-    needed, stock = _look(plan, folder, current_origins(plan), retry, fresh=fresh, allow_mixed=allow_mixed)
-    if len(stock.keys):
-        return _ready(needed, folder, stock)
+    found = _look(plan, folder, current_origins(plan), retry, fresh=fresh, allow_mixed=allow_mixed)
+    needed = found.plan
+    if len(found.stock.keys):
+        return _ready(needed, folder, found.stock)
     # Of a million data sets, counting is quicker than naming.
     counts = (needed.data_sets, needed.data_sets * needed.distinct_each, 0, 0)
     return events.PlanReady(plan.experiment, folder, *counts, at_most=_monte_carlo(plan).get("at_most"))
@@ -373,6 +375,16 @@ def _ready(plan: Plan, folder: Path, stock: Stock) -> events.PlanReady:
     return events.PlanReady(plan.experiment, folder, *counts, at_most=at_most, again=again)
 
 
+@dataclass(frozen=True)
+class _Found:
+    """A plan as far as it is decided by what is stored, and that."""
+
+    plan: Plan
+    stock: Stock
+    #: State of the journal that tells it.
+    state: str | None = None
+
+
 def _look(
     plan: Plan,
     folder: Path,
@@ -381,16 +393,17 @@ def _look(
     *,
     fresh: bool,
     allow_mixed: bool,
-) -> tuple[Plan, Stock]:
-    """The plan as far as it is decided, and what is stored in a folder that it may be run into."""
+) -> _Found:
+    """What there is in a folder that a plan may be run into."""
     if fresh or not folder.exists():
-        return plan, Stock()
+        return _Found(plan, Stock())
     with place.lock(folder, shared=True):
         place.check_free(folder, plan.manifest(), origins, allow_mixed=allow_mixed)
         with place.reading_journal(folder) as log:
             if log is None:
-                return plan, Stock()
-            return as_needed(plan, log), take_stock(log, retry, Limits.of(plan.spec.canonical()))
+                return _Found(plan, Stock())
+            stock = take_stock(log, retry, Limits.of(plan.spec.canonical()))
+            return _Found(as_needed(plan, log), stock, log.state())
 
 
 def _monte_carlo(plan: Plan) -> dict[str, Any]:

@@ -168,14 +168,21 @@ def announce(folder: Path, experiment: str, started: str, done: int, total: int)
         temporary.replace(folder / RUNNING)
 
 
-def check_free(folder: Path, manifest: Manifest, origins: Mapping[str, Origin], *, allow_mixed: bool) -> None:
-    """Refuse a folder, whose lock this process holds, if this run must not add to its results."""
+def check_free(
+    folder: Path, manifest: Manifest, origins: Mapping[str, Origin], *, allow_mixed: bool, known: str | None = None
+) -> None:
+    """Refuse a folder, whose lock this process holds, if this run must not add to its results.
+
+    A journal in the state that is known was checked before.
+    """
     experiment = manifest["experiment"]
     with saying_what_is_safe(folder), read_journal(folder / FILE_NAME) as log:
         if log is None:
             if (folder / SEALED).exists():
                 why = f"{SEALED} without the {FILE_NAME} it was made from, so nothing can be added to it"
                 raise RefusedError(f"{folder} holds {why}; {_ELSEWHERE}")
+            return
+        if known is not None and log.state() == known:
             return
         log.check()
         if log.experiment() != experiment:

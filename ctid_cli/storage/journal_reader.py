@@ -4,16 +4,19 @@ import hashlib
 import json
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
+import numpy as np
+
 from ctid_cli.errors import DamageError, StorageError
 from ctid_cli.storage.foreign import read_json, require_manifest
 from ctid_cli.storage.identity import Origin, gathered
 from ctid_cli.storage.manifest import Key, Manifest, refuse_newer
+from ctid_cli.storage.pieces import ROWS, ranges
 from ctid_cli.temporary import TemporaryFolder
 
 FILE_NAME = "journal.sqlite"
@@ -35,6 +38,8 @@ _WITH_RUNS = "estimates JOIN sessions ON session = number"
 _HINDRANCES = ("READONLY", "CANTOPEN", "FULL", "IOERR", "PERM", "AUTH", "BUSY", "LOCKED", "NOMEM", "PROTOCOL")
 #: What damage can cause while it is read.
 ERRORS = (sqlite3.Error, ValueError, TypeError, KeyError, IndexError, OverflowError)
+#: What a row is written as for its checksum; made once, because there are many rows.
+_ROW_TEXT = json.JSONEncoder(default=repr).encode
 #: How long a reader waits for a moment at which the file can be read [s].
 _READER_PATIENCE = 2.0
 #: Bytes at the beginning of a write-ahead log.
@@ -54,7 +59,9 @@ class Row(NamedTuple):
 
     def is_intact(self) -> bool:
         """Whether it is what was written; before format 4 times, runs and origins had no checksum."""
-        return self.checksum in (self.digest(), _text_digest("\n".join([*map(str, self.key), self.result])))
+        if self.checksum == self.digest():
+            return True
+        return self.checksum == _text_digest("\n".join([*map(str, self.key), self.result]))
 
     def digest(self) -> str:
         """Checksum of all of it."""
@@ -72,6 +79,12 @@ class Tally:
         """Count an estimate."""
         self.count += 1
         self.mark ^= int(checksum, 16)
+
+    def add_all(self, checksums: str) -> None:
+        """Count estimates, whose checksums stand one behind the other."""
+        halves = np.frombuffer(bytes.fromhex(checksums), dtype=">u8").reshape(-1, 2)
+        self.count += len(halves)
+        self.mark ^= int.from_bytes(np.bitwise_xor.reduce(halves, axis=0).astype(">u8").tobytes(), "big")
 
     def remove(self, checksum: str) -> None:
         """Count one no more."""
@@ -116,6 +129,11 @@ class JournalReader:
     def sealed(self) -> str | None:
         """Checksum of the sealed file, or None if estimates came after it."""
         return self._meta(SEALED)
+
+    def state(self) -> str | None:
+        """What changes with everything that a run writes; None before format 4."""
+        tally = self._meta(TALLY)
+        return None if tally is None else f"{tally} {self._rows('SELECT max(number) FROM sessions')[0][0]}"
 
     def origins(self) -> tuple[Origin, ...]:
         """Where the stored estimates come from."""
@@ -175,15 +193,14 @@ class JournalReader:
     def unchecked_rows(self) -> Iterator[Row]:
         """Every row of the table of estimates."""
         with self._guard():
-            for row in self._connection.execute(self._selected):
+            for row in self._connection.execute(f"SELECT {self._selected} FROM {self._estimates}"):
                 yield Row(Key(*row[:4]), *row[4:])
 
     @property
     def _selected(self) -> str:
         # A file that is only read keeps its format.
         cpu = "cpu_seconds" if self._format > 2 else "NULL"
-        chosen = f"{KEY}, result, estimates.checksum, seconds, {cpu}, session, origin"
-        return f"SELECT {chosen} FROM {self._estimates}"
+        return f"{KEY}, result, estimates.checksum, seconds, {cpu}, session, origin"
 
     def _require_count(self, count: int) -> None:
         stored = self._meta(TALLY)
@@ -247,12 +264,19 @@ class JournalReader:
         ((mean,),) = self._rows("SELECT avg(seconds) FROM estimates")
         return None if mean is None else float(mean)
 
-    def row(self, key: Key) -> Row | None:
-        """One estimate as it is stored, compared with its checksum."""
-        where = " AND ".join(f"{name} = ?" for name in KEY.split(", "))
-        with self._guard():
-            found = self._connection.execute(f"{self._selected} WHERE {where}", key).fetchone()
-        return None if found is None else self._intact(Row(Key(*found[:4]), *found[4:]))
+    def rows_of(
+        self, data_hash: str, estimator_hash: str, replicates: Sequence[int], starts: Sequence[str]
+    ) -> Iterator[Row]:
+        """Those of an estimator on a data cell that are stored, in this order, compared with their checksums."""
+        # SQLite keeps to the order of a cross join, and looks each of them up.
+        given = "json_each(?) AS replicates CROSS JOIN json_each(?) AS starts"
+        where = "data_hash = ? AND replicate = replicates.value AND estimator_hash = ? AND start = starts.value"
+        query = f"SELECT {self._selected} FROM {given} CROSS JOIN {self._estimates} WHERE {where}"
+        for first, last in ranges(len(replicates)):
+            some = json.dumps(list(replicates[first:last])), json.dumps(list(starts))
+            with self._guard():
+                for row in self._connection.execute(query, (*some, data_hash, estimator_hash)):
+                    yield self._intact(Row(Key(*row[:4]), *row[4:]))
 
     def _intact(self, row: Row) -> Row:
         if not row.is_intact():
@@ -271,33 +295,35 @@ class JournalReader:
 
         What is told of is all that was written; whether each is as it was written is asked when it is read.
         """
-        tally = Tally()
         if self._format < CHECKED:
             for row in self.rows():
                 heed(row.key, str(json.loads(row.result)["status"]), row.session)
             return
+        tally = Tally()
         with self._guard():
             chosen = f"SELECT {KEY}, json_extract(result, '$.status'), session, checksum FROM estimates"
-            for *key, status, session, checksum in self._connection.execute(chosen):
-                tally.add(checksum)
-                heed(Key(*key), str(status), session)
+            found = self._connection.execute(chosen)
+            while some := found.fetchmany(ROWS):
+                tally.add_all("".join([row[-1] for row in some]))
+                for *key, status, session, _ in some:
+                    heed(Key(*key), str(status), session)
         self._require(tally)
 
-    def require_all(self) -> Tally:
-        """Refuse a file that lacks some of what was written, or of few estimates one in which any has changed.
-
-        Of many, single rows are compared when they are read.
-        """
+    def require_complete(self) -> Tally:
+        """Refuse a file that lacks some of what was written; what has changed is noticed where it is read."""
         tally = Tally()
-        if self._format < CHECKED or not self.is_large:
-            for row in self.rows():
-                tally.add(row.checksum)
-            return tally
-        with self._guard():
-            for (checksum,) in self._connection.execute("SELECT checksum FROM estimates"):
-                tally.add(checksum)
+        for (checksums,) in self._rows("SELECT group_concat(checksum, '') FROM estimates GROUP BY data_hash"):
+            with self._guard():
+                tally.add_all(checksums)
         self._require(tally)
         return tally
+
+    def require_all(self) -> Tally:
+        """The same, and of few estimates also one in which any has changed."""
+        if self._format < CHECKED or not self.is_large:
+            for _ in self.rows():
+                pass
+        return self.require_complete()
 
     def origins_of(self, made: Iterable[tuple[str, int]]) -> tuple[Origin, ...]:
         """The origins that estimators and numbers of origins mean."""
@@ -377,7 +403,7 @@ def format_of(connection: sqlite3.Connection, path: Path) -> int:
 
 def row_digest(table: str, *values: object) -> str:
     """Checksum of a row."""
-    return _text_digest(json.dumps([table, *values], default=repr))
+    return _text_digest(_ROW_TEXT([table, *values]))
 
 
 def _text_digest(text: str) -> str:

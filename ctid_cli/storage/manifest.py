@@ -7,7 +7,7 @@ a row of the table of estimates holds.
 
 import hashlib
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,13 +70,27 @@ def refuse_newer(path: Path, written: int, known: int) -> None:
 
 def slots(manifest: Manifest) -> Iterator[Slot]:
     """Every estimate that a plan asks for, or that its shard is to compute."""
+    for estimator, cell, replicates in planned_parts(manifest):
+        for replicate in replicates:
+            for start in estimator["starts"]:
+                yield Slot(Key(cell["hash"], replicate, estimator["hash"], start), cell, estimator)
+
+
+def planned_parts(manifest: Manifest) -> Iterator[tuple[Mapping[str, Any], Mapping[str, Any], Sequence[int]]]:
+    """Every estimator on every data cell, in the order of the plan, with the data sets that are asked for."""
     cells, shard = manifest["data_cells"], shard_of(manifest)
+    asked: list[Sequence[int]] = [range(cell["replicates"]) for cell in cells]
+    if shard is not None:
+        asked = [[k for k in some if shard.has(number, k, len(cells))] for number, some in enumerate(asked)]
     for estimator in manifest["estimators"]:
-        for number, cell in enumerate(cells):
-            for replicate in range(cell["replicates"]):
-                if shard is None or shard.has(number, replicate, len(cells)):
-                    for start in estimator["starts"]:
-                        yield Slot(Key(cell["hash"], replicate, estimator["hash"], start), cell, estimator)
+        for cell, replicates in zip(cells, asked, strict=True):
+            if replicates:
+                yield estimator, cell, replicates
+
+
+def planned_count(manifest: Manifest) -> int:
+    """How many estimates that are, those that two names share counted twice."""
+    return sum(len(replicates) * len(estimator["starts"]) for estimator, _, replicates in planned_parts(manifest))
 
 
 def shard_of(manifest: Manifest) -> Shard | None:

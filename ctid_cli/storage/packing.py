@@ -55,10 +55,8 @@ class PackedTable:
 
     def _pack(self, rows: Sequence[Packed]) -> None:
         self.count += len(rows)
-        values = [{**row.result, **plan_values(row.slot, self._manifest)} for row in rows]
-        for value in values:
-            if not value.keys() <= self._known:
-                self._known |= value.keys()
+        results, plans = [row.result for row in rows], [plan_values(row.slot, self._manifest) for row in rows]
+        self._known.update(plans[0], *results)
         append = self._pieces.append
         append("estimator_hash", texts([row.slot.key.estimator_hash for row in rows]))
         append("session", np.array([row.session for row in rows], dtype=np.int64))
@@ -66,14 +64,15 @@ class PackedTable:
             if column.source == "clock":
                 append(name, floats([getattr(row, name) for row in rows]))
             elif name != "experiment":
-                for part, array in self._arrays(column, [value.get(name) for value in values]):
+                values = [value.get(name) for value in (plans if column.source == "plan" else results)]
+                for part, array in self._arrays(column, values):
                     append(part, array)
         codes = [self._codes_of(row.slot) for row in rows] if self._swept else []
         for name in self._swept:
             append(f"swept/{name}", np.array([code[name] for code in codes], dtype=np.int64))
-        for value in values:
-            if value.get("track") is not None:
-                self.tracks.setdefault(value["id"], value["track"])
+        for plan, result in zip(plans, results, strict=True):
+            if result.get("track") is not None:
+                self.tracks.setdefault(plan["id"], result["track"])
 
     def _codes_of(self, slot: Slot) -> dict[str, int]:
         """Numbers of the values of swept fields among the distinct ones of each."""
@@ -95,9 +94,10 @@ class PackedTable:
                 yield name, np.array([MISSING if row is None else row for row in rows], dtype=np.int64)
             case "coefficients":
                 lengths = np.array([MISSING if row is None else len(row) for row in rows], dtype=np.int64)
-                width = int(lengths.max(initial=1))
-                padded = [[*(row or ()), *[None] * (width - len(row or ()))] for row in rows]
-                yield name, floats(padded)
+                padded = np.full((len(rows), lengths.max(initial=1)), np.nan)
+                there = np.arange(padded.shape[1]) < lengths[:, np.newaxis]
+                padded[there] = floats([value for row in rows if row for value in row])
+                yield name, padded
                 yield f"{name}_length", lengths
             case "by name":
                 known = self._names[name]

@@ -1,27 +1,11 @@
 """Which estimates a plan asks for, and which there are, told without a list of them."""
 
-from collections.abc import Container, Iterator, Mapping
-from typing import Any
+from collections.abc import Container, Iterator
 
 import numpy as np
 
 from ctid_cli.arrays import BoolArray
 from ctid_cli.storage.manifest import Key, Manifest, shard_of
-
-
-def planned_parts(manifest: Manifest) -> Iterator[tuple[Mapping[str, Any], Mapping[str, Any], int]]:
-    """Every estimator on every data cell, in the order of the plan, with the number of estimates that are asked for."""
-    cells, shard = manifest["data_cells"], shard_of(manifest)
-    counts = [cell["replicates"] for cell in cells]
-    if shard is not None:
-        counts = [
-            sum(shard.has(number, replicate, len(cells)) for replicate in range(count))
-            for number, count in enumerate(counts)
-        ]
-    for estimator in manifest["estimators"]:
-        for cell, count in zip(cells, counts, strict=True):
-            if count:
-                yield estimator, cell, count * len(estimator["starts"])
 
 
 class KeySet(Container[Key]):

@@ -29,7 +29,7 @@ from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, unpack_track
 from ctid_cli.storage import columns
 from ctid_cli.storage.foreign import read_json, require_manifest
 from ctid_cli.storage.identity import Origin
-from ctid_cli.storage.manifest import Manifest, refuse_newer, row_columns, slots, swept_names
+from ctid_cli.storage.manifest import Manifest, planned_count, refuse_newer, row_columns, swept_names
 from ctid_cli.storage.packing import MISSING, PackedTable, decoded, texts
 from ctid_cli.storage.pieces import ROWS, AnyArray, ranges
 
@@ -242,7 +242,7 @@ def _write_plan(file: h5py.File, manifest: Manifest, origins: Sequence[Origin]) 
             "spec_hash": manifest["spec_hash"],
             "seed": "none" if manifest["seed"] is None else manifest["seed"],
             "runs": manifest["runs"],
-            "estimates_planned": sum(1 for _ in slots(manifest)),
+            "estimates_planned": planned_count(manifest),
             "origins": json.dumps([asdict(origin) for origin in origins], sort_keys=True),
             "code_version": " ".join(dict.fromkeys(origin.code_version for origin in origins)),
             "platform": " | ".join(dict.fromkeys(origin.platform for origin in origins)),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -13,6 +12,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic_core import from_json
+
 from ctid_cli.errors import CtidError, StorageError, UsageError
 from ctid_cli.storage import columns
 from ctid_cli.storage import folder as place
@@ -20,10 +21,10 @@ from ctid_cli.storage.folder import SEALED, TIMINGS, InUseError
 from ctid_cli.storage.identity import Origin, are_mixed
 from ctid_cli.storage.journal import Journal
 from ctid_cli.storage.journal_reader import FILE_NAME, JournalReader
-from ctid_cli.storage.manifest import Manifest, Slot, is_of_signal, row_columns, shard_of, slots, swept_names
+from ctid_cli.storage.manifest import Manifest, Slot, is_of_signal, planned_parts, row_columns, shard_of, swept_names
 from ctid_cli.storage.packing import Packed, PackedTable, decoded, keys
 from ctid_cli.storage.pieces import Pieces
-from ctid_cli.storage.planned import PlannedKeys, planned_parts
+from ctid_cli.storage.planned import PlannedKeys
 from ctid_cli.storage.provenance import as_text
 from ctid_cli.storage.stored import Stored, first_with
 from ctid_cli.storage.timings import TimedTable, times_table
@@ -127,7 +128,8 @@ def _sealed_before(folder: Path, log: JournalReader) -> tuple[int, str] | None:
     if log.sealed() is None:
         return None
     try:
-        runs = open_sealed(folder / SEALED, fully=True)
+        # Its bytes have a checksum of their own.
+        runs = open_sealed(folder / SEALED)
     except CtidError:
         return None
     times = hashlib.sha256(_times_of(folder)).hexdigest() in log.files().get(TIMINGS, ())
@@ -162,14 +164,14 @@ def _reading(folder: Path) -> Iterator[JournalReader | None]:
 def _planned(log: JournalReader, folder: Path | None = None) -> tuple[tuple[Origin, ...], PackedTable]:
     """What a plan asks for, out of all that a journal holds, every row of which is compared with its checksum."""
     manifest, made = log.manifest(), set()
-    log.require_all()
+    log.require_complete()
 
     def rows() -> Iterator[Packed]:
-        for slot in slots(manifest):
-            row = log.row(slot.key)
-            if row is not None:
-                made.add((slot.key.estimator_hash, row.origin))
-                yield Packed(slot, json.loads(row.result), row.seconds, row.cpu_seconds, row.session)
+        for estimator, cell, replicates in planned_parts(manifest):
+            for row in log.rows_of(cell["hash"], estimator["hash"], replicates, estimator["starts"]):
+                made.add((row.key.estimator_hash, row.origin))
+                slot = Slot(row.key, cell, estimator)
+                yield Packed(slot, from_json(row.result), row.seconds, row.cpu_seconds, row.session)
 
     table = PackedTable(manifest, rows(), Pieces(folder))
     return log.origins_of(made), table
@@ -333,9 +335,9 @@ def _status(
     running: dict[str, Any] | None,
 ) -> ExperimentStatus:
     groups = []
-    for estimator, cell, planned in planned_parts(manifest):
+    for estimator, cell, replicates in planned_parts(manifest):
         part = (cell["hash"], estimator["hash"])
-        counts = (planned, done.get(part, 0), failed.get(part, 0))
+        counts = (len(replicates) * len(estimator["starts"]), done.get(part, 0), failed.get(part, 0))
         groups.append(GroupStatus(*counts, estimator["name"], cell["hash"], {**cell["swept"], **estimator["swept"]}))
     counts = tuple(sum(getattr(group, name) for group in groups) for name in ("planned", "done", "failed"))
     name, found_groups, dealt = manifest["experiment"], tuple(groups), shard_of(manifest)

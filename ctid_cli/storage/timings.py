@@ -22,11 +22,12 @@ def times_table(table: PackedTable) -> bytes:
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(("id", *CLOCKS, "session"))
     seen: set[str] = set()
+    shares = table.shares_estimates
     for start, stop in ranges(table.count):
         times = ([None if t != t else t for t in table.read(clock, start, stop).tolist()] for clock in CLOCKS)
         ids, sessions = decoded(table.read("id", start, stop)), table.read("session", start, stop).tolist()
         for row in zip(ids, *times, sessions, strict=True):
-            if table.shares_estimates:
+            if shares:
                 if row[0] in seen:
                     continue
                 seen.add(row[0])
