@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import shlex
 import sys
@@ -167,6 +168,8 @@ def run(
     if not yes:
         for plan, folder in zip(plans, folders, strict=True):
             _ask_if_large(plan, folder, jobs, how)
+    # What was imported stays: looking for garbage in it again and again would be a tenth of sealing many estimates.
+    gc.freeze()
     hopeless, ends = [], None if time_budget is None else time.monotonic() + time_budget
     for plan, folder in zip(plans, folders, strict=True):
         left = None if ends is None else max(ends - time.monotonic(), 0.0)

@@ -35,12 +35,10 @@ def take_stock(log: JournalReader, retry: Collection[str], limits: Limits) -> St
     """What a journal holds, where failures of some statuses are unwanted, and those that a limit no longer explains."""
     stock, before = Stock(), {session["session"]: Limits.of(session) for session in log.sessions()}
 
-    def heed(key: Key, status: str, session: int) -> None:
+    for key, status, session in log.stock():
         stock.keys.add(key)
         if status in FAILURES:
             stock.failed.add(key)
             if status in retry or limits.rose_since(before[session], status):
                 stock.again.add(key)
-
-    log.stock(heed)
     return stock

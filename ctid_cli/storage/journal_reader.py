@@ -4,7 +4,7 @@ import hashlib
 import json
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,8 +38,8 @@ _WITH_RUNS = "estimates JOIN sessions ON session = number"
 _HINDRANCES = ("READONLY", "CANTOPEN", "FULL", "IOERR", "PERM", "AUTH", "BUSY", "LOCKED", "NOMEM", "PROTOCOL")
 #: What damage can cause while it is read.
 ERRORS = (sqlite3.Error, ValueError, TypeError, KeyError, IndexError, OverflowError)
-#: What a row is written as for its checksum; made once, because there are many rows.
-_ROW_TEXT = json.JSONEncoder(default=repr).encode
+#: What a row is written as for its checksum: made once, and rows hold no other rows, because there are many of them.
+_ROW_TEXT = json.JSONEncoder(default=repr, check_circular=False).encode
 #: How long a reader waits for a moment at which the file can be read [s].
 _READER_PATIENCE = 2.0
 #: Bytes at the beginning of a write-ahead log.
@@ -284,29 +284,30 @@ class JournalReader:
         return row
 
     def statuses(self) -> Iterator[tuple[Key, str]]:
-        """Status of every stored estimate."""
+        """Status of every stored estimate, of few compared with its checksum."""
+        if self.is_large:
+            yield from ((key, status) for key, status, _ in self.stock())
+            return
         for row in self.rows():
-            with self._guard():
-                status = json.loads(row.result)["status"]
-            yield row.key, str(status)
+            yield row.key, _status(row)
 
-    def stock(self, heed: Callable[[Key, str, int], None]) -> None:
-        """Tell of every estimate its status and the run that it comes from, without taking its numbers apart.
+    def stock(self) -> Iterator[tuple[Key, str, int]]:
+        """Every stored estimate with its status and the run that it comes from, its numbers not taken apart.
 
         What is told of is all that was written; whether each is as it was written is asked when it is read.
         """
         if self._format < CHECKED:
             for row in self.rows():
-                heed(row.key, str(json.loads(row.result)["status"]), row.session)
+                yield row.key, _status(row), row.session
             return
         tally = Tally()
+        chosen = f"SELECT {KEY}, json_extract(result, '$.status'), session, checksum FROM estimates"
         with self._guard():
-            chosen = f"SELECT {KEY}, json_extract(result, '$.status'), session, checksum FROM estimates"
             found = self._connection.execute(chosen)
             while some := found.fetchmany(ROWS):
                 tally.add_all("".join([row[-1] for row in some]))
-                for *key, status, session, _ in some:
-                    heed(Key(*key), str(status), session)
+                for row in some:
+                    yield Key(*row[:4]), row[4], row[5]
         self._require(tally)
 
     def require_complete(self) -> Tally:
@@ -399,6 +400,10 @@ def format_of(connection: sqlite3.Connection, path: Path) -> int:
         raise DamageError(f"{path} is an SQLite file, but not a journal of ctid")
     refuse_newer(path, written_by, FORMAT)
     return int(written_by)
+
+
+def _status(row: Row) -> str:
+    return str(json.loads(row.result)["status"])
 
 
 def row_digest(table: str, *values: object) -> str:

@@ -30,7 +30,7 @@ class Key(NamedTuple):
     @property
     def id(self) -> str:
         """Short name of the estimate."""
-        return hashlib.sha256("/".join(map(str, self)).encode()).hexdigest()[:12]
+        return hashlib.sha256(f"{self[0]}/{self[1]}/{self[2]}/{self[3]}".encode()).hexdigest()[:12]
 
 
 class Outcome(NamedTuple):
@@ -91,6 +91,12 @@ def planned_parts(manifest: Manifest) -> Iterator[tuple[Mapping[str, Any], Mappi
 def planned_count(manifest: Manifest) -> int:
     """How many estimates that are, those that two names share counted twice."""
     return sum(len(replicates) * len(estimator["starts"]) for estimator, _, replicates in planned_parts(manifest))
+
+
+def shares_estimates(manifest: Manifest) -> bool:
+    """Whether two names of the same estimator, or data cell, share their estimates."""
+    parts = [[part["hash"] for part in manifest[of]] for of in ("data_cells", "estimators")]
+    return any(len(set(hashes)) < len(hashes) for hashes in parts)
 
 
 def shard_of(manifest: Manifest) -> Shard | None:

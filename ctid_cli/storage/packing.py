@@ -113,12 +113,6 @@ class PackedTable:
                 # "random" is no number: where the search started is in start_delay, and the label in start.
                 yield name, floats([None if isinstance(row, str) else row for row in rows])
 
-    @property
-    def shares_estimates(self) -> bool:
-        """Whether two names of the same estimator, or data cell, share their estimates."""
-        parts = [[part["hash"] for part in self._manifest[of]] for of in ("data_cells", "estimators")]
-        return any(len(set(hashes)) < len(hashes) for hashes in parts)
-
     # --- reading ----------------------------------------------------------------------------------------------------
 
     def has(self, name: str) -> bool:

@@ -16,10 +16,13 @@ class KeySet(Container[Key]):
 
     def add(self, key: Key) -> None:
         """Put one in."""
-        flags = self._there.setdefault((key.data_hash, key.estimator_hash, key.start), bytearray())
-        if key.replicate >= len(flags):
-            flags.extend(bytes(key.replicate + 1 - len(flags)))
-        flags[key.replicate] = 1
+        data, replicate, estimator, start = key
+        flags = self._there.get((data, estimator, start))
+        if flags is None:
+            flags = self._there[data, estimator, start] = bytearray()
+        if replicate >= len(flags):
+            flags.extend(bytes(replicate + 1 - len(flags)))
+        flags[replicate] = 1
 
     def discard(self, key: Key) -> None:
         """Take one out."""

@@ -12,6 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from pydantic_core import from_json
 
 from ctid_cli.errors import CtidError, StorageError, UsageError
@@ -21,7 +22,16 @@ from ctid_cli.storage.folder import SEALED, TIMINGS, InUseError
 from ctid_cli.storage.identity import Origin, are_mixed
 from ctid_cli.storage.journal import Journal
 from ctid_cli.storage.journal_reader import FILE_NAME, JournalReader
-from ctid_cli.storage.manifest import Manifest, Slot, is_of_signal, planned_parts, row_columns, shard_of, swept_names
+from ctid_cli.storage.manifest import (
+    Manifest,
+    Slot,
+    is_of_signal,
+    planned_parts,
+    row_columns,
+    shard_of,
+    shares_estimates,
+    swept_names,
+)
 from ctid_cli.storage.packing import Packed, PackedTable, decoded, keys
 from ctid_cli.storage.pieces import Pieces
 from ctid_cli.storage.planned import PlannedKeys
@@ -107,10 +117,11 @@ def seal(folder: Path, log: Journal) -> tuple[int, str]:
     if present is not None:
         return present
     target, safe = folder / SEALED, f"all {log.count()} estimates are safe in {log.path}"
+    manifest = log.manifest()
     origins, table = _planned(log, folder)
     try:
-        log.write_beside(TIMINGS, times_table(table))
-        checksum = replace_file(target, lambda path: write_sealed(log.manifest(), origins, table, path))
+        log.write_beside(TIMINGS, times_table(table, shared=shares_estimates(manifest)))
+        checksum = replace_file(target, lambda path: write_sealed(manifest, origins, table, path))
     except OSError as error:
         log.require_in_place()
         reason = f"{target} could not be written ({error.strerror or error})"
@@ -143,10 +154,9 @@ def read_stored(folder: Path) -> Stored:
             return read_sealed_alone(folder)
         if not log.is_large:
             log.check()
-        if log.sealed() is not None and (folder / SEALED).exists():
-            stored = _read_sealed_beside(folder, log)
-            if stored is not None:
-                return stored
+        stored = _read_sealed_beside(folder, log)
+        if stored is not None:
+            return stored
         log.check()
         return Stored.of(log.manifest(), *_planned(log))
 
@@ -198,9 +208,11 @@ def read_sealed_alone(folder: Path) -> Stored:
 
 
 def _read_sealed_beside(folder: Path, log: JournalReader) -> Stored | None:
-    """The sealed file of a journal, with its times if they are what was written; None for that of another one."""
+    """The sealed file of a journal, if that was sealed to it, and its times are what was written."""
     from ctid_cli.storage.sealed import open_sealed
 
+    if log.sealed() is None or not (folder / SEALED).exists():
+        return None
     try:
         runs = open_sealed(folder / SEALED)
     except StorageError as error:
@@ -282,31 +294,48 @@ def experiment_status(folder: Path) -> ExperimentStatus:
     """Count what is done and what is missing."""
     try:
         with _reading(folder) as log:
-            if log is not None:
-                log.check()
-                manifest, running = log.manifest(), _running(folder) if log.live else None
-                done: Counter[Part] = Counter()
-                failed: Counter[Part] = Counter()
-                planned, aside = PlannedKeys(manifest), 0
-                for key, status in log.statuses():
-                    if key not in planned:
-                        aside += 1
-                        continue
-                    done[key.data_hash, key.estimator_hash] += 1
-                    failed[key.data_hash, key.estimator_hash] += status in columns.FAILURES
-                return _status(folder, manifest, done, failed, aside, are_mixed(log.origins()), running)
+            if log is None:
+                stored = read_sealed_alone(folder)
+                return _status(folder, stored.manifest, *_counted(stored), None, stored.mixed, None)
+            log.check()
+            manifest, running = log.manifest(), _running(folder) if log.live else None
+            sealed = _read_sealed_beside(folder, log)
+            if sealed is not None:
+                distinct = len(np.unique(sealed.column("id"))) if shares_estimates(manifest) else sealed.table.count
+                done, failed, aside = *_counted(sealed), log.count() - distinct
+            else:
+                done, failed, aside = _counted_in(log, manifest)
+            return _status(folder, manifest, done, failed, aside, are_mixed(log.origins()), running)
     except InUseError:
         # A run that is just beginning has nothing to read yet.
         running = _running(folder)
         name = str(running.get("experiment") or folder.name)
         return ExperimentStatus(0, 0, 0, name, folder, None, False, running, ())
-    stored = read_sealed_alone(folder)
-    done, failed = Counter(), Counter()
+
+
+def _counted(stored: Stored) -> tuple[Counter[Part], Counter[Part]]:
+    """Estimates and failures of every data cell and estimator."""
+    done: Counter[Part] = Counter()
+    failed: Counter[Part] = Counter()
     for block in stored.blocks:
         part = (block.cell["hash"], block.estimator["hash"])
         done[part] = block.last - block.first
         failed[part] = int(stored.failures(slice(block.first, block.last)).sum())
-    return _status(folder, stored.manifest, done, failed, None, stored.mixed, None)
+    return done, failed
+
+
+def _counted_in(log: JournalReader, manifest: Manifest) -> tuple[Counter[Part], Counter[Part], int]:
+    """The same in a journal, and how many the plan does not ask for."""
+    done: Counter[Part] = Counter()
+    failed: Counter[Part] = Counter()
+    planned, aside = PlannedKeys(manifest), 0
+    for key, status in log.statuses():
+        if key not in planned:
+            aside += 1
+            continue
+        done[key.data_hash, key.estimator_hash] += 1
+        failed[key.data_hash, key.estimator_hash] += status in columns.FAILURES
+    return done, failed, aside
 
 
 def _running(folder: Path) -> dict[str, Any]:

@@ -15,19 +15,18 @@ from ctid_cli.storage.pieces import AnyArray, Table, ranges
 FEW = 10
 
 
-def times_table(table: PackedTable) -> bytes:
-    """The content of the file; estimates that two names share are in it once."""
+def times_table(table: PackedTable, *, shared: bool) -> bytes:
+    """The content of the file; estimates that are shared by two names are in it once."""
     content = io.BytesIO()
     text = io.TextIOWrapper(content, encoding="utf-8", newline="", write_through=True)
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(("id", *CLOCKS, "session"))
     seen: set[str] = set()
-    shares = table.shares_estimates
     for start, stop in ranges(table.count):
         times = ([None if t != t else t for t in table.read(clock, start, stop).tolist()] for clock in CLOCKS)
         ids, sessions = decoded(table.read("id", start, stop)), table.read("session", start, stop).tolist()
         for row in zip(ids, *times, sessions, strict=True):
-            if shares:
+            if shared:
                 if row[0] in seen:
                     continue
                 seen.add(row[0])
