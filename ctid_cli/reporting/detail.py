@@ -13,10 +13,6 @@ from ctid_cli.kinds import KINDS
 from ctid_cli.reporting.estimate import as_object, parameter_object, parameter_table, parameters
 from ctid_cli.reporting.layout import Table, delay_label, number, seconds
 from ctid_cli.reporting.results import out_option
-from ctid_cli.running.plan import build_plan
-from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name, measure_names
-from ctid_cli.simulation.frequency_runs import FrequencyFit, SignalDataSet
-from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.store import FoundEstimate, spec_folder
 
 #: A repeated estimate agrees if no parameter moved by more than this fraction; other processors give other last bits.
@@ -96,6 +92,8 @@ def _fitted(found: FoundEstimate) -> list[list[str]]:
 
 def _measured(row: Mapping[str, Any]) -> list[list[str]]:
     """What was measured of the frequencies of a signal."""
+    from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name, measure_names
+
     measures = row["measures"] or {}
     body = [
         [name, number(measures[name], 8 if name.startswith("omega") else 4), MEASURE_UNITS[base_name(name)[0]]]
@@ -116,6 +114,10 @@ def _redo_command(found: FoundEstimate, out: Path) -> str:
 
 def repeat(found: FoundEstimate, *, allow_code: bool = False) -> Repeated:
     """Make the data set of an estimate and the estimate once more."""
+    from ctid_cli.running.plan import build_plan
+    from ctid_cli.simulation.frequency_runs import FrequencyFit, SignalDataSet
+    from ctid_cli.specification.load import spec_from_canonical
+
     row = found.row
     folder = spec_folder(found.folder)
     plan = build_plan(spec_from_canonical(found.stored.manifest["spec"], folder, allow_code=allow_code))

@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from ctid_cli.simulation.frequency_measures import measure_names
-
 #: Statuses of estimates that have no result because something went wrong.
 FAILURES = ("FAILED", "CRASHED", "TIMEOUT", "MEMORY")
 
@@ -28,6 +26,13 @@ def parameter_names(rows: Iterable[ByName | None]) -> list[str]:
         return (1, int(submodel), letter, int(power)) if submodel else (0, "ba".index(letter), letter, int(power))
 
     return sorted({name for row in rows if row for name in row}, key=place)
+
+
+def measure_names(rows: Iterable[ByName | None]) -> list[str]:
+    """Names of measures that any estimate has."""
+    from ctid_cli.simulation import frequency_measures
+
+    return frequency_measures.measure_names(rows)
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,26 @@ class Table(Protocol):
         """Names of the columns of an array that has several."""
 
 
+class Window:
+    """Some rows of a table, following each other."""
+
+    def __init__(self, table: Table, start: int, stop: int) -> None:
+        self._table, self._start, self.count = table, start, stop - start
+
+    def has(self, name: str) -> bool:
+        """Whether there is such an array."""
+        return self._table.has(name)
+
+    def parts(self, name: str) -> list[str]:
+        """Names of the columns of an array that has several."""
+        return self._table.parts(name)
+
+    def read(self, name: str, start: int = 0, stop: int | None = None) -> AnyArray:
+        """Some rows of an array."""
+        stop = self.count if stop is None else min(stop, self.count)
+        return self._table.read(name, self._start + start, self._start + stop)
+
+
 class _Place(NamedTuple):
     """Where a piece is in the file, and what it is."""
 

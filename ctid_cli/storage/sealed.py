@@ -22,10 +22,8 @@ import numpy as np
 
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import CtidError, DataError, StorageError
-from ctid_cli.frequency.flags import Flag
 from ctid_cli.signals.files import require_file
 from ctid_cli.signals.hdf5 import require_plain_tree
-from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, unpack_track
 from ctid_cli.storage import columns
 from ctid_cli.storage.foreign import read_json, require_manifest
 from ctid_cli.storage.identity import Origin
@@ -139,7 +137,12 @@ class SealedTable:
     def read(self, name: str, start: int = 0, stop: int | None = None) -> AnyArray:
         """Some rows of an array."""
         with _saying_where(self._path):
-            return np.asarray(self._group[name][start:stop])
+            values = np.asarray(self._group[name][start:stop])
+            if name.endswith("_length") and values.size:
+                most = self._group[name.removesuffix("_length")].shape[1]
+                if not MISSING <= values.min() <= values.max() <= most:
+                    raise ValueError(f"{name} has values that it cannot have")
+            return values
 
 
 @dataclass(frozen=True)
@@ -257,6 +260,9 @@ def _write_plan(file: h5py.File, manifest: Manifest, origins: Sequence[Origin]) 
 
 
 def _write_track(group: h5py.Group, packed: Mapping[str, Any]) -> None:
+    from ctid_cli.frequency.flags import Flag
+    from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, unpack_track
+
     units = {"t": "s", "omega": MEASURE_UNITS["omega"], "flags": "-", "uncertainty": "rad/s"}
     for name, values in unpack_track(packed).items():
         _write_array(group, name, values).attrs["unit"] = units[name]
@@ -333,11 +339,9 @@ def _require_columns(group: h5py.Group, count: int) -> None:
         if dataset.dtype.kind not in letters or dataset.ndim != dimensions or len(dataset) != count:
             raise ValueError(f"{name} is no column of {count} estimates")
         if kind == "coefficients":
-            lengths = group[f"{name}_length"][()]
+            lengths = group[f"{name}_length"]
             if lengths.dtype.kind not in "iu" or lengths.shape != (count,):
                 raise ValueError(f"{name} has no lengths")
-            if count and not MISSING <= lengths.min() <= lengths.max() <= dataset.shape[1]:
-                raise ValueError(f"{name} has lengths that it cannot have")
         if kind == "by name":
             names = decoded(group[_names_of(name)][()])
             if len(set(names)) != len(names):

@@ -33,7 +33,7 @@ from ctid_cli.storage.manifest import (
     swept_names,
 )
 from ctid_cli.storage.packing import Packed, PackedTable, decoded, keys
-from ctid_cli.storage.pieces import Pieces
+from ctid_cli.storage.pieces import Pieces, Window
 from ctid_cli.storage.planned import PlannedKeys
 from ctid_cli.storage.provenance import as_text
 from ctid_cli.storage.stored import Stored, first_with
@@ -52,20 +52,18 @@ class FoundEstimate:
     """One estimate among those of its plan."""
 
     folder: Path
+    #: It alone.
     stored: Stored
-    #: Its place in the order of the sealed file.
-    place: int
 
     @cached_property
     def row(self) -> dict[str, Any]:
         """Its row."""
-        return self.stored.every()[self.place]
+        return self.stored.every()[0]
 
     @cached_property
     def slot(self) -> Slot:
         """What it is of."""
-        (key,) = keys(self.stored.table, self.place, self.place + 1)
-        block = next(block for block in self.stored.blocks if block.first <= self.place < block.last)
+        (key,), (block,) = keys(self.stored.table, 0, 1), self.stored.blocks
         return Slot(key, block.cell, block.estimator)
 
 
@@ -274,7 +272,8 @@ def find_estimate(results: Path, prefix: str) -> FoundEstimate:
             continue
         for number in first_with(stored.table, prefix):
             (name,) = decoded(stored.table.read("id", number, number + 1))
-            matches.setdefault(name, FoundEstimate(folder, stored, number))
+            alone = Stored.of(stored.manifest, stored.origins, Window(stored.table, number, number + 1))
+            matches.setdefault(name, FoundEstimate(folder, alone))
     if not matches:
         raise UsageError(f"no id in {results} begins with {prefix!r}{in_use}; 'ctid export' lists all ids")
     if len(matches) > 1:

@@ -316,5 +316,9 @@ def first_with(table: Table, prefix: str) -> list[int]:
     ids, wanted = table.read("id"), prefix.encode()
     if len(wanted) > ids.dtype.itemsize:
         return []
-    letters = ids.view("S1").reshape(len(ids), -1)[:, : len(wanted)] if len(ids) else ids.reshape(0, 0)
-    return [int(k) for k in np.flatnonzero((letters == [bytes([c]) for c in wanted]).all(axis=1))]
+    letters = np.ascontiguousarray(ids).view(np.uint8).reshape(len(ids), -1)
+    found = np.arange(len(ids))
+    for k, letter in enumerate(wanted):
+        found = found[letters[found, k] == letter]
+    rows: list[int] = found.tolist()
+    return rows

@@ -21,8 +21,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.inference.monte_carlo import wilson_interval
-from ctid_cli.simulation.frequency_measures import is_settled
 from ctid_cli.storage import columns
 from ctid_cli.storage.manifest import found_values
 
@@ -59,6 +57,8 @@ def judged(
     if rule.get("parameter_relative_error") is not None and others:
         conditions += [_near(found[name], truth[name], rule["parameter_relative_error"]) for name in others]
     if rule.get("band") is not None and measures is not None:
+        from ctid_cli.simulation.frequency_measures import is_settled
+
         conditions.append(np.array([is_settled(one, rule["band"], rule.get("by")) for one in measures], dtype=bool))
     if rule.get("fit_percent") is not None:
         conditions.append(fit_percent >= rule["fit_percent"])
@@ -77,6 +77,8 @@ def counted(failures: BoolArray, converged: BoolArray | None, clocks: Mapping[st
         known = times[np.isfinite(times)]
         row[f"median_{clock}"] = float(np.median(known)) if known.size else None
     if converged is not None:
+        from ctid_cli.inference.monte_carlo import wilson_interval
+
         k = int(converged.sum())
         low, high = wilson_interval(k, n)
         row |= {"converged": k, "percent": 100 * k / n, "low": 100 * low, "high": 100 * high}

@@ -4,12 +4,13 @@ import csv
 import io
 from collections.abc import Mapping
 from functools import cached_property
+from itertools import islice
 
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.storage.packing import CLOCKS, PackedTable, decoded
-from ctid_cli.storage.pieces import AnyArray, Table, ranges
+from ctid_cli.storage.packing import CLOCKS, PackedTable, decoded, texts
+from ctid_cli.storage.pieces import ROWS, AnyArray, Table, ranges
 
 #: Estimates whose times are looked up one by one before the whole file is taken apart.
 FEW = 10
@@ -72,22 +73,24 @@ def _times(content: bytes, ids: AnyArray) -> Mapping[str, Array]:
     """Times of estimates in the order of their ids."""
     nothing = {clock: np.full(len(ids), np.nan) for clock in CLOCKS}
     try:
-        found: dict[str, list[str]] = {name: [] for name in ("id", *CLOCKS)}
         lines = csv.reader(io.TextIOWrapper(io.BytesIO(content), encoding="utf-8"))
-        names = next(lines, [])
-        for line in lines:
-            if line:
-                for name, value in zip(names, line, strict=False):
-                    if name in found:
-                        found[name].append(value)
-        numbers = {
-            clock: np.array([float(value or "nan") for value in found[clock]]) for clock in CLOCKS if found[clock]
-        }
-        known = np.array(found["id"], dtype=np.bytes_ if found["id"] else "S1")
+        places = {name: k for k, name in enumerate(next(lines, [])) if name in ("id", *CLOCKS)}
+        pieces: dict[str, list[AnyArray]] = {name: [] for name in places}
+        while some := [line for line in islice(lines, ROWS) if line]:
+            columns = list(zip(*some, strict=True))
+            for name, k in places.items():
+                of_times = name in CLOCKS
+                pieces[name].append(
+                    np.array([value or "nan" for value in columns[k]], dtype=float) if of_times else texts(columns[k])
+                )
+        if not pieces.get("id"):
+            return nothing
+        found = {name: np.concatenate(parts) for name, parts in pieces.items()}
+        known = found.pop("id")
         if known.shape == ids.shape and (known == ids).all():
-            return nothing | numbers
-        places = {name: k for k, name in enumerate(known.tolist())}
-        where = np.array([places.get(name, -1) for name in ids.tolist()], dtype=np.intp)
-        return nothing | {clock: np.where(where < 0, np.nan, values[where]) for clock, values in numbers.items()}
+            return nothing | found
+        rows = {name: k for k, name in enumerate(known.tolist())}
+        where = np.array([rows.get(name, -1) for name in ids.tolist()], dtype=np.intp)
+        return nothing | {clock: np.where(where < 0, np.nan, values[where]) for clock, values in found.items()}
     except (ValueError, IndexError, csv.Error):
         return nothing
