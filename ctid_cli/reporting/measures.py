@@ -49,7 +49,7 @@ def measure_rows(results: Results, names: Sequence[str], first: int | None = Non
     groups = results.groups()
     of_errors = any(requested(name).source == "errors" for name in names)
     estimates = {one.group: one for one in estimates_by_group(results)} if of_errors else {}
-    known = {status.decode() for status in set(results.stored.column("status").tolist())}
+    known = {status.decode() for status in np.unique(results.stored.column("status")).tolist()}
     statuses = sorted(known - SUCCESSES) or ["FAILED"]
     bounds = least_variances(results) if any(name.startswith("efficiency") for name in names) else {}
     cells = {cell["hash"]: cell for cell in results.manifest["data_cells"]}

@@ -123,7 +123,7 @@ def _percentages(one: Rows, other: Rows) -> Iterator[Row]:
 
 def _errors(one: ParameterEstimates, other: ParameterEstimates) -> Iterator[Row]:
     """Root mean square errors of the parameters that both estimate."""
-    places = [{replicate: k for k, replicate in enumerate(side.replicates)} for side in (one, other)]
+    places = [{replicate: k for k, replicate in enumerate(side.replicates.tolist())} for side in (one, other)]
     common = sorted(places[0].keys() & places[1].keys())
     for name in [name for name in one.names if name in other.names]:
         errors = np.array(

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.errors import CtidError, DataError, UsageError
 from ctid_cli.inference import monte_carlo
 from ctid_cli.inference.monte_carlo import Sample
@@ -62,7 +62,7 @@ class ParameterEstimates:
     #: Whether each estimate failed, and whether one that did not fail did not converge either, shape (R,).
     failures: BoolArray
     unconverged: BoolArray
-    replicates: tuple[int, ...]
+    replicates: IndexArray
     #: N times the variance that theory predicts for long records; None where there is no theory, shape (p,).
     theory: Array | None = None
 
@@ -99,10 +99,9 @@ class ParameterEstimates:
 
     def first(self, n: int) -> "ParameterEstimates":
         """Those of the first data sets only."""
-        kept = np.array(self.replicates) < n
-        arrays = ("values", "standard_errors", "failures", "unconverged")
-        replicates = tuple(replicate for replicate in self.replicates if replicate < n)
-        return replace(self, replicates=replicates, **{name: getattr(self, name)[kept] for name in arrays})
+        kept = self.replicates < n
+        arrays = ("values", "standard_errors", "failures", "unconverged", "replicates")
+        return replace(self, **{name: getattr(self, name)[kept] for name in arrays})
 
 
 @dataclass(frozen=True)
@@ -257,7 +256,7 @@ def _estimates(
         standard_errors=errors,
         failures=failures,
         unconverged=(rows.column("status") != b"CONVERGED") & ~failures,
-        replicates=tuple(rows.column("replicate").tolist()),
+        replicates=rows.column("replicate"),
     )
 
 

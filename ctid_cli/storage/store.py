@@ -141,8 +141,9 @@ def _sealed_before(folder: Path, log: JournalReader) -> tuple[int, str] | None:
         runs = open_sealed(folder / SEALED)
     except CtidError:
         return None
-    times = hashlib.sha256(_times_of(folder)).hexdigest() in log.files().get(TIMINGS, ())
-    return (runs.table.count, runs.checksum) if runs.has_head and times and runs.checksum == log.sealed() else None
+    times = log.files().get(TIMINGS)
+    known = times is not None and _digest_of_times(folder) in times
+    return (runs.table.count, runs.checksum) if runs.has_head and known and runs.checksum == log.sealed() else None
 
 
 def read_stored(folder: Path) -> Stored:
@@ -201,7 +202,7 @@ def read_sealed_alone(folder: Path) -> Stored:
     from ctid_cli.storage.sealed import open_sealed
 
     runs = open_sealed(folder / SEALED)
-    table = TimedTable(runs.table, _times_of(folder))
+    table = TimedTable(runs.table, folder / TIMINGS)
     return Stored.of(runs.manifest, runs.origins, table)
 
 
@@ -219,18 +220,18 @@ def _read_sealed_beside(folder: Path, log: JournalReader) -> Stored | None:
     # Another file, however intact, is not what this journal was sealed to.
     if runs.checksum != log.sealed():
         return None
-    times, noted = _times_of(folder), log.files().get(TIMINGS)
-    if noted is not None and hashlib.sha256(times).hexdigest() not in noted:
+    times = log.files().get(TIMINGS)
+    if times is not None and _digest_of_times(folder) not in times:
         return None
-    return Stored.of(runs.manifest, runs.origins, TimedTable(runs.table, times))
+    return Stored.of(runs.manifest, runs.origins, TimedTable(runs.table, folder / TIMINGS))
 
 
-def _times_of(folder: Path) -> bytes:
-    # Times are extra: results without them, copied from elsewhere, are complete.
+def _digest_of_times(folder: Path) -> str:
     try:
-        return (folder / TIMINGS).read_bytes()
+        with (folder / TIMINGS).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
-        return b""
+        return ""
 
 
 def load_estimates(folder: Path) -> pd.DataFrame:
@@ -319,7 +320,7 @@ def _counted(stored: Stored) -> tuple[Counter[Part], Counter[Part]]:
     for block in stored.blocks:
         part = (block.cell["hash"], block.estimator["hash"])
         done[part] = block.last - block.first
-        failed[part] = int(stored.failures(slice(block.first, block.last)).sum())
+        failed[part] = int(stored.failures(np.arange(block.first, block.last)).sum())
     return done, failed
 
 

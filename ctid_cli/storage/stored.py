@@ -18,13 +18,19 @@ from ctid_cli.errors import StorageError
 from ctid_cli.storage import columns
 from ctid_cli.storage.identity import Origin, are_mixed
 from ctid_cli.storage.manifest import Key, Manifest, Slot, found_values, row_columns, slots, true_values
-from ctid_cli.storage.packing import CLOCKS, Packed, PackedTable, keys, results, unpacked
+from ctid_cli.storage.packing import CLOCKS, Packed, PackedTable, decoded, keys, results, unpacked
 from ctid_cli.storage.pieces import ROWS, AnyArray, Table, ranges
 from ctid_cli.storage.summary import judged
 
 _FAILED = [name.encode() for name in columns.FAILURES]
-#: What parameters of an estimate are found in.
-_OF_PARAMETERS = ("numerator", "denominator", "delay", "parameters", "standard_errors")
+#: What parameters of an estimate are found in, and what says which of these places are filled.
+_OF_PARAMETERS = {
+    "numerator": "length",
+    "denominator": "length",
+    "delay": "",
+    "parameters": "present",
+    "standard_errors": "present",
+}
 
 
 @dataclass(frozen=True)
@@ -80,19 +86,42 @@ class Stored:
         return Rows(self, np.arange(self.table.count))
 
     @cached_property
-    def blocks(self) -> list[Block]:
-        """The rows of every estimator on every data cell, which follow each other."""
+    def _windows(self) -> dict[str, tuple[int, int, AnyArray]]:
+        """The rows of each column that were asked for last."""
+        return {}
+
+    def at(self, name: str, places: IndexArray) -> AnyArray:
+        """A column at some places; of blocks of many rows, only the last one is kept."""
+        if name in self._read or not places.size:
+            return np.asarray(self.column(name)[places])
+        starts, _ = self._starts
+        first, last = (int(np.searchsorted(starts, place, side="right")) for place in (places.min(), places.max()))
+        start, stop = int(starts[first - 1]), int(starts[last])
+        if stop - start < ROWS:
+            return np.asarray(self.column(name)[places])
+        if self._windows.get(name, ())[:2] != (start, stop):
+            self._windows[name] = (start, stop, self.table.read(name, start, stop))
+        return np.asarray(self._windows[name][2][places - start])
+
+    @cached_property
+    def _starts(self) -> tuple[IndexArray, list[tuple[str, ...]]]:
+        """First row of every block, and the number of rows; estimator, its name and the data cell of each block."""
+        parts = [self.table.read(name) for name in ("estimator_hash", "estimator", "cell")]
         count = self.table.count
-        parts = [self.column(name) for name in ("estimator_hash", "estimator", "cell")]
         differs: BoolArray = np.zeros(max(count - 1, 0), dtype=bool)
         for part in parts:
             differs |= part[1:] != part[:-1]
-        places = [0, *(np.flatnonzero(differs) + 1).tolist(), count] if count else []
+        places = np.array([*([0] if count else []), *(np.flatnonzero(differs) + 1), count], dtype=np.intp)
+        return places, list(zip(*(decoded(part[places[:-1]]) for part in parts), strict=True))
+
+    @cached_property
+    def blocks(self) -> list[Block]:
+        """The rows of every estimator on every data cell, which follow each other."""
         known = {(part["hash"], part["name"]): part for part in self.manifest["estimators"]}
         cells = {cell["hash"]: cell for cell in self.manifest["data_cells"]}
         found = []
-        for first, last in pairwise(places):
-            estimator, name, cell = (part[first].decode() for part in parts)
+        places, parts = self._starts
+        for (first, last), (estimator, name, cell) in zip(pairwise(places.tolist()), parts, strict=True):
             if cell not in cells or (estimator, name) not in known:
                 raise StorageError(
                     f"estimates of {name} on the data cell {cell} are stored that the plan does not have"
@@ -109,9 +138,9 @@ class Stored:
         except (TypeError, ValueError, KeyError, AttributeError) as error:
             raise StorageError(f"the plan of {self.manifest['experiment']} holds a system that is none") from error
 
-    def failures(self, where: AnyArray | slice = slice(None)) -> BoolArray:
+    def failures(self, where: AnyArray | None = None) -> BoolArray:
         """Which estimates are failures."""
-        return np.isin(self.column("status")[where], _FAILED)
+        return np.isin(self.column("status") if where is None else self.at("status", where), _FAILED)
 
     def converged(self, block: Block, where: AnyArray) -> BoolArray | None:
         """Which estimates of a block satisfy the rule; None where there is none."""
@@ -125,7 +154,7 @@ class Stored:
             whole = unpacked(self.table, column, first, last)
             measures = [whole[k - first] for k in where.tolist()]
         values = self.found(where, tuple(truth))[0]
-        fit = self.column("fit_percent")[where]
+        fit = self.at("fit_percent", where)
         return judged(success, truth, self.failures(where), dict(zip(truth, values.T, strict=True)), fit, measures)
 
     def found(self, where: AnyArray, names: Sequence[str]) -> tuple[Array, Array]:
@@ -133,17 +162,17 @@ class Stored:
 
         Rows that have the same form take their numbers from the same places: what `found_values` says of places.
         """
-        held = {name: self.column(name)[where] for name in _OF_PARAMETERS if self.table.has(name)}
-        lengths = [f"{name}_length" for name in ("numerator", "denominator") if name in held]
-        named = [f"{name}_present" for name in ("parameters", "standard_errors") if name in held]
-        forms = [self.column(name)[where].reshape(len(where), -1) for name in (*lengths, *named)]
+        names_of_forms = [f"{name}_{form}" for name, form in _OF_PARAMETERS.items() if form and self.table.has(name)]
+        held = {name: self.at(name, where) for name in _OF_PARAMETERS if self.table.has(name)}
+        held |= {name: self.at(name, where) for name in names_of_forms}
+        forms = [held[name].reshape(len(where), -1) for name in names_of_forms]
         form: AnyArray = np.hstack(forms) if forms else np.zeros((len(where), 1), dtype=int)
         values, errors = np.full((2, len(where), len(names)), np.nan)
         left = np.ones(len(where), dtype=bool)
         while left.any():
             some = int(left.argmax())
             alike = left & (form == form[some]).all(axis=1)
-            row = self._places(int(where[some]), held.keys())
+            row = self._places(some, held)
             for target, places in zip((values, errors), found_values(row, names), strict=True):
                 for k, name in enumerate(names):
                     place = places[name]
@@ -154,16 +183,16 @@ class Stored:
             left &= ~alike
         return values, errors
 
-    def _places(self, number: int, held: Any) -> dict[str, Any]:
-        """A row with the places of its numbers in their place."""
+    def _places(self, number: int, held: Mapping[str, AnyArray]) -> dict[str, Any]:
+        """One of some rows with the places of its numbers in their place."""
         row: dict[str, Any] = {"delay": ("delay", 0) if "delay" in held else None}
-        for name in ("numerator", "denominator"):
-            length = self.column(f"{name}_length")[number] if name in held else -1
-            row[name] = None if length < 0 else [(name, k) for k in range(length)]
-        for name in ("parameters", "standard_errors"):
-            if name in held:
-                there = self.column(f"{name}_present")[number]
-                row[name] = {part: (name, k) for k, part in enumerate(self.table.parts(name)) if there[k]} or None
+        for name, form in _OF_PARAMETERS.items():
+            if form and name in held:
+                there = held[f"{name}_{form}"][number]
+                if form == "length":
+                    row[name] = None if there < 0 else [(name, k) for k in range(there)]
+                else:
+                    row[name] = {part: (name, k) for k, part in enumerate(self.table.parts(name)) if there[k]} or None
         return row
 
 
@@ -213,7 +242,7 @@ class Rows(Sequence[dict[str, Any]]):
 
     def column(self, name: str) -> AnyArray:
         """A column as an array."""
-        return np.asarray(self.stored.column(name)[self.places])
+        return self.stored.at(name, self.places)
 
     def has(self, name: str) -> bool:
         """Whether they have such a column at all."""

@@ -2,8 +2,10 @@
 
 import csv
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -39,8 +41,8 @@ def times_table(table: PackedTable, *, shared: bool) -> bytes:
 class TimedTable:
     """A sealed table with the times that belong to it, read when they are asked for; NaN where they are not known."""
 
-    def __init__(self, table: Table, content: bytes) -> None:
-        self._table, self._content = table, content
+    def __init__(self, table: Table, path: Path) -> None:
+        self._table, self._path = table, path
         self.count = table.count
 
     def has(self, name: str) -> bool:
@@ -57,50 +59,52 @@ class TimedTable:
             return self._table.read(name, start, stop)
         if stop is not None and stop - start <= FEW and "_times" not in self.__dict__:
             ids = self._table.read("id", start, stop)
-            lines = [self._content.partition(b"\n")[0], *filter(None, map(self._line, ids.tolist()))]
-            return _times(b"\n".join(lines), ids)[name]
+            return _times(_lines(self._path, ids.tolist()), ids)[name]
         return self._times[name][start:stop]
 
     @cached_property
     def _times(self) -> Mapping[str, Array]:
-        return _times(self._content, self._table.read("id"))
+        # Times are extra: results without them, copied from elsewhere, are complete.
+        try:
+            with self._path.open("rb") as file:
+                return _times(file, self._table.read("id"))
+        except OSError:
+            return _times(io.BytesIO(), self._table.read("id"))
 
-    def _line(self, name: bytes) -> bytes:
-        place = self._content.find(b"\n" + name + b",") + 1
-        return self._content[place : self._content.find(b"\n", place)] if place else b""
 
-
-def _times(content: bytes, ids: AnyArray) -> Mapping[str, Array]:
-    """Times of estimates in the order of their ids."""
-    nothing = {clock: np.full(len(ids), np.nan) for clock in CLOCKS}
+def _lines(path: Path, ids: Sequence[bytes]) -> io.BytesIO:
+    """The lines of some estimates in the file, below its first one."""
     try:
-        head, _, body = content.partition(b"\n")
-        names = head.decode().split(",")
-        pieces: dict[str, list[AnyArray]] = {name: [] for name in names if name in ("id", *CLOCKS)}
-        for some in _pieces(body):
+        content = path.read_bytes()
+    except OSError:
+        content = b""
+    places = [content.find(b"\n" + name + b",") + 1 for name in ids]
+    found = [content[place : content.find(b"\n", place) + 1] for place in [0, *(place for place in places if place)]]
+    return io.BytesIO(b"".join(found))
+
+
+def _times(file: BinaryIO, ids: AnyArray) -> Mapping[str, Array]:
+    """Times of estimates in the order of their ids."""
+    found = {clock: np.full(len(ids), np.nan) for clock in CLOCKS}
+    places: dict[bytes, int] = {}
+    row = 0
+    try:
+        names = file.readline().decode().strip().split(",")
+        clocks = [clock for clock in CLOCKS if clock in names]
+        while lines := file.readlines(AT_ONCE):
             # Nothing in there is quoted, so that cells are what stands between commas.
-            cells = some.rstrip(b"\n").replace(b"\n", b",").split(b",")
-            for name, parts in pieces.items():
-                column = cells[names.index(name) :: len(names)]
-                of_times = name in CLOCKS
-                parts.append(np.array([float(cell or b"nan") for cell in column] if of_times else column))
-        if not pieces.get("id"):
-            return nothing
-        found = {name: np.concatenate(parts) for name, parts in pieces.items()}
-        known = found.pop("id")
-        if known.shape == ids.shape and (known == ids).all():
-            return nothing | found
-        rows = {name: k for k, name in enumerate(known.tolist())}
-        where = np.array([rows.get(name, -1) for name in ids.tolist()], dtype=np.intp)
-        return nothing | {clock: np.where(where < 0, np.nan, values[where]) for clock, values in found.items()}
+            cells = b"".join(lines).rstrip(b"\n").replace(b"\n", b",").split(b",")
+            known, where = np.array(cells[names.index("id") :: len(names)]), slice(row, row + len(lines))
+            row += len(lines)
+            inside: Any = slice(None)
+            if places or known.shape != ids[where].shape or (known != ids[where]).any():
+                places = places or {name: k for k, name in enumerate(ids.tolist())}
+                rows = np.array([places.get(name, -1) for name in known.tolist()], dtype=np.intp)
+                inside = rows >= 0
+                where = rows[inside]
+            for clock in clocks:
+                values = np.array([float(cell or b"nan") for cell in cells[names.index(clock) :: len(names)]])
+                found[clock][where] = values[inside]
     except (ValueError, IndexError):
-        return nothing
-
-
-def _pieces(content: bytes) -> Iterator[bytes]:
-    """Some lines at a time."""
-    start = 0
-    while start < len(content):
-        end = content.find(b"\n", start + AT_ONCE) + 1 or len(content)
-        yield content[start:end]
-        start = end
+        return {clock: np.full(len(ids), np.nan) for clock in CLOCKS}
+    return found

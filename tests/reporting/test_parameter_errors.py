@@ -51,7 +51,7 @@ def test_groups_follow_the_specification(plan, tmp_path):
         assert group.names == NAMES
         assert group.truth == pytest.approx(TRUTH)
         assert (group.runs, group.failed, group.not_converged) == (40, 0, 0)
-        assert group.replicates == tuple(range(40))
+        assert group.replicates.tolist() == [*range(40)]
         assert group.settings == {}
 
 
