@@ -15,13 +15,15 @@ from tests.faults.record import Record, published, refusal
 PUBLISHED = ROOT / "results" / "published" / "faults"
 
 
-def numbers(record: Record, campaign: Campaign, share: float, again: bool, until: float) -> Iterator[int]:
+def numbers(record: Record, campaign: Campaign, options: argparse.Namespace, until: float) -> Iterator[int]:
     """What of a campaign is to be tried, as long as there is time."""
-    wanted = record.failed(campaign) if again else record.missing(campaign, round(share * campaign.trials))
-    for number in wanted:
+    part, parts = map(int, options.part.split("/"))
+    at_most = round(options.share * campaign.trials)
+    for number in record.failed(campaign) if options.again else record.missing(campaign, at_most):
         if monotonic() > until:
             return
-        yield number
+        if number % parts == part - 1:
+            yield number
 
 
 def main() -> int:
@@ -30,6 +32,7 @@ def main() -> int:
     parser.add_argument("--folder", type=Path, default=ROOT / "build" / "faults", help="where trials are kept")
     parser.add_argument("--share", type=float, default=1.0, help="how much of the full form; 2: others after it")
     parser.add_argument("--only", default="", help="campaigns, by comma")
+    parser.add_argument("--part", default="1/1", help="for several processes at once: 1/2 here, 2/2 there")
     parser.add_argument("--again", action="store_true", help="repeat the trials that brought about what must not be")
     parser.add_argument("--minutes", type=float, default=1e6, help="stop after this time; call it again to go on")
     parser.add_argument("--publish", action="store_true", help="write what came of it to results/published")
@@ -41,7 +44,7 @@ def main() -> int:
     for campaign in CAMPAIGNS:
         if campaign.name not in names:
             continue
-        chosen = numbers(record, campaign, options.share, options.again, until)
+        chosen = numbers(record, campaign, options, until)
         for tried, trial in enumerate(campaign.tried(chosen), 1):
             record.add(campaign, trial)
             if trial.found or tried % 100 == 0:
