@@ -83,6 +83,7 @@ def track(
     if mains.wanted({**given, **{name: value is not None for name, value in others.items()}}):
         track_mains(file, reading, mains, style, out, as_json)
         return
+    from ctid_cli.frequency.left_over import with_lines_left
     from ctid_cli.reporting.track_columns import track_bytes, track_table
     from ctid_cli.reporting.track_plot import track_drawing
     from ctid_cli.reporting.track_report import track_object, track_text
@@ -102,7 +103,7 @@ def track(
     if accuracy is not None and not found.states_errors:
         what = f"the method {procedure.method} states no standard errors to compare with --accuracy"
         raise UsageError(f"{what}; leave --accuracy or --method out")
-    found = found.of_accuracy(accuracy)
+    found = with_lines_left(found.of_accuracy(accuracy), record.samples, record.interval)
     files = [data, figure, result]
     content = track_object(record, procedure, found, accuracy)
     drawn = track_drawing(found, record.start, record.unit, f"{file.name}: {procedure.method}").saved()

@@ -23,7 +23,7 @@ class MissingLine(NamedTuple):
 
     #: Frequency [rad/s].
     omega: float
-    #: Share of the rows in which it was left over.
+    #: Share of the rows in which it was left over; NaN where that is not known.
     share: float
     #: Amplitude where it was left over, a median [signal unit].
     amplitude: float

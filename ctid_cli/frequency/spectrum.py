@@ -65,7 +65,7 @@ def find_peaks(samples: Array, interval: float, tones: int) -> Peaks:
         while size >= min(SHORTEST_SEGMENT, values.size):
             spectrum = median_spectrum(values, missing, size, most_missing)
             if spectrum is not None:
-                bins, amplitudes = _significant(spectrum)
+                bins, amplitudes = significant(spectrum)
                 found.append(Peaks(2.0 * np.pi * bins / (size * interval), amplitudes, size * interval))
             size //= 2
     if not found:
@@ -93,7 +93,7 @@ def median_spectrum(values: Array, missing: BoolArray, size: int, most_missing: 
     return np.asarray(np.median(spectra, axis=0)) if spectra else None
 
 
-def _significant(spectrum: Array) -> tuple[Array, Array]:
+def significant(spectrum: Array) -> tuple[Array, Array]:
     """Places [bins] and amplitudes of the peaks that are neither noise nor leakage, the largest first."""
     coarse = spectrum[::PADDING]
     around = np.lib.stride_tricks.sliding_window_view(np.pad(coarse, FLOOR_BINS, mode="reflect"), 2 * FLOOR_BINS + 1)

@@ -23,6 +23,8 @@ SHOWN_PERCENT = 98.0
 MARGIN = 0.35
 #: Amplitudes that differ by more than this factor are drawn on a logarithmic axis.
 LOGARITHMIC = 10.0
+#: The axis of the others ends at so many times the largest.
+HEADROOM = 1.1
 
 
 def track_drawing(track: RecordTrack, start: float, unit: str | None, title: str, kind: Kind | None = None) -> Drawing:
@@ -115,7 +117,7 @@ def _draw_amplitudes(axes: Any, track: RecordTrack, t: Array, unit: str | None, 
         axes.set_yscale("log")
         axes.set_ylim(bottom=0.5 * float(seen.min()))
     elif seen.size:
-        axes.set_ylim(bottom=0.0)
+        axes.set_ylim(0.0, HEADROOM * float(seen.max()))
     axes.set(xlabel="t [s]", ylabel=f"amplitude [{plain(unit)}]" if unit else "amplitude")
     axes.margins(x=0.0)
     if t.size > 1:

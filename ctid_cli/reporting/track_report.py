@@ -75,7 +75,10 @@ def tones_block(track: RecordTrack, start: float = 0.0, unit: str | None = None)
         return []
     columns: list[tuple[str, list[str]]] = [
         ("tone", [str(tone["tone"]) for tone in tones]),
-        ("frequency [Hz]", [_to_error(tone["frequency_hz"], _finest(tone)) for tone in tones]),
+        (
+            "frequency [Hz]",
+            [_to_error(tone["frequency_hz"], tone["standard_error_hz"] or tone["spread_hz"]) for tone in tones],
+        ),
         ("std. error", [number(tone["standard_error_hz"], 2) for tone in tones]),
         ("spread [Hz]", [number(tone["spread_hz"], 2) for tone in tones]),
         (f"amplitude [{unit}]" if unit else "amplitude", [number(tone["amplitude"], 4) for tone in tones]),
@@ -98,12 +101,6 @@ def tones_block(track: RecordTrack, start: float = 0.0, unit: str | None = None)
 
 def _after(start: float, instant: Any) -> float | None:
     return None if instant is None else start + float(instant)
-
-
-def _finest(tone: dict[str, Any]) -> float | None:
-    """The smaller one of spread and standard error that is not zero."""
-    spread: float | None = tone["spread_hz"]
-    return min((each for each in (spread, tone["standard_error_hz"]) if each), default=spread)
 
 
 def _to_error(value: float | None, error: float | None) -> str:

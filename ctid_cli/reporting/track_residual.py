@@ -1,18 +1,14 @@
-"""What the tones of a track leave of its record, as amplitude spectra."""
+"""What the tones of a track leave of its record, as it is shown."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array
+from ctid_cli.frequency.left_over import left_over
 from ctid_cli.frequency.record_track import RecordTrack
-from ctid_cli.frequency.spectrum import MOST_MISSING, PADDING, SHORTEST_SEGMENT, median_spectrum
-from ctid_cli.frequency.synthesis import synthesised
+from ctid_cli.frequency.spectrum import PADDING
 from ctid_cli.signals.sampled_signal import SampledSignal
-
-#: A spectrum is a median over about so many half-overlapping segments of at most so many samples.
-SEGMENTS = 16
-LONGEST = 2**15
 
 
 class Spectra(NamedTuple):
@@ -34,21 +30,10 @@ class Spectra(NamedTuple):
 
 def spectra_of(signal: SampledSignal, track: RecordTrack) -> Spectra | None:
     """Spectra of a signal and of what its tones leave, where all tones are known; None where they never are."""
-    t = signal.interval * np.arange(signal.samples.size, dtype=np.float64)
-    present = np.isfinite(signal.samples)
-    centred = signal.samples - float(np.mean(signal.samples[present]))
-    left = centred - synthesised(track, t)
-    missing = ~np.isfinite(left)
-    if missing.all():
+    left = left_over(signal.samples, signal.interval, track)
+    if left is None:
         return None
-    size = min(LONGEST, max(SHORTEST_SEGMENT, 2 * t.size // (SEGMENTS + 1)), t.size)
-    while size >= min(SHORTEST_SEGMENT, t.size):
-        parts = [
-            median_spectrum(np.where(missing, 0.0, each), missing, size, MOST_MISSING[0]) for each in (centred, left)
-        ]
-        if parts[0] is not None and parts[1] is not None:
-            hertz = np.arange(parts[0].size) / (PADDING * size * signal.interval)
-            whole, rest = (float(np.sqrt(np.mean(each[~missing] ** 2))) for each in (centred, left))
-            return Spectra(hertz, parts[0], parts[1], size * signal.interval, whole, rest, float(np.mean(~missing)))
-        size //= 2
-    return None
+    segment, known = left.size * signal.interval, ~left.unknown
+    hertz = np.arange(left.signal_spectrum.size) / (PADDING * segment)
+    whole, rest = (float(np.sqrt(np.mean(each[known] ** 2))) for each in (left.signal, left.residual))
+    return Spectra(hertz, left.signal_spectrum, left.residual_spectrum, segment, whole, rest, float(np.mean(known)))

@@ -89,8 +89,8 @@ def missing_lines(track: RecordTrack) -> list[str]:
 
 
 def _line_words(line: MissingLine) -> str:
-    amplitude, rows = f"amplitude {line.amplitude:.3g}", f"in {100 * line.share:.3g} % of the rows"
-    return f"{line.omega / (2.0 * np.pi):.6g} Hz ({amplitude}, {rows})"
+    rows = f", in {100 * line.share:.3g} % of the rows" if np.isfinite(line.share) else ""
+    return f"{line.omega / (2.0 * np.pi):.6g} Hz (amplitude {line.amplitude:.3g}{rows})"
 
 
 def invalid_rows(track: RecordTrack) -> list[str]:
