@@ -13,6 +13,8 @@ from ctid_cli.arrays import Array, ComplexArray, IntArray
 #: Frequencies are found again until the kernels are centred on them to this [Hz].
 CENTRED = 1e-3
 MOST_PASSES = 6
+#: Samples of a cycle that are enough to begin with.
+COARSE_SAMPLES = 64
 
 
 @njit(cache=True, nogil=True)
@@ -24,16 +26,19 @@ def _reach(place: float, half: float, cycles: float, count: int) -> tuple[int, i
 
 @njit(cache=True, nogil=True)
 def _moments(
-    samples: Array, place: float, cycles: float, tables: Array, half: float, points: int, sums: ComplexArray
+    samples: Array, place: float, cycles: float, tables: Array, half: float, points: int, skip: int, sums: ComplexArray
 ) -> tuple[Array, ComplexArray]:
-    """Kernel sums of the samples (into ``sums``), of the model's powers, and of its image; ``cycles`` to a sample."""
+    """Kernel sums of every ``skip``-th sample (into ``sums``), of the model's powers, and of its image.
+
+    ``cycles`` of the tone pass from one sample to the next.
+    """
     count, channels = samples.shape
     first, end = _reach(place, half, cycles, count)
     straight, image = np.zeros((3, 3)), np.zeros((3, 3), np.complex128)
     sums[:] = 0.0
-    step = np.exp(-2j * np.pi * cycles)
+    step = np.exp(-2j * np.pi * cycles * skip)
     turn = np.exp(-2j * np.pi * (first - place) * cycles)
-    for k in range(first, end):
+    for k in range(first, end, skip):
         u = (k - place) * cycles
         at = (u + half) * points
         cell = min(max(int(at), 0), tables.shape[0] - 2)
@@ -152,11 +157,14 @@ def measure_phasors(
     left, wrong = np.full(count, np.nan), np.zeros(count, np.int64)
     sums, found = np.empty((3, channels), np.complex128), np.empty((3, channels), np.complex128)
     p = np.empty(3, np.complex128)
+    coarse = max(1, int(rate / nominal / COARSE_SAMPLES))
     for row in range(count):
         centre = nominal
-        for _ in range(MOST_PASSES):
+        for passes in range(MOST_PASSES):
+            # The first pass only finds where to centre the kernels: some of the samples will do.
+            skip = coarse if passes == 0 else 1
             cycles = centre / rate
-            straight, image = _moments(samples, places[row], cycles, tables, half, points, sums)
+            straight, image = _moments(samples, places[row], cycles, tables, half, points, skip, sums)
             _solve(straight, image, sums, curved, found)
             for i in range(3):
                 p[i] = 0.0
@@ -170,7 +178,7 @@ def measure_phasors(
             if not np.isfinite(estimate):
                 break
             nearest = min(max(estimate, nominal - furthest), nominal + furthest)
-            if abs(nearest - centre) < CENTRED:
+            if skip == 1 and abs(nearest - centre) < CENTRED:
                 break
             centre = nearest
         if not np.isfinite(estimate):
