@@ -1,0 +1,253 @@
+"""Sums of decaying chirps fitted to many windows of a signal at once: nonlinear least squares, compiled."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ctid_cli.arrays import Array, BoolArray, IndexArray
+
+#: Numbers of a tone: cosine and sine amplitude, and over half a window: logarithmic growth, phase, and curvature of phase.
+NUMBERS = 5
+#: Of them only so many are free in the first steps: what curves is fitted when what turns is nearly right.
+STRAIGHT = 4
+#: Largest logarithmic growth over half a window, and phase bent over half a window [rad].
+MOST_GROWTH = 4.0
+MOST_BEND = 30.0
+#: Iterations at most; stop when no phase turns by more than this [rad] and no amplitude changes by more than this share.
+ITERATIONS = 30
+#: Longest step of a phase over half a window [rad].
+MOST_TURNED = 2.0
+SMALL = 1e-7
+#: Marquardt's damping, in units of the diagonal: at first, its factors, and where it gives up.
+DAMPING = 1e-4
+RAISED = 10.0
+LOWERED = 0.1
+MOST_DAMPING = 1e6
+#: Added to the diagonal before a covariance is found, as a share of it.
+RIDGE = 1e-13
+
+
+class Windows(NamedTuple):
+    """Windows of one length, and the tones that are fitted in each."""
+
+    #: First sample of each window, shape (R,).
+    first: IndexArray
+    #: Number of tones in each window, shape (R,).
+    count: IndexArray
+    #: Numbers of the tones, shape (R, n, 5).
+    numbers: Array
+    #: Mean squares of what is left, shape (R,).
+    left: Array
+    #: Inverse of the scaled normal matrix, tones first and the constant last, shape (R, 5 n + 1, 5 n + 1).
+    inverse: Array
+    #: Whether the iteration ended at a minimum, shape (R,).
+    converged: BoolArray
+    #: Samples that are there, shape (R,).
+    present: IndexArray
+
+
+def windows_at(first: IndexArray, most_tones: int) -> Windows:
+    """Windows without a tone yet."""
+    rows, size = first.size, NUMBERS * most_tones + 1
+    return Windows(
+        first=np.ascontiguousarray(first, dtype=np.int64),
+        count=np.zeros(rows, np.int64),
+        numbers=np.zeros((rows, most_tones, NUMBERS)),
+        left=np.zeros(rows),
+        inverse=np.zeros((rows, size, size)),
+        converged=np.zeros(rows, np.bool_),
+        present=np.zeros(rows, np.int64),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _starts(tones: Array, length: int, z: NDArray[np.complex128], q: NDArray[np.complex128], p: NDArray[np.complex128]) -> None:
+    """Phasor of each tone at the first sample, its first factor from sample to sample, and the factor of that factor."""
+    du = 2.0 / (length - 1)
+    for k in range(tones.shape[0]):
+        growth, turn, bend = tones[k, 2], tones[k, 3], tones[k, 4]
+        z[k] = np.exp(complex(-growth, -turn + bend))
+        # phi(u + du) - phi(u) = turn du + bend (2 u du + du^2), at u = -1
+        q[k] = np.exp(complex(growth * du, turn * du + bend * (du * du - 2.0 * du)))
+        p[k] = np.exp(complex(0.0, 2.0 * bend * du * du))
+
+
+@njit(cache=True, nogil=True)
+def _left_over(y: Array, tones: Array, constant: float, out: Array) -> float:
+    """What the tones leave of a window; its sum of squares."""
+    length, n = y.size, tones.shape[0]
+    z, q, p = np.empty(n, np.complex128), np.empty(n, np.complex128), np.empty(n, np.complex128)
+    _starts(tones, length, z, q, p)
+    total = 0.0
+    for i in range(length):
+        r = y[i] - constant
+        for k in range(n):
+            r -= tones[k, 0] * z[k].real + tones[k, 1] * z[k].imag
+            z[k] *= q[k]
+            q[k] *= p[k]
+        out[i] = r
+        if not math.isnan(r):
+            total += r * r
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _normal_equations(y: Array, tones: Array, constant: float, free: int, gram: Array, right: Array) -> float:
+    """``sum psi psi'`` and ``sum psi r`` of the free numbers, and the sum of squares of what is left."""
+    length, n = y.size, tones.shape[0]
+    size = free * n + 1
+    z, q, p = np.empty(n, np.complex128), np.empty(n, np.complex128), np.empty(n, np.complex128)
+    _starts(tones, length, z, q, p)
+    row = np.empty(size)
+    row[size - 1] = 1.0
+    gram[:size, :size] = 0.0
+    right[:size] = 0.0
+    total = 0.0
+    for i in range(length):
+        u = 2.0 * i / (length - 1) - 1.0
+        r = y[i] - constant
+        for k in range(n):
+            real, imag = z[k].real, z[k].imag
+            s = tones[k, 0] * real + tones[k, 1] * imag
+            turned = tones[k, 1] * real - tones[k, 0] * imag
+            r -= s
+            row[free * k] = real
+            row[free * k + 1] = imag
+            if free >= STRAIGHT:
+                row[free * k + 2] = u * s
+                row[free * k + 3] = u * turned
+            if free == NUMBERS:
+                row[free * k + 4] = u * u * turned
+            z[k] *= q[k]
+            q[k] *= p[k]
+        if math.isnan(r):
+            continue
+        total += r * r
+        for a in range(size):
+            value = row[a]
+            right[a] += value * r
+            for b in range(a + 1):
+                gram[a, b] += value * row[b]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _factor(gram: Array, size: int, damping: float, scale: Array, factor: Array) -> bool:
+    """Cholesky factor of the scaled, damped normal matrix; whether it is definite."""
+    for a in range(size):
+        scale[a] = math.sqrt(gram[a, a]) if gram[a, a] > 0.0 else 1.0
+    for a in range(size):
+        for b in range(a + 1):
+            value = gram[a, b] / (scale[a] * scale[b])
+            if a == b:
+                value += damping
+                if gram[a, a] <= 0.0:
+                    value = 1.0
+            for c in range(b):
+                value -= factor[a, c] * factor[b, c]
+            if a == b:
+                if value <= 0.0:
+                    return False
+                factor[a, a] = math.sqrt(value)
+            else:
+                factor[a, b] = value / factor[b, b]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _solve(factor: Array, size: int, scale: Array, right: Array, step: Array) -> None:
+    for a in range(size):
+        value = right[a] / scale[a]
+        for c in range(a):
+            value -= factor[a, c] * step[c]
+        step[a] = value / factor[a, a]
+    for a in range(size - 1, -1, -1):
+        value = step[a]
+        for c in range(a + 1, size):
+            value -= factor[c, a] * step[c]
+        step[a] = value / factor[a, a]
+    for a in range(size):
+        step[a] /= scale[a]
+
+
+@njit(cache=True, nogil=True)
+def _iterate(y: Array, tones: Array, constant: float, free: int, most: int, work: Array, residual: Array) -> tuple[float, bool]:
+    """Levenberg-Marquardt steps; the constant and whether they ended at a minimum. ``tones`` is changed in place."""
+    n = tones.shape[0]
+    size = free * n + 1
+    gram, factor = work[0], work[1]
+    right, scale, step = work[2, 0], work[2, 1], work[2, 2]
+    trial = np.empty_like(tones)
+    damping = DAMPING
+    cost = _normal_equations(y, tones, constant, free, gram, right)
+    for _ in range(most):
+        while True:
+            if damping > MOST_DAMPING:
+                return constant, True
+            if _factor(gram, size, damping, scale, factor):
+                _solve(factor, size, scale, right, step)
+                largest, turned = 0.0, 0.0
+                for k in range(n):
+                    for j in range(NUMBERS):
+                        trial[k, j] = tones[k, j] + (step[free * k + j] if j < free else 0.0)
+                    trial[k, 2] = min(max(trial[k, 2], -MOST_GROWTH), MOST_GROWTH)
+                    trial[k, 4] = min(max(trial[k, 4], -MOST_BEND), MOST_BEND)
+                    height = math.hypot(tones[k, 0], tones[k, 1]) + 1e-300
+                    for j in range(free):
+                        moved = abs(trial[k, j] - tones[k, j])
+                        largest = max(largest, moved / height if j < 2 else moved)
+                        turned = max(turned, 0.0 if j < 2 else moved)
+                level = constant + step[size - 1]
+                if largest <= SMALL:
+                    return constant, True
+                # A longer step may land on any of the minima.
+                if turned < MOST_TURNED:
+                    reached = _left_over(y, trial, level, residual)
+                    if reached <= cost:
+                        tones[:] = trial
+                        constant = level
+                        damping = max(damping * LOWERED, 1e-12)
+                        break
+            damping *= RAISED
+        cost = _normal_equations(y, tones, constant, free, gram, right)
+    return constant, False
+
+
+@njit(cache=True, nogil=True)
+def fit_windows(samples: Array, length: int, windows: Windows, chosen: IndexArray, residuals: Array) -> None:
+    """Fit the tones of some windows, beginning with the numbers that they have; what is left goes to ``residuals``."""
+    most = windows.numbers.shape[1]
+    full = NUMBERS * most + 1
+    work = np.empty((3, max(full, 3), max(full, 3)))
+    residual = np.empty(length)
+    for row in chosen:
+        y = samples[windows.first[row] : windows.first[row] + length]
+        n = windows.count[row]
+        tones = windows.numbers[row, :n]
+        constant = 0.0
+        there = 0
+        for value in y:
+            if not math.isnan(value):
+                constant += value
+                there += 1
+        constant = constant / there if there else 0.0
+        windows.present[row] = there
+        constant, done = _iterate(y, tones, constant, 2, 1, work, residual)
+        constant, done = _iterate(y, tones, constant, STRAIGHT, 4, work, residual)
+        constant, done = _iterate(y, tones, constant, NUMBERS, ITERATIONS, work, residual)
+        windows.converged[row] = done
+        size = NUMBERS * n + 1
+        cost = _normal_equations(y, tones, constant, NUMBERS, work[0], work[2, 0])
+        windows.left[row] = cost / max(1, there - size)
+        _left_over(y, tones, constant, residuals[row])
+        if _factor(work[0], size, RIDGE, work[2, 1], work[1]):
+            for a in range(size):
+                work[2, 0, :size] = 0.0
+                work[2, 0, a] = 1.0
+                _solve(work[1], size, work[2, 1], work[2, 0], work[2, 2])
+                windows.inverse[row, a, :size] = work[2, 2, :size]
+        else:
+            windows.inverse[row, :size, :size] = np.nan

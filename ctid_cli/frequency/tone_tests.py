@@ -1,0 +1,163 @@
+"""What tones leave of their windows: the level of the noise, further lines, and changes within the window."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.arrays import Array, IndexArray
+
+#: Highest order of the autoregressive model that whitens what is left: colour, not lines.
+WHITENING_ORDER = 4
+#: Points of a periodogram for each bin of an unpadded one.
+PADDING = 2
+#: The floor beneath an ordinate is the running median of so many bins, and no more than half of them all.
+FLOOR_BINS = 101
+#: Ordinates higher than so many times the floor are cut before the floor's colour is modelled.
+CUT = 5.0
+ROUNDS = 3
+#: The running median is as sure as the mean of so many bins for each of its own.
+MEDIAN_EFFICIENCY = 0.48
+#: Independent ordinates in a padded periodogram, for each sample.
+INDEPENDENT = 0.8
+#: A change is looked for in the middle of the window, without this share at each end.
+ENDS = 0.05
+
+
+class Left(NamedTuple):
+    """What is left of windows of one length, whitened."""
+
+    #: Whitened residuals of mean square 1 where they are noise; zero where a sample is missing, shape (R, L).
+    white: Array
+    #: Prediction-error filter of each window, shape (R, p + 1).
+    filters: Array
+    #: Mean square of the innovations, shape (R,).
+    innovations: Array
+    #: Samples that are there, shape (R,).
+    present: IndexArray
+
+    def noise(self, turn: Array) -> Array:
+        """Noise at a phase from sample to sample [rad]: mean square of equally strong white noise, shape (R,)."""
+        lags = np.arange(self.filters.shape[1])
+        response = (self.filters * np.exp(-1j * turn[:, None] * lags)).sum(axis=1)
+        return np.asarray(self.innovations / np.abs(response) ** 2)
+
+
+def whiten(residuals: Array, fitted: IndexArray) -> Left:
+    """Whiten rows of residuals, from which ``fitted`` numbers each were fitted, by autoregressive models.
+
+    The models are those of the floor: lines are cut from the spectrum before they are made.
+    """
+    length = residuals.shape[1]
+    there = np.isfinite(residuals)
+    present = there.sum(axis=1)
+    values = np.where(there, residuals, 0.0)
+    taper = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
+    power = np.abs(np.fft.rfft(values * taper, 2 * length, axis=1)) ** 2
+    shape = np.ones_like(power)
+    for _ in range(ROUNDS):
+        floor = shape * running_floor(power / shape, 2)
+        cut = np.minimum(power, CUT * floor)
+        filters = _prediction_errors(np.fft.irfft(cut, axis=1)[:, : WHITENING_ORDER + 1], present)
+        shape = 1.0 / np.abs(np.fft.rfft(filters, 2 * length, axis=1)) ** 2
+    white = values.copy()
+    for lag in range(1, WHITENING_ORDER + 1):
+        white[:, lag:] += filters[:, lag, None] * values[:, : length - lag]
+    white[~there] = 0.0
+    order = (filters != 0.0).sum(axis=1) - 1
+    squares = (white**2).sum(axis=1) / np.maximum(present - fitted - order, 1)
+    return Left(white / np.sqrt(np.where(squares > 0.0, squares, 1.0))[:, None], filters, squares, present)
+
+
+def running_floor(power: Array, padding: int) -> Array:
+    """Running median of rows of ordinates, as the mean of exponential variables, shape (R, M)."""
+    size = power.shape[1]
+    bins = floor_bins(size, padding)
+    half = bins * padding // 2
+    middles = np.arange(0, size + half // 2, max(1, half // 2))
+    padded = np.pad(power, ((0, 0), (half, half + middles[-1] + 1 - size)), mode="reflect")
+    medians = np.stack([np.median(padded[:, m : m + 2 * half + 1 : padding], axis=1) for m in middles])
+    place = np.arange(size) / max(1, half // 2)
+    below = np.minimum(place.astype(int), middles.size - 2)
+    share = (place - below)[:, None]
+    found = (1.0 - share) * medians[below] + share * medians[below + 1]
+    return np.asarray(found.T / np.log(2.0))
+
+
+def floor_bins(size: int, padding: int) -> int:
+    """Unpadded bins in one running median."""
+    return min(FLOOR_BINS, size // padding // 2) // 2 * 2 + 1
+
+
+def _prediction_errors(covariances: Array, count: IndexArray) -> Array:
+    """Prediction-error filters by Levinson's recursion, each of the order with the least AICc, shape (R, p + 1)."""
+    rows, most = covariances.shape[0], covariances.shape[1] - 1
+    filters = np.zeros((rows, most + 1))
+    filters[:, 0] = 1.0
+    scale = np.where(covariances[:, 0] > 0.0, covariances[:, 0], 1.0)
+    r = covariances / scale[:, None]
+    error = np.ones(rows)
+    best, best_score = filters.copy(), np.zeros(rows)
+    for order in range(1, most + 1):
+        mirrored = filters[:, :order][:, ::-1]
+        reflection = np.clip(-(mirrored * r[:, 1 : order + 1]).sum(axis=1) / error, -0.999, 0.999)
+        filters[:, 1 : order + 1] += reflection[:, None] * mirrored
+        error = error * (1.0 - reflection**2)
+        score = count * np.log(error) + 2.0 * order * count / np.maximum(count - order - 2, 1)
+        better = score < best_score
+        best[better], best_score[better] = filters[better], score[better]
+    return best
+
+
+def strongest_line(left: Left) -> tuple[Array, Array]:
+    """Chance of noise to have the strongest line of each row, and the line's phase from sample to sample [rad]."""
+    rows, length = left.white.shape
+    ordinates = np.abs(np.fft.rfft(left.white, PADDING * length, axis=1)) ** 2
+    ratio = ordinates / np.maximum(running_floor(ordinates, PADDING), 1e-300)
+    ratio[:, :PADDING] = 0.0
+    place = ratio.argmax(axis=1)
+    height = ratio[np.arange(rows), place]
+    # The floor is uncertain: a ratio of exponential variables.
+    sure = MEDIAN_EFFICIENCY * floor_bins(ordinates.shape[1], PADDING)
+    one = (1.0 + height / sure) ** -sure
+    chance = -np.expm1(INDEPENDENT * length * np.log1p(-np.minimum(one, 1.0 - 1e-16)))
+    return chance, place * 2.0 * np.pi / (PADDING * length)
+
+
+def change(left: Left, phasors: NDArray[np.complex128]) -> Array:
+    """Largest sum of squares that a change of phase and amplitude at one instant would take away, in units of noise.
+
+    ``phasors`` turn the tone back to phase zero, shape (R, L). The sum of the demodulated residual up to an instant has
+    of the noise what the fitted polynomials (phase 1, u, u^2; amplitude 1, u) leave of it.
+    """
+    length = left.white.shape[1]
+    sums = np.cumsum(_demodulated(left, phasors), axis=1)
+    x = np.arange(1, length + 1) / length
+    # Integrals of the orthonormal Legendre polynomials from -1 to v = 2 x - 1, squared.
+    v = 2.0 * x - 1.0
+    amplitude = length * (x - x**2 - 3.0 * (0.25 * (v**2 - 1.0)) ** 2)
+    phase = amplitude - length * 5.0 * (0.25 * (v**3 - v)) ** 2
+    inside = slice(max(1, int(ENDS * length)), length - max(1, int(ENDS * length)))
+    parts = sums.real[:, inside] ** 2 / amplitude[inside] + sums.imag[:, inside] ** 2 / phase[inside]
+    return np.asarray(2.0 * parts.max(axis=1))
+
+
+def cubic_phase(left: Left, phasors: NDArray[np.complex128], amplitude: Array, noise: Array) -> tuple[Array, Array]:
+    """Coefficient of ``P3(u)`` in the phase that is left [rad], and its standard error, each of shape (R,)."""
+    length = left.white.shape[1]
+    u = np.linspace(-1.0, 1.0, length)
+    cube = 0.5 * (5.0 * u**3 - 3.0 * u)
+    square = length / 7.0
+    per_unit = np.sqrt(noise) / amplitude
+    # A sin(phi) of unit square is left by a phase of 1 rad: half of the square of the tone, twice its demodulation.
+    found = -2.0 * (_demodulated(left, phasors).imag @ cube) / square * per_unit
+    return -found, np.sqrt(2.0 / square) * per_unit
+
+
+def _demodulated(left: Left, phasors: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Whitened residuals turned back by a tone's phase and that of the whitening filter at its frequency."""
+    middle = phasors.shape[1] // 2
+    turn = np.angle(phasors[:, middle] * np.conj(phasors[:, middle + 1]))
+    lags = np.arange(left.filters.shape[1])
+    response = (left.filters * np.exp(-1j * turn[:, None] * lags)).sum(axis=1)
+    return np.asarray(left.white * phasors * np.exp(-1j * np.angle(response))[:, None])
