@@ -20,7 +20,7 @@ MOST_BEND = 30.0
 ITERATIONS = 30
 #: Longest step of a phase over half a window [rad].
 MOST_TURNED = 2.0
-SMALL = 1e-7
+SMALL = 1e-5
 #: Marquardt's damping, in units of the diagonal: at first, its factors, and where it gives up.
 DAMPING = 1e-4
 RAISED = 10.0

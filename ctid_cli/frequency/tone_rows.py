@@ -1,178 +1,184 @@
-"""The tones at each of many instants: of all windows around it, the longest that the shorter ones allow."""
+"""The tones at each of many instants, read from the longest of all windows around it in which nothing speaks against it."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.frequency.tone_search import LEVEL, ToneRows, tones_of_windows
 
-#: Shortest window: so many periods of the lowest frequency that is looked for, and so many samples.
-PERIODS = 4.0
+#: Shortest window [samples]; the others are twice as long as one another, up to the whole signal.
 SHORTEST = 64
-#: Windows of a length begin so many times in one of them, at most.
-OVERLAPPING = 16
-#: An interval reaches so many standard errors to both sides.
-REACH = 2.5
-#: A curvature, or a rate, below so many of its standard errors may be nothing.
-QUIET = 2.0
-#: Two estimates this many standard errors apart, or half a bin, may be those of one tone.
-GATE = 5.0
+#: Windows of a length overlap by the inverse of this.
+HOPS = 2
+#: Energy that is left by a change or a line d bins away, in units of the noise, disturbs a tone if it exceeds d^2.
+NEAR = 1.0
 #: Lines of one window that are closer than so many bins may be one tone that changes.
-RESOLVED = 4.0
-#: Lines so many bins of its window beside a tone that moves are part of it.
-BESIDE = 3.0
-#: A line is a tone if its amplitude is so many times its standard error.
-SIGNIFICANT = 4.0
+RESOLVED = 1.7
+#: A window shows so many periods of a tone.
+PERIODS = 4.0
+#: A tone is there if its amplitude at the instant is so many times its standard error.
+SIGNIFICANT = 5.0
+#: Readings closer than so many bins of the shorter window, or so many standard errors, are of one tone.
+SAME_BINS = 1.5
+SAME_ERRORS = 5.0
+#: A curvature of the frequency is left out of the reading below so many of its standard errors.
+QUIET = 2.0
+#: Frequencies that move by more than so many errors over their window may move otherwise than along a line. A kink that no
+#: test would find moves the frequency at its place by this share of the fitted sweep, and by no more than so many errors.
+MOVES = 2.5
+KINK = 0.27
+HIDDEN_KINK = 18.0
+#: Steps of the phase that noise alone shows no more often than this may be there, and are worth so many errors.
+DOUBTFUL = 0.1
+DOUBT = 2.3
+#: Two tones in one line, which no test would tell from one that grows by less than this over half a window, pull its
+#: frequency by no more than its growth [rad/sample].
+BLENDED_GROWTH = 0.75
+#: What should be covered by 3 errors is divided by 3.
+COVERED = 3.0
+#: Standard error of the growth over half a window, in relative errors of the amplitude.
+GROWTH_ERROR = 3.0**0.5
 
 
-@dataclass(frozen=True)
-class Tone:
-    """A tone at an instant."""
+class Readings(NamedTuple):
+    """What the windows say of the tones at many instants: one entry for each instant and tone, in order of the instants."""
 
+    #: Which of the instants.
+    row: IndexArray
     #: Frequency and its standard error [rad/sample].
-    omega: float
-    error: float
-    amplitude: float
-    amplitude_error: float
-    phase: float
-    growth: float
-    rate: float
-    #: Samples of the window that it was taken from.
-    window: int
-    #: What the intervals of all windows up to this one have in common [rad/sample].
-    low: float
-    high: float
-    #: Whether a longer window was refused by the shorter ones: the tone moves.
-    frozen: bool = False
+    omega: Array
+    error: Array
+    amplitude: Array
+    amplitude_error: Array
+    #: Phase at the instant [rad].
+    phase: Array
+    #: Logarithmic growth of the amplitude [1/sample] and rate of change of the frequency [rad/sample^2].
+    growth: Array
+    rate: Array
+    #: Length of the window [samples].
+    window: IndexArray
+    #: Whether the window tells the tone from its neighbours, and whether the tone is there beyond doubt.
+    resolved: BoolArray
+    significant: BoolArray
 
 
-@dataclass(frozen=True)
-class Row:
-    """All tones at an instant, ascending."""
-
-    place: float
-    tones: tuple[Tone, ...]
-    #: Longest window in which noise alone was left; zero if there was none.
-    clean: int
-    #: Strongest line that the shortest window left [rad/sample]; NaN if none.
-    missing: float
-
-
-def window_lengths(count: int, lowest: float) -> list[int]:
-    """Lengths of windows, doubled from the shortest one to the whole signal; odd, so that there is a middle."""
+def window_lengths(count: int) -> list[int]:
+    """Lengths of windows, doubled from the shortest one to the whole signal."""
     lengths = []
-    length = min(SHORTEST, count)
+    length = SHORTEST
     while length < count:
-        lengths.append(length - 1 + length % 2)
+        lengths.append(length)
         length *= 2
-    return [*lengths, count - 1 + count % 2]
+    return [*lengths, count]
 
 
-def rows_of(samples: Array, places: Array, lengths: list[int], most: int) -> list[Row]:
-    """Tones at each of some places [samples]."""
-    found = []
-    for length in lengths:
-        first = _firsts(samples.size, places, length)
-        found.append((length, first, tones_of_windows(samples, length, first, most)))
-    rows = []
-    for place in places:
-        row = Row(float(place), (), 0, np.nan)
-        for length, first, tones in found:
-            row = _longer(row, tones, _nearest(first, length, place), length)
-        rows.append(row)
-    return rows
+def readings_at(samples: Array, places: Array, most: int) -> Readings:
+    """Tones of a signal at some places [samples], ascending: of each tone the reading of its longest sound window."""
+    parts: list[Readings] = []
+    tones: ToneRows | None = None
+    for length in window_lengths(samples.size):
+        last = samples.size - length
+        first = np.unique(np.append(np.arange(0, last + 1, length // HOPS), last))
+        tones = tones_of_windows(samples, length, first, most, tones)
+        parts.append(_readings(tones, length, places))
+    # The longest windows first, and of those of one length the one whose middle is nearest.
+    everything = Readings(*(np.concatenate(fields) for fields in zip(*parts[::-1], strict=True)))
+    order = np.argsort(everything.row, kind="stable")
+    everything = Readings(*(field[order] for field in everything))
+    bounds = np.searchsorted(everything.row, np.arange(places.size + 1))
+    chosen = [begin + _chosen(everything, begin, end) for begin, end in pairwise(bounds) if end > begin]
+    kept = np.concatenate(chosen) if chosen else np.empty(0, np.int64)
+    return Readings(*(field[kept] for field in everything))
 
 
-def _firsts(count: int, places: Array, length: int) -> IndexArray:
-    """First samples of the windows of a length that are nearest to the places."""
-    hop = max(1, length // OVERLAPPING)
-    wanted = np.clip(np.round((places - 0.5 * (length - 1)) / hop) * hop, 0, count - length)
-    return np.unique(wanted.astype(np.int64))
+def _readings(tones: ToneRows, length: int, places: Array) -> Readings:
+    """Readings of windows of one length at all places that lie in them, the windows nearest to a place first."""
+    half = 0.5 * length
+    order = np.argsort(tones.middle)
+    low = np.searchsorted(tones.middle[order], places - half, side="right")
+    count = np.searchsorted(tones.middle[order], places + half, side="right") - low
+    row = np.repeat(np.arange(places.size), count)
+    window = order[np.repeat(low, count) + np.arange(row.size) - np.repeat(np.cumsum(count) - count, count)]
+    near = np.argsort(np.abs(places[row] - tones.middle[window]), kind="stable")
+    row, window = row[near], window[near]
+    sound = _sound(tones, length)
+    pair, tone = np.nonzero(sound[window])
+    row, window = row[pair], window[pair]
+
+    def of(values: Array) -> Array:
+        return np.asarray(values[window, tone])
+
+    x = places[row] - tones.middle[window]
+    u = x / half
+    growth, rate, omega_error = of(tones.growth), of(tones.rate), of(tones.omega_error)
+    relative = of(tones.amplitude_error) / of(tones.amplitude)
+    # The amplitude at the end of a window depends on its growth.
+    amplitude = of(tones.amplitude) * np.exp(np.clip(growth * x, -20.0, 20.0))
+    amplitude_error = of(tones.amplitude_error) * np.hypot(1.0, GROWTH_ERROR * u)
+    omega = of(tones.omega) + rate * x
+    error = np.hypot(omega_error, of(tones.rate_error) * x)
+    # A phase c P3(u) that was left out changes the frequency at u by (7.5 u^2 - 1.5) c, which the middle knows as `bend`.
+    bent = np.abs(of(tones.bend)) > QUIET * of(tones.bend_error)
+    share = 1.0 - 5.0 * u * u
+    omega = np.where(bent, omega - share * of(tones.bend), omega)
+    error = np.where(bent, np.hypot(error, share * of(tones.bend_error)), error)
+    hidden = np.minimum(KINK * np.abs(rate) * length, HIDDEN_KINK * omega_error) / COVERED
+    error = np.where(np.abs(rate) > MOVES * of(tones.rate_error), np.hypot(error, hidden), error)
+    error = np.where(of(tones.change_chance) < DOUBTFUL, DOUBT * error, error)
+    grown = np.abs(growth) * half
+    blended = (grown > COVERED * GROWTH_ERROR * relative) & (grown < BLENDED_GROWTH)
+    error = np.where(blended, np.hypot(error, np.abs(growth) / COVERED), error)
+    return Readings(
+        row,
+        omega,
+        error,
+        amplitude,
+        amplitude_error,
+        of(tones.phase) + of(tones.omega) * x + 0.5 * rate * x**2,
+        growth,
+        rate,
+        np.full(row.size, length),
+        (_distance(tones, length) >= RESOLVED)[window, tone],
+        (amplitude > SIGNIFICANT * amplitude_error) & (of(tones.omega) * length > PERIODS * 2.0 * np.pi),
+    )
 
 
-def _nearest(first: IndexArray, length: int, place: float) -> int:
-    after = int(np.searchsorted(first, place - 0.5 * (length - 1)))
-    near = [k for k in (after - 1, after) if 0 <= k < first.size]
-    return min(near, key=lambda k: abs(first[k] + 0.5 * (length - 1) - place))
+def _sound(tones: ToneRows, length: int) -> BoolArray:
+    """Tones that nothing which is left of their window disturbs, shape (R, n)."""
+    bins = length / (2.0 * np.pi)
+    own = tones.change_chance < LEVEL
+    sound = np.isfinite(tones.omega_error) & tones.converged[:, None] & ~own
+    line = np.where(tones.line_chance < LEVEL, tones.line_energy, 0.0)
+    sound &= line[:, None] <= NEAR * ((tones.omega - tones.line[:, None]) * bins) ** 2
+    for j in range(own.shape[1]):
+        energy = np.where(own[:, j], tones.change_energy[:, j], 0.0)
+        disturbed = energy[:, None] > NEAR * ((tones.omega - tones.omega[:, j, None]) * bins) ** 2
+        disturbed[:, j] = False
+        sound &= ~disturbed
+    return sound
 
 
-def _longer(row: Row, found: ToneRows, k: int, length: int) -> Row:
-    """What a window adds to what the shorter ones have shown."""
-    if not found.converged[k] or found.line_chance[k] < LEVEL:
-        return row if row.clean else replace(row, missing=float(found.line[k]))
-    tones = list(row.tones)
-    apart = row.place - float(found.middle[k])
-    count = int(found.count[k])
-    for j in range(count):
-        others = np.abs(np.delete(found.omega[k, :count], j) - found.omega[k, j])
-        if others.min(initial=np.inf) * length < RESOLVED * 2.0 * np.pi:
-            continue
-        if found.omega[k, j] * length < PERIODS * 2.0 * np.pi:
-            continue
-        if found.change_chance[k, j] < LEVEL or not found.amplitude[k, j] > SIGNIFICANT * found.amplitude_error[k, j]:
-            continue
-        tones = _joined(tones, list(_candidates(found, k, j, apart, length)))
-    return Row(row.place, tuple(tones), length, np.nan)
+def _distance(tones: ToneRows, length: int) -> Array:
+    """Distance of each tone from the nearest other one of its window [bins], shape (R, n)."""
+    apart = np.abs(tones.omega[:, :, None] - tones.omega[:, None, :])
+    n = apart.shape[1]
+    apart[:, np.arange(n), np.arange(n)] = np.inf
+    return np.asarray(np.where(np.isnan(apart), np.inf, apart).min(axis=2) * length / (2.0 * np.pi))
 
 
-def _candidates(found: ToneRows, k: int, j: int, apart: float, length: int) -> Iterator[Tone]:
-    """Estimates of one tone from one window: less and less of it is assumed to move."""
-    omega, rate = float(found.omega[k, j]), float(found.rate[k, j])
-    moved = omega + rate * apart
-    error = float(found.omega_error[k, j])
-    straight = float(np.hypot(error, found.rate_error[k, j] * apart))
-    bent = float(np.hypot(straight, found.bend_error[k, j]))
-    common = {
-        "amplitude": float(found.amplitude[k, j] * np.exp(np.clip(found.growth[k, j] * apart, -20.0, 20.0))),
-        "amplitude_error": float(found.amplitude_error[k, j]),
-        "phase": float(found.phase[k, j] + omega * apart + 0.5 * rate * apart**2),
-        "growth": float(found.growth[k, j]),
-        "rate": rate,
-        "window": length,
-    }
-    reach = QUIET * found.bend_error[k, j]
-    options = [(moved - float(found.bend[k, j]), bent)]
-    if abs(found.bend[k, j]) < reach:
-        options.append((moved, straight))
-        if straight > 1.2 * error and abs(rate) < QUIET * found.rate_error[k, j]:
-            options.append((omega, error))
-    for value, uncertain in options:
-        if np.isfinite(uncertain):
-            reach = REACH * uncertain
-            yield Tone(value, uncertain, low=value - reach, high=value + reach, **common)
-
-
-def _joined(tones: list[Tone], estimates: list[Tone]) -> list[Tone]:
-    """The tones with further estimates of one of them, or with a further one."""
-    if not estimates:
-        return tones
-    new = estimates[0]
-
-    def distance(tone: Tone) -> float:
-        return abs(tone.omega - new.omega)
-
-    # What stands beside a tone that moves is its side bands.
-    if any(tone.frozen and distance(tone) < BESIDE * 2.0 * np.pi / tone.window for tone in tones):
-        return tones
-    near = [tone for tone in tones if distance(tone) < max(GATE * np.hypot(tone.error, new.error), np.pi / tone.window)]
-    if not near:
-        old, better = None, new
-    else:
-        old = min(near, key=distance)
-        better = _narrowed(old, new)
-    for estimate in estimates[1:]:
-        if not better.frozen:
-            narrower = _narrowed(better, estimate)
-            # A bolder reading of the same window that does not agree is left out.
-            better = better if narrower.frozen else narrower
-    return [*(tone for tone in tones if tone is not old), better]
-
-
-def _narrowed(old: Tone, new: Tone) -> Tone:
-    """A tone with a further estimate: the surer one of both if their intervals, and all before, have a point in common."""
-    low, high = max(old.low, new.low), min(old.high, new.high)
-    if low > high:
-        return replace(old, frozen=True, error=max(old.error, 0.5 * abs(old.omega - new.omega)))
-    return replace(new if new.error <= old.error else old, low=low, high=high)
+def _chosen(everything: Readings, begin: int, end: int) -> IndexArray:
+    """Which readings of one instant are kept: none that is near to one of a longer, or nearer, window."""
+    omega, error = everything.omega[begin:end], everything.error[begin:end]
+    window = everything.window[begin:end]
+    kept = []
+    open_ = np.ones(omega.size, np.bool_)
+    while open_.any():
+        best = int(open_.argmax())
+        kept.append(best)
+        reach = np.maximum(SAME_BINS * 2.0 * np.pi / window, SAME_ERRORS * np.hypot(error, error[best]))
+        near = np.abs(omega - omega[best]) < reach
+        open_ &= ~near
+        open_[best] = False
+    return np.array(sorted(kept, key=lambda k: omega[k]))

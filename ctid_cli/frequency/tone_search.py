@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.frequency.tone_fit import NUMBERS, Windows, fit_windows, windows_at
@@ -18,6 +19,8 @@ APART = 1.5
 TURNED_BY_CUBE = 1.5
 #: Samples for each number that is fitted.
 SAMPLES_PER_NUMBER = 3
+#: Tones of shorter windows are taken over if their amplitude is so many times its standard error.
+SURE = 6.0
 #: Windows that are fitted together: their residuals are in memory at once.
 BLOCK_SAMPLES = 2_000_000
 
@@ -47,23 +50,49 @@ class ToneRows(NamedTuple):
     #: Chance of noise to show as strong a line as is left, and where it stands [rad/sample], shape (R,).
     line_chance: Array
     line: Array
+    #: Energy of that line in units of the noise, shape (R,).
+    line_energy: Array
+    #: Energy that a change of each tone would explain, in units of the noise, shape (R, n).
+    change_energy: Array
     #: Whether the iterations reached a minimum, shape (R,).
     converged: BoolArray
 
 
-def tones_of_windows(samples: Array, length: int, first: IndexArray, most: int) -> ToneRows:
-    """Tones of windows of one length, in blocks."""
+def tones_of_windows(
+    samples: Array, length: int, first: IndexArray, most: int, shorter: ToneRows | None = None
+) -> ToneRows:
+    """Tones of windows of one length, in blocks; what was found in shorter windows is where the search begins."""
     most = max(1, min(most, (length // SAMPLES_PER_NUMBER - 1) // NUMBERS))
     size = max(1, BLOCK_SAMPLES // length)
-    blocks = [_block(samples, length, first[k : k + size], most) for k in range(0, first.size, size)]
+    blocks = [_block(samples, length, first[k : k + size], most, shorter) for k in range(0, first.size, size)]
     return ToneRows(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
 
 
-def _block(samples: Array, length: int, first: IndexArray, most: int) -> ToneRows:
+def _begun(windows: Windows, length: int, shorter: ToneRows) -> None:
+    """Put into windows the tones of the shorter windows nearest to their middles, where nothing is wrong with them."""
+    half = 0.5 * (length - 1)
+    middle = windows.first + half
+    between = 0.5 * (shorter.middle[1:] + shorter.middle[:-1])
+    nearest = np.searchsorted(between, middle)
+    clean = shorter.converged & (shorter.line_chance >= LEVEL) & ~(shorter.change_chance < LEVEL).any(axis=1)
+    sure = shorter.amplitude > SURE * shorter.amplitude_error
+    for j in range(min(shorter.omega.shape[1], windows.numbers.shape[1])):
+        rows = np.flatnonzero((clean & sure[:, j])[nearest])
+        of, place = nearest[rows], windows.count[rows]
+        omega = shorter.omega[of, j] + shorter.rate[of, j] * (middle[rows] - shorter.middle[of])
+        windows.numbers[rows, place] = 0.0
+        windows.numbers[rows, place, 3] = omega * half
+        windows.numbers[rows, place, 4] = 0.5 * shorter.rate[of, j] * half**2
+        windows.count[rows] += 1
+
+
+def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: ToneRows | None) -> ToneRows:
     windows = windows_at(first, most)
+    if shorter is not None:
+        _begun(windows, length, shorter)
     residuals = np.empty((first.size, length))
     left: Left | None = None
-    chance, line = np.ones(first.size), np.zeros(first.size)
+    chance, line, height = np.ones(first.size), np.zeros(first.size), np.zeros(first.size)
     half = 0.5 * (length - 1)
     todo = np.arange(first.size)
     whole = np.empty((first.size, length))
@@ -76,30 +105,52 @@ def _block(samples: Array, length: int, first: IndexArray, most: int) -> ToneRow
         else:
             for name in Left._fields:
                 getattr(left, name)[todo] = getattr(part, name)
-        chance[todo], line[todo] = strongest_line(part)
+        chance[todo], line[todo], height[todo] = strongest_line(part)
         if round_ == most:
             break
         apart = np.abs(windows.numbers[todo, :, 3] / half - line[todo, None])
         apart[np.arange(most) >= windows.count[todo, None]] = np.inf
         new = (chance[todo] < LEVEL) & (apart.min(axis=1) * length > APART * 2.0 * np.pi)
         todo = todo[new]
+        todo = todo[~_rather_changed(windows, left, todo, length)]
         if not todo.size:
             break
         windows.numbers[todo, windows.count[todo]] = 0.0
         windows.numbers[todo, windows.count[todo], 3] = line[todo] * half
         windows.count[todo] += 1
     assert left is not None
-    return _rows(windows, left, chance, line, length)
+    return _rows(windows, left, chance, line, height, length)
 
 
-def _rows(windows: Windows, left: Left, chance: Array, line: Array, length: int) -> ToneRows:
+def _rather_changed(windows: Windows, left: Left, rows: IndexArray, length: int) -> BoolArray:
+    """Whether the change of a tone that is fitted explains more than a further line would, for some rows."""
+    most = windows.numbers.shape[1]
+    largest = np.zeros(rows.size)
+    for k in range(most):
+        here = np.flatnonzero(windows.count[rows] > k)
+        if here.size:
+            part = Left(*(field[rows[here]] for field in left))
+            c = change(part, _phasors(windows.numbers[rows[here], k], length))
+            largest[here] = np.maximum(largest[here], c)
+    white = left.white[rows]
+    line = 2.0 * (np.abs(np.fft.rfft(white, 2 * length, axis=1)) ** 2).max(axis=1) / length
+    return np.asarray(largest > line)
+
+
+def _phasors(numbers: Array, length: int) -> NDArray[np.complex128]:
+    """What turns a tone of each row back to phase zero, shape (R, L)."""
+    u = np.linspace(-1.0, 1.0, length)
+    phase = np.arctan2(-numbers[:, 1], numbers[:, 0])
+    return np.asarray(np.exp(-1j * (numbers[:, 3, None] * u + numbers[:, 4, None] * u * u + phase[:, None])))
+
+
+def _rows(windows: Windows, left: Left, chance: Array, line: Array, height: Array, length: int) -> ToneRows:
     half = 0.5 * (length - 1)
     rows, most = windows.numbers.shape[:2]
     empty = np.arange(most) >= windows.count[:, None]
     cosine, sine, growth, turn, bend = (np.where(empty, np.nan, windows.numbers[:, :, j]) for j in range(NUMBERS))
     errors = np.full((5, rows, most), np.nan)
-    changes = np.full((rows, most), np.nan)
-    u = np.linspace(-1.0, 1.0, length)
+    changes, energies = np.full((rows, most), np.nan), np.full((rows, most), np.nan)
     for k in range(most):
         here = np.flatnonzero(~empty[:, k])
         if not here.size:
@@ -111,13 +162,12 @@ def _rows(windows: Windows, left: Left, chance: Array, line: Array, length: int)
             errors[0, here, k] = np.sqrt(noise * inverse[:, 3, 3]) / half
             errors[4, here, k] = 2.0 * np.sqrt(noise * inverse[:, 4, 4]) / half**2
             errors[1, here, k] = np.sqrt(noise * 0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]))
-        phase = np.arctan2(-sine[here, k], cosine[here, k])
-        angles = turn[here, k, None] * u + bend[here, k, None] * u * u + phase[:, None]
-        phasors = np.exp(-1j * angles)
+        phasors = _phasors(windows.numbers[here, k], length)
         c = change(part, phasors)
         with np.errstate(invalid="ignore"):
             cubic, uncertain = cubic_phase(part, phasors, np.hypot(cosine[here, k], sine[here, k]), noise)
         errors[2, here, k], errors[3, here, k] = TURNED_BY_CUBE * cubic / half, TURNED_BY_CUBE * uncertain / half
+        energies[here, k] = 0.5 * c
         changes[here, k] = np.minimum(1.0, CHANGE_TAIL * c * np.exp(-0.5 * c))
     return ToneRows(
         windows.first + half,
@@ -135,5 +185,7 @@ def _rows(windows: Windows, left: Left, chance: Array, line: Array, length: int)
         changes,
         chance,
         line,
+        height,
+        energies,
         windows.converged.copy(),
     )

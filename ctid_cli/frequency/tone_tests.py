@@ -16,6 +16,8 @@ FLOOR_BINS = 101
 #: Ordinates higher than so many times the floor are cut before the floor's colour is modelled.
 CUT = 5.0
 ROUNDS = 3
+#: A whitening filter is taken to let at least this share through.
+SMALLEST_GAIN = 1e-12
 #: The running median is as sure as the mean of so many bins for each of its own.
 MEDIAN_EFFICIENCY = 0.48
 #: Independent ordinates in a padded periodogram, for each sample.
@@ -53,13 +55,18 @@ def whiten(residuals: Array, fitted: IndexArray) -> Left:
     present = there.sum(axis=1)
     values = np.where(there, residuals, 0.0)
     taper = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
-    power = np.abs(np.fft.rfft(values * taper, 2 * length, axis=1)) ** 2
+    power = np.abs(np.fft.rfft(values * taper, PADDING * length, axis=1)) ** 2
+    cosines = np.cos(np.outer(np.arange(WHITENING_ORDER + 1), np.linspace(0.0, np.pi, power.shape[1])))
+    weights = np.full(power.shape[1], 2.0)
+    weights[[0, -1]] = 1.0
     shape = np.ones_like(power)
     for _ in range(ROUNDS):
-        floor = shape * running_floor(power / shape, 2)
-        cut = np.minimum(power, CUT * floor)
-        filters = _prediction_errors(np.fft.irfft(cut, axis=1)[:, : WHITENING_ORDER + 1], present)
-        shape = 1.0 / np.abs(np.fft.rfft(filters, 2 * length, axis=1)) ** 2
+        cut = np.minimum(power, CUT * shape * running_floor(power / shape))
+        filters = _prediction_errors((cut * weights) @ cosines.T, present)
+        # |A|^2 is the cosine series of the filter's own correlation.
+        own = np.stack([(filters[:, k:] * filters[:, : WHITENING_ORDER + 1 - k]).sum(axis=1) for k in range(WHITENING_ORDER + 1)])
+        own[1:] *= 2.0
+        shape = 1.0 / np.maximum(own.T @ cosines, SMALLEST_GAIN)
     white = values.copy()
     for lag in range(1, WHITENING_ORDER + 1):
         white[:, lag:] += filters[:, lag, None] * values[:, : length - lag]
@@ -69,24 +76,25 @@ def whiten(residuals: Array, fitted: IndexArray) -> Left:
     return Left(white / np.sqrt(np.where(squares > 0.0, squares, 1.0))[:, None], filters, squares, present)
 
 
-def running_floor(power: Array, padding: int) -> Array:
+def running_floor(power: Array) -> Array:
     """Running median of rows of ordinates, as the mean of exponential variables, shape (R, M)."""
     size = power.shape[1]
-    bins = floor_bins(size, padding)
-    half = bins * padding // 2
-    middles = np.arange(0, size + half // 2, max(1, half // 2))
-    padded = np.pad(power, ((0, 0), (half, half + middles[-1] + 1 - size)), mode="reflect")
-    medians = np.stack([np.median(padded[:, m : m + 2 * half + 1 : padding], axis=1) for m in middles])
-    place = np.arange(size) / max(1, half // 2)
-    below = np.minimum(place.astype(int), middles.size - 2)
-    share = (place - below)[:, None]
-    found = (1.0 - share) * medians[below] + share * medians[below + 1]
-    return np.asarray(found.T / np.log(2.0))
+    half = floor_bins(size) * PADDING // 2
+    hop = max(1, half // 2)
+    count = -(-size // hop) + 1
+    padded = np.pad(power, ((0, 0), (half, half + (count - 1) * hop + 1 - size)), mode="reflect")
+    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=1)[:, ::hop, ::PADDING]
+    medians = np.median(around, axis=2)
+    place = np.arange(size) / hop
+    below = place.astype(int)
+    share = place - below
+    found = (1.0 - share) * medians[:, below] + share * medians[:, below + 1]
+    return np.asarray(found / np.log(2.0))
 
 
-def floor_bins(size: int, padding: int) -> int:
-    """Unpadded bins in one running median."""
-    return min(FLOOR_BINS, size // padding // 2) // 2 * 2 + 1
+def floor_bins(size: int) -> int:
+    """Unpadded bins in one running median of so many ordinates."""
+    return min(FLOOR_BINS, size // PADDING // 2) // 2 * 2 + 1
 
 
 def _prediction_errors(covariances: Array, count: IndexArray) -> Array:
@@ -109,19 +117,20 @@ def _prediction_errors(covariances: Array, count: IndexArray) -> Array:
     return best
 
 
-def strongest_line(left: Left) -> tuple[Array, Array]:
-    """Chance of noise to have the strongest line of each row, and the line's phase from sample to sample [rad]."""
+def strongest_line(left: Left) -> tuple[Array, Array, Array]:
+    """Chance of noise to have the strongest line of each row, its phase from sample to sample [rad], and its height over the
+    floor."""
     rows, length = left.white.shape
     ordinates = np.abs(np.fft.rfft(left.white, PADDING * length, axis=1)) ** 2
-    ratio = ordinates / np.maximum(running_floor(ordinates, PADDING), 1e-300)
+    ratio = ordinates / np.maximum(running_floor(ordinates), 1e-300)
     ratio[:, :PADDING] = 0.0
     place = ratio.argmax(axis=1)
     height = ratio[np.arange(rows), place]
     # The floor is uncertain: a ratio of exponential variables.
-    sure = MEDIAN_EFFICIENCY * floor_bins(ordinates.shape[1], PADDING)
+    sure = MEDIAN_EFFICIENCY * floor_bins(ordinates.shape[1])
     one = (1.0 + height / sure) ** -sure
     chance = -np.expm1(INDEPENDENT * length * np.log1p(-np.minimum(one, 1.0 - 1e-16)))
-    return chance, place * 2.0 * np.pi / (PADDING * length)
+    return chance, place * 2.0 * np.pi / (PADDING * length), height
 
 
 def change(left: Left, phasors: NDArray[np.complex128]) -> Array:
