@@ -16,16 +16,20 @@ STRAIGHT = 4
 #: Largest logarithmic growth over half a window, and phase bent over half a window [rad].
 MOST_GROWTH = 4.0
 MOST_BEND = 30.0
-#: Iterations at most; stop when no phase turns by more than this [rad] and no amplitude changes by more than this share.
+#: Iterations at most; stop when the step would lower the sum of squares by less than this share of one sample's, or change
+#: no phase by more than this [rad] and no amplitude by more than this share.
 ITERATIONS = 30
+SMALL = 1e-3
+SMALLEST = 1e-9
 #: Longest step of a phase over half a window [rad].
 MOST_TURNED = 2.0
-SMALL = 1e-5
 #: Marquardt's damping, in units of the diagonal: at first, its factors, and where it gives up.
 DAMPING = 1e-4
 RAISED = 10.0
 LOWERED = 0.1
 MOST_DAMPING = 1e6
+#: Tones that are so many bins apart do not disturb each other's steps.
+FAR = 8.0
 #: Added to the diagonal before a covariance is found, as a share of it.
 RIDGE = 1e-13
 
@@ -95,42 +99,78 @@ def _left_over(y: Array, tones: Array, constant: float, out: Array) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _normal_equations(y: Array, tones: Array, constant: float, free: int, gram: Array, right: Array) -> float:
-    """``sum psi psi'`` and ``sum psi r`` of the free numbers, and the sum of squares of what is left."""
+def _neighbours(tones: Array, free: int, pairs: IndexArray) -> tuple[int, int]:
+    """Pairs of tones that disturb each other, each with itself too, and the number of tones that the constant disturbs.
+
+    Those tones are listed in the last row of ``pairs``.
+    """
+    n = tones.shape[0]
+    count, low = 0, 0
+    for a in range(n):
+        wide = FAR * math.pi + 2.0 * abs(tones[a, 4])
+        if abs(tones[a, 3]) < wide:
+            pairs[2, low] = a
+            low += 1
+        for b in range(a + 1):
+            if abs(tones[a, 3] - tones[b, 3]) < wide + 2.0 * abs(tones[b, 4]):
+                pairs[0, count], pairs[1, count] = a, b
+                count += 1
+    return count, low
+
+
+@njit(cache=True, nogil=True)
+def _normal_equations(y: Array, tones: Array, constant: float, free: int, work: Array, pairs: IndexArray) -> float:
+    """``sum psi psi'`` and ``sum psi r`` of the free numbers, and the sum of squares of what is left.
+
+    Products of tones that are far from each other are left out: they vary so fast that their sums are nearly nothing.
+    """
+    gram, right, rows = work[0], work[2, 0], work[3]
     length, n = y.size, tones.shape[0]
     size = free * n + 1
+    last = size - 1
+    count, low = _neighbours(tones, free, pairs)
     z, q, p = np.empty(n, np.complex128), np.empty(n, np.complex128), np.empty(n, np.complex128)
     _starts(tones, length, z, q, p)
-    row = np.empty(size)
-    row[size - 1] = 1.0
     gram[:size, :size] = 0.0
     right[:size] = 0.0
     total = 0.0
+    step = 2.0 / (length - 1)
     for i in range(length):
-        u = 2.0 * i / (length - 1) - 1.0
+        u = step * i - 1.0
         r = y[i] - constant
         for k in range(n):
             real, imag = z[k].real, z[k].imag
             s = tones[k, 0] * real + tones[k, 1] * imag
             turned = tones[k, 1] * real - tones[k, 0] * imag
             r -= s
-            row[free * k] = real
-            row[free * k + 1] = imag
+            row = rows[k]
+            row[0] = real
+            row[1] = imag
             if free >= STRAIGHT:
-                row[free * k + 2] = u * s
-                row[free * k + 3] = u * turned
+                row[2] = u * s
+                row[3] = u * turned
             if free == NUMBERS:
-                row[free * k + 4] = u * u * turned
+                row[4] = u * u * turned
             z[k] *= q[k]
             q[k] *= p[k]
         if math.isnan(r):
             continue
         total += r * r
-        for a in range(size):
-            value = row[a]
-            right[a] += value * r
-            for b in range(a + 1):
-                gram[a, b] += value * row[b]
+        gram[last, last] += 1.0
+        right[last] += r
+        for k in range(n):
+            for a in range(free):
+                right[free * k + a] += rows[k, a] * r
+        for j in range(low):
+            k = pairs[2, j]
+            for a in range(free):
+                gram[last, free * k + a] += rows[k, a]
+        for j in range(count):
+            one, two = pairs[0, j], pairs[1, j]
+            for a in range(free):
+                value = rows[one, a]
+                for b in range(a + 1 if one == two else free):
+                    gram[free * one + a, free * two + b] += value * rows[two, b]
     return total
 
 
@@ -174,7 +214,7 @@ def _solve(factor: Array, size: int, scale: Array, right: Array, step: Array) ->
 
 
 @njit(cache=True, nogil=True)
-def _iterate(y: Array, tones: Array, constant: float, free: int, most: int, work: Array, residual: Array) -> tuple[float, bool]:
+def _iterate(y: Array, tones: Array, constant: float, free: int, most: int, work: Array, pairs: IndexArray, residual: Array) -> tuple[float, bool]:
     """Levenberg-Marquardt steps; the constant and whether they ended at a minimum. ``tones`` is changed in place."""
     n = tones.shape[0]
     size = free * n + 1
@@ -182,7 +222,7 @@ def _iterate(y: Array, tones: Array, constant: float, free: int, most: int, work
     right, scale, step = work[2, 0], work[2, 1], work[2, 2]
     trial = np.empty_like(tones)
     damping = DAMPING
-    cost = _normal_equations(y, tones, constant, free, gram, right)
+    cost = _normal_equations(y, tones, constant, free, work, pairs)
     for _ in range(most):
         while True:
             if damping > MOST_DAMPING:
@@ -201,7 +241,11 @@ def _iterate(y: Array, tones: Array, constant: float, free: int, most: int, work
                         largest = max(largest, moved / height if j < 2 else moved)
                         turned = max(turned, 0.0 if j < 2 else moved)
                 level = constant + step[size - 1]
-                if largest <= SMALL:
+                gain = 0.0
+                for a in range(size):
+                    gain += step[a] * right[a]
+                # So small a share of the standard errors matters to nobody, nor does rounding.
+                if gain <= SMALL * cost / gram[size - 1, size - 1] or largest <= SMALLEST:
                     return constant, True
                 # A longer step may land on any of the minima.
                 if turned < MOST_TURNED:
@@ -212,7 +256,7 @@ def _iterate(y: Array, tones: Array, constant: float, free: int, most: int, work
                         damping = max(damping * LOWERED, 1e-12)
                         break
             damping *= RAISED
-        cost = _normal_equations(y, tones, constant, free, gram, right)
+        cost = _normal_equations(y, tones, constant, free, work, pairs)
     return constant, False
 
 
@@ -221,7 +265,8 @@ def fit_windows(samples: Array, length: int, windows: Windows, chosen: IndexArra
     """Fit the tones of some windows, beginning with the numbers that they have; what is left goes to ``residuals``."""
     most = windows.numbers.shape[1]
     full = NUMBERS * most + 1
-    work = np.empty((3, max(full, 3), max(full, 3)))
+    work = np.empty((4, max(full, NUMBERS), max(full, NUMBERS)))
+    pairs = np.empty((3, most * (most + 1) // 2 + 1), np.int64)
     residual = np.empty(length)
     for row in chosen:
         y = samples[windows.first[row] : windows.first[row] + length]
@@ -235,12 +280,16 @@ def fit_windows(samples: Array, length: int, windows: Windows, chosen: IndexArra
                 there += 1
         constant = constant / there if there else 0.0
         windows.present[row] = there
-        constant, done = _iterate(y, tones, constant, 2, 1, work, residual)
-        constant, done = _iterate(y, tones, constant, STRAIGHT, 4, work, residual)
-        constant, done = _iterate(y, tones, constant, NUMBERS, ITERATIONS, work, residual)
+        if there <= NUMBERS * n + 1:
+            windows.converged[row] = False
+            residuals[row] = np.nan
+            continue
+        constant, done = _iterate(y, tones, constant, 2, 1, work, pairs, residual)
+        constant, done = _iterate(y, tones, constant, STRAIGHT, 4, work, pairs, residual)
+        constant, done = _iterate(y, tones, constant, NUMBERS, ITERATIONS, work, pairs, residual)
         windows.converged[row] = done
         size = NUMBERS * n + 1
-        cost = _normal_equations(y, tones, constant, NUMBERS, work[0], work[2, 0])
+        cost = _normal_equations(y, tones, constant, NUMBERS, work, pairs)
         windows.left[row] = cost / max(1, there - size)
         _left_over(y, tones, constant, residuals[row])
         if _factor(work[0], size, RIDGE, work[2, 1], work[1]):

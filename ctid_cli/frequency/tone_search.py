@@ -3,11 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.frequency.tone_fit import NUMBERS, Windows, fit_windows, windows_at
-from ctid_cli.frequency.tone_tests import Left, change, cubic_phase, strongest_line, whiten
+from ctid_cli.frequency.tone_tests import Left, Line, find_changes, strongest_line, whiten
 
 #: Noise alone shows a line, or a change, in this share of the windows.
 LEVEL = 5e-4
@@ -91,101 +90,86 @@ def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: T
     if shorter is not None:
         _begun(windows, length, shorter)
     residuals = np.empty((first.size, length))
-    left: Left | None = None
-    chance, line, height = np.ones(first.size), np.zeros(first.size), np.zeros(first.size)
-    half = 0.5 * (length - 1)
+    tests: _Tests | None = None
     todo = np.arange(first.size)
-    whole = np.empty((first.size, length))
-    filters: list[Array] = []
     for round_ in range(most + 1):
         fit_windows(samples, length, windows, todo, residuals)
-        part = whiten(residuals[todo], NUMBERS * windows.count[todo] + 1)
-        if left is None:
-            left = part
-        else:
-            for name in Left._fields:
-                getattr(left, name)[todo] = getattr(part, name)
-        chance[todo], line[todo], height[todo] = strongest_line(part)
+        new = _tested(residuals[todo], windows, todo)
+        tests = new if tests is None else tests.replaced(todo, new)
         if round_ == most:
             break
-        apart = np.abs(windows.numbers[todo, :, 3] / half - line[todo, None])
+        apart = np.abs(windows.numbers[todo, :, 3] - new.line.omega[:, None] * 0.5 * (length - 1))
         apart[np.arange(most) >= windows.count[todo, None]] = np.inf
-        new = (chance[todo] < LEVEL) & (apart.min(axis=1) * length > APART * 2.0 * np.pi)
-        todo = todo[new]
-        todo = todo[~_rather_changed(windows, left, todo, length)]
+        joins = (new.line.chance < LEVEL) & (windows.count[todo] < most) & (apart.min(axis=1) > APART * np.pi)
+        # What a change explains better is none.
+        joins &= np.where(np.isnan(new.change), 0.0, new.change).max(axis=1) <= new.line.energy
+        todo, turns = todo[joins], new.line.omega[joins] * 0.5 * (length - 1)
         if not todo.size:
             break
         windows.numbers[todo, windows.count[todo]] = 0.0
-        windows.numbers[todo, windows.count[todo], 3] = line[todo] * half
+        windows.numbers[todo, windows.count[todo], 3] = turns
         windows.count[todo] += 1
-    assert left is not None
-    return _rows(windows, left, chance, line, height, length)
+    assert tests is not None
+    return _rows(windows, tests, length)
 
 
-def _rather_changed(windows: Windows, left: Left, rows: IndexArray, length: int) -> BoolArray:
-    """Whether the change of a tone that is fitted explains more than a further line would, for some rows."""
-    most = windows.numbers.shape[1]
-    largest = np.zeros(rows.size)
-    for k in range(most):
-        here = np.flatnonzero(windows.count[rows] > k)
-        if here.size:
-            part = Left(*(field[rows[here]] for field in left))
-            c = change(part, _phasors(windows.numbers[rows[here], k], length))
-            largest[here] = np.maximum(largest[here], c)
-    white = left.white[rows]
-    line = 2.0 * (np.abs(np.fft.rfft(white, 2 * length, axis=1)) ** 2).max(axis=1) / length
-    return np.asarray(largest > line)
+class _Tests(NamedTuple):
+    """What is left of windows, and what it shows."""
+
+    left: Left
+    line: Line
+    #: Energy that a change would explain, and P3 in the phase that is left, as `find_changes` tells, shape (R, n).
+    change: Array
+    cube: Array
+
+    def replaced(self, rows: IndexArray, new: "_Tests") -> "_Tests":
+        """With other tests of some windows."""
+        for old, now in ((self.left, new.left), (self.line, new.line), ((self.change, self.cube), (new.change, new.cube))):
+            for field, values in zip(old, now, strict=True):
+                field[rows] = values
+        return self
 
 
-def _phasors(numbers: Array, length: int) -> NDArray[np.complex128]:
-    """What turns a tone of each row back to phase zero, shape (R, L)."""
-    u = np.linspace(-1.0, 1.0, length)
-    phase = np.arctan2(-numbers[:, 1], numbers[:, 0])
-    return np.asarray(np.exp(-1j * (numbers[:, 3, None] * u + numbers[:, 4, None] * u * u + phase[:, None])))
+def _tested(residuals: Array, windows: Windows, rows: IndexArray) -> _Tests:
+    """Tests of what is left of some windows, which lose it on the way."""
+    left = whiten(residuals, NUMBERS * windows.count[rows] + 1)
+    change, cube = (np.full((rows.size, windows.numbers.shape[1]), np.nan) for _ in range(2))
+    find_changes(left.white, left.filters, windows.numbers[rows], windows.count[rows], change, cube)
+    line = strongest_line(left)
+    return _Tests(left._replace(white=np.empty((rows.size, 0))), line, change, cube)
 
 
-def _rows(windows: Windows, left: Left, chance: Array, line: Array, height: Array, length: int) -> ToneRows:
+def _rows(windows: Windows, tests: _Tests, length: int) -> ToneRows:
     half = 0.5 * (length - 1)
     rows, most = windows.numbers.shape[:2]
     empty = np.arange(most) >= windows.count[:, None]
     cosine, sine, growth, turn, bend = (np.where(empty, np.nan, windows.numbers[:, :, j]) for j in range(NUMBERS))
-    errors = np.full((5, rows, most), np.nan)
-    changes, energies = np.full((rows, most), np.nan), np.full((rows, most), np.nan)
-    for k in range(most):
-        here = np.flatnonzero(~empty[:, k])
-        if not here.size:
-            continue
-        part = Left(*(field[here] for field in left))
-        noise = part.noise(turn[here, k] / half)
-        inverse = windows.inverse[here][:, NUMBERS * k : NUMBERS * (k + 1), NUMBERS * k : NUMBERS * (k + 1)]
-        with np.errstate(invalid="ignore"):
-            errors[0, here, k] = np.sqrt(noise * inverse[:, 3, 3]) / half
-            errors[4, here, k] = 2.0 * np.sqrt(noise * inverse[:, 4, 4]) / half**2
-            errors[1, here, k] = np.sqrt(noise * 0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]))
-        phasors = _phasors(windows.numbers[here, k], length)
-        c = change(part, phasors)
-        with np.errstate(invalid="ignore"):
-            cubic, uncertain = cubic_phase(part, phasors, np.hypot(cosine[here, k], sine[here, k]), noise)
-        errors[2, here, k], errors[3, here, k] = TURNED_BY_CUBE * cubic / half, TURNED_BY_CUBE * uncertain / half
-        energies[here, k] = 0.5 * c
-        changes[here, k] = np.minimum(1.0, CHANGE_TAIL * c * np.exp(-0.5 * c))
+    variances = np.diagonal(windows.inverse, axis1=1, axis2=2)[:, : NUMBERS * most].reshape(rows, most, NUMBERS)
+    noise = np.where(empty, np.nan, tests.left.noise(np.where(empty, 0.0, turn / half)))
+    amplitude = np.hypot(cosine, sine)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        errors = np.sqrt(noise[:, :, None] * variances)
+        # A sin(phi) of unit square is left by a phase of 1 rad: half of the square of the tone, twice its demodulation.
+        per_unit = np.sqrt(noise) / amplitude * TURNED_BY_CUBE / half
+        bent, uncertain = 2.0 * tests.cube / (length / 7.0) * per_unit, np.sqrt(2.0 / (length / 7.0)) * per_unit
+    chances = np.minimum(1.0, CHANGE_TAIL * 2.0 * tests.change * np.exp(-tests.change))
     return ToneRows(
         windows.first + half,
-        windows.count.copy(),
+        windows.count,
         turn / half,
-        errors[0],
-        np.hypot(cosine, sine),
-        errors[1],
+        errors[:, :, 3] / half,
+        amplitude,
+        np.sqrt(0.5 * (errors[:, :, 0] ** 2 + errors[:, :, 1] ** 2)),
         np.arctan2(-sine, cosine),
         growth / half,
         2.0 * bend / half**2,
-        errors[4],
-        errors[2],
-        errors[3],
-        changes,
-        chance,
-        line,
-        height,
-        energies,
-        windows.converged.copy(),
+        2.0 * errors[:, :, 4] / half**2,
+        bent,
+        uncertain,
+        chances,
+        tests.line.chance,
+        tests.line.omega,
+        tests.line.height,
+        tests.change,
+        windows.converged,
     )

@@ -1,9 +1,10 @@
 """What tones leave of their windows: the level of the noise, further lines, and changes within the window."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
 
 from ctid_cli.arrays import Array, IndexArray
 
@@ -39,10 +40,13 @@ class Left(NamedTuple):
     present: IndexArray
 
     def noise(self, turn: Array) -> Array:
-        """Noise at a phase from sample to sample [rad]: mean square of equally strong white noise, shape (R,)."""
+        """Noise at some phases from sample to sample [rad] of each window: mean square of equally strong white noise.
+
+        Both shapes (R, n).
+        """
         lags = np.arange(self.filters.shape[1])
-        response = (self.filters * np.exp(-1j * turn[:, None] * lags)).sum(axis=1)
-        return np.asarray(self.innovations / np.abs(response) ** 2)
+        response = (self.filters[:, None, :] * np.exp(-1j * turn[:, :, None] * lags)).sum(axis=2)
+        return np.asarray(self.innovations[:, None] / np.abs(response) ** 2)
 
 
 def whiten(residuals: Array, fitted: IndexArray) -> Left:
@@ -117,9 +121,21 @@ def _prediction_errors(covariances: Array, count: IndexArray) -> Array:
     return best
 
 
-def strongest_line(left: Left) -> tuple[Array, Array, Array]:
-    """Chance of noise to have the strongest line of each row, its phase from sample to sample [rad], and its height over the
-    floor."""
+class Line(NamedTuple):
+    """The strongest line that is left of each window."""
+
+    #: Chance of noise to have one as strong, shape (R,).
+    chance: Array
+    #: Its phase from sample to sample [rad], shape (R,).
+    omega: Array
+    #: Its height over the floor, shape (R,).
+    height: Array
+    #: Sum of squares that the largest line would take away, in units of all the noise, shape (R,).
+    energy: Array
+
+
+def strongest_line(left: Left) -> Line:
+    """The strongest line of each row, in the ratio of the periodogram to its running median."""
     rows, length = left.white.shape
     ordinates = np.abs(np.fft.rfft(left.white, PADDING * length, axis=1)) ** 2
     ratio = ordinates / np.maximum(running_floor(ordinates), 1e-300)
@@ -130,43 +146,48 @@ def strongest_line(left: Left) -> tuple[Array, Array, Array]:
     sure = MEDIAN_EFFICIENCY * floor_bins(ordinates.shape[1])
     one = (1.0 + height / sure) ** -sure
     chance = -np.expm1(INDEPENDENT * length * np.log1p(-np.minimum(one, 1.0 - 1e-16)))
-    return chance, place * 2.0 * np.pi / (PADDING * length), height
+    return Line(chance, place * 2.0 * np.pi / (PADDING * length), height, ordinates.max(axis=1) / length)
 
 
-def change(left: Left, phasors: NDArray[np.complex128]) -> Array:
-    """Largest sum of squares that a change of phase and amplitude at one instant would take away, in units of noise.
+@njit(cache=True, nogil=True)
+def find_changes(white: Array, filters: Array, numbers: Array, count: IndexArray, energy: Array, cube: Array) -> None:
+    """How much the tones of each window seem to change within it.
 
-    ``phasors`` turn the tone back to phase zero, shape (R, L). The sum of the demodulated residual up to an instant has
-    of the noise what the fitted polynomials (phase 1, u, u^2; amplitude 1, u) leave of it.
+    ``energy``, shape (R, n): the largest sum of squares that a change of phase and amplitude at one instant would take away
+    of a whitened residual, in units of the noise. The sum of the demodulated residual up to an instant has of the noise
+    what the fitted polynomials (phase 1, u, u^2; amplitude 1, u) leave of it. ``cube``, shape (R, n): the sum of the
+    demodulated residual's quadrature times ``P3(u)``.
     """
-    length = left.white.shape[1]
-    sums = np.cumsum(_demodulated(left, phasors), axis=1)
-    x = np.arange(1, length + 1) / length
-    # Integrals of the orthonormal Legendre polynomials from -1 to v = 2 x - 1, squared.
-    v = 2.0 * x - 1.0
-    amplitude = length * (x - x**2 - 3.0 * (0.25 * (v**2 - 1.0)) ** 2)
-    phase = amplitude - length * 5.0 * (0.25 * (v**3 - v)) ** 2
-    inside = slice(max(1, int(ENDS * length)), length - max(1, int(ENDS * length)))
-    parts = sums.real[:, inside] ** 2 / amplitude[inside] + sums.imag[:, inside] ** 2 / phase[inside]
-    return np.asarray(2.0 * parts.max(axis=1))
-
-
-def cubic_phase(left: Left, phasors: NDArray[np.complex128], amplitude: Array, noise: Array) -> tuple[Array, Array]:
-    """Coefficient of ``P3(u)`` in the phase that is left [rad], and its standard error, each of shape (R,)."""
-    length = left.white.shape[1]
-    u = np.linspace(-1.0, 1.0, length)
-    cube = 0.5 * (5.0 * u**3 - 3.0 * u)
-    square = length / 7.0
-    per_unit = np.sqrt(noise) / amplitude
-    # A sin(phi) of unit square is left by a phase of 1 rad: half of the square of the tone, twice its demodulation.
-    found = -2.0 * (_demodulated(left, phasors).imag @ cube) / square * per_unit
-    return -found, np.sqrt(2.0 / square) * per_unit
-
-
-def _demodulated(left: Left, phasors: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Whitened residuals turned back by a tone's phase and that of the whitening filter at its frequency."""
-    middle = phasors.shape[1] // 2
-    turn = np.angle(phasors[:, middle] * np.conj(phasors[:, middle + 1]))
-    lags = np.arange(left.filters.shape[1])
-    response = (left.filters * np.exp(-1j * turn[:, None] * lags)).sum(axis=1)
-    return np.asarray(left.white * phasors * np.exp(-1j * np.angle(response))[:, None])
+    length = white.shape[1]
+    begin = max(1, int(ENDS * length))
+    # Integrals of the orthonormal Legendre polynomials from -1 to v, squared.
+    of_amplitude, of_phase = np.empty(length), np.empty(length)
+    for i in range(length):
+        x = (i + 1) / length
+        v = 2.0 * x - 1.0
+        of_amplitude[i] = length * (x - x * x - 3.0 * (0.25 * (v * v - 1.0)) ** 2)
+        of_phase[i] = of_amplitude[i] - length * 5.0 * (0.25 * (v**3 - v)) ** 2
+    du = 2.0 / (length - 1)
+    for row in range(white.shape[0]):
+        for k in range(count[row]):
+            cosine, sine, turn, bend = numbers[row, k, 0], numbers[row, k, 1], numbers[row, k, 3], numbers[row, k, 4]
+            response = 0.0j
+            for lag in range(filters.shape[1]):
+                response += filters[row, lag] * np.exp(complex(0.0, -turn * du * lag))
+            phase = math.atan2(-sine, cosine) + math.atan2(response.imag, response.real)
+            z = np.exp(complex(0.0, turn - bend - phase))
+            q = np.exp(complex(0.0, -turn * du - bend * (du * du - 2.0 * du)))
+            p = np.exp(complex(0.0, -2.0 * bend * du * du))
+            real, imag, largest, third = 0.0, 0.0, 0.0, 0.0
+            for i in range(length):
+                u = du * i - 1.0
+                value = white[row, i]
+                real += value * z.real
+                imag += value * z.imag
+                third += value * z.imag * 0.5 * (5.0 * u * u - 3.0) * u
+                if begin <= i < length - begin:
+                    largest = max(largest, real * real / of_amplitude[i] + imag * imag / of_phase[i])
+                z *= q
+                q *= p
+            energy[row, k] = largest
+            cube[row, k] = third
