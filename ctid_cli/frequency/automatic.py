@@ -122,7 +122,7 @@ def choose_settings(
         require_choice("method", method, tuple(KINDS["frequency_estimator"]))
     if window is not None:
         require_positive("window", window, "s")
-    _refuse_unusable(samples, tones)
+    refuse_unusable(samples, SAMPLES_PER_TONE * tones, f" for {tones} tones")
     peaks = find_peaks(samples, interval, tones)
     seconds = f"{samples.size * interval:.4g} s"
     if peaks.omega.size == 0:
@@ -166,11 +166,12 @@ def _preparation(peaks: Peaks, tones: int, offset: float, bridged: float) -> Ite
         yield f"Gaps of up to {bridged:.3g} s are bridged by straight lines."
 
 
-def _refuse_unusable(samples: Array, tones: int) -> None:
+def refuse_unusable(samples: Array, fewest: int, what: str = "") -> None:
+    """Raise DataError for a signal that is too short, constant, or out of range."""
     present = np.isfinite(samples)
     count = np.count_nonzero(present)
-    if count < SAMPLES_PER_TONE * tones:
-        raise DataError(f"{count} samples are too few for {tones} tones, which need {SAMPLES_PER_TONE * tones}")
+    if count < fewest:
+        raise DataError(f"{count} samples are too few{what}: there must be {fewest}")
     low, high = samples.min(where=present, initial=np.inf), samples.max(where=present, initial=-np.inf)
     largest = max(abs(low), abs(high))
     if high - low <= CONSTANT * largest:

@@ -15,7 +15,7 @@ NUMBERS = 5
 STRAIGHT = 4
 #: Largest logarithmic growth over half a window, and phase bent over half a window [rad].
 MOST_GROWTH = 4.0
-MOST_BEND = 30.0
+MOST_BEND = 1e4
 #: Iterations at most; stop when the step would lower the sum of squares by less than this share of one sample's, or change
 #: no phase by more than this [rad] and no amplitude by more than this share.
 ITERATIONS = 30

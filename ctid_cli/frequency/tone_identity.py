@@ -36,7 +36,7 @@ def paths_of(found: Readings, places: Array) -> list[IndexArray]:
     """The readings of each tone, the strongest tone first."""
     step = float(np.median(np.diff(places))) if places.size > 1 else 1.0
     paths = _joined(_followed(found, places, step), found, places.size)
-    paths = [path for path in paths if _described(found, path)]
+    paths = [path for path in paths if _described(found, path, float(np.ptp(places)) + step)]
     return sorted(paths, key=lambda path: -float((found.amplitude[path] ** 2).sum()))
 
 
@@ -102,8 +102,12 @@ def _joined(paths: list[IndexArray], found: Readings, rows: int) -> list[IndexAr
     return joined
 
 
-def _described(found: Readings, path: IndexArray) -> bool:
-    """Whether a tone is worth its numbers (minimum description length) in one of its windows at least."""
+def _described(found: Readings, path: IndexArray, length: float) -> bool:
+    """Whether a tone is worth its numbers, and saying in which window it is, in one of its windows at least.
+
+    That is the minimum description length of a tone of so long a signal.
+    """
     sure = found.resolved[path] & found.significant[path]
     gain = 0.5 * (found.amplitude[path] / found.amplitude_error[path]) ** 2
-    return bool((sure & (gain > 0.5 * NUMBERS * np.log(found.window[path]))).any())
+    window = found.window[path]
+    return bool((sure & (gain > 0.5 * NUMBERS * np.log(window) + np.log(length / window))).any())

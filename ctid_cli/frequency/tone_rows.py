@@ -1,5 +1,6 @@
 """The tones at each of many instants, read from the longest of all windows around it in which nothing speaks against it."""
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -20,6 +21,8 @@ RESOLVED = 1.7
 PERIODS = 4.0
 #: A tone is there if its amplitude at the instant is so many times its standard error.
 SIGNIFICANT = 5.0
+#: Three lines at equal distances, that differ by no more than this share, may be one tone that is modulated.
+UNEQUAL = 0.05
 #: Readings closer than so many bins of the shorter window, or so many standard errors, are of one tone.
 SAME_BINS = 1.5
 SAME_ERRORS = 5.0
@@ -57,28 +60,34 @@ class Readings(NamedTuple):
     #: Logarithmic growth of the amplitude [1/sample] and rate of change of the frequency [rad/sample^2].
     growth: Array
     rate: Array
-    #: Length of the window [samples].
+    #: Length of the window, and where its middle is [samples].
     window: IndexArray
+    middle: Array
     #: Whether the window tells the tone from its neighbours, and whether the tone is there beyond doubt.
     resolved: BoolArray
     significant: BoolArray
 
 
-def window_lengths(count: int) -> list[int]:
-    """Lengths of windows, doubled from the shortest one to the whole signal."""
+def window_lengths(longest: int) -> list[int]:
+    """Lengths of windows, doubled from the shortest one to the longest."""
     lengths = []
     length = SHORTEST
-    while length < count:
+    while length < longest:
         lengths.append(length)
         length *= 2
-    return [*lengths, count]
+    return [*lengths, longest]
 
 
-def readings_at(samples: Array, places: Array, most: int) -> Readings:
+def readings_at(
+    samples: Array, places: Array, most: int, longest: int, tell: Callable[[int, int], None] | None = None
+) -> Readings:
     """Tones of a signal at some places [samples], ascending: of each tone the reading of its longest sound window."""
     parts: list[Readings] = []
     tones: ToneRows | None = None
-    for length in window_lengths(samples.size):
+    lengths = window_lengths(longest)
+    for done, length in enumerate(lengths):
+        if tell is not None:
+            tell(done, len(lengths))
         last = samples.size - length
         first = np.unique(np.append(np.arange(0, last + 1, length // HOPS), last))
         tones = tones_of_windows(samples, length, first, most, tones)
@@ -88,7 +97,11 @@ def readings_at(samples: Array, places: Array, most: int) -> Readings:
     order = np.argsort(everything.row, kind="stable")
     everything = Readings(*(field[order] for field in everything))
     bounds = np.searchsorted(everything.row, np.arange(places.size + 1))
-    chosen = [begin + _chosen(everything, begin, end) for begin, end in pairwise(bounds) if end > begin]
+    chosen = [
+        begin + _chosen(Readings(*(field[begin:end] for field in everything)))
+        for begin, end in pairwise(bounds)
+        if end > begin
+    ]
     kept = np.concatenate(chosen) if chosen else np.empty(0, np.int64)
     return Readings(*(field[kept] for field in everything))
 
@@ -115,8 +128,10 @@ def _readings(tones: ToneRows, length: int, places: Array) -> Readings:
     growth, rate, omega_error = of(tones.growth), of(tones.rate), of(tones.omega_error)
     relative = of(tones.amplitude_error) / of(tones.amplitude)
     # The amplitude at the end of a window depends on its growth.
-    amplitude = of(tones.amplitude) * np.exp(np.clip(growth * x, -20.0, 20.0))
-    amplitude_error = of(tones.amplitude_error) * np.hypot(1.0, GROWTH_ERROR * u)
+    grown = np.exp(np.clip(growth * x, -20.0, 20.0))
+    amplitude = of(tones.amplitude) * grown
+    # Where the amplitude has vanished, an exponential that is none would seem surer than the noise allows.
+    amplitude_error = of(tones.amplitude_error) * np.hypot(1.0, GROWTH_ERROR * u) * np.maximum(1.0, grown)
     omega = of(tones.omega) + rate * x
     error = np.hypot(omega_error, of(tones.rate_error) * x)
     # A phase c P3(u) that was left out changes the frequency at u by (7.5 u^2 - 1.5) c, which the middle knows as `bend`.
@@ -127,8 +142,8 @@ def _readings(tones: ToneRows, length: int, places: Array) -> Readings:
     hidden = np.minimum(KINK * np.abs(rate) * length, HIDDEN_KINK * omega_error) / COVERED
     error = np.where(np.abs(rate) > MOVES * of(tones.rate_error), np.hypot(error, hidden), error)
     error = np.where(of(tones.change_chance) < DOUBTFUL, DOUBT * error, error)
-    grown = np.abs(growth) * half
-    blended = (grown > COVERED * GROWTH_ERROR * relative) & (grown < BLENDED_GROWTH)
+    growing = np.abs(growth) * half
+    blended = (growing > COVERED * GROWTH_ERROR * relative) & (growing < BLENDED_GROWTH)
     error = np.where(blended, np.hypot(error, np.abs(growth) / COVERED), error)
     return Readings(
         row,
@@ -140,6 +155,7 @@ def _readings(tones: ToneRows, length: int, places: Array) -> Readings:
         growth,
         rate,
         np.full(row.size, length),
+        tones.middle[window],
         (_distance(tones, length) >= RESOLVED)[window, tone],
         (amplitude > SIGNIFICANT * amplitude_error) & (of(tones.omega) * length > PERIODS * 2.0 * np.pi),
     )
@@ -168,12 +184,34 @@ def _distance(tones: ToneRows, length: int) -> Array:
     return np.asarray(np.where(np.isnan(apart), np.inf, apart).min(axis=2) * length / (2.0 * np.pi))
 
 
-def _chosen(everything: Readings, begin: int, end: int) -> IndexArray:
+def _modulated(readings: Readings) -> BoolArray:
+    """Readings of one instant that are lines of a comb, and not what a shorter window shows, which is one tone that moves.
+
+    Amplitude or frequency that changes periodically makes lines at equal distances, each of them as steady as a tone.
+    """
+    omega, error, window = readings.omega, readings.error, readings.window
+    combs = np.zeros(omega.size, np.bool_)
+    for length, middle in {(int(w), float(m)) for w, m in zip(window, readings.middle, strict=True)}:
+        lines = np.flatnonzero((window == length) & (readings.middle == middle))
+        lines = lines[np.argsort(omega[lines])]
+        gaps, sure = np.diff(omega[lines]), np.hypot(error[lines][1:], error[lines][:-1])
+        equal = np.abs(np.diff(gaps)) < np.maximum(SAME_ERRORS * np.hypot(sure[1:], sure[:-1]), UNEQUAL * gaps[1:])
+        for k in np.flatnonzero(equal):
+            places = (omega[lines] - omega[lines[k]]) / gaps[k]
+            comb = lines[np.abs(places - np.round(places)) < UNEQUAL]
+            shorter = (window < length) & (window * gaps[k] < 2.0 * np.pi)
+            shorter &= (omega > omega[comb[0]] - gaps[k]) & (omega < omega[comb[-1]] + gaps[k])
+            if shorter.any():
+                best = np.flatnonzero(shorter)[error[shorter].argmin()]
+                combs[comb] |= np.abs(omega[comb] - omega[best]) > COVERED * error[best]
+    return combs
+
+
+def _chosen(readings: Readings) -> IndexArray:
     """Which readings of one instant are kept: none that is near to one of a longer, or nearer, window."""
-    omega, error = everything.omega[begin:end], everything.error[begin:end]
-    window = everything.window[begin:end]
+    omega, error, window = readings.omega, readings.error, readings.window
     kept = []
-    open_ = np.ones(omega.size, np.bool_)
+    open_ = ~_modulated(readings)
     while open_.any():
         best = int(open_.argmax())
         kept.append(best)

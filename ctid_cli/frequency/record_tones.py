@@ -1,0 +1,220 @@
+"""All tones of a recorded signal over time: how many there are, and what is known of each at every instant."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.errors import DataError
+from ctid_cli.frequency.automatic import SUSPICIOUS, refuse_unusable
+from ctid_cli.frequency.decimation import Decimation, low_pass
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.record_track import MOST_ASKED, MissingLine, Procedure, RecordTrack
+from ctid_cli.frequency.spectrum import find_peaks
+from ctid_cli.frequency.tone_identity import paths_of
+from ctid_cli.frequency.tone_rows import SHORTEST, Readings, readings_at
+from ctid_cli.signals.checks import require_integer, require_positive
+
+#: Name of the method.
+METHOD = "tone_windows"
+#: Rows of a track if nobody says how many.
+USUAL_ROWS = 1000
+#: Fewest samples that show anything.
+FEWEST = 32
+#: Most lines that are fitted in one window.
+MOST_LINES = 16
+#: Records with no more samples are not thinned.
+UNTHINNED = 2**15
+#: Of a thinned record this share of the band is kept, and the highest tone lies in this share of it.
+KEPT_BAND = 0.9
+TONE_BAND = 0.8
+#: What the filter leaves of what would fold into that band [dB].
+STOP_BAND = 60.0
+#: Gaps shorter than this share of the shortest period are bridged before a filter.
+BRIDGED = 0.05
+#: Names of readings where those of a track differ.
+FIELDS = {"amplitudes": "amplitude"}
+#: Most lines that are named as missing.
+MOST_MISSING = 5
+
+
+def follow_tones(
+    samples: Array,
+    interval: float,
+    tones: int | None = None,
+    *,
+    every: float | None = None,
+    window: float | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> tuple[RecordTrack, Procedure]:
+    """Follow the strongest tones of a recorded signal, or all of them.
+
+    In windows of all lengths, doubled from 64 samples to the whole record, decaying chirps are fitted one by one until the
+    residual, whitened, shows no further line. At each instant each tone is read from the longest window in which nothing
+    speaks against it: no line left near it, no change within the window, no other tone too close.
+
+    Parameters
+    ----------
+    samples : ndarray, shape (N,)
+        Signal on a regular clock [signal unit]; NaN where missing.
+    interval : float
+        Sampling interval [s].
+    tones : int, optional
+        Number of tones, 0 to 20, the strongest ones; all that are worth their numbers (minimum description length) if not
+        given.
+    every : float, optional
+        Time from row to row [s]; a thousandth of the record if not given.
+    window : float, optional
+        Longest window [s]; the whole record if not given.
+    on_progress : callable, optional
+        Told how much of how much is done.
+
+    Returns
+    -------
+    RecordTrack
+        The tones, ascending in frequency.
+    Procedure
+        How they were found.
+
+    Raises
+    ------
+    DataError
+        If the signal is too short, constant, or shows no tone.
+    """
+    require_positive("interval", interval, "s")
+    if tones is not None:
+        require_integer("tones", tones, 0, MOST_ASKED)
+    refuse_unusable(samples, FEWEST)
+    decimation, reasons = _thinning(samples, interval, tones)
+    scale = float(np.nanmax(np.abs(samples)))
+    thinned = decimation.apply(samples / scale)
+    thin = interval * decimation.factor
+    longest = _longest(window, thin, thinned.size)
+    step = (samples.size * interval / USUAL_ROWS if every is None else every) / thin
+    places = np.arange(0.0, thinned.size - 0.5, max(step, 1.0))
+    found = readings_at(thinned, places, MOST_LINES, longest, on_progress)
+    paths = paths_of(found, places)
+    if not paths and tones is None:
+        raise DataError(f"no tone stands out of {samples.size * interval:.4g} s; use a longer record, or --tones 1")
+    wanted = paths[: MOST_ASKED if tones is None else tones]
+    wanted.sort(key=lambda path: float(np.median(found.omega[path])))
+    count = len(wanted) if tones is None else tones
+    lost = paths[len(wanted) :][:MOST_MISSING]
+    track = RecordTrack.of(
+        places * thin + 0.5 * (decimation.weights.size - 1) * interval,
+        *_frequencies(found, wanted, places, count, thin),
+        max(step, 1.0) * thin,
+        missing=tuple(_missing(found, path, places.size, thin, scale) for path in lost),
+        **_others(found, wanted, (places.size, count), thin, scale, decimation),
+    )
+    used = {"interval": thin, "kept_of": decimation.factor, "filter_samples": decimation.weights.size}
+    sentences = (*_counted(paths, count, tones), *reasons, *_windows_used(found, wanted, thin))
+    highest = max((float(np.median(found.omega[path])) for path in wanted), default=0.0) / (2.0 * np.pi * thin)
+    doubts = tuple(_doubts(len(paths), tones, highest, 0.5 / interval))
+    return track, Procedure(METHOD, False, sentences, doubts, used | {"longest_window": longest * thin})
+
+
+def _thinning(samples: Array, interval: float, tones: int | None) -> tuple[Decimation, list[str]]:
+    """A filter, and how many samples are left out after it, where the strongest tones need few of many samples."""
+    if samples.size <= UNTHINNED:
+        return Decimation(np.ones(1)), []
+    peaks = find_peaks(samples, interval, tones or MOST_ASKED)
+    if not peaks.omega.size:
+        return Decimation(np.ones(1)), []
+    top = float(peaks.omega[: tones or MOST_ASKED].max())
+    factor = min(int(np.pi * TONE_BAND / (top * interval)), -(-samples.size // UNTHINNED))
+    if factor <= 1:
+        return Decimation(np.ones(1)), []
+    nyquist = np.pi / (factor * interval)
+    weights = low_pass(KEPT_BAND * nyquist, (2.0 - KEPT_BAND) * nyquist, STOP_BAND, interval)
+    bridge = int(BRIDGED * 2.0 * np.pi / (top * interval))
+    edge = f"{KEPT_BAND * nyquist / (2.0 * np.pi):.4g} Hz"
+    kept = f"One of {factor} samples is kept, every {factor * interval:.4g} s"
+    return Decimation(weights, factor, bridge), [f"{kept}, after a low-pass that keeps what is below {edge}."]
+
+
+def _longest(window: float | None, thin: float, count: int) -> int:
+    """Samples of the longest window."""
+    if window is None:
+        return count
+    length = round(min(window / thin, count + 1.0))
+    if not SHORTEST <= length <= count:
+        allowed = f"from {SHORTEST * thin:.4g} s to {count * thin:.4g} s"
+        raise DataError(f"the longest window must be {allowed}, not {window:g} s")
+    return length
+
+
+_Flags = NDArray[np.uint16]
+
+
+def _frequencies(
+    found: Readings, paths: list[IndexArray], places: Array, count: int, thin: float
+) -> tuple[Array, _Flags]:
+    """Frequencies [rad/s] and flags, both of shape (N, n)."""
+    omega = np.full((places.size, count), np.nan)
+    flags = np.full((places.size, count), int(Flag.ABSENT), np.uint16)
+    for k, path in enumerate(paths):
+        rows = found.row[path]
+        # Between its readings the tone is there, but no window is free of changes.
+        flags[rows[0] : rows[-1] + 1, k] = int(Flag.CHANGE)
+        omega[rows, k] = found.omega[path] / thin
+        unsure = np.where(found.significant[path], 0, int(Flag.ABSENT))
+        flags[rows, k] = unsure | np.where(found.resolved[path], 0, int(Flag.UNRESOLVED))
+    return omega, flags
+
+
+def _others(
+    found: Readings, paths: list[IndexArray], shape: tuple[int, int], thin: float, scale: float, filter_: Decimation
+) -> dict[str, Array]:
+    """What else is known of the tones, in units of the record."""
+    factors = {
+        "error": 1.0 / thin,
+        "amplitudes": scale,
+        "amplitude_error": scale,
+        "phase": 1.0,
+        "growth": 1.0 / thin,
+        "rate": 1.0 / thin**2,
+        "window": thin,
+    }
+    values = {name: np.full(shape, np.nan) for name in factors}
+    gain = filter_.gain(found.omega / filter_.factor, 1.0)
+    for k, path in enumerate(paths):
+        for name, factor in factors.items():
+            values[name][found.row[path], k] = factor * np.asarray(getattr(found, FIELDS.get(name, name)))[path]
+        for name in ("amplitudes", "amplitude_error"):
+            values[name][found.row[path], k] /= gain[path]
+    # Readings are of cosines, tracks of sines.
+    values["phase"] = np.angle(1j * np.exp(1j * values["phase"]))
+    return values
+
+
+def _missing(found: Readings, path: IndexArray, rows: int, thin: float, scale: float) -> MissingLine:
+    return MissingLine(
+        float(np.median(found.omega[path])) / thin, path.size / rows, scale * float(np.median(found.amplitude[path]))
+    )
+
+
+def _counted(paths: list[IndexArray], count: int, tones: int | None) -> Iterator[str]:
+    """How many tones there are, and how that is known."""
+    if tones is None:
+        more = f" The strongest {count} of {len(paths)} are followed." if len(paths) > count else ""
+        how = "lines join until the whitened residual shows none, and stay if they are worth their numbers"
+        yield f"Tones: {count}, from the record ({how}: minimum description length).{more}"
+
+
+def _windows_used(found: Readings, paths: list[IndexArray], thin: float) -> Iterator[str]:
+    """From which windows the tones were read."""
+    if paths:
+        windows = found.window[np.concatenate(paths)] * thin
+        low, middle, high = windows.min(), np.median(windows), windows.max()
+        how = "the longest in which no line is left and nothing changes"
+        yield f"Windows of {low:.4g} s to {high:.4g} s, half of them up to {middle:.4g} s: {how}."
+
+
+def _doubts(found: int, tones: int | None, highest: float, nyquist: float) -> Iterator[str]:
+    """What the user should know before believing the tones [Hz]."""
+    if tones is not None and found < tones:
+        yield f"Only {found} of {tones} tones stand out of the record: the other columns are empty."
+    if highest > SUSPICIOUS * nyquist:
+        yield f"The tone at {highest:.6g} Hz may be the image of one above the Nyquist frequency, {nyquist:.6g} Hz."
