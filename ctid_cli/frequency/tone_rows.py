@@ -22,7 +22,9 @@ PERIODS = 4.0
 #: A tone is there if its amplitude at the instant is so many times its standard error.
 SIGNIFICANT = 5.0
 #: Three lines at equal distances, that differ by no more than this share, may be one tone that is modulated.
+#: Lines so many distances beside such a comb belong to it.
 UNEQUAL = 0.05
+BESIDE = 3.0
 #: Readings closer than so many bins of the shorter window, or so many standard errors, are of one tone.
 SAME_BINS = 1.5
 SAME_ERRORS = 5.0
@@ -196,13 +198,15 @@ def _modulated(readings: Readings) -> BoolArray:
         lines = lines[np.argsort(omega[lines])]
         gaps, sure = np.diff(omega[lines]), np.hypot(error[lines][1:], error[lines][:-1])
         equal = np.abs(np.diff(gaps)) < np.maximum(SAME_ERRORS * np.hypot(sure[1:], sure[:-1]), UNEQUAL * gaps[1:])
-        for k in np.flatnonzero(equal):
-            places = (omega[lines] - omega[lines[k]]) / gaps[k]
-            comb = lines[np.abs(places - np.round(places)) < UNEQUAL]
-            shorter = (window < length) & (window * gaps[k] < 2.0 * np.pi)
-            shorter &= (omega > omega[comb[0]] - gaps[k]) & (omega < omega[comb[-1]] + gaps[k])
+        runs = np.flatnonzero(np.diff(np.concatenate(([False], equal, [False])).astype(np.int8)))
+        for begin, end in zip(runs[::2], runs[1::2], strict=True):
+            gap = gaps[begin : end + 1].mean()
+            low, high = omega[lines[begin]] - BESIDE * gap, omega[lines[end + 1]] + BESIDE * gap
+            around = (omega > low) & (omega < high)
+            shorter = around & (window < length) & (window * gap < 2.0 * np.pi)
             if shorter.any():
                 best = np.flatnonzero(shorter)[error[shorter].argmin()]
+                comb = lines[around[lines]]
                 combs[comb] |= np.abs(omega[comb] - omega[best]) > COVERED * error[best]
     return combs
 
