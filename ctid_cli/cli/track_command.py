@@ -131,13 +131,18 @@ def _follow(record: SampledSignal, asked: Asked) -> tuple[RecordTrack, Procedure
     """The track of a record, and how it was found."""
     from ctid_cli.frequency.automatic import choose_settings
     from ctid_cli.frequency.estimator_rows import procedure_of, track_record
+    from ctid_cli.frequency.record_tones import follow_tones
 
-    if asked.tones is None:
-        raise UsageError("--tones is missing: the number of sinusoids, such as --tones 2")
-    samples, interval = record.samples, record.interval
+    samples, interval, method = record.samples, record.interval, asked.method
     try:
-        settings = choose_settings(samples, interval, asked.tones, method=asked.method, window=asked.window)
         with RecordProgress(Path(record.file).name) as tell:
+            if method is None:
+                return follow_tones(
+                    samples, interval, asked.tones, every=asked.every, window=asked.window, on_progress=tell
+                )
+            if asked.tones is None:
+                raise UsageError(f"--method {method} needs the number of sinusoids, such as --tones 2")
+            settings = choose_settings(samples, interval, asked.tones, method=method, window=asked.window)
             found = track_record(samples, interval, settings, every=asked.every, on_progress=tell)
     except ValueError as error:
         raise UsageError(str(error)) from None

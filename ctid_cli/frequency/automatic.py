@@ -18,11 +18,6 @@ from ctid_cli.signals.checks import require_choice, require_integer, require_pos
 #: Estimators that take windows of the record, and those that integrate; the others delay.
 BATCH = ("esprit", "nonlinear_least_squares")
 INTEGRATING = ("adaptive_observer", "filter_regression")
-#: Why one is chosen.
-WHY = {
-    "esprit": "ESPRIT, the most exact one for a whole record without gaps",
-    "nonlinear_least_squares": "nonlinear least squares, since samples are missing",
-}
 #: Samples in a period of the highest tone, and how many tones more than the wanted ones may share the band, for
 #: estimators that take windows, that integrate, and for the others, that delay.
 SAMPLING = dict.fromkeys(BATCH, (4, MOST_TONES)) | dict.fromkeys(INTEGRATING, (60, 0))
@@ -105,9 +100,9 @@ class _Band:
 
 
 def choose_settings(
-    samples: Array, interval: float, tones: int, *, method: str | None = None, window: float | None = None
+    samples: Array, interval: float, tones: int, *, method: str = "esprit", window: float | None = None
 ) -> Settings:
-    """Choose an estimator and everything that it needs.
+    """Choose everything that an estimator needs.
 
     The tones are the strongest peaks of the median spectrum of the record's segments. A low-pass whose stop band begins
     before what would fold onto them, and before the next strong tone, allows to keep only some samples in each period
@@ -118,8 +113,7 @@ def choose_settings(
     """
     require_integer("tones", tones, 1, MOST_TONES)
     require_positive("interval", interval, "s")
-    if method is not None:
-        require_choice("method", method, tuple(KINDS["frequency_estimator"]))
+    require_choice("method", method, tuple(KINDS["frequency_estimator"]))
     if window is not None:
         require_positive("window", window, "s")
     refuse_unusable(samples, SAMPLES_PER_TONE * tones, f" for {tones} tones")
@@ -130,22 +124,17 @@ def choose_settings(
     offset = _offset(samples, float(peaks.amplitudes[:tones][-1]))
     bridge = int(BRIDGED * 2.0 * np.pi / (peaks.omega[:tones].max() * interval))
     gaps = bool((~np.isfinite(samples)).any())
-    chosen = method or ("nonlinear_least_squares" if gaps else "esprit")
-    band = _choose_band(samples.size * interval, interval, tones, peaks, chosen, bridge, gaps)
+    band = _choose_band(samples.size * interval, interval, tones, peaks, method, bridge, gaps)
     thinned = band.decimation.apply(samples, offset)
     thin = interval * band.decimation.factor
-    if method is None and gaps and np.isfinite(thinned).all():
-        chosen = "esprit"
     if np.isfinite(thinned).sum() < SAMPLES_PER_TONE * tones:
         filtered = f"{band.decimation.weights.size * interval:.4g} s of filter"
         raise DataError(f"the record is too short or has too many gaps: {seconds} for {filtered}; use a longer one")
-    batch = chosen in BATCH
-    length, sentence = _choose_window(thinned, thin, tones, band, chosen if batch else "esprit", window)
-    options, how = _options(chosen, band, tones, thin, length * thin)
-    estimator = resolve("frequency_estimator", chosen)(tones=band.expected.size, **options)
+    batch = method in BATCH
+    length, sentence = _choose_window(thinned, thin, tones, band, method if batch else "esprit", window)
+    options, how = _options(method, band, tones, thin, length * thin)
+    estimator = resolve("frequency_estimator", method)(tones=band.expected.size, **options)
     reasons = [*_preparation(peaks, tones, offset, bridge * interval if gaps else 0.0), *band.sentences]
-    if method is None:
-        reasons.append(f"Method: {chosen}: {WHY[chosen]}.")
     if how:
         reasons.append(how)
     reasons.append(sentence if batch else f"Amplitudes are found from the last {length * thin:.4g} s before each row.")

@@ -209,7 +209,8 @@ def _windows_used(found: Readings, paths: list[IndexArray], thin: float) -> Iter
         windows = found.window[np.concatenate(paths)] * thin
         low, middle, high = windows.min(), np.median(windows), windows.max()
         how = "the longest in which no line is left and nothing changes"
-        yield f"Windows of {low:.4g} s to {high:.4g} s, half of them up to {middle:.4g} s: {how}."
+        range_ = f"to {high:.4g} s, half of them up to {middle:.4g} s" if low < high else "everywhere"
+        yield f"Windows of {low:.4g} s {range_}: {how}."
 
 
 def _doubts(found: int, tones: int | None, highest: float, nyquist: float) -> Iterator[str]:

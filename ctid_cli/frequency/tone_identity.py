@@ -36,7 +36,7 @@ def paths_of(found: Readings, places: Array) -> list[IndexArray]:
     """The readings of each tone, the strongest tone first."""
     step = float(np.median(np.diff(places))) if places.size > 1 else 1.0
     paths = _joined(_followed(found, places, step), found, places.size)
-    paths = [path for path in paths if _described(found, path, float(np.ptp(places)) + step)]
+    paths = [path for path in paths if _described(found, path, places, step)]
     return sorted(paths, key=lambda path: -float((found.amplitude[path] ** 2).sum()))
 
 
@@ -102,12 +102,14 @@ def _joined(paths: list[IndexArray], found: Readings, rows: int) -> list[IndexAr
     return joined
 
 
-def _described(found: Readings, path: IndexArray, length: float) -> bool:
-    """Whether a tone is worth its numbers, and saying in which window it is, in one of its windows at least.
+def _described(found: Readings, path: IndexArray, places: Array, step: float) -> bool:
+    """Whether a tone lasts for one of its windows, and is worth its numbers and the saying in which window it is.
 
-    That is the minimum description length of a tone of so long a signal.
+    That is the minimum description length of a tone of a signal.
     """
     sure = found.resolved[path] & found.significant[path]
     gain = 0.5 * (found.amplitude[path] / found.amplitude_error[path]) ** 2
     window = found.window[path]
-    return bool((sure & (gain > 0.5 * NUMBERS * np.log(window) + np.log(length / window))).any())
+    worth = gain > 0.5 * NUMBERS * np.log(window) + np.log(np.maximum(1.0, places[-1] / window))
+    lasting = places[found.row[path[-1]]] - places[found.row[path[0]]] + 2.0 * step >= np.minimum(window, places[-1])
+    return bool((sure & worth & lasting).any())
