@@ -7,6 +7,7 @@ from scipy.optimize import linear_sum_assignment
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.frequency.tone_rows import Readings
+from ctid_cli.frequency.tone_tests import FLOOR_BINS, MEDIAN_EFFICIENCY
 
 #: A reading goes on with a tone if it is no more than so many standard errors, or bins of the shorter window, off.
 GATE_ERRORS = 5.0
@@ -108,8 +109,10 @@ def _described(found: Readings, path: IndexArray, places: Array, step: float) ->
     That is the minimum description length of a tone of a signal.
     """
     sure = found.resolved[path] & found.significant[path]
-    gain = 0.5 * (found.amplitude[path] / found.amplitude_error[path]) ** 2
     window = found.window[path]
+    # The noise beneath a line is uncertain too, as it is for the test that finds lines.
+    known = MEDIAN_EFFICIENCY * np.minimum(FLOOR_BINS, 0.5 * window)
+    gain = known * np.log1p(0.5 * (found.amplitude[path] / found.amplitude_error[path]) ** 2 / known)
     worth = gain > 0.5 * NUMBERS * np.log(window) + np.log(np.maximum(1.0, places[-1] / window))
     lasting = places[found.row[path[-1]]] - places[found.row[path[0]]] + 2.0 * step >= np.minimum(window, places[-1])
     return bool((sure & worth & lasting).any())
