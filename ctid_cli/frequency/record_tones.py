@@ -1,6 +1,7 @@
 """All tones of a recorded signal over time: how many there are, and what is known of each at every instant."""
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,8 @@ STOP_BAND = 60.0
 BRIDGED = 0.05
 #: Names of readings where those of a track differ.
 FIELDS = {"amplitudes": "amplitude"}
+#: Noise that is added, as a share of the largest sample.
+DITHER = 1e-7
 #: Most lines that are named as missing.
 MOST_MISSING = 5
 
@@ -88,7 +91,9 @@ def follow_tones(
     refuse_unusable(samples, FEWEST)
     decimation, reasons = _thinning(samples, interval, tones)
     scale = float(np.nanmax(np.abs(samples)))
-    thinned = decimation.apply(samples / scale)
+    # Rounding leaves no noise by which errors could be told.
+    dither = DITHER * np.random.default_rng(0).standard_normal(samples.size)
+    thinned = decimation.apply(samples / scale + dither)
     thin = interval * decimation.factor
     longest = _longest(window, thin, thinned.size)
     step = (samples.size * interval / USUAL_ROWS if every is None else every) / thin
@@ -100,14 +105,13 @@ def follow_tones(
     wanted = paths[: MOST_ASKED if tones is None else tones]
     wanted.sort(key=lambda path: float(np.median(found.omega[path])))
     count = len(wanted) if tones is None else tones
+    alone = _alone(thinned, places)
     lost = paths[len(wanted) :][:MOST_MISSING]
-    track = RecordTrack.of(
-        places * thin + 0.5 * (decimation.weights.size - 1) * interval,
-        *_frequencies(found, wanted, places, count, thin),
-        max(step, 1.0) * thin,
-        missing=tuple(_missing(found, path, places.size, thin, scale) for path in lost),
-        **_others(found, wanted, (places.size, count), thin, scale, decimation),
-    )
+    omega, flags = _frequencies(found, wanted, alone, count, thin)
+    others: dict[str, Any] = _others(found, wanted, omega.shape, thin, scale, decimation)
+    others["missing"] = tuple(_missing(found, path, places.size, thin, scale) for path in lost)
+    t = places * thin + 0.5 * (decimation.weights.size - 1) * interval
+    track = RecordTrack.of(t, omega, flags, max(step, 1.0) * thin, **others)
     used = {"interval": thin, "kept_of": decimation.factor, "filter_samples": decimation.weights.size}
     sentences = (*_counted(paths, count, tones), *reasons, *_windows_used(found, wanted, thin))
     highest = max((float(np.median(found.omega[path])) for path in wanted), default=0.0) / (2.0 * np.pi * thin)
@@ -149,11 +153,11 @@ _Flags = NDArray[np.uint16]
 
 
 def _frequencies(
-    found: Readings, paths: list[IndexArray], places: Array, count: int, thin: float
+    found: Readings, paths: list[IndexArray], alone: Array, count: int, thin: float
 ) -> tuple[Array, _Flags]:
-    """Frequencies [rad/s] and flags, both of shape (N, n)."""
-    omega = np.full((places.size, count), np.nan)
-    flags = np.full((places.size, count), int(Flag.ABSENT), np.uint16)
+    """Frequencies [rad/s] and flags, both of shape (N, n), of rows so far from the nearest sample [samples]."""
+    omega = np.full((alone.size, count), np.nan)
+    flags = np.full((alone.size, count), int(Flag.ABSENT), np.uint16)
     for k, path in enumerate(paths):
         rows = found.row[path]
         # Between its readings the tone is there, but no window is free of changes.
@@ -161,11 +165,21 @@ def _frequencies(
         omega[rows, k] = found.omega[path] / thin
         unsure = np.where(found.significant[path], 0, int(Flag.ABSENT))
         flags[rows, k] = unsure | np.where(found.resolved[path], 0, int(Flag.UNRESOLVED))
+        # A tone may have done anything where there is no sample in a period of it.
+        flags[rows, k] |= np.where(alone[rows] * found.omega[path] > 2.0 * np.pi, int(Flag.GAP), 0).astype(np.uint16)
     return omega, flags
 
 
+def _alone(samples: Array, places: Array) -> Array:
+    """How far the nearest sample is from each place [samples]."""
+    present = np.flatnonzero(np.isfinite(samples))
+    after = np.searchsorted(present, places)
+    before, behind = present[np.maximum(after - 1, 0)], present[np.minimum(after, present.size - 1)]
+    return np.asarray(np.minimum(np.abs(places - before), np.abs(places - behind)))
+
+
 def _others(
-    found: Readings, paths: list[IndexArray], shape: tuple[int, int], thin: float, scale: float, filter_: Decimation
+    found: Readings, paths: list[IndexArray], shape: tuple[int, ...], thin: float, scale: float, filter_: Decimation
 ) -> dict[str, Array]:
     """What else is known of the tones, in units of the record."""
     factors = {

@@ -40,7 +40,7 @@ class Windows(NamedTuple):
     #: First sample of each window, shape (R,).
     first: IndexArray
     #: Number of tones in each window, shape (R,).
-    count: IndexArray
+    used: IndexArray
     #: Numbers of the tones, shape (R, n, 5).
     numbers: Array
     #: Mean squares of what is left, shape (R,).
@@ -58,7 +58,7 @@ def windows_at(first: IndexArray, most_tones: int) -> Windows:
     rows, size = first.size, NUMBERS * most_tones + 1
     return Windows(
         first=np.ascontiguousarray(first, dtype=np.int64),
-        count=np.zeros(rows, np.int64),
+        used=np.zeros(rows, np.int64),
         numbers=np.zeros((rows, most_tones, NUMBERS)),
         left=np.zeros(rows),
         inverse=np.zeros((rows, size, size)),
@@ -68,7 +68,9 @@ def windows_at(first: IndexArray, most_tones: int) -> Windows:
 
 
 @njit(cache=True, nogil=True)
-def _starts(tones: Array, length: int, z: NDArray[np.complex128], q: NDArray[np.complex128], p: NDArray[np.complex128]) -> None:
+def _starts(
+    tones: Array, length: int, z: NDArray[np.complex128], q: NDArray[np.complex128], p: NDArray[np.complex128]
+) -> None:
     """Phasor of each tone at the first sample, its first factor from sample to sample, and the factor of that factor."""
     du = 2.0 / (length - 1)
     for k in range(tones.shape[0]):
@@ -214,7 +216,9 @@ def _solve(factor: Array, size: int, scale: Array, right: Array, step: Array) ->
 
 
 @njit(cache=True, nogil=True)
-def _iterate(y: Array, tones: Array, constant: float, free: int, most: int, work: Array, pairs: IndexArray, residual: Array) -> tuple[float, bool]:
+def _iterate(
+    y: Array, tones: Array, constant: float, free: int, most: int, work: Array, pairs: IndexArray, residual: Array
+) -> tuple[float, bool]:
     """Levenberg-Marquardt steps; the constant and whether they ended at a minimum. ``tones`` is changed in place."""
     n = tones.shape[0]
     size = free * n + 1
@@ -270,7 +274,7 @@ def fit_windows(samples: Array, length: int, windows: Windows, chosen: IndexArra
     residual = np.empty(length)
     for row in chosen:
         y = samples[windows.first[row] : windows.first[row] + length]
-        n = windows.count[row]
+        n = windows.used[row]
         tones = windows.numbers[row, :n]
         constant = 0.0
         there = 0

@@ -69,6 +69,10 @@ class Readings(NamedTuple):
     resolved: BoolArray
     significant: BoolArray
 
+    def at(self, which: IndexArray | slice) -> "Readings":
+        """Some of the readings."""
+        return Readings(**{name: getattr(self, name)[which] for name in self._fields})
+
 
 def window_lengths(longest: int) -> list[int]:
     """Lengths of windows, doubled from the shortest one to the longest."""
@@ -95,17 +99,15 @@ def readings_at(
         tones = tones_of_windows(samples, length, first, most, tones)
         parts.append(_readings(tones, length, places))
     # The longest windows first, and of those of one length the one whose middle is nearest.
-    everything = Readings(*(np.concatenate(fields) for fields in zip(*parts[::-1], strict=True)))
+    everything = Readings(
+        **{name: np.concatenate([getattr(part, name) for part in parts[::-1]]) for name in Readings._fields}
+    )
     order = np.argsort(everything.row, kind="stable")
-    everything = Readings(*(field[order] for field in everything))
+    everything = everything.at(order)
     bounds = np.searchsorted(everything.row, np.arange(places.size + 1))
-    chosen = [
-        begin + _chosen(Readings(*(field[begin:end] for field in everything)))
-        for begin, end in pairwise(bounds)
-        if end > begin
-    ]
+    chosen = [begin + _chosen(everything.at(slice(begin, end))) for begin, end in pairwise(bounds) if end > begin]
     kept = np.concatenate(chosen) if chosen else np.empty(0, np.int64)
-    return Readings(*(field[kept] for field in everything))
+    return everything.at(kept)
 
 
 def _readings(tones: ToneRows, length: int, places: Array) -> Readings:

@@ -30,7 +30,7 @@ class ToneRows(NamedTuple):
     #: Middle of each window [samples], shape (R,).
     middle: Array
     #: Number of tones, shape (R,).
-    count: IndexArray
+    used: IndexArray
     #: At the middle: frequency [rad/sample], its standard error, amplitude, its standard error, phase [rad],
     #: growth [1/sample], rate of change of frequency [rad/sample^2]; NaN beyond the count; each of shape (R, n).
     omega: Array
@@ -64,7 +64,7 @@ def tones_of_windows(
     most = max(1, min(most, (length // SAMPLES_PER_NUMBER - 1) // NUMBERS))
     size = max(1, BLOCK_SAMPLES // length)
     blocks = [_block(samples, length, first[k : k + size], most, shorter) for k in range(0, first.size, size)]
-    return ToneRows(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
+    return ToneRows(**{name: np.concatenate([getattr(block, name) for block in blocks]) for name in ToneRows._fields})
 
 
 def _begun(windows: Windows, length: int, shorter: ToneRows) -> None:
@@ -77,12 +77,12 @@ def _begun(windows: Windows, length: int, shorter: ToneRows) -> None:
     sure = shorter.amplitude > SURE * shorter.amplitude_error
     for j in range(min(shorter.omega.shape[1], windows.numbers.shape[1])):
         rows = np.flatnonzero((clean & sure[:, j])[nearest])
-        of, place = nearest[rows], windows.count[rows]
+        of, place = nearest[rows], windows.used[rows]
         omega = shorter.omega[of, j] + shorter.rate[of, j] * (middle[rows] - shorter.middle[of])
         windows.numbers[rows, place] = 0.0
         windows.numbers[rows, place, 3] = omega * half
         windows.numbers[rows, place, 4] = 0.5 * shorter.rate[of, j] * half**2
-        windows.count[rows] += 1
+        windows.used[rows] += 1
 
 
 def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: ToneRows | None) -> ToneRows:
@@ -99,16 +99,16 @@ def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: T
         if round_ == most:
             break
         apart = np.abs(windows.numbers[todo, :, 3] - new.line.omega[:, None] * 0.5 * (length - 1))
-        apart[np.arange(most) >= windows.count[todo, None]] = np.inf
-        joins = (new.line.chance < LEVEL) & (windows.count[todo] < most) & (apart.min(axis=1) > APART * np.pi)
+        apart[np.arange(most) >= windows.used[todo, None]] = np.inf
+        joins = (new.line.chance < LEVEL) & (windows.used[todo] < most) & (apart.min(axis=1) > APART * np.pi)
         # What a change explains better is none.
         joins &= np.where(np.isnan(new.change), 0.0, new.change).max(axis=1) <= new.line.energy
         todo, turns = todo[joins], new.line.omega[joins] * 0.5 * (length - 1)
         if not todo.size:
             break
-        windows.numbers[todo, windows.count[todo]] = 0.0
-        windows.numbers[todo, windows.count[todo], 3] = turns
-        windows.count[todo] += 1
+        windows.numbers[todo, windows.used[todo]] = 0.0
+        windows.numbers[todo, windows.used[todo], 3] = turns
+        windows.used[todo] += 1
     assert tests is not None
     return _rows(windows, tests, length)
 
@@ -124,7 +124,11 @@ class _Tests(NamedTuple):
 
     def replaced(self, rows: IndexArray, new: "_Tests") -> "_Tests":
         """With other tests of some windows."""
-        for old, now in ((self.left, new.left), (self.line, new.line), ((self.change, self.cube), (new.change, new.cube))):
+        for old, now in (
+            (self.left, new.left),
+            (self.line, new.line),
+            ((self.change, self.cube), (new.change, new.cube)),
+        ):
             for field, values in zip(old, now, strict=True):
                 field[rows] = values
         return self
@@ -132,9 +136,9 @@ class _Tests(NamedTuple):
 
 def _tested(residuals: Array, windows: Windows, rows: IndexArray) -> _Tests:
     """Tests of what is left of some windows, which lose it on the way."""
-    left = whiten(residuals, NUMBERS * windows.count[rows] + 1)
+    left = whiten(residuals, NUMBERS * windows.used[rows] + 1)
     change, cube = (np.full((rows.size, windows.numbers.shape[1]), np.nan) for _ in range(2))
-    find_changes(left.white, left.filters, windows.numbers[rows], windows.count[rows], change, cube)
+    find_changes(left.white, left.filters, windows.numbers[rows], windows.used[rows], change, cube)
     line = strongest_line(left)
     return _Tests(left._replace(white=np.empty((rows.size, 0))), line, change, cube)
 
@@ -142,7 +146,7 @@ def _tested(residuals: Array, windows: Windows, rows: IndexArray) -> _Tests:
 def _rows(windows: Windows, tests: _Tests, length: int) -> ToneRows:
     half = 0.5 * (length - 1)
     rows, most = windows.numbers.shape[:2]
-    empty = np.arange(most) >= windows.count[:, None]
+    empty = np.arange(most) >= windows.used[:, None]
     cosine, sine, growth, turn, bend = (np.where(empty, np.nan, windows.numbers[:, :, j]) for j in range(NUMBERS))
     variances = np.diagonal(windows.inverse, axis1=1, axis2=2)[:, : NUMBERS * most].reshape(rows, most, NUMBERS)
     noise = np.where(empty, np.nan, tests.left.noise(np.where(empty, 0.0, turn / half)))
@@ -154,8 +158,8 @@ def _rows(windows: Windows, tests: _Tests, length: int) -> ToneRows:
         bent, uncertain = 2.0 * tests.cube / (length / 7.0) * per_unit, np.sqrt(2.0 / (length / 7.0)) * per_unit
     chances = np.minimum(1.0, CHANGE_TAIL * 2.0 * tests.change * np.exp(-tests.change))
     return ToneRows(
-        windows.first + half,
-        windows.count,
+        np.asarray(windows.first + half, dtype=np.float64),
+        windows.used,
         turn / half,
         errors[:, :, 3] / half,
         amplitude,

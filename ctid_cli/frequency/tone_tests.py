@@ -8,8 +8,9 @@ from numba import njit
 
 from ctid_cli.arrays import Array, IndexArray
 
-#: Highest order of the autoregressive model that whitens what is left: colour, not lines.
+#: Highest order of the autoregressive model that whitens what is left, and samples for each: colour, not lines.
 WHITENING_ORDER = 4
+SAMPLES_PER_ORDER = 128
 #: Points of a periodogram for each bin of an unpadded one.
 PADDING = 2
 #: The floor beneath an ordinate is the running median of so many bins, and no more than half of them all.
@@ -17,6 +18,10 @@ FLOOR_BINS = 101
 #: Ordinates higher than so many times the floor are cut before the floor's colour is modelled.
 CUT = 5.0
 ROUNDS = 3
+#: A floor is never divided by less.
+SMALLEST_FLOOR = 1e-300
+#: A tapered spectrum so high above its floor shows a line, whatever the colour of the noise.
+LINE_HEIGHT = 2e4
 #: A whitening filter is taken to let at least this share through.
 SMALLEST_GAIN = 1e-12
 #: The running median is as sure as the mean of so many bins for each of its own.
@@ -38,6 +43,10 @@ class Left(NamedTuple):
     innovations: Array
     #: Samples that are there, shape (R,).
     present: IndexArray
+    #: Where the tapered spectrum has its largest ordinate, as a share of all, and how far that is above its floor before
+    #: any whitening, shape (R,).
+    peak: Array
+    peak_height: Array
 
     def noise(self, turn: Array) -> Array:
         """Noise at some phases from sample to sample [rad] of each window: mean square of equally strong white noise.
@@ -60,24 +69,31 @@ def whiten(residuals: Array, fitted: IndexArray) -> Left:
     values = np.where(there, residuals, 0.0)
     taper = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
     power = np.abs(np.fft.rfft(values * taper, PADDING * length, axis=1)) ** 2
-    cosines = np.cos(np.outer(np.arange(WHITENING_ORDER + 1), np.linspace(0.0, np.pi, power.shape[1])))
+    orders = min(WHITENING_ORDER, max(1, length // SAMPLES_PER_ORDER))
+    cosines = np.cos(np.outer(np.arange(orders + 1), np.linspace(0.0, np.pi, power.shape[1])))
     weights = np.full(power.shape[1], 2.0)
     weights[[0, -1]] = 1.0
+    peak = power.argmax(axis=1)
+    floor = np.take_along_axis(running_floor(power), peak[:, None], axis=1)[:, 0]
+    height = power[np.arange(peak.size), peak] / np.maximum(floor, SMALLEST_FLOOR)
     shape = np.ones_like(power)
     for _ in range(ROUNDS):
         cut = np.minimum(power, CUT * shape * running_floor(power / shape))
         filters = _prediction_errors((cut * weights) @ cosines.T, present)
         # |A|^2 is the cosine series of the filter's own correlation.
-        own = np.stack([(filters[:, k:] * filters[:, : WHITENING_ORDER + 1 - k]).sum(axis=1) for k in range(WHITENING_ORDER + 1)])
+        own = np.stack(
+            [(filters[:, k:] * filters[:, : orders + 1 - k]).sum(axis=1) for k in range(orders + 1)]
+        )
         own[1:] *= 2.0
         shape = 1.0 / np.maximum(own.T @ cosines, SMALLEST_GAIN)
     white = values.copy()
-    for lag in range(1, WHITENING_ORDER + 1):
+    for lag in range(1, orders + 1):
         white[:, lag:] += filters[:, lag, None] * values[:, : length - lag]
     white[~there] = 0.0
     order = (filters != 0.0).sum(axis=1) - 1
     squares = (white**2).sum(axis=1) / np.maximum(present - fitted - order, 1)
-    return Left(white / np.sqrt(np.where(squares > 0.0, squares, 1.0))[:, None], filters, squares, present)
+    white /= np.sqrt(np.where(squares > 0.0, squares, 1.0))[:, None]
+    return Left(white, filters, squares, present, peak / (power.shape[1] - 1), height)
 
 
 def running_floor(power: Array) -> Array:
@@ -138,7 +154,7 @@ def strongest_line(left: Left) -> Line:
     """The strongest line of each row, in the ratio of the periodogram to its running median."""
     rows, length = left.white.shape
     ordinates = np.abs(np.fft.rfft(left.white, PADDING * length, axis=1)) ** 2
-    ratio = ordinates / np.maximum(running_floor(ordinates), 1e-300)
+    ratio = ordinates / np.maximum(running_floor(ordinates), SMALLEST_FLOOR)
     ratio[:, :PADDING] = 0.0
     place = ratio.argmax(axis=1)
     height = ratio[np.arange(rows), place]
@@ -146,7 +162,12 @@ def strongest_line(left: Left) -> Line:
     sure = MEDIAN_EFFICIENCY * floor_bins(ordinates.shape[1])
     one = (1.0 + height / sure) ** -sure
     chance = -np.expm1(INDEPENDENT * length * np.log1p(-np.minimum(one, 1.0 - 1e-16)))
-    return Line(chance, place * 2.0 * np.pi / (PADDING * length), height, ordinates.max(axis=1) / length)
+    omega = place * 2.0 * np.pi / (PADDING * length)
+    # The models of the noise have taken the skirts of a very strong line for its colour.
+    plain = left.peak_height > LINE_HEIGHT
+    chance, omega = np.where(plain, 0.0, chance), np.where(plain, np.pi * left.peak, omega)
+    energy = np.where(plain, left.peak_height, ordinates.max(axis=1) / length)
+    return Line(chance, omega, np.where(plain, left.peak_height, height), energy)
 
 
 @njit(cache=True, nogil=True)

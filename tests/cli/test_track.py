@@ -37,7 +37,7 @@ def test_names_of_the_methods(ctid):
 def test_table_track_and_figure(ctid, record, tmp_path):
     out = tmp_path / "new"
     text = ctid("track", record, "--tones", 2, "--out", out).stdout
-    for part in ("record.csv: 3000 samples", "frequency [Hz]", "Strongest tones", "Windows of", "track.svg"):
+    for part in ("record.csv: 3000 samples", "frequency [Hz]", "std. error", "Windows of", "track.svg"):
         assert part in text
     frame = pd.read_csv(out / "track.csv")
     valid = frame[frame["valid_1"] == 1]
@@ -75,7 +75,7 @@ def test_units_windows_and_rates(ctid, tmp_path):
     wavfile.write(tmp_path / "a.wav", 500, (8000 * signal()).astype(np.int16))
     assert found(tmp_path / "a.wav")[1] == expected
     assert found(write(tmp_path / "b.csv", np.arange(3000), signal(), "number,y"), "--rate", 500)[1] == expected
-    assert found(tmp_path / "b.csv", "--interval", 0.002, "--window", 1.0)[0]["settings"]["window_seconds"] == (
+    assert found(tmp_path / "b.csv", "--interval", 0.002, "--window", 1.0)[0]["settings"]["longest_window"] == (
         pytest.approx(1.0, rel=0.05)
     )
 
@@ -104,11 +104,12 @@ def test_missing_samples_are_flagged(ctid, tmp_path):
         (T, np.zeros(T.size), (), "is constant (0)"),
         (T, np.full(T.size, 4.0), (), "constant"),
         (T[:5], signal()[:5], (), "too few"),
-        (T, np.random.default_rng(1).standard_normal(T.size), (), "no tone stands out"),
+        (T, np.random.default_rng(1).standard_normal(T.size), ("--tones", "auto"), "no tone stands out"),
         (T**1.1, signal(), (), "clock is not regular"),
-        (T, signal(), ("--tones", 9), "tones must be an integer from 1 to 8"),
+        (T, signal(), ("--tones", 21), "--tones must be a number from 0 to 20, or auto"),
+        (T, signal(), ("--tones", 9, "--method", "esprit"), "tones must be an integer from 1 to 8"),
         (T, signal(), ("--every", -1), "--every"),
-        (T, signal(), ("--window", 1000), "window must be from"),
+        (T, signal(), ("--window", 1000), "the longest window must be from"),
         (T, signal(), ("--rate", 0), "--rate"),
         (T, signal(), ("--rate", 5, "--interval", 2), "one of them"),
         (T, signal(), ("--signal", "z"), "'z'"),
@@ -117,10 +118,10 @@ def test_missing_samples_are_flagged(ctid, tmp_path):
         (T, signal(), ("--to", "inf"), "--to must be an instant"),
         (T, signal(), ("--from", 1e308), "no sample lies"),
         (T, signal(), ("--to", -1e308), "no sample lies"),
-        (T, signal(), ("--window", 1e308), "window must be from"),
+        (T, signal(), ("--window", 1e308), "the longest window must be from"),
         (T, signal(), ("--rate", 1e-320), "--rate must be a positive number"),
         (T, 1e200 * signal(), (), "give it in a unit in which it is between"),
-        (T, np.where(np.random.default_rng(1).random(T.size) < 0.1, signal(), np.nan), (), "fewer gaps"),
+        (T, np.where(np.random.default_rng(1).random(T.size) < 0.005, signal(), np.nan), (), "too few"),
     ],
 )
 def test_mistakes_are_one_sentence(ctid, tmp_path, t, y, options, message):
@@ -133,7 +134,7 @@ def test_mistakes_are_one_sentence(ctid, tmp_path, t, y, options, message):
 
 
 @pytest.mark.parametrize("every", [50, 1e308])
-@pytest.mark.parametrize("method", ["esprit", "restarting_least_squares"])
+@pytest.mark.parametrize("method", ["automatic", "esprit", "restarting_least_squares"])
 def test_rows_farther_apart_than_the_record_is_long_are_one(ctid, record, tmp_path, method, every):
     done = ctid("track", record, "--tones", 2, "--every", every, "--method", method, "--out", tmp_path)
     assert len(pd.read_csv(tmp_path / "track.csv")) == 1
@@ -146,7 +147,7 @@ def test_many_single_samples_may_be_missing(ctid, tmp_path):
     out = tmp_path / "out"
     content = json.loads(ctid("track", write(tmp_path / "a.csv", T, y), "--tones", 2, "--json", "--out", out).stdout)
     assert [tone["frequency_hz"] for tone in content["tones"]] == pytest.approx([12.0, 19.0], abs=0.02)
-    assert content["method"] == "nonlinear_least_squares"
+    assert content["method"] == "tone_windows"
 
 
 @pytest.mark.parametrize("name", ["track.csv", "track.svg", "track.json"])

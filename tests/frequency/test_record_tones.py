@@ -1,0 +1,156 @@
+"""All tones of a record: what is called valid is right, whatever else the record holds."""
+
+import numpy as np
+import pytest
+
+from ctid_cli.errors import DataError
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.record_tones import follow_tones
+
+INTERVAL = 0.001
+T = INTERVAL * np.arange(4000)
+NOISE = 0.01 * np.random.default_rng(2).standard_normal(T.size)
+HERTZ = 2.0 * np.pi
+
+
+def tone(hertz, amplitude=1.0, phase=0.0):
+    return amplitude * np.cos(HERTZ * np.cumsum(np.broadcast_to(hertz, T.shape)) * INTERVAL + phase)
+
+
+def follow(y, tones=None, **options):
+    track, procedure = follow_tones(y + NOISE, INTERVAL, tones, every=0.02, **options)
+    return track.of_accuracy(None), procedure
+
+
+def wrong(track, column, truth):
+    """Valid rows that are off by more than the accuracy and more than 3.3 of their errors."""
+    off = np.abs(track.omega[:, column] - HERTZ * np.interp(track.t, T, np.broadcast_to(truth, T.shape)))
+    limit = np.maximum(3.3 * track.error[:, column], 1e-3 * track.omega[:, column])
+    return int((track.valid[:, column] & (off > limit)).sum())
+
+
+def test_a_steady_tone_is_known_as_well_as_can_be():
+    """The bound of Cramer and Rao for the frequency of a whole record: 24 s^2/(A^2 N^3) [rad/sample]^2."""
+    track, _ = follow(tone(60.0, phase=0.4), 1)
+    bound = np.sqrt(24.0 * 1e-4 / T.size**3) / INTERVAL
+    middle = track.t.size // 2
+    assert track.error[middle, 0] == pytest.approx(bound, rel=0.2)
+    assert abs(track.omega[middle, 0] - HERTZ * 60.0) < 3.3 * bound
+    assert track.amplitudes[middle, 0] == pytest.approx(1.0, abs=2e-3)
+    assert np.angle(np.exp(1j * (track.phase[:, 0] - 0.4 - np.pi / 2 - HERTZ * 60.0 * (track.t + INTERVAL)))) == (
+        pytest.approx(0.0, abs=0.02)
+    )
+    assert track.valid.all()
+
+
+@pytest.mark.parametrize("other", [53.7, 85.0])
+def test_a_weaker_tone_does_not_pull_the_stronger_one(other):
+    track, _ = follow(tone(50.0) + tone(other, 0.1), 1)
+    assert track.valid.all()
+    assert wrong(track, 0, 50.0) == 0
+    (line,) = track.missing
+    assert line.omega / HERTZ == pytest.approx(other, abs=0.01)
+    assert (line.share, line.amplitude) == (1.0, pytest.approx(0.1, rel=0.02))
+
+
+def test_the_number_of_tones_is_found():
+    track, procedure = follow(tone(50.0) + tone(53.7, 0.1, 1.0) + tone(200.0, 0.02))
+    assert np.median(track.omega, axis=0) / HERTZ == pytest.approx([50.0, 53.7, 200.0], abs=0.01)
+    assert track.missing == ()
+    assert "Tones: 3, from the record" in procedure.reasons[0]
+
+
+@pytest.mark.parametrize("degrees", [10.0, 45.0, 90.0])
+def test_no_window_straddles_a_step_of_phase(degrees):
+    track, _ = follow(tone(60.0, phase=np.deg2rad(degrees) * (T > 1.7)), 1)
+    assert wrong(track, 0, 60.0) == 0
+    assert track.valid.mean() > 0.9
+    assert not track.valid[np.abs(track.t - 1.7) < 0.004].any()
+
+
+def test_a_tone_keeps_its_column_over_a_step_of_frequency():
+    hertz = np.where(T < 2.2, 60.0, 63.0)
+    track, _ = follow(tone(hertz) + tone(30.0, 0.5), 2)
+    assert wrong(track, 1, hertz) == wrong(track, 0, 30.0) == 0
+    assert track.valid.mean() > 0.9
+    assert np.nanmax(np.abs(track.omega[:, 0] - HERTZ * 30.0)) < 0.5
+
+
+@pytest.mark.parametrize(
+    "hertz", [60.0 + 2.0 * T, 100.0 * (1.0 + 0.02 * np.sin(HERTZ * 0.5 * T))], ids=["chirp", "vibrato"]
+)
+def test_a_tone_that_moves_is_followed(hertz):
+    track, _ = follow(tone(hertz), 1)
+    assert wrong(track, 0, hertz) <= 0.01 * track.t.size
+    assert track.valid.mean() > 0.9
+
+
+def test_crossing_tones_keep_their_columns():
+    up, down = 60.0 + 10.0 * T, 100.0 - 10.0 * T
+    track, _ = follow(tone(up) + tone(down, 0.5, 1.0), 2)
+    rising = int(np.nanmean(track.rate[:, 0]) < np.nanmean(track.rate[:, 1]))
+    assert wrong(track, rising, up) + wrong(track, 1 - rising, down) == 0
+    sure = track.valid[:, rising]
+    assert track.rate[sure, rising] / HERTZ == pytest.approx(10.0, abs=0.5)
+
+
+def test_a_decaying_tone_is_valid_as_long_as_it_is_heard():
+    track, _ = follow(np.exp(-T / 0.5) * tone(82.0), 1)
+    assert wrong(track, 0, 82.0) == 0
+    assert track.valid[track.t < 1.5].mean() > 0.95
+    assert not track.valid[track.t > 3.5].any()
+    assert np.nanmedian(track.growth) == pytest.approx(-2.0, rel=0.05)
+
+
+def test_a_spike_spoils_no_valid_row():
+    y = tone(60.0)
+    y[2000] += 1e6
+    track, _ = follow(y, 1)
+    assert wrong(track, 0, 60.0) == 0
+    assert not track.valid[np.abs(track.t - 2.0) < 0.004].any()
+    assert track.valid.mean() > 0.9
+
+
+def test_a_gap_is_flagged_and_no_more_than_the_gap():
+    y = tone(60.0)
+    y[1500:2000] = np.nan
+    track, _ = follow(y, 1)
+    inside = (track.t > 1.52) & (track.t < 1.98)
+    assert (track.flags[inside, 0] & Flag.GAP).all()
+    assert track.valid[(track.t < 1.49) | (track.t > 2.01)].all()
+
+
+def test_noise_alone_has_no_tone():
+    rng = np.random.default_rng(5)
+    for _ in range(5):
+        with pytest.raises(DataError, match="no tone stands out"):
+            follow_tones(rng.standard_normal(2000), INTERVAL)
+    track, procedure = follow_tones(rng.standard_normal(2000), INTERVAL, 1)
+    assert (track.flags == Flag.ABSENT).all()
+    assert "Only 0 of 1 tones" in procedure.warnings[0]
+
+
+def test_units_only_scale():
+    y = tone(50.0) + tone(80.0, 0.3) + NOISE
+    one, _ = follow_tones(y, INTERVAL, 2)
+    other, _ = follow_tones(1e6 * y, 1e3 * INTERVAL, 2)
+    assert other.omega == pytest.approx(one.omega / 1e3, rel=1e-9)
+    assert other.amplitudes == pytest.approx(1e6 * one.amplitudes, rel=1e-9)
+
+
+def test_a_long_record_is_thinned_and_its_amplitudes_are_of_before():
+    t = np.arange(200_000) / 48_000.0
+    y = np.sin(HERTZ * 440.0 * t) + 0.01 * np.random.default_rng(1).standard_normal(t.size)
+    track, procedure = follow_tones(y, 1 / 48_000.0, 1)
+    assert "samples is kept" in " ".join(procedure.reasons)
+    assert track.valid.all()
+    middle = track.t.size // 2
+    assert abs(track.omega[middle, 0] / HERTZ - 440.0) < 1e-3
+    assert track.amplitudes[middle, 0] == pytest.approx(1.0, abs=1e-3)
+    assert np.angle(np.exp(1j * (track.phase[:, 0] - HERTZ * 440.0 * track.t))) == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.parametrize(("length", "window"), [(20, None), (1000, 0.01), (1000, 3.0)])
+def test_what_cannot_be_followed(length, window):
+    with pytest.raises(DataError, match="too few|longest window must be"):
+        follow_tones((tone(60.0) + NOISE)[:length], INTERVAL, 1, window=window)
