@@ -53,9 +53,9 @@ def follow_tones(
 ) -> tuple[RecordTrack, Procedure]:
     """Follow the strongest tones of a recorded signal, or all of them.
 
-    In windows of all lengths, doubled from 64 samples to the whole record, decaying chirps are fitted one by one until the
-    residual, whitened, shows no further line. At each instant each tone is read from the longest window in which nothing
-    speaks against it: no line left near it, no change within the window, no other tone too close.
+    In windows of all lengths, doubled from 64 samples to the whole record, decaying chirps are fitted one by one until
+    the residual, whitened, shows no further line. At each instant each tone is read from the longest window in which
+    nothing speaks against it: no line left near it, no change within the window, no other tone too close.
 
     Parameters
     ----------
@@ -64,8 +64,8 @@ def follow_tones(
     interval : float
         Sampling interval [s].
     tones : int, optional
-        Number of tones, 0 to 20, the strongest ones; all that are worth their numbers (minimum description length) if not
-        given.
+        Number of tones, 0 to 20, the strongest ones; if not given all that are worth their numbers (minimum description
+        length).
     every : float, optional
         Time from row to row [s]; a thousandth of the record if not given.
     window : float, optional

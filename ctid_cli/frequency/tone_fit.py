@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
 
-#: Numbers of a tone: cosine and sine amplitude, and over half a window: logarithmic growth, phase, and curvature of phase.
+#: Numbers of a tone: cosine and sine amplitude, and over half a window logarithmic growth, phase, curvature of phase.
 NUMBERS = 5
 #: Of them only so many are free in the first steps: what curves is fitted when what turns is nearly right.
 STRAIGHT = 4
 #: Largest logarithmic growth over half a window, and phase bent over half a window [rad].
 MOST_GROWTH = 4.0
 MOST_BEND = 1e4
-#: Iterations at most; stop when the step would lower the sum of squares by less than this share of one sample's, or change
-#: no phase by more than this [rad] and no amplitude by more than this share.
+#: Iterations at most; stop when the step would lower the sum of squares by less than this share of one sample's, or
+#: change no phase by more than this [rad] and no amplitude by more than this share.
 ITERATIONS = 30
 SMALL = 1e-3
 SMALLEST = 1e-9
@@ -71,7 +71,7 @@ def windows_at(first: IndexArray, most_tones: int) -> Windows:
 def _starts(
     tones: Array, length: int, z: NDArray[np.complex128], q: NDArray[np.complex128], p: NDArray[np.complex128]
 ) -> None:
-    """Phasor of each tone at the first sample, its first factor from sample to sample, and the factor of that factor."""
+    """Phasor of each tone at the first sample, its factor from there to the next, and the factor of that factor."""
     du = 2.0 / (length - 1)
     for k in range(tones.shape[0]):
         growth, turn, bend = tones[k, 2], tones[k, 3], tones[k, 4]

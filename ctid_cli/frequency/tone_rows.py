@@ -1,4 +1,4 @@
-"""The tones at each of many instants, read from the longest of all windows around it in which nothing speaks against it."""
+"""The tones at each of many instants, read from the longest window around it in which nothing speaks against them."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -30,17 +30,19 @@ SAME_BINS = 1.5
 SAME_ERRORS = 5.0
 #: A curvature of the frequency is left out of the reading below so many of its standard errors.
 QUIET = 2.0
-#: Frequencies that move by more than so many errors over their window may move otherwise than along a line. A kink that no
-#: test would find moves the frequency at its place by this share of the fitted sweep, and by no more than so many errors.
+#: Frequencies that move by more than so many errors over their window may move otherwise than along a line. A kink that
+#: no test would find moves the frequency at its place by this share of the fitted sweep, and by no more than so many
+#: errors.
 MOVES = 2.5
 KINK = 0.27
 HIDDEN_KINK = 18.0
 #: Steps of the phase that noise alone shows no more often than this may be there, and are worth so many errors.
 DOUBTFUL = 0.1
 DOUBT = 2.3
-#: Two tones in one line, which no test would tell from one that grows by less than this over half a window, pull its
-#: frequency by no more than its growth [rad/sample].
-BLENDED_GROWTH = 0.75
+#: Two tones in one line, which no test would tell from one that grows by so many errors but less than this over half a
+#: window, pull its frequency by no more than its growth [rad/sample].
+GROWS = 2.0
+BLENDED_GROWTH = 1.0
 #: What should be covered by 3 errors is divided by 3.
 COVERED = 3.0
 #: Standard error of the growth over half a window, in relative errors of the amplitude.
@@ -48,7 +50,7 @@ GROWTH_ERROR = 3.0**0.5
 
 
 class Readings(NamedTuple):
-    """What the windows say of the tones at many instants: one entry for each instant and tone, in order of the instants."""
+    """What windows say of the tones at many instants: one entry for each instant and tone, in order of the instants."""
 
     #: Which of the instants.
     row: IndexArray
@@ -138,7 +140,7 @@ def _readings(tones: ToneRows, length: int, places: Array) -> Readings:
     amplitude_error = of(tones.amplitude_error) * np.hypot(1.0, GROWTH_ERROR * u) * np.maximum(1.0, grown)
     omega = of(tones.omega) + rate * x
     error = np.hypot(omega_error, of(tones.rate_error) * x)
-    # A phase c P3(u) that was left out changes the frequency at u by (7.5 u^2 - 1.5) c, which the middle knows as `bend`.
+    # A phase c P3(u) that was left out changes the frequency at u by (7.5 u^2 - 1.5) c; `bend` is that at the middle.
     bent = np.abs(of(tones.bend)) > QUIET * of(tones.bend_error)
     share = 1.0 - 5.0 * u * u
     omega = np.where(bent, omega - share * of(tones.bend), omega)
@@ -147,7 +149,7 @@ def _readings(tones: ToneRows, length: int, places: Array) -> Readings:
     error = np.where(np.abs(rate) > MOVES * of(tones.rate_error), np.hypot(error, hidden), error)
     error = np.where(of(tones.change_chance) < DOUBTFUL, DOUBT * error, error)
     growing = np.abs(growth) * half
-    blended = (growing > COVERED * GROWTH_ERROR * relative) & (growing < BLENDED_GROWTH)
+    blended = (growing > GROWS * GROWTH_ERROR * relative) & (growing < BLENDED_GROWTH)
     error = np.where(blended, np.hypot(error, np.abs(growth) / COVERED), error)
     return Readings(
         row,
@@ -189,7 +191,7 @@ def _distance(tones: ToneRows, length: int) -> Array:
 
 
 def _modulated(readings: Readings) -> BoolArray:
-    """Readings of one instant that are lines of a comb, and not what a shorter window shows, which is one tone that moves.
+    """Readings of one instant that are lines of a comb, where a shorter window shows one tone that moves.
 
     Amplitude or frequency that changes periodically makes lines at equal distances, each of them as steady as a tone.
     """

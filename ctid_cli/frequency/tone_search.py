@@ -14,7 +14,7 @@ LEVEL = 5e-4
 CHANGE_TAIL = 3.6
 #: Lines closer than so many bins to a tone are changes of it, or another one that the window does not tell apart.
 APART = 1.5
-#: A phase c P3(u), P3 = (5 u^3 - 3 u)/2, is left where the phase c' u^3 has turned the tone: its line has 3/2 c more slope.
+#: A phase c P3(u), P3 = (5 u^3 - 3 u)/2, that is left has taken 3/2 c from the slope of the tone's phase at u = 0.
 TURNED_BY_CUBE = 1.5
 #: Samples for each number that is fitted.
 SAMPLES_PER_NUMBER = 3

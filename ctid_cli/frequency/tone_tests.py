@@ -43,8 +43,8 @@ class Left(NamedTuple):
     innovations: Array
     #: Samples that are there, shape (R,).
     present: IndexArray
-    #: Where the tapered spectrum has its largest ordinate, as a share of all, and how far that is above its floor before
-    #: any whitening, shape (R,).
+    #: Where the tapered spectrum has its largest ordinate, as a share of all, and how high that is above the floor
+    #: before any whitening, shape (R,).
     peak: Array
     peak_height: Array
 
@@ -81,9 +81,7 @@ def whiten(residuals: Array, fitted: IndexArray) -> Left:
         cut = np.minimum(power, CUT * shape * running_floor(power / shape))
         filters = _prediction_errors((cut * weights) @ cosines.T, present)
         # |A|^2 is the cosine series of the filter's own correlation.
-        own = np.stack(
-            [(filters[:, k:] * filters[:, : orders + 1 - k]).sum(axis=1) for k in range(orders + 1)]
-        )
+        own = np.stack([(filters[:, k:] * filters[:, : orders + 1 - k]).sum(axis=1) for k in range(orders + 1)])
         own[1:] *= 2.0
         shape = 1.0 / np.maximum(own.T @ cosines, SMALLEST_GAIN)
     white = values.copy()
@@ -174,8 +172,8 @@ def strongest_line(left: Left) -> Line:
 def find_changes(white: Array, filters: Array, numbers: Array, count: IndexArray, energy: Array, cube: Array) -> None:
     """How much the tones of each window seem to change within it.
 
-    ``energy``, shape (R, n): the largest sum of squares that a change of phase and amplitude at one instant would take away
-    of a whitened residual, in units of the noise. The sum of the demodulated residual up to an instant has of the noise
+    ``energy``, shape (R, n): the largest sum of squares that a change of phase and amplitude at one instant would take
+    away of a whitened residual, in units of the noise. The sum of the demodulated residual up to an instant has of the noise
     what the fitted polynomials (phase 1, u, u^2; amplitude 1, u) leave of it. ``cube``, shape (R, n): the sum of the
     demodulated residual's quadrature times ``P3(u)``.
     """

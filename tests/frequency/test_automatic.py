@@ -94,7 +94,7 @@ def test_gaps_are_stood_by_a_method_that_can():
     t = 0.01 * np.arange(3000)
     y = np.sin(20.0 * t) + 0.5 * np.sin(45.0 * t)
     y[np.random.default_rng(4).random(t.size) < 0.05] = np.nan
-    settings, track, found = medians(y, 0.01, 2, method="nonlinear_least_squares")
+    _, track, found = medians(y, 0.01, 2, method="nonlinear_least_squares")
     assert found * 2 * np.pi == pytest.approx([20.0, 45.0], rel=1e-3)
     assert track.valid.mean() > 0.9
 

@@ -152,5 +152,5 @@ def test_a_long_record_is_thinned_and_its_amplitudes_are_of_before():
 
 @pytest.mark.parametrize(("length", "window"), [(20, None), (1000, 0.01), (1000, 3.0)])
 def test_what_cannot_be_followed(length, window):
-    with pytest.raises(DataError, match="too few|longest window must be"):
+    with pytest.raises(DataError, match=r"too few|longest window must be"):
         follow_tones((tone(60.0) + NOISE)[:length], INTERVAL, 1, window=window)
