@@ -172,10 +172,10 @@ def strongest_line(left: Left) -> Line:
 def find_changes(white: Array, filters: Array, numbers: Array, count: IndexArray, energy: Array, cube: Array) -> None:
     """How much the tones of each window seem to change within it.
 
-    ``energy``, shape (R, n): the largest sum of squares that a change of phase and amplitude at one instant would take
-    away of a whitened residual, in units of the noise. The sum of the demodulated residual up to an instant has of the noise
-    what the fitted polynomials (phase 1, u, u^2; amplitude 1, u) leave of it. ``cube``, shape (R, n): the sum of the
-    demodulated residual's quadrature times ``P3(u)``.
+    ``energy``, shape (R, n), is the largest sum of squares that a change of phase and amplitude at one instant would
+    take away of a whitened residual, in units of the noise. The sum of the demodulated residual up to an instant has of
+    the noise what the fitted polynomials (phase 1, u, u^2; amplitude 1, u) leave of it. ``cube``, shape (R, n), is the
+    sum of the demodulated residual's quadrature times ``P3(u)``.
     """
     length = white.shape[1]
     begin = max(1, int(ENDS * length))
