@@ -11,6 +11,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.frequency.decimation import PIECE, Decimation, low_pass, without_low
 from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES
 from ctid_cli.frequency.spectrum import Peaks, find_peaks
+from ctid_cli.frequency.spikes import TIMES, find_spikes
 from ctid_cli.frequency.windows import estimate_window
 from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.signals.checks import require_choice, require_integer, require_positive
@@ -111,6 +112,8 @@ def choose_settings(
     with a prefilter of 2 h. Windows begin with three beats of the closest tones and are doubled until nearly all
     estimates are certain.
     """
+    spikes = find_spikes(samples)
+    samples = np.where(spikes, np.nan, samples)
     require_integer("tones", tones, 1, MOST_TONES)
     require_positive("interval", interval, "s")
     require_choice("method", method, tuple(KINDS["frequency_estimator"]))
@@ -138,6 +141,8 @@ def choose_settings(
     if how:
         reasons.append(how)
     reasons.append(sentence if batch else f"Amplitudes are found from the last {length * thin:.4g} s before each row.")
+    if spikes.any():
+        reasons.append(f"Spikes, {TIMES:g} times as high as all around them, are taken as missing: {spikes.sum()}.")
     warnings = tuple(_doubts(peaks, tones, interval))
     return Settings(estimator, tones, band.expected, offset, band.decimation, thin, length, tuple(reasons), warnings)
 

@@ -9,6 +9,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.frequency.automatic import Settings
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.record_track import Procedure, RecordTrack
+from ctid_cli.frequency.spikes import without_spikes
 from ctid_cli.frequency.windows import WindowEstimate, estimate_window, sinusoids_of, wanted_tones
 
 #: Rows of a track if nobody says how many.
@@ -31,7 +32,7 @@ def track_record(
     on_progress: Callable[[int, int], None] | None = None,
 ) -> RecordTrack:
     """Follow the frequencies of a recorded signal."""
-    thinned = settings.decimation.apply(samples, settings.offset)
+    thinned = settings.decimation.apply(without_spikes(samples), settings.offset)
     thin, online = settings.interval, settings.estimator.online
     wanted_step = samples.size * interval / USUAL_ROWS
     if every is not None:
