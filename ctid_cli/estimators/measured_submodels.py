@@ -18,6 +18,7 @@ from ctid_cli.estimation.measured_records import without_means
 from ctid_cli.estimation.profile_refinement import AppliedModel
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
 from ctid_cli.estimators.delay_profile import FittedSamples, MeasuredFit
+from ctid_cli.filtering.filter_data import used_samples
 from ctid_cli.filtering.free_response import free_response
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
@@ -94,7 +95,7 @@ class LaidOutSubmodels:
             psi = np.column_stack((psi, columns))
             state = np.asarray(np.linalg.lstsq(columns, error)[0], dtype=float)
             error = np.asarray(error - columns @ state, dtype=float)
-        return AppliedModel((error,), (problem.data.use,), (state,), (self.offset,), (psi,))
+        return AppliedModel((error,), (used_samples(problem.data, self.record),), (state,), (self.offset,), (psi,))
 
 
 def replace_initial(problem: AdditiveProblem) -> AdditiveProblem:
@@ -259,10 +260,11 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
 
     def _samples_of(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> FittedSamples:
         """What a fit says of each used sample, from its parameters."""
-        return self._samples(self._factors(fit), fit.initial_states[0], laid_out.problem)
+        return self._samples(self._factors(fit), fit.initial_states[0], laid_out)
 
-    def _samples(self, model: AdditiveModel, state: Array, problem: AdditiveProblem) -> FittedSamples:
+    def _samples(self, model: AdditiveModel, state: Array, laid_out: LaidOutSubmodels) -> FittedSamples:
         """Residuals and sensitivities, those of a monic fraction by its coefficients."""
+        problem = laid_out.problem
         ordered = AdditiveProblem(problem.data, model.terms, self.delay, problem.filter.loop, problem.initial_state)
         rows = ordered.filter.rows(np.concatenate((model.theta, state)))
         assert rows is not None
@@ -270,7 +272,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         if not self.factored:
             slopes = self._slopes(model, size)
             psi = np.column_stack((psi[:, :size] @ np.linalg.inv(slopes.T), psi[:, size:]))
-        return FittedSamples((rows[2],), (psi,), (problem.data.use,), None)
+        return FittedSamples((rows[2],), (psi,), (used_samples(problem.data, laid_out.record),), None)
 
     def _apply(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> AppliedModel:
         """The model on another record."""
