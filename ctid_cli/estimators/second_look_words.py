@@ -40,6 +40,10 @@ class Cause(NamedTuple):
     share: float
     #: What was seen, and the command to try; or what was tried, where it was ruled out.
     words: str
+    #: Whether a better model mends it, and whether it is only named where none does. Another hold is no better model:
+    #: it shifts all by half a sampling interval, as a bad clock may.
+    mends: bool = False
+    last: bool = False
 
 
 def of_second_look(
@@ -62,6 +66,9 @@ def of_second_look(
         return words
     causes = list(_causes(look, options, fit, tests, gains))
     named = sorted((cause for cause in causes if cause.share > 0), key=lambda cause: -cause.share)
+    if any(cause.mends for cause in named):
+        # What a better model leaves may no longer look like a bad clock.
+        named = [cause for cause in named if not cause.last]
     words += [cause.words for cause in named[:MOST_NAMED] if cause.share >= COMPARABLE * named[0].share]
     if look.integrator > 0:
         words.append(_of_integrator(look, options, fit))
@@ -112,7 +119,7 @@ def _causes(
     offset = gains.get("offset", 0.0)
     # An integrator, or a pole as slow as the record, makes both.
     if options.offset == "none" and not look.integrator > 0:
-        yield Cause(offset, of_treatment({"offset": offset}, options)[0] if offset else "an offset")
+        yield Cause(offset, of_treatment({"offset": offset}, options)[0] if offset else "an offset", mends=True)
     for k, one in enumerate(look.records):
         for cause in (_drift(one, look, offset), _feedback(one)):
             yield cause._replace(words=_of_which(k, look) * (cause.share > 0 or k > 0) + cause.words)
@@ -133,7 +140,7 @@ def _order(look: SecondLook, options: Options, fit: MeasuredFit, correlated: boo
     if richer is not None:
         poor, found = richer.fall, f"{100 * richer.fall:.2g} % of the residuals' variance"
     what = f"the structure is too poor (try --poles {options.poles + 1}{zeros})"
-    return Cause(SIMPLER * poor, f"{found} is what one more pole explains: {what}.")
+    return Cause(SIMPLER * poor, f"{found} is what one more pole explains: {what}.", mends=True)
 
 
 def _delay(look: SecondLook, options: Options, correlated: bool) -> Cause:
@@ -148,6 +155,7 @@ def _delay(look: SecondLook, options: Options, correlated: bool) -> Cause:
         elsewhere.fall,
         f"A delay of {elsewhere.delay:.3g} lowers the cost by {100 * elsewhere.fall:.2g} %, and {_range(low, high)} "
         f"{known}: the range of the delay is wrong (try --delay {reach}).",
+        mends=True,
     )
 
 
@@ -187,12 +195,13 @@ def _clock(look: SecondLook, faulty: bool) -> Cause:
     clock = look.clock
     if faulty or clock.share < ANOTHER:
         return Cause(0.0, "the clock")
+    interval = look.records[0].examined.report.interval
     words = (
         f"{100 * clock.share:.2g} % of the residuals' variance goes with the speed of the output (p = "
-        f"{clock.p_value:.1g}), as if the clock were wrong by about {clock.jitter:.2g}: look at the time stamps, and "
-        "give those of the recorder (--time COLUMN)."
+        f"{clock.p_value:.1g}), as if the clock were wrong by about {clock.jitter / interval:.2g} sampling intervals: "
+        "look at the time stamps, and give those of the recorder (--time COLUMN)."
     )
-    return Cause(clock.share, words)
+    return Cause(clock.share, words, last=True)
 
 
 # --- evidence ----------------------------------------------------------------------------------------
