@@ -10,7 +10,6 @@ import typer
 from ctid_cli.cli._common import (
     From,
     InputColumn,
-    InputHold,
     Json,
     OutputColumn,
     TimeColumn,
@@ -22,7 +21,7 @@ from ctid_cli.cli._common import (
 from ctid_cli.cli._progress import FitProgress
 from ctid_cli.cli.fit_structure import Asked, ModelForm, check_loop, delay_bounds, estimator_of, with_loop
 from ctid_cli.errors import UsageError
-from ctid_cli.signals.treatment import InitialState, LossKind, Offset
+from ctid_cli.signals.treatment import AskedHold, Hold, InitialState, LossKind, Offset
 from ctid_cli.text import wrapped
 
 
@@ -57,7 +56,7 @@ def fit(
     initial_state: Annotated[InitialState, typer.Option("--initial-state", help="State before the record.")] = "rest",
     offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output.")] = "none",
     loss: Annotated[LossKind, typer.Option("--loss", help="What large output errors count.")] = "squares",
-    hold: InputHold = "zoh",
+    hold: Annotated[AskedHold, typer.Option("--hold", help="The input between its samples.")] = "auto",
     time: TimeColumn = None,
     input: InputColumn = None,
     output: OutputColumn = None,
@@ -84,27 +83,45 @@ def fit(
     if bootstrap is not None and bootstrap < LEAST_DRAWS:
         raise UsageError(f"--bootstrap must be at least {LEAST_DRAWS} draws, for example 500; got {bootstrap}")
     check_loop(loop, reference, ignore_loop)
-    read = partial(read_measurement, time=time, input=input, output=output, hold=hold, reference=reference)
+    read = partial(read_measurement, time=time, input=input, output=output, reference=reference)
     bounds = None if delay is None else delay_bounds(delay)
-    searched = ""
+    said: list[str] = []
+
+    def held() -> Hold:
+        """The hold that is given, or the best for one fraction in open loop."""
+        if hold != "auto":
+            return hold
+        if loop is not None or model != "fraction" or integrators:
+            return "zoh"
+        from ctid_cli.reporting.hold_choice import chosen_hold
+
+        shown = [read(file, start=start, stop=stop, hold="zoh").record for file in files]
+        chosen, why = chosen_hold(shown, poles, zeros, bounds, initial_state, offset)
+        said.extend([why] if why else [])
+        return chosen
+
     if poles is None and model == "fraction" and terms is None:
         if loop is not None or fix or integrators or loss != "squares":
             raise UsageError("--poles is missing: with --loop, --fix, --integrators or --loss it must be given")
         from ctid_cli.reporting.order_proposal import propose_structure
 
-        first = [read(file, start=start, stop=stop) for file in files]
+        hold = held()
+        first = [read(file, start=start, stop=stop, hold=hold) for file in files]
         unit = common_units(first).time
         proposal = propose_structure([item.record for item in first], zeros, bounds, initial_state, offset, unit)
         poles, zeros, bounds, searched = proposal
+        said.append(searched)
+    taken: Hold = "zoh" if hold == "auto" else hold
     asked = Asked(
-        *(model, terms, poles, zeros, integrators, bounds or (0.0, 0.0), fix or (), initial_state, offset, loss, hold),
+        *(model, terms, poles, zeros, integrators, bounds or (0.0, 0.0), fix or (), initial_state, offset, loss, taken),
         loop=loop is not None and not ignore_loop,
     )
     options = estimator_of(asked)
     if asked.iterated and len(files) > 1:
         raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")
-    measurements = [read(file, start=start, stop=stop) for file in files]
-    other = None if validate is None else read(validate)
+    hold = held()
+    measurements = [read(file, start=start, stop=stop, hold=hold) for file in files]
+    other = None if validate is None else read(validate, hold=hold)
     if loop is not None:
         measurements = [with_loop(loop, measurement, ignore_loop) for measurement in measurements]
         other = other and with_loop(loop, other, ignore_loop)
@@ -125,7 +142,7 @@ def fit(
     if as_json:
         typer.echo(text)
     else:
-        if searched:
-            typer.echo(wrapped(searched) + "\n")
+        for sentence in said:
+            typer.echo(wrapped(sentence) + "\n")
         typer.echo(identification_text(result, measurements, units))
         typer.echo(f"\nWritten: {', '.join(map(str, contents))}")

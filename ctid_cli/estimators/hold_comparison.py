@@ -48,7 +48,7 @@ def best_other_hold(refinement: Refinement, fit: MeasuredFit, records: Sequence[
     if kinds <= {"constant", "steps"}:
         return None
     most = MOST // len(records)
-    short = [_beginning(record, most) for record in records]
+    short = [beginning(record, most) for record in records]
     given, delay = _least(refinement, fit, short)
     tried: list[Hold] = [hold for hold in get_args(Hold) if hold != records[0].input.hold]
     if kinds != {"continuous"} or any(regular_interval(record.input.t) is None for record in short):
@@ -77,7 +77,7 @@ def _least(refinement: Refinement, fit: MeasuredFit, records: Sequence[Record]) 
     return found.squared_error, found.point.delay.seconds
 
 
-def _beginning(record: Record, samples: int) -> Record:
+def beginning(record: Record, samples: int) -> Record:
     """The first samples, with the input until then."""
     if record.n_samples <= samples:
         return record

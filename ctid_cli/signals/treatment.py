@@ -4,6 +4,8 @@ from typing import Literal
 
 #: The input between its samples: held, straight lines, or without power above half the sampling frequency.
 Hold = Literal["zoh", "foh", "band-limited"]
+#: The same, or whichever describes a record best.
+AskedHold = Literal["auto", "zoh", "foh", "band-limited"]
 #: How a frequency response is estimated.
 ResponseMethod = Literal["auto", "periodic", "local-polynomial", "welch"]
 #: How an estimator's filters join the samples of the output.
