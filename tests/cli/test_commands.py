@@ -49,6 +49,18 @@ def test_help_imports_nothing_slow():
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
 
 
+def test_show_imports_nothing_that_it_does_not_need(tmp_path):
+    code = (
+        "import sys; from ctid_cli.cli.main import app\n"
+        f"try: app(['show', '', '--out', {str(tmp_path)!r}])\n"
+        "except SystemExit: pass\n"
+        "import ctid_cli.reporting.detail, ctid_cli.storage.sealed\n"
+        "slow = {'scipy', 'pandas', 'numba', 'joblib', 'rich'} & set(sys.modules)\n"
+        "assert not slow, slow"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
+
+
 def test_workers_import_nothing_slow():
     # What a worker process is sent, and every estimator: half a second of imports each would be longer than the work.
     code = (

@@ -13,7 +13,7 @@ import pytest
 from ctid_cli.errors import DamageError, RefusedError, StorageError
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.journal import Journal, open_journal
-from ctid_cli.storage.journal_reader import read_journal
+from ctid_cli.storage.journal_reader import Tally, read_journal
 from ctid_cli.storage.manifest import Key, Outcome
 from tests.running.fakes import FakePlan
 
@@ -47,6 +47,33 @@ def before_format_4(log: Journal) -> None:
 
 def files(folder: Path) -> dict[str, str]:
     return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.iterdir()}
+
+
+def test_checksums_are_counted_one_by_one_or_together() -> None:
+    checksums = [hashlib.sha256(bytes([k])).hexdigest()[:32] for k in range(9)]
+    one, all_at_once = Tally(), Tally()
+    for checksum in checksums:
+        one.add(checksum)
+    all_at_once.add_all("".join(checksums))
+    assert str(one) == str(all_at_once)
+
+
+def test_the_state_changes_with_everything_a_run_writes(tmp_path: Path) -> None:
+    log = filled(tmp_path / "journal.sqlite")
+    states = [log.state()]
+    for step in (
+        lambda: log.add([outcome(3, 1.0)], 1),
+        lambda: log.add([outcome(3, 2.0)], 1),
+        lambda: log.begin(MANIFEST, ORIGINS, "2026-11-21T06:00:00Z", {}),
+    ):
+        step()
+        states.append(log.state())
+    log.close()
+    assert None not in states
+    assert len(set(states)) == 4
+    with read_journal(tmp_path / "journal.sqlite") as read:
+        assert read is not None
+        assert read.state() == states[-1]
 
 
 def test_what_was_added_is_read_back_exactly(tmp_path: Path) -> None:

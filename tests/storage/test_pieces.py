@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
-from ctid_cli.storage import packing, pieces
+from ctid_cli.storage import packing, pieces, timings
 from ctid_cli.storage.columns import failed, no_result
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import Slot, slots
@@ -91,6 +91,58 @@ def test_pieces_give_the_same_file_and_rows_as_all_at_once(tmp_path: Path, monke
     assert Stored.of(manifest, (ORIGIN,), at_once).rows() == rows
     with h5py.File(tmp_path / "once.h5") as file:
         assert file["estimates/message"].dtype.itemsize == max(len(row["message"]) for row in rows)
+
+
+def test_columns_at_some_places_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    manifest, table = filled(11)
+    places = [range(3, 9), range(40, 44), [65, 1, 30], range(66), [8]]
+    # Blocks have 22 or 11 rows: once that is many, once few.
+    for rows in (7, 8192):
+        monkeypatch.setattr("ctid_cli.storage.stored.ROWS", rows)
+        stored = Stored.of(manifest, (ORIGIN,), table)
+        for name in ("delay", "numerator", "status", "delay"):
+            for some in places:
+                chosen = np.array(some)
+                np.testing.assert_array_equal(stored.at(name, chosen), table.read(name)[chosen])
+    assert stored.at("status", np.zeros(0, dtype=int)).size == 0
+
+
+def test_a_row_alone_is_what_it_is_among_others() -> None:
+    manifest, table = filled(11)
+    rows = Stored.of(manifest, (ORIGIN,), table).rows()
+    for k in (0, 3, 64):
+        alone = Stored.of(manifest, (ORIGIN,), pieces.Window(table, k, k + 1))
+        assert alone.rows() == [rows[k]]
+        assert alone.blocks[0].last == 1
+
+
+@pytest.mark.parametrize("at_once", [50, 1_000_000])
+def test_times_belong_to_ids_whatever_their_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: int
+) -> None:
+    monkeypatch.setattr(timings, "AT_ONCE", at_once)
+    _, table = filled(5)
+    content = timings.times_table(table, shared=False)
+    head, *lines = content.decode().splitlines()
+    lines = [line.replace(",0.5,", f",{k}.25,") for k, line in enumerate(lines)]
+    expected = np.arange(table.count) + 0.25
+
+    def read(*lines: str) -> Any:
+        (tmp_path / "timings.csv").write_text("".join(f"{line}\n" for line in lines))
+        timed = timings.TimedTable(table, tmp_path / "timings.csv")
+        few = timed.read("seconds", 2, 4)
+        whole = timed.read("seconds")
+        np.testing.assert_array_equal(few, whole[2:4])
+        return whole
+
+    np.testing.assert_array_equal(read(head, *lines), expected)
+    np.testing.assert_array_equal(read(head, *lines[::-1]), expected)
+    without = read(head, *lines[:2], *lines[3:])
+    assert np.isnan(without[2])
+    np.testing.assert_array_equal(np.delete(without, 2), np.delete(expected, 2))
+    assert np.isnan(read(head)).all()
+    assert np.isnan(read("no", "such", "file")).all()
+    assert np.isnan(timings.TimedTable(table, tmp_path / "none.csv").read("cpu_seconds")).all()
 
 
 def test_found_values_are_those_of_single_rows() -> None:

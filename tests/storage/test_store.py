@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -255,6 +256,18 @@ def test_find_an_estimate_by_the_beginning_of_its_id(place: Path) -> None:
         find_estimate(place.parent, "")
     with pytest.raises(UsageError, match=r"no id in .* begins with 'xyz'"):
         find_estimate(place.parent, "xyz")
+
+
+@pytest.mark.parametrize("runs", [2, 6])
+def test_sealed_and_journalled_estimates_count_alike(place: Path, runs: int) -> None:
+    plan = FakePlan(Toy("raise", at=1), Toy(order=3), runs=runs)
+    # With fewer data sets some are set aside; a name more shares the estimates of another.
+    plan.estimators = (*plan.estimators, replace(plan.estimators[0], name="again"))
+    run_experiment(plan, place, jobs=1, warm=lambda: 0.0)  # type: ignore[arg-type]
+    sealed = experiment_status(place)
+    (place / "runs.h5").unlink()
+    assert experiment_status(place) == sealed
+    assert (sealed.left_aside == 0) == (runs == 6)
 
 
 def test_estimates_of_a_killed_run_are_readable(place: Path) -> None:
