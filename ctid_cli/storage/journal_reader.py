@@ -4,6 +4,7 @@ import hashlib
 import json
 import shutil
 import sqlite3
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -95,16 +96,23 @@ class Tally:
         return f"{self.count} {self.mark:032x}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Entry:
     """A stored estimate."""
 
-    result: dict[str, Any]
+    #: Its result as JSON, which takes a fifth of the memory.
+    text: str
     #: Time it took, and processor time [s].
     seconds: float | None
     cpu_seconds: float | None
     session: int
     origin: Origin
+
+    @property
+    def result(self) -> dict[str, Any]:
+        """Its result."""
+        found: dict[str, Any] = json.loads(self.text)
+        return found
 
 
 class JournalReader:
@@ -172,7 +180,7 @@ class JournalReader:
         origins = self._known_origins()
         with self._guard():
             return {
-                row.key: Entry(json.loads(row.result), row.seconds, row.cpu_seconds, row.session, origins[row.origin])
+                _shared(row.key): Entry(row.result, row.seconds, row.cpu_seconds, row.session, origins[row.origin])
                 for row in self.rows()
             }
 
@@ -400,6 +408,11 @@ def format_of(connection: sqlite3.Connection, path: Path) -> int:
         raise DamageError(f"{path} is an SQLite file, but not a journal of ctid")
     refuse_newer(path, written_by, FORMAT)
     return int(written_by)
+
+
+def _shared(key: Key) -> Key:
+    """A key whose texts are those of others."""
+    return Key(sys.intern(key.data_hash), key.replicate, sys.intern(key.estimator_hash), sys.intern(key.start))
 
 
 def _status(row: Row) -> str:

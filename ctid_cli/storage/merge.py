@@ -10,6 +10,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from ctid_cli.storage.identity import Origin, are_mixed
 from ctid_cli.storage.journal import Journal, open_journal
 from ctid_cli.storage.journal_reader import FILE_NAME, Entry, JournalReader
 from ctid_cli.storage.manifest import Key, Manifest, Outcome, shard_of, slots, whole
+from ctid_cli.storage.pieces import ROWS
 from ctid_cli.storage.shards import Shard, owner, ranges
 from ctid_cli.storage.store import seal
 
@@ -195,7 +197,7 @@ def _new_entries(present: Sequence[Source], read: Sequence[Source]) -> dict[Key,
     for source in (*present, *read):
         for key, entry in source.entries.items():
             other, stored = found.setdefault(key, (source, entry))
-            if stored.result == entry.result:
+            if stored.text == entry.text or stored.result == entry.result:
                 continue
             if any(one.result["status"] in LIMITED for one in (stored, entry)):
                 found[key] = max(found[key], (source, entry), key=_rank)
@@ -253,7 +255,9 @@ def _take_over(source: Source, entries: Mapping[Key, Entry], plan: Manifest, log
         if own:
             info = {name: value for name, value in run.items() if name not in _OF_SESSION}
             number = log.begin(plan, {key.estimator_hash: e.origin for key, e in own.items()}, run["started"], info)
-            log.add([Outcome(key, e.result, e.seconds, e.cpu_seconds) for key, e in own.items()], number)
+            outcomes = (Outcome(key, e.result, e.seconds, e.cpu_seconds) for key, e in own.items())
+            while some := list(islice(outcomes, ROWS)):
+                log.add(some, number)
             if run["stopped"] is not None:
                 log.end(number, run["stopped"], run["reason"])
             with _writing(log.path.parent):

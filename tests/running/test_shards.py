@@ -135,7 +135,7 @@ def limited(source: Source, status: str, **limits: float) -> Source:
     (key, entry), *_ = source.entries.items()
     result = failed(f"under {sorted(limits.items())}", status)
     sessions = [{**session, "limits": limits} for session in source.sessions]
-    return replace(source, entries={**source.entries, key: replace(entry, result=result)}, sessions=sessions)
+    return replace(source, entries={**source.entries, key: replace(entry, text=json.dumps(result))}, sessions=sessions)
 
 
 def test_a_result_is_better_than_a_limit_and_a_high_limit_better_than_a_low_one(
@@ -161,8 +161,9 @@ def test_a_result_is_better_than_a_limit_and_a_high_limit_better_than_a_low_one(
 def test_two_results_of_one_estimate_are_refused(parts: list[Path], tmp_path: Path) -> None:
     sources = [read_source(part) for part in parts]
     copy = read_source(parts[0])
-    key = next(iter(copy.entries))
-    copy.entries[key].result["delay"] = 1.0
+    (key, entry), *_ = copy.entries.items()
+    entries = {**copy.entries, key: replace(entry, text=json.dumps(entry.result | {"delay": 1.0}))}
+    copy = replace(copy, entries=entries)
     with pytest.raises(RefusedError, match=f"estimate {key.id} is one thing in .* and another in"):
         merge([*sources, copy], tmp_path / "toys")
     assert not (tmp_path / "toys").exists()
