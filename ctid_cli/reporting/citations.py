@@ -97,6 +97,7 @@ _MIXING = """\
 
 #: Whose work the methods of ``ctid track`` are.
 _OF_TRACKS = {
+    "tone_windows": _TONES,
     "esprit": _ESPRIT,
     "nonlinear_least_squares": _TONES,
     **dict.fromkeys(("drem_window", "drem_finite_time", "drem_gradient"), _MIXING),
