@@ -3,14 +3,14 @@
     python benchmarks/track_honesty.py [--signals 1000] [--seed 1] [--show]
 
 Signals of 1000 to 8000 samples: none to five tones over 60 dB, a quarter of them 3 to 12 bins beside another, steady,
-drifting, decaying or with a step of phase, frequency or amplitude, some with harmonics; white or coloured noise 10 to 60
-dB below the strongest, some with spikes or a gap. A valid row is wrong if its frequency is off the nearest true one by
-more than 3.3 of its standard errors and more than .001 of the frequency. A row could be right if the bound of Cramer and
-Rao for the stretch between two events of the signal (rate of change unknown) is below the accuracy, its tone is no weaker
-than six standard errors of its amplitude and three bins of the stretch from any other.
+drifting, decaying or with a step of phase, frequency or amplitude, some with harmonics; white or coloured noise 10 to
+60 dB below the strongest, some with spikes or a gap. A valid row is wrong if its frequency is off the nearest true one
+by more than 3.3 of its standard errors and more than .001 of the frequency. A row could be right if the bound of Cramer
+and Rao for the stretch between two events of the signal (rate of change unknown) is below the accuracy, its tone is no
+weaker than six standard errors of its amplitude and three bins of the stretch from any other.
 
-Then: coverage of the standard errors and their size beside the bound, for one to three steady tones in white and coloured
-noise.
+Then: coverage of the standard errors and their size beside the bound, for one to three steady tones in white and
+coloured noise.
 """
 
 import argparse
@@ -126,7 +126,7 @@ def could_be_right(signal: Signal, places: np.ndarray) -> np.ndarray:
 
 
 def judged(signal: Signal, track: RecordTrack) -> tuple[int, int, int, int]:
-    """Valid rows, wrong ones; rows that could be right while all that could be are found, valid and right ones of them."""
+    """Valid rows, wrong ones; rows that could be right where all that could be are found, and how many are valid."""
     places = np.minimum(np.round(track.t).astype(int), signal.samples.size - 1)
     possible = could_be_right(signal, places)
     valid = wrong = 0
@@ -188,9 +188,8 @@ def efficiency(records: int, seed: int) -> None:
                 error = track.omega[1] - omega[:tones]
                 off += list(zip(np.abs(error) < 1.96 * track.error[1], error / bound, strict=True))
             inside, ratio = np.array(off).T
-            print(
-                f"{tones:5} {'white' if not pole else 'AR .9':8} {100 * inside.mean():7.1f}% {np.sqrt(np.mean(ratio**2)):12.3f}"
-            )
+            name = "AR .9" if pole else "white"
+            print(f"{tones:5} {name:8} {100 * inside.mean():7.1f}% {np.sqrt(np.mean(ratio**2)):12.3f}", flush=True)
 
 
 def main() -> None:

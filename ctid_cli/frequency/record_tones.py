@@ -13,6 +13,7 @@ from ctid_cli.frequency.decimation import Decimation, low_pass
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.record_track import MOST_ASKED, MissingLine, Procedure, RecordTrack
 from ctid_cli.frequency.spectrum import find_peaks
+from ctid_cli.frequency.spikes import TIMES, find_spikes
 from ctid_cli.frequency.tone_identity import paths_of
 from ctid_cli.frequency.tone_rows import SHORTEST, Readings, readings_at
 from ctid_cli.signals.checks import require_integer, require_positive
@@ -25,8 +26,10 @@ USUAL_ROWS = 1000
 FEWEST = 32
 #: Most lines that are fitted in one window.
 MOST_LINES = 16
-#: Records with no more samples are not thinned.
-UNTHINNED = 2**15
+#: Records are thinned to no fewer samples than this, or than that if all their tones are wanted: the weakest ones show
+#: only in the longest windows, and may be anywhere.
+FEWEST_KEPT = 2**12
+FEWEST_OF_ALL = 2**15
 #: Of a thinned record this share of the band is kept, and the highest tone lies in this share of it.
 KEPT_BAND = 0.9
 TONE_BAND = 0.8
@@ -89,6 +92,8 @@ def follow_tones(
     if tones is not None:
         require_integer("tones", tones, 0, MOST_ASKED)
     refuse_unusable(samples, FEWEST)
+    spikes = find_spikes(samples)
+    samples = np.where(spikes, np.nan, samples)
     decimation, reasons = _thinning(samples, interval, tones)
     scale = float(np.nanmax(np.abs(samples)))
     # Rounding leaves no noise by which errors could be told.
@@ -112,6 +117,8 @@ def follow_tones(
     others["missing"] = tuple(_missing(found, path, places.size, thin, scale) for path in lost)
     t = places * thin + 0.5 * (decimation.weights.size - 1) * interval
     track = RecordTrack.of(t, omega, flags, max(step, 1.0) * thin, **others)
+    if spikes.any():
+        reasons.append(f"Spikes, {TIMES:g} times as high as all around them, are taken as missing: {spikes.sum()}.")
     used = {"interval": thin, "kept_of": decimation.factor, "filter_samples": decimation.weights.size}
     sentences = (*_counted(paths, count, tones), *reasons, *_windows_used(found, wanted, thin))
     highest = max((float(np.median(found.omega[path])) for path in wanted), default=0.0) / (2.0 * np.pi * thin)
@@ -121,13 +128,14 @@ def follow_tones(
 
 def _thinning(samples: Array, interval: float, tones: int | None) -> tuple[Decimation, list[str]]:
     """A filter, and how many samples are left out after it, where the strongest tones need few of many samples."""
-    if samples.size <= UNTHINNED:
+    fewest = FEWEST_OF_ALL if tones is None else FEWEST_KEPT
+    if samples.size < 2 * fewest or tones == 0:
         return Decimation(np.ones(1)), []
     peaks = find_peaks(samples, interval, tones or MOST_ASKED)
     if not peaks.omega.size:
         return Decimation(np.ones(1)), []
     top = float(peaks.omega[: tones or MOST_ASKED].max())
-    factor = min(int(np.pi * TONE_BAND / (top * interval)), -(-samples.size // UNTHINNED))
+    factor = min(int(np.pi * TONE_BAND / (top * interval)), samples.size // fewest)
     if factor <= 1:
         return Decimation(np.ones(1)), []
     nyquist = np.pi / (factor * interval)

@@ -19,6 +19,8 @@ PATIENCE = 3
 LARGEST_JUMP = 0.25
 #: Cost of a pause, as a share of the frequency, if it lasts for the whole signal.
 PAUSE = 0.25
+#: What is never known better than to this share of its frequency is no tone.
+COARSE = 0.01
 #: A tone is one if what it explains of some window exceeds the description length of five numbers.
 NUMBERS = 5
 
@@ -38,7 +40,8 @@ def paths_of(found: Readings, places: Array) -> list[IndexArray]:
     step = float(np.median(np.diff(places))) if places.size > 1 else 1.0
     paths = _joined(_followed(found, places, step), found, places.size)
     paths = [path for path in paths if _described(found, path, places, step)]
-    return sorted(paths, key=lambda path: -float((found.amplitude[path] ** 2).sum()))
+    # What lasts counts more than what is loud for a moment.
+    return sorted(paths, key=lambda path: -float(found.amplitude[path].sum()))
 
 
 def _followed(found: Readings, places: Array, step: float) -> list[IndexArray]:
@@ -108,7 +111,7 @@ def _described(found: Readings, path: IndexArray, places: Array, step: float) ->
 
     That is the minimum description length of a tone of a signal.
     """
-    sure = found.resolved[path] & found.significant[path]
+    sure = found.resolved[path] & found.significant[path] & (found.error[path] < COARSE * found.omega[path])
     window = found.window[path]
     # The noise beneath a line is uncertain too, as it is for the test that finds lines.
     known = MEDIAN_EFFICIENCY * np.minimum(FLOOR_BINS, 0.5 * window)

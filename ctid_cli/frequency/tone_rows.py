@@ -28,8 +28,10 @@ BESIDE = 3.0
 #: Readings closer than so many bins of the shorter window, or so many standard errors, are of one tone.
 SAME_BINS = 1.5
 SAME_ERRORS = 5.0
-#: A curvature of the frequency is left out of the reading below so many of its standard errors.
+#: A curvature of the frequency of more than so many of its standard errors adds to the error of the reading, of more
+#: than so many to the reading.
 QUIET = 2.0
+BENT = 4.0
 #: Frequencies that move by more than so many errors over their window may move otherwise than along a line. A kink that
 #: no test would find moves the frequency at its place by this share of the fitted sweep, and by no more than so many
 #: errors.
@@ -141,8 +143,9 @@ def _readings(tones: ToneRows, length: int, places: Array) -> Readings:
     omega = of(tones.omega) + rate * x
     error = np.hypot(omega_error, of(tones.rate_error) * x)
     # A phase c P3(u) that was left out changes the frequency at u by (7.5 u^2 - 1.5) c; `bend` is that at the middle.
-    bent = np.abs(of(tones.bend)) > QUIET * of(tones.bend_error)
-    share = 1.0 - 5.0 * u * u
+    share, bend = 1.0 - 5.0 * u * u, np.abs(of(tones.bend)) / of(tones.bend_error)
+    error = np.where(bend > QUIET, np.hypot(error, 0.5 * share * of(tones.bend)), error)
+    bent = bend > BENT
     omega = np.where(bent, omega - share * of(tones.bend), omega)
     error = np.where(bent, np.hypot(error, share * of(tones.bend_error)), error)
     hidden = np.minimum(KINK * np.abs(rate) * length, HIDDEN_KINK * omega_error) / COVERED

@@ -102,15 +102,28 @@ def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: T
         apart[np.arange(most) >= windows.used[todo, None]] = np.inf
         joins = (new.line.chance < LEVEL) & (windows.used[todo] < most) & (apart.min(axis=1) > APART * np.pi)
         # What a change explains better is none.
-        joins &= np.where(np.isnan(new.change), 0.0, new.change).max(axis=1) <= new.line.energy
-        todo, turns = todo[joins], new.line.omega[joins] * 0.5 * (length - 1)
+        changed = np.where(np.isnan(new.change), 0.0, new.change).max(axis=1)
+        joins &= changed <= new.line.energy
+        further = np.where(new.line.further_energy >= changed[:, None], new.line.further, np.nan)
+        todo, lines = todo[joins], np.column_stack((new.line.omega, further))[joins]
         if not todo.size:
             break
-        windows.numbers[todo, windows.used[todo]] = 0.0
-        windows.numbers[todo, windows.used[todo], 3] = turns
-        windows.used[todo] += 1
+        for omega in lines.T:
+            _join(windows, todo, omega * 0.5 * (length - 1))
     assert tests is not None
     return _rows(windows, tests, length)
+
+
+def _join(windows: Windows, rows: IndexArray, turns: Array) -> None:
+    """Add a line to each of some windows, where it is one, there is room, and it is not beside a tone."""
+    most = windows.numbers.shape[1]
+    apart = np.abs(windows.numbers[rows, :, 3] - turns[:, None])
+    apart[np.arange(most) >= windows.used[rows, None]] = np.inf
+    fits = (apart.min(axis=1) > APART * np.pi) & (windows.used[rows] < most)
+    rows, turns = rows[fits], turns[fits]
+    windows.numbers[rows, windows.used[rows]] = 0.0
+    windows.numbers[rows, windows.used[rows], 3] = turns
+    windows.used[rows] += 1
 
 
 class _Tests(NamedTuple):

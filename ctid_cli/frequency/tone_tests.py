@@ -28,6 +28,13 @@ SMALLEST_GAIN = 1e-12
 MEDIAN_EFFICIENCY = 0.48
 #: Independent ordinates in a padded periodogram, for each sample.
 INDEPENDENT = 0.8
+#: Lines that join together with the strongest one: how many, bins between them, the share of its ordinate that they
+#: exceed, and how far, times, they are above the height that noise exceeds with a chance.
+FURTHER = 4
+LOBES = 8.0
+SIDE_LOBE = 0.1
+SURELY = 1.5
+LEAST_CHANCE = 1e-7
 #: A change is looked for in the middle of the window, without this share at each end.
 ENDS = 0.05
 
@@ -146,6 +153,10 @@ class Line(NamedTuple):
     height: Array
     #: Sum of squares that the largest line would take away, in units of all the noise, shape (R,).
     energy: Array
+    #: Further lines, too far from any stronger one to be its side lobes [rad]; NaN where none is, shape (R, K).
+    further: Array
+    #: The sum of squares that each would take away, shape (R, K).
+    further_energy: Array
 
 
 def strongest_line(left: Left) -> Line:
@@ -160,12 +171,26 @@ def strongest_line(left: Left) -> Line:
     sure = MEDIAN_EFFICIENCY * floor_bins(ordinates.shape[1])
     one = (1.0 + height / sure) ** -sure
     chance = -np.expm1(INDEPENDENT * length * np.log1p(-np.minimum(one, 1.0 - 1e-16)))
-    omega = place * 2.0 * np.pi / (PADDING * length)
+    turn = 2.0 * np.pi / (PADDING * length)
+    omega = place * turn
+    further, energies = np.full((rows, FURTHER), np.nan), np.zeros((rows, FURTHER))
+    bins, top = np.arange(ordinates.shape[1]), ordinates.max(axis=1)
+    near = np.abs(bins - place[:, None]) < LOBES * PADDING
+    for k in range(FURTHER):
+        left_over = np.where(near, 0.0, ratio)
+        other = left_over.argmax(axis=1)
+        surely = left_over[np.arange(rows), other] > SURELY * sure * (LEAST_CHANCE ** (-1.0 / sure) - 1.0)
+        surely &= ordinates[np.arange(rows), other] > SIDE_LOBE * top
+        if not surely.any():
+            break
+        further[surely, k] = other[surely] * turn
+        energies[surely, k] = ordinates[surely, other[surely]] / length
+        near |= np.abs(bins - other[:, None]) < LOBES * PADDING
     # The models of the noise have taken the skirts of a very strong line for its colour.
     plain = left.peak_height > LINE_HEIGHT
     chance, omega = np.where(plain, 0.0, chance), np.where(plain, np.pi * left.peak, omega)
     energy = np.where(plain, left.peak_height, ordinates.max(axis=1) / length)
-    return Line(chance, omega, np.where(plain, left.peak_height, height), energy)
+    return Line(chance, omega, np.where(plain, left.peak_height, height), energy, further, energies)
 
 
 @njit(cache=True, nogil=True)
