@@ -10,6 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from ctid_cli.arrays import Array
+from ctid_cli.errors import StorageError
 from ctid_cli.storage.packing import CLOCKS, PackedTable, decoded
 from ctid_cli.storage.pieces import AnyArray, Table, ranges
 
@@ -64,20 +65,28 @@ class TimedTable:
 
     @cached_property
     def _times(self) -> Mapping[str, Array]:
-        # Times are extra: results without them, copied from elsewhere, are complete.
+        # Times are extra: results without them, copied from elsewhere, are complete. One that cannot be read is told.
         try:
             with self._path.open("rb") as file:
                 return _times(file, self._table.read("id"))
-        except OSError:
+        except FileNotFoundError:
             return _times(io.BytesIO(), self._table.read("id"))
+        except OSError as error:
+            raise _unreadable(self._path, error) from error
+
+
+def _unreadable(path: Path, error: OSError) -> StorageError:
+    return StorageError(f"{path} cannot be read ({error.strerror or error})")
 
 
 def _lines(path: Path, ids: Sequence[bytes]) -> io.BytesIO:
     """The lines of some estimates in the file, below its first one."""
     try:
         content = path.read_bytes()
-    except OSError:
+    except FileNotFoundError:
         content = b""
+    except OSError as error:
+        raise _unreadable(path, error) from error
     places = [content.find(b"\n" + name + b",") + 1 for name in ids]
     found = [content[place : content.find(b"\n", place) + 1] for place in [0, *(place for place in places if place)]]
     return io.BytesIO(b"".join(found))

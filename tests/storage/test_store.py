@@ -360,3 +360,14 @@ def test_what_hdf5_cannot_write_is_an_error_and_nothing_else(what, tmp_path):
     said = done.stdout.splitlines()
     assert set(said) - {"no such column"} == {"File too large"}
     assert said.count("File too large") > 5
+
+
+def test_times_that_are_there_and_cannot_be_read_are_not_missing(tmp_path):
+    place = tmp_path / "system"
+    shutil.copytree(Path(__file__).parent / "stored" / "system", place)
+    (place / "journal.sqlite").unlink(missing_ok=True)
+    (place / "timings.csv").unlink(missing_ok=True)
+    assert load_estimates(place)["seconds"].isna().all()
+    (place / "timings.csv").mkdir()
+    with pytest.raises(StorageError, match=r"timings.csv cannot be read \(Is a directory\)"):
+        load_estimates(place)
