@@ -1,13 +1,16 @@
 """How often is the right number of poles and zeros recommended? Six systems, N = 2000, white noise at 15 dB.
 
-    python benchmarks/order_selection.py FILE [--runs 200] [--seed 20261123]
+    python benchmarks/order_selection.py FILE [--runs 200] [--seed 20261123] [--publish FOLDER]
 
 Each run draws an input of random levels and noise, and searches 1 to 6 poles with 0 to 3 zeros and a free delay. A line
-for each run goes to FILE, a CSV file; what is there already is not computed again. Ends with a table.
+for each run goes to FILE, a CSV file; what is there already is not computed again. Ends with a
+table, which is written with the runs and their environment if a folder is given.
 """
 
 import argparse
 import csv
+import json
+import platform
 import time
 from pathlib import Path
 
@@ -15,6 +18,8 @@ import numpy as np
 
 from ctid_cli import HeldSignal, Record, TransferFunction, simulate
 from ctid_cli.estimators.order_search import recommend_order
+from ctid_cli.storage.identity import numeric_platform, package_versions
+from ctid_cli.storage.provenance import git_commit, now
 
 #: System, sampling interval and least duration of a level [s], bounds of the delay [s], poles and zeros, or None.
 CASES = {
@@ -49,6 +54,7 @@ def main() -> None:
     parser.add_argument("file", type=Path)
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--seed", type=int, default=20261123)
+    parser.add_argument("--publish", type=Path)
     given = parser.parse_args()
     rows = list(csv.DictReader(given.file.open())) if given.file.exists() else []
     done = {(row["case"], int(row["run"])) for row in rows if int(row["seed"]) == given.seed}
@@ -69,12 +75,41 @@ def main() -> None:
                 writer.writerow(row)
                 file.flush()
                 rows.append(row)
-    print(f"{'case':12}  {'right':6}  runs  recommended")
+    print(table(rows))
+    if given.publish:
+        publish(rows, given.publish)
+
+
+def table(rows: list[dict[str, str]]) -> str:
+    """How often each case was right, and what was recommended otherwise."""
+    lines = ["| case | right | runs | recommended | otherwise |", "|:--|:--|--:|--:|:--|"]
     for case, (*_, right) in CASES.items():
         own = [row["recommended"] for row in rows if row["case"] == case]
         hits = own.count(right)
-        others = ", ".join(f"{name}: {own.count(name)}" for name in sorted(set(own) - {right}))
-        print(f"{case:12}  {right:6}  {len(own):4}  {hits} ({100 * hits / max(len(own), 1):.1f} %)  {others}")
+        others = ", ".join(f"{own.count(name)} x {name}" for name in sorted(set(own) - {right}))
+        lines.append(f"| {case} | {right} | {len(own)} | {hits} ({100 * hits / max(len(own), 1):.1f} %) | {others} |")
+    return "\n".join(lines)
+
+
+def publish(rows: list[dict[str, str]], folder: Path) -> None:
+    """Write the runs, their table, and what made them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    commit = git_commit(Path(__file__).resolve().parents[1])
+    packages = {"python": platform.python_version(), **package_versions()}
+    environment = {"commit": commit, "published": now(), "numeric_platform": numeric_platform(), "packages": packages}
+    (folder / "environment.json").write_text(json.dumps(environment, indent=2) + "\n", encoding="utf-8")
+    with (folder / "orders.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    seeds = ", ".join(sorted({row["seed"] for row in rows}))
+    text = (
+        "# How often the right order is recommended\n\n"
+        f"{SAMPLES} samples, input of random levels, white noise at {SNR_DB:g} dB; searched were 1 to 6 poles\n"
+        f"with 0 to 3 zeros and a free delay. Seed {seeds}, which nothing was tuned on. Made by\n"
+        f"`benchmarks/order_selection.py` at commit {commit}.\nOf noise the right answer is that there is no model.\n\n"
+    )
+    (folder / "orders.md").write_text(text + table(rows) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
