@@ -54,39 +54,13 @@ def follow_tones(
     window: float | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> tuple[RecordTrack, Procedure]:
-    """Follow the strongest tones of a recorded signal, or all of them.
+    """The strongest tones of a recorded signal, or all of them, ascending in frequency, and how they were found.
 
     In windows of all lengths, doubled from 64 samples to the whole record, decaying chirps are fitted one by one until
     the residual, whitened, shows no further line. At each instant each tone is read from the longest window in which
-    nothing speaks against it: no line left near it, no change within the window, no other tone too close.
-
-    Parameters
-    ----------
-    samples : ndarray, shape (N,)
-        Signal on a regular clock [signal unit]; NaN where missing.
-    interval : float
-        Sampling interval [s].
-    tones : int, optional
-        Number of tones, 0 to 20, the strongest ones; if not given all that are worth their numbers (minimum description
-        length).
-    every : float, optional
-        Time from row to row [s]; a thousandth of the record if not given.
-    window : float, optional
-        Longest window [s]; the whole record if not given.
-    on_progress : callable, optional
-        Told how much of how much is done.
-
-    Returns
-    -------
-    RecordTrack
-        The tones, ascending in frequency.
-    Procedure
-        How they were found.
-
-    Raises
-    ------
-    DataError
-        If the signal is too short, constant, or shows no tone.
+    nothing speaks against it: no line left near it, no change within the window, no other tone too close. Missing samples
+    are NaN; ``every`` [s] is the time from row to row, ``window`` [s] the longest window. Raises DataError for a signal
+    that is too short, constant, or shows no tone.
     """
     require_positive("interval", interval, "s")
     if tones is not None:

@@ -21,6 +21,7 @@ def mains(tmp_path):
 def test_columns_figure_and_summary(ctid, mains, tmp_path):
     out = tmp_path / "new"
     text = ctid("track", mains, "--signal", "va", "--pmu", 60, "--out", out).stdout
+    text = " ".join(text.split())
     for part in ("mains.csv: 2000 samples of 'va'", "Class P at 60 Hz, 60 reports a second", "frequency [Hz]"):
         assert part in text
     frame = pd.read_csv(out / "synchrophasors.csv")

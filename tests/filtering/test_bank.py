@@ -62,7 +62,8 @@ def test_irregular_code_on_a_regular_clock_is_the_regular_code(system, delay, ho
     regular = filter_data(record(seed, hold=hold), 2.0, hold_output)
     irregular = regular._replace(interval=0.0)
     assert regular.interval > 0.0
-    assert_close(standard_rows(irregular, *system, delay, form), standard_rows(regular, *system, delay, form), 1e-10)
+    # Partial fractions of three poles that are 10 % apart lose some digits.
+    assert_close(standard_rows(irregular, *system, delay, form), standard_rows(regular, *system, delay, form), 1e-9)
 
 
 @given(systems(), DELAYS, HOLDS, HOLDS, st.integers(0, 2**31), st.booleans())
