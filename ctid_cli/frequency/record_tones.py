@@ -59,7 +59,7 @@ def follow_tones(
     In windows of all lengths, doubled from 64 samples to the whole record, decaying chirps are fitted one by one until
     the residual, whitened, shows no further line. At each instant each tone is read from the longest window in which
     nothing speaks against it: no line left near it, no change within the window, no other tone too close. Missing
-    samples are NaN; ``every`` [s] is the time from row to row, ``window`` [s] the longest window. DataError is raised for
+    samples are NaN; ``every`` [s] is the time from row to row, ``window`` [s] the longest window. Raises DataError for
     a signal that is too short, constant, or shows no tone.
     """
     require_positive("interval", interval, "s")
