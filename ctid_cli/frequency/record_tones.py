@@ -30,6 +30,8 @@ MOST_LINES = 16
 #: only in the longest windows, and may be anywhere.
 FEWEST_KEPT = 2**12
 FEWEST_OF_ALL = 2**15
+#: Samples of all segments of a length in whose spectra the highest of the strongest tones is looked for.
+LOOKED_AT = 2**18
 #: Of a thinned record this share of the band is kept, and the highest tone lies in this share of it.
 KEPT_BAND = 0.9
 TONE_BAND = 0.8
@@ -105,7 +107,7 @@ def _thinning(samples: Array, interval: float, tones: int | None) -> tuple[Decim
     fewest = FEWEST_OF_ALL if tones is None else FEWEST_KEPT
     if samples.size < 2 * fewest or tones == 0:
         return Decimation(np.ones(1)), []
-    peaks = find_peaks(samples, interval, tones or MOST_ASKED)
+    peaks = find_peaks(samples, interval, tones or MOST_ASKED, LOOKED_AT)
     if not peaks.omega.size:
         return Decimation(np.ones(1)), []
     top = float(peaks.omega[: tones or MOST_ASKED].max())

@@ -45,12 +45,13 @@ class Peaks:
         return 4.0 * np.pi / self.segment
 
 
-def find_peaks(samples: Array, interval: float, tones: int) -> Peaks:
+def find_peaks(samples: Array, interval: float, tones: int, looked_at: int = MOST_SAMPLES) -> Peaks:
     """Peaks of the median spectrum of a record's segments, of a length that shows as many strong ones as wanted.
 
     The median over segments shows what is there most of the time, not what is loud for a moment. Long segments tell
     close tones apart and short ones stand it if a tone moves: of the lengths N, N/2, N/4, ... the longest is taken that
-    shows the weakest of the wanted peaks (nearly) as large as any length does.
+    shows the weakest of the wanted peaks (nearly) as large as any length does. All segments of one length have no more
+    than ``looked_at`` samples.
     """
     missing = ~np.isfinite(samples)
     values = np.asarray(samples, dtype=float)
@@ -63,7 +64,7 @@ def find_peaks(samples: Array, interval: float, tones: int) -> Peaks:
             break
         size = min(values.size, LONGEST_SEGMENT)
         while size >= min(SHORTEST_SEGMENT, values.size):
-            spectrum = median_spectrum(values, missing, size, most_missing)
+            spectrum = median_spectrum(values, missing, size, most_missing, looked_at)
             if spectrum is not None:
                 bins, amplitudes = significant(spectrum)
                 found.append(Peaks(2.0 * np.pi * bins / (size * interval), amplitudes, size * interval))
@@ -79,9 +80,11 @@ def find_peaks(samples: Array, interval: float, tones: int) -> Peaks:
     return next((peaks for peaks in good if peaks.segment <= LONGEST_FRACTION * values.size * interval), good[-1])
 
 
-def median_spectrum(values: Array, missing: BoolArray, size: int, most_missing: float) -> Array | None:
+def median_spectrum(
+    values: Array, missing: BoolArray, size: int, most_missing: float, looked_at: int = MOST_SAMPLES
+) -> Array | None:
     """Median over segments of the amplitude spectrum, with a Hann window."""
-    count = max(1, min(2 * values.size // size - 1, MOST_SAMPLES // size))
+    count = max(1, min(2 * values.size // size - 1, looked_at // size))
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(size) + 0.5) / size)
     window /= window.sum()
     spectra = []

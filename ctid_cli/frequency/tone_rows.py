@@ -23,6 +23,7 @@ PERIODS = 4.0
 SIGNIFICANT = 5.0
 #: Three lines at equal distances, that differ by no more than this share, may be one tone that is modulated.
 #: Lines so many distances beside such a comb belong to it.
+COMB = 3
 UNEQUAL = 0.05
 BESIDE = 3.0
 #: Readings closer than so many bins of the shorter window, or so many standard errors, are of one tone.
@@ -200,7 +201,8 @@ def _modulated(readings: Readings) -> BoolArray:
     """
     omega, error, window = readings.omega, readings.error, readings.window
     combs = np.zeros(omega.size, np.bool_)
-    for length, middle in {(int(w), float(m)) for w, m in zip(window, readings.middle, strict=True)}:
+    windows, lines_in = np.unique(np.column_stack((window, readings.middle)), axis=0, return_counts=True)
+    for length, middle in windows[lines_in >= COMB]:
         lines = np.flatnonzero((window == length) & (readings.middle == middle))
         lines = lines[np.argsort(omega[lines])]
         gaps, sure = np.diff(omega[lines]), np.hypot(error[lines][1:], error[lines][:-1])
