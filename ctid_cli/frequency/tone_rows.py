@@ -21,8 +21,8 @@ RESOLVED = 1.7
 PERIODS = 4.0
 #: A tone is there if its amplitude at the instant is so many times its standard error.
 SIGNIFICANT = 5.0
-#: Three lines at equal distances, that differ by no more than this share, may be one tone that is modulated.
-#: Lines so many distances beside such a comb belong to it.
+#: So many lines at equal distances, that differ by no more than this share, may be one tone that is modulated; lines so
+#: many distances beside such a comb belong to it.
 COMB = 3
 UNEQUAL = 0.05
 BESIDE = 3.0
