@@ -11,7 +11,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.frequency.decimation import PIECE, Decimation, low_pass, without_low
 from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES
 from ctid_cli.frequency.spectrum import Peaks, find_peaks
-from ctid_cli.frequency.spikes import TIMES, find_spikes
+from ctid_cli.frequency.spikes import find_spikes, spikes_told
 from ctid_cli.frequency.windows import estimate_window
 from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.signals.checks import require_choice, require_integer, require_positive
@@ -141,8 +141,7 @@ def choose_settings(
     if how:
         reasons.append(how)
     reasons.append(sentence if batch else f"Amplitudes are found from the last {length * thin:.4g} s before each row.")
-    if spikes.any():
-        reasons.append(f"Spikes, {TIMES:g} times as high as all around them, are taken as missing: {spikes.sum()}.")
+    reasons += spikes_told(spikes)
     warnings = tuple(_doubts(peaks, tones, interval))
     return Settings(estimator, tones, band.expected, offset, band.decimation, thin, length, tuple(reasons), warnings)
 
@@ -178,7 +177,11 @@ def _doubts(peaks: Peaks, tones: int, interval: float) -> Iterator[str]:
     if peaks.omega.size < tones:
         closer = f"closer than {peaks.resolution / (2 * np.pi):.4g} Hz"
         yield f"Only {peaks.omega.size} of {tones} tones stand out: use fewer, or a longer record if they are {closer}."
-    highest, nyquist = float(peaks.omega[:tones].max()) / (2 * np.pi), 0.5 / interval
+    yield from image_doubt(float(peaks.omega[:tones].max()) / (2 * np.pi), 0.5 / interval)
+
+
+def image_doubt(highest: float, nyquist: float) -> Iterator[str]:
+    """What to know of a tone near the Nyquist frequency [Hz]."""
     if highest > SUSPICIOUS * nyquist:
         yield f"The tone at {highest:.6g} Hz may be the image of one above the Nyquist frequency, {nyquist:.6g} Hz."
 

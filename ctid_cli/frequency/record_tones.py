@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
-from ctid_cli.frequency.automatic import SUSPICIOUS, refuse_unusable
+from ctid_cli.frequency.automatic import image_doubt, refuse_unusable
 from ctid_cli.frequency.decimation import Decimation, low_pass
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.record_track import MOST_ASKED, MissingLine, Procedure, RecordTrack
 from ctid_cli.frequency.spectrum import find_peaks
-from ctid_cli.frequency.spikes import TIMES, find_spikes
+from ctid_cli.frequency.spikes import find_spikes, spikes_told
 from ctid_cli.frequency.tone_identity import paths_of
 from ctid_cli.frequency.tone_rows import SHORTEST, Readings, readings_at
 from ctid_cli.signals.checks import require_integer, require_positive
@@ -93,10 +93,8 @@ def follow_tones(
     others["missing"] = tuple(_missing(found, path, places.size, thin, scale) for path in lost)
     t = places * thin + 0.5 * (decimation.weights.size - 1) * interval
     track = RecordTrack.of(t, omega, flags, max(step, 1.0) * thin, **others)
-    if spikes.any():
-        reasons.append(f"Spikes, {TIMES:g} times as high as all around them, are taken as missing: {spikes.sum()}.")
     used = {"interval": thin, "kept_of": decimation.factor, "filter_samples": decimation.weights.size}
-    sentences = (*_counted(paths, count, tones), *reasons, *_windows_used(found, wanted, thin))
+    sentences = (*_counted(paths, count, tones), *reasons, *spikes_told(spikes), *_windows_used(found, wanted, thin))
     highest = max((float(np.median(found.omega[path])) for path in wanted), default=0.0) / (2.0 * np.pi * thin)
     doubts = tuple(_doubts(len(paths), tones, highest, 0.5 / interval))
     return track, Procedure(METHOD, False, sentences, doubts, used | {"longest_window": longest * thin})
@@ -215,5 +213,4 @@ def _doubts(found: int, tones: int | None, highest: float, nyquist: float) -> It
     """What the user should know before believing the tones [Hz]."""
     if tones is not None and found < tones:
         yield f"Only {found} of {tones} tones stand out of the record: the other columns are empty."
-    if highest > SUSPICIOUS * nyquist:
-        yield f"The tone at {highest:.6g} Hz may be the image of one above the Nyquist frequency, {nyquist:.6g} Hz."
+    yield from image_doubt(highest, nyquist)

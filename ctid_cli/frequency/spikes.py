@@ -30,6 +30,12 @@ def find_spikes(samples: Array) -> BoolArray:
     return spikes if spikes.mean() <= MOST else np.zeros_like(spikes)
 
 
+def spikes_told(spikes: BoolArray) -> list[str]:
+    """What is said of the spikes of a record."""
+    told = f"Spikes, {TIMES:g} times as high as all around them, are taken as missing: {spikes.sum()}."
+    return [told] if spikes.any() else []
+
+
 def without_spikes(samples: Array) -> Array:
     """The record with its spikes as missing samples."""
     return np.where(find_spikes(samples), np.nan, samples)

@@ -8,6 +8,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
+from ctid_cli.frequency.moments import factorise, substitute
 
 #: Numbers of a tone: cosine and sine amplitude, and over half a window logarithmic growth, phase, curvature of phase.
 NUMBERS = 5
@@ -43,14 +44,10 @@ class Windows(NamedTuple):
     used: IndexArray
     #: Numbers of the tones, shape (R, n, 5).
     numbers: Array
-    #: Mean squares of what is left, shape (R,).
-    left: Array
     #: Inverse of the scaled normal matrix, tones first and the constant last, shape (R, 5 n + 1, 5 n + 1).
     inverse: Array
     #: Whether the iteration ended at a minimum, shape (R,).
     converged: BoolArray
-    #: Samples that are there, shape (R,).
-    present: IndexArray
 
 
 def windows_at(first: IndexArray, most_tones: int) -> Windows:
@@ -60,10 +57,8 @@ def windows_at(first: IndexArray, most_tones: int) -> Windows:
         first=np.ascontiguousarray(first, dtype=np.int64),
         used=np.zeros(rows, np.int64),
         numbers=np.zeros((rows, most_tones, NUMBERS)),
-        left=np.zeros(rows),
         inverse=np.zeros((rows, size, size)),
         converged=np.zeros(rows, np.bool_),
-        present=np.zeros(rows, np.int64),
     )
 
 
@@ -177,42 +172,13 @@ def _normal_equations(y: Array, tones: Array, constant: float, free: int, work: 
 
 
 @njit(cache=True, nogil=True)
-def _factor(gram: Array, size: int, damping: float, scale: Array, factor: Array) -> bool:
-    """Cholesky factor of the scaled, damped normal matrix; whether it is definite."""
-    for a in range(size):
-        scale[a] = math.sqrt(gram[a, a]) if gram[a, a] > 0.0 else 1.0
-    for a in range(size):
-        for b in range(a + 1):
-            value = gram[a, b] / (scale[a] * scale[b])
-            if a == b:
-                value += damping
-                if gram[a, a] <= 0.0:
-                    value = 1.0
-            for c in range(b):
-                value -= factor[a, c] * factor[b, c]
-            if a == b:
-                if value <= 0.0:
-                    return False
-                factor[a, a] = math.sqrt(value)
-            else:
-                factor[a, b] = value / factor[b, b]
-    return True
-
-
-@njit(cache=True, nogil=True)
-def _solve(factor: Array, size: int, scale: Array, right: Array, step: Array) -> None:
-    for a in range(size):
-        value = right[a] / scale[a]
-        for c in range(a):
-            value -= factor[a, c] * step[c]
-        step[a] = value / factor[a, a]
-    for a in range(size - 1, -1, -1):
-        value = step[a]
-        for c in range(a + 1, size):
-            value -= factor[c, a] * step[c]
-        step[a] = value / factor[a, a]
-    for a in range(size):
-        step[a] /= scale[a]
+def _solve(factor: Array, scales: Array, right: Array, step: Array) -> None:
+    """Solve the scaled normal equations whose factor is known."""
+    for a in range(scales.size):
+        step[a] = right[a] / scales[a]
+    substitute(factor, step[: scales.size])
+    for a in range(scales.size):
+        step[a] /= scales[a]
 
 
 @njit(cache=True, nogil=True)
@@ -223,7 +189,7 @@ def _iterate(
     n = tones.shape[0]
     size = free * n + 1
     gram, factor = work[0], work[1]
-    right, scale, step = work[2, 0], work[2, 1], work[2, 2]
+    right, scales, step = work[2, 0], work[2, 1, :size], work[2, 2]
     trial = np.empty_like(tones)
     damping = DAMPING
     cost = _normal_equations(y, tones, constant, free, work, pairs)
@@ -231,8 +197,8 @@ def _iterate(
         while True:
             if damping > MOST_DAMPING:
                 return constant, True
-            if _factor(gram, size, damping, scale, factor):
-                _solve(factor, size, scale, right, step)
+            if factorise(gram, damping, factor, scales):
+                _solve(factor, scales, right, step)
                 largest, turned = 0.0, 0.0
                 for k in range(n):
                     for j in range(NUMBERS):
@@ -283,7 +249,6 @@ def fit_windows(samples: Array, length: int, windows: Windows, chosen: IndexArra
                 constant += value
                 there += 1
         constant = constant / there if there else 0.0
-        windows.present[row] = there
         if there <= NUMBERS * n + 1:
             windows.converged[row] = False
             residuals[row] = np.nan
@@ -293,14 +258,14 @@ def fit_windows(samples: Array, length: int, windows: Windows, chosen: IndexArra
         constant, done = _iterate(y, tones, constant, NUMBERS, ITERATIONS, work, pairs, residual)
         windows.converged[row] = done
         size = NUMBERS * n + 1
-        cost = _normal_equations(y, tones, constant, NUMBERS, work, pairs)
-        windows.left[row] = cost / max(1, there - size)
+        _normal_equations(y, tones, constant, NUMBERS, work, pairs)
         _left_over(y, tones, constant, residuals[row])
-        if _factor(work[0], size, RIDGE, work[2, 1], work[1]):
+        scales = work[2, 1, :size]
+        if factorise(work[0], RIDGE, work[1], scales):
             for a in range(size):
                 work[2, 0, :size] = 0.0
                 work[2, 0, a] = 1.0
-                _solve(work[1], size, work[2, 1], work[2, 0], work[2, 2])
+                _solve(work[1], scales, work[2, 0], work[2, 2])
                 windows.inverse[row, a, :size] = work[2, 2, :size]
         else:
             windows.inverse[row, :size, :size] = np.nan

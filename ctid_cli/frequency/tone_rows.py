@@ -29,8 +29,8 @@ BESIDE = 3.0
 #: Readings closer than so many bins of the shorter window, or so many standard errors, are of one tone.
 SAME_BINS = 1.5
 SAME_ERRORS = 5.0
-#: A curvature of the frequency of more than so many of its standard errors adds to the error of the reading, of more
-#: than so many to the reading.
+#: A curvature of the frequency of more than so many of its standard errors adds to the error of the reading; one of
+#: more than so many is taken from the reading too.
 QUIET = 2.0
 BENT = 4.0
 #: Frequencies that move by more than so many errors over their window may move otherwise than along a line. A kink that

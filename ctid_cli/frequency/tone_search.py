@@ -98,24 +98,24 @@ def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: T
         tests = new if tests is None else tests.replaced(todo, new)
         if round_ == most:
             break
-        apart = np.abs(windows.numbers[todo, :, 3] - new.line.omega[:, None] * 0.5 * (length - 1))
-        apart[np.arange(most) >= windows.used[todo, None]] = np.inf
-        joins = (new.line.chance < LEVEL) & (windows.used[todo] < most) & (apart.min(axis=1) > APART * np.pi)
-        # What a change explains better is none.
+        # What a change explains better is no line.
         changed = np.where(np.isnan(new.change), 0.0, new.change).max(axis=1)
-        joins &= changed <= new.line.energy
         further = np.where(new.line.further_energy >= changed[:, None], new.line.further, np.nan)
-        todo, lines = todo[joins], np.column_stack((new.line.omega, further))[joins]
+        lines = np.column_stack((new.line.omega, further)) * 0.5 * (length - 1)
+        new_one = (new.line.chance < LEVEL) & (changed <= new.line.energy)
+        todo, lines = todo[new_one], lines[new_one]
+        joined = _join(windows, todo, lines[:, 0])
+        todo, lines = todo[joined], lines[joined]
         if not todo.size:
             break
-        for omega in lines.T:
-            _join(windows, todo, omega * 0.5 * (length - 1))
+        for turns in lines.T[1:]:
+            _join(windows, todo, turns)
     assert tests is not None
     return _rows(windows, tests, length)
 
 
-def _join(windows: Windows, rows: IndexArray, turns: Array) -> None:
-    """Add a line to each of some windows, where it is one, there is room, and it is not beside a tone."""
+def _join(windows: Windows, rows: IndexArray, turns: Array) -> BoolArray:
+    """Add a line to each of some windows, and tell where: where it is one, there is room, and no tone is beside it."""
     most = windows.numbers.shape[1]
     apart = np.abs(windows.numbers[rows, :, 3] - turns[:, None])
     apart[np.arange(most) >= windows.used[rows, None]] = np.inf
@@ -124,6 +124,7 @@ def _join(windows: Windows, rows: IndexArray, turns: Array) -> None:
     windows.numbers[rows, windows.used[rows]] = 0.0
     windows.numbers[rows, windows.used[rows], 3] = turns
     windows.used[rows] += 1
+    return np.asarray(fits)
 
 
 class _Tests(NamedTuple):

@@ -48,8 +48,6 @@ class Left(NamedTuple):
     filters: Array
     #: Mean square of the innovations, shape (R,).
     innovations: Array
-    #: Samples that are there, shape (R,).
-    present: IndexArray
     #: Where the tapered spectrum has its largest ordinate, as a share of all, and how high that is above the floor
     #: before any whitening, shape (R,).
     peak: Array
@@ -98,7 +96,7 @@ def whiten(residuals: Array, fitted: IndexArray) -> Left:
     order = (filters != 0.0).sum(axis=1) - 1
     squares = (white**2).sum(axis=1) / np.maximum(present - fitted - order, 1)
     white /= np.sqrt(np.where(squares > 0.0, squares, 1.0))[:, None]
-    return Left(white, filters, squares, present, peak / (power.shape[1] - 1), height)
+    return Left(white, filters, squares, peak / (power.shape[1] - 1), height)
 
 
 def running_floor(power: Array) -> Array:
