@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.prefilter import fast_convolve
@@ -10,6 +11,8 @@ from ctid_cli.frequency.prefilter import fast_convolve
 #: A long record is filtered in pieces of so many samples, or of some filters if these are longer, and never copied.
 PIECE = 2**18
 LENGTHS = 4
+#: Where no more than so many weights come to a sample that is left out, only what is kept is computed, by its sum.
+FEW_WEIGHTS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,15 +31,34 @@ class Decimation:
             return bridged[:: self.factor] - offset
         length = self.factor * (max(PIECE, LENGTHS * taps) // self.factor)
         parts = [
-            fast_convolve(bridged[first : first + length + taps - 1] - offset, self.weights)[:: self.factor]
+            self._filtered(bridged[first : first + length + taps - 1] - offset)
             for first in range(0, samples.size - taps + 1, length)
         ]
         return np.concatenate(parts or [np.empty(0)])
+
+    def _filtered(self, samples: Array) -> Array:
+        """What is kept of a piece."""
+        if self.weights.size > FEW_WEIGHTS * self.factor:
+            return fast_convolve(samples, self.weights)[:: self.factor]
+        out = np.empty((samples.size - self.weights.size) // self.factor + 1)
+        _thin(samples, self.weights, self.factor, out)
+        return out
 
     def gain(self, omega: Array, interval: float) -> Array:
         """Factor by which the filter changes amplitudes."""
         places = np.arange(self.weights.size) - 0.5 * (self.weights.size - 1)
         return np.asarray(np.abs(np.cos(np.multiply.outer(omega * interval, places)) @ self.weights))
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _thin(samples: Array, weights: Array, factor: int, out: Array) -> None:
+    """Every so many samples of what a symmetrical impulse response makes of a signal."""
+    for k in range(out.size):
+        part = samples[factor * k : factor * k + weights.size]
+        total = 0.0
+        for j in range(weights.size):
+            total += weights[j] * part[j]
+        out[k] = total
 
 
 def bridge_gaps(samples: Array, longest: int) -> Array:
@@ -59,13 +81,18 @@ def low_pass(pass_edge: float, stop_edge: float, attenuation: float, interval: f
 
     Sine cardinal times Kaiser's window: ``L = (attenuation - 7.95)/(2.285 (stop_edge - pass_edge) interval)``.
     """
-    from scipy.signal import kaiser_beta  # slow to import, needed only here
-
     half = int(np.ceil((attenuation - 7.95) / (2.285 * (stop_edge - pass_edge) * interval) / 2.0))
     places = np.arange(-half, half + 1)
     edge = 0.5 * (pass_edge + stop_edge) * interval / np.pi
-    weights = np.sinc(edge * places) * np.kaiser(2 * half + 1, kaiser_beta(attenuation))
+    weights = np.sinc(edge * places) * np.kaiser(2 * half + 1, _kaiser_beta(attenuation))
     return np.asarray(weights / weights.sum())
+
+
+def _kaiser_beta(attenuation: float) -> float:
+    """Parameter of Kaiser's window for an attenuation [dB], as he gives it."""
+    if attenuation > 50.0:
+        return 0.1102 * (attenuation - 8.7)
+    return 0.5842 * (attenuation - 21.0) ** 0.4 + 0.07886 * (attenuation - 21.0) if attenuation > 21.0 else 0.0
 
 
 def without_low(weights: Array, stop_edge: float, pass_edge: float, attenuation: float, interval: float) -> Array:

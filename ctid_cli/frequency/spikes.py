@@ -1,6 +1,7 @@
 """Samples that no sum of a few tones can have: so far above all others around them that they are taken as missing."""
 
 import numpy as np
+from numba import njit
 
 from ctid_cli.arrays import Array, BoolArray
 
@@ -14,20 +15,30 @@ MOST = 0.01
 
 def find_spikes(samples: Array) -> BoolArray:
     """Where the spikes of a record are, which may have missing samples (NaN)."""
-    from scipy.ndimage import maximum_filter1d
-
     there = np.isfinite(samples)
     if not there.any():
         return there
     size = np.where(there, np.abs(samples - np.median(samples[there])), 0.0)
-    # The largest on each side: a filter over so many samples that ends WIDTH before, or begins WIDTH after the sample.
-    padded = np.pad(size, AROUND + WIDTH)
-    largest = maximum_filter1d(padded, AROUND, mode="constant", origin=-(AROUND // 2))
-    after = largest[AROUND + 2 * WIDTH + 1 :][: size.size]
-    before = largest[: size.size]
-    around = np.maximum(before, after)
-    spikes = (size > TIMES * around) & (around > 0.0)
+    spikes = np.zeros(size.size, np.bool_)
+    _mark_spikes(size, spikes)
     return spikes if spikes.mean() <= MOST else np.zeros_like(spikes)
+
+
+@njit(cache=True, nogil=True)
+def _mark_spikes(size: Array, spikes: BoolArray) -> None:
+    """Mark what is so much larger than all around it, where that is not all zero."""
+    for k in range(size.size):
+        found = True
+        positive = False
+        # From the sample outwards: nearly always one of the first is large enough.
+        for away in range(WIDTH + 1, WIDTH + AROUND + 1):
+            for i in (k - away, k + away):
+                if 0 <= i < size.size:
+                    positive |= size[i] > 0.0
+                    found &= size[k] > TIMES * size[i]
+            if not found:
+                break
+        spikes[k] = found and positive
 
 
 def spikes_told(spikes: BoolArray) -> list[str]:

@@ -3,8 +3,6 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
-
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.frequency.tone_rows import Readings
 from ctid_cli.frequency.tone_tests import FLOOR_BINS, MEDIAN_EFFICIENCY
@@ -60,13 +58,24 @@ def _followed(found: Readings, places: Array, step: float) -> list[IndexArray]:
         if open_:
             before = np.array([p.readings[-1] for p in open_])
             cost = _misfit(found, before, here, places)
-            for old, new in zip(*linear_sum_assignment(np.minimum(cost, 1.0)), strict=True):
-                if cost[old, new] < 1.0:
-                    open_[old].readings.append(int(here[new]))
-                    open_[old].last = row
-                    free[new] = False
+            for old, new in _paired(cost):
+                open_[old].readings.append(int(here[new]))
+                open_[old].last = row
+                free[new] = False
         open_ += [Path([int(k)], row) for k in here[free]]
     return [np.array(p.readings) for p in ended + open_]
+
+
+def _paired(cost: Array) -> list[tuple[int, int]]:
+    """Pairs of the least sum of costs, of those below 1."""
+    able = cost < 1.0
+    if able.sum(axis=0).max() > 1 or able.sum(axis=1).max() > 1:
+        from scipy.optimize import linear_sum_assignment  # slow to import, and needed only where there is a choice
+
+        chosen = np.zeros_like(able)
+        chosen[linear_sum_assignment(np.minimum(cost, 1.0))] = True
+        able &= chosen
+    return [(int(old), int(new)) for old, new in np.argwhere(able)]
 
 
 def _misfit(found: Readings, before: IndexArray, here: IndexArray, places: Array) -> Array:

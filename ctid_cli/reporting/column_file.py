@@ -1,6 +1,8 @@
 """Columns over time as a file: CSV, or HDF5 with the units as attributes."""
 
+import csv
 import io
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,11 +13,11 @@ from numpy.typing import NDArray
 def columns_bytes(table: Mapping[str, NDArray[Any]], style: str, units: Mapping[str, str | None]) -> bytes:
     """The file of a table (``csv`` or ``h5``), with the units of those of its columns that have one."""
     if style == "csv":
-        import pandas as pd
-
-        marks = {name: int for name, values in table.items() if values.dtype == bool}
-        frame = pd.DataFrame(dict(table)).replace([np.inf, -np.inf], np.nan).astype(marks)
-        return frame.to_csv(index=False, float_format="%.12g", lineterminator="\n").encode()
+        text = io.StringIO()
+        lines = csv.writer(text, lineterminator="\n")
+        lines.writerow(table)
+        lines.writerows(zip(*(_cells(values) for values in table.values()), strict=True))
+        return text.getvalue().encode()
     import h5py
 
     file = io.BytesIO()
@@ -28,3 +30,12 @@ def columns_bytes(table: Mapping[str, NDArray[Any]], style: str, units: Mapping[
             if units.get(name) is not None:
                 column.attrs["unit"] = units[name]
     return file.getvalue()
+
+
+def _cells(values: NDArray[Any]) -> list[Any]:
+    """A column of a text file: an empty field where there is no finite number."""
+    if values.dtype == bool:
+        return values.astype(int).tolist()
+    if values.dtype.kind != "f":
+        return values.tolist()
+    return [f"{value:.12g}" if math.isfinite(value) else "" for value in values.tolist()]

@@ -2,6 +2,7 @@
 
 import os
 import warnings
+import wave
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -58,13 +59,30 @@ def read_sound(path: str | os.PathLike[str]) -> tuple[Table, float, str]:
 
 
 def _read_wav(path: str | os.PathLike[str]) -> Sound:
-    from scipy.io import wavfile
+    usual = _read_usual_wav(path)
+    if usual is not None:
+        return usual
+    from scipy.io import wavfile  # slow to import: it brings sparse matrices
 
     with warnings.catch_warnings():
         # Chunks with titles and the like are no concern of the samples.
         warnings.simplefilter("ignore", wavfile.WavFileWarning)
         rate, data = wavfile.read(path)
     return int(rate), data
+
+
+def _read_usual_wav(path: str | os.PathLike[str]) -> Sound | None:
+    """A sound of 16 bits that is whole; None if it is another."""
+    try:
+        with wave.open(os.fspath(path), "rb") as file:
+            if file.getsampwidth() != 2:
+                return None
+            rate, count, channels = file.getframerate(), file.getnframes(), file.getnchannels()
+            content = file.readframes(count)
+    except (wave.Error, EOFError):
+        return None
+    whole = len(content) == 2 * channels * count
+    return (rate, np.frombuffer(content, "<i2").reshape(count, channels)) if whole else None
 
 
 def _read_flac(path: str | os.PathLike[str]) -> Sound:
