@@ -46,8 +46,8 @@ class Decimation:
 
     def gain(self, omega: Array, interval: float) -> Array:
         """Factor by which the filter changes amplitudes."""
-        places = np.arange(self.weights.size) - 0.5 * (self.weights.size - 1)
-        return np.asarray(np.abs(np.cos(np.multiply.outer(omega * interval, places)) @ self.weights))
+        turns = np.ascontiguousarray(omega * interval, dtype=np.float64)
+        return np.abs(_response(turns.ravel(), self.weights)).reshape(turns.shape)
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
@@ -59,6 +59,21 @@ def _thin(samples: Array, weights: Array, factor: int, out: Array) -> None:
         for j in range(weights.size):
             total += weights[j] * part[j]
         out[k] = total
+
+
+@njit(cache=True, nogil=True)
+def _response(turns: Array, weights: Array) -> Array:
+    """Factor of a symmetrical impulse response at some phases from sample to sample [rad]."""
+    out = np.empty(turns.size)
+    half = 0.5 * (weights.size - 1)
+    for k in range(turns.size):
+        z, q = np.exp(complex(0.0, -half * turns[k])), np.exp(complex(0.0, turns[k]))
+        total = 0.0
+        for weight in weights:
+            total += weight * z.real
+            z *= q
+        out[k] = total
+    return out
 
 
 def bridge_gaps(samples: Array, longest: int) -> Array:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.frequency.medians import medians_of_columns
 
 #: Points of the spectrum for each bin of an unpadded one.
 PADDING = 4
@@ -12,6 +13,8 @@ PADDING = 4
 SHORTEST_SEGMENT = 64
 LONGEST_SEGMENT = 2**18
 MOST_SAMPLES = 2**21
+#: Points of spectra that are made at once.
+TOGETHER = 2**17
 #: A segment with a larger fraction of missing samples is left out, or with the second one if no segment had fewer.
 MOST_MISSING = (0.1, 0.5)
 #: A peak must stand so many times (in amplitude) above the median of the bins around it, so many on each side, and
@@ -87,13 +90,16 @@ def median_spectrum(
     count = max(1, min(2 * values.size // size - 1, looked_at // size))
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(size) + 0.5) / size)
     window /= window.sum()
-    spectra = []
-    for first in np.linspace(0, values.size - size, count).astype(int):
-        if missing[first : first + size].mean() > most_missing:
-            continue
-        part = values[first : first + size]
-        spectra.append(2.0 * np.abs(np.fft.rfft((part - window @ part) * window, PADDING * size)))
-    return np.asarray(np.median(spectra, axis=0)) if spectra else None
+    begins = np.linspace(0, values.size - size, count).astype(int)
+    if missing.any():
+        begins = np.array([k for k in begins if missing[k : k + size].mean() <= most_missing], dtype=int)
+    spectra = np.empty((begins.size, PADDING * size // 2 + 1))
+    together = max(1, TOGETHER // (PADDING * size))
+    for done in range(0, begins.size, together):
+        parts = [values[k : k + size] for k in begins[done : done + together]]
+        tapered = np.array([(part - window @ part) * window for part in parts])
+        spectra[done : done + together] = 2.0 * np.abs(np.fft.rfft(tapered, PADDING * size))
+    return medians_of_columns(spectra) if begins.size else None
 
 
 def significant(spectrum: Array) -> tuple[Array, Array]:

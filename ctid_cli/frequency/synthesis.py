@@ -1,6 +1,9 @@
 """The signal that the rows of a track describe."""
 
+import math
+
 import numpy as np
+from numba import njit
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.frequency.flags import Flag
@@ -30,20 +33,29 @@ def _piece(track: RecordTrack, t: Array) -> Array:
     after = np.minimum(before + 1, last)
     step = np.where(after > before, track.t[after] - track.t[before], 1.0)
     share = np.clip((t - track.t[before]) / step, 0.0, 1.0)
+    absent = ((track.flags & int(Flag.ABSENT)) != 0) & ~np.isfinite(track.omega)
+    # Where a tone is absent its numbers do not matter.
+    omega, amplitudes, phase = (
+        np.where(absent, 0.0, values) for values in (track.omega, track.amplitudes, track.phase)
+    )
+    growth, rate = np.nan_to_num(track.growth), np.nan_to_num(track.rate)
     total = np.zeros(t.size)
     for k in range(track.omega.shape[1]):
-        total += (1.0 - share) * _tone(track, k, before, t) + share * _tone(track, k, after, t)
+        numbers = np.column_stack((amplitudes[:, k], phase[:, k], omega[:, k], rate[:, k], growth[:, k]))
+        _add_tone(numbers, track.t, before, 1.0 - share, t, total)
+        _add_tone(numbers, track.t, after, share, t, total)
     outside = np.maximum(track.t[0] - t, t - track.t[-1])
     window = track.window[np.isfinite(track.window)]
     reach = 0.5 * max(float(np.median(window)) if window.size else 0.0, track.every)
     return np.where(outside <= reach, total, np.nan)
 
 
-def _tone(track: RecordTrack, k: int, row: IndexArray, t: Array) -> Array:
-    """One tone as some rows describe it, each at one instant."""
-    passed = t - track.t[row]
-    growth, rate = (np.nan_to_num(values[row, k]) for values in (track.growth, track.rate))
-    phase = track.phase[row, k] + track.omega[row, k] * passed + 0.5 * rate * passed**2
-    amplitude = track.amplitudes[row, k] * np.exp(np.clip(growth * passed, -MOST_GROWTH, MOST_GROWTH))
-    absent = (track.flags[row, k] & int(Flag.ABSENT)) != 0
-    return np.asarray(np.where(absent & ~np.isfinite(track.omega[row, k]), 0.0, amplitude * np.sin(phase)))
+@njit(cache=True, nogil=True)
+def _add_tone(numbers: Array, rows: Array, row: IndexArray, share: Array, t: Array, total: Array) -> None:
+    """Add a share of one tone as some rows describe it, each at one instant; a row is what `_piece` puts into it."""
+    for i in range(t.size):
+        k = row[i]
+        passed = t[i] - rows[k]
+        phase = numbers[k, 1] + numbers[k, 2] * passed + 0.5 * numbers[k, 3] * passed * passed
+        grown = min(max(numbers[k, 4] * passed, -MOST_GROWTH), MOST_GROWTH)
+        total[i] += share[i] * numbers[k, 0] * math.exp(grown) * math.sin(phase)

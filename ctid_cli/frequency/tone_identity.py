@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.frequency.tone_rows import Readings
 from ctid_cli.frequency.tone_tests import FLOOR_BINS, MEDIAN_EFFICIENCY

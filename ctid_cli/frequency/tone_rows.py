@@ -1,10 +1,11 @@
 """The tones at each of many instants, read from the longest window around it in which nothing speaks against them."""
 
+import math
 from collections.abc import Callable
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.frequency.tone_search import LEVEL, ToneRows, tones_of_windows
@@ -110,9 +111,10 @@ def readings_at(
     order = np.argsort(everything.row, kind="stable")
     everything = everything.at(order)
     bounds = np.searchsorted(everything.row, np.arange(places.size + 1))
-    chosen = [begin + _chosen(everything.at(slice(begin, end))) for begin, end in pairwise(bounds) if end > begin]
-    kept = np.concatenate(chosen) if chosen else np.empty(0, np.int64)
-    return everything.at(kept)
+    kept = np.zeros(everything.row.size, np.bool_)
+    _keep(everything.omega, everything.error, everything.window, everything.middle, bounds, kept)
+    everything = everything.at(np.flatnonzero(kept))
+    return everything.at(np.lexsort((everything.omega, everything.row)))
 
 
 def _readings(tones: ToneRows, length: int, places: Array) -> Readings:
@@ -194,42 +196,72 @@ def _distance(tones: ToneRows, length: int) -> Array:
     return np.asarray(np.where(np.isnan(apart), np.inf, apart).min(axis=2) * length / (2.0 * np.pi))
 
 
-def _modulated(readings: Readings) -> BoolArray:
-    """Readings of one instant that are lines of a comb, where a shorter window shows one tone that moves.
+@njit(cache=True, nogil=True)
+def _mark_combs(omega: Array, error: Array, window: IndexArray, middle: Array, combs: BoolArray) -> None:
+    """Mark readings of one instant that are lines of a comb, where a shorter window shows one tone that moves.
 
     Amplitude or frequency that changes periodically makes lines at equal distances, each of them as steady as a tone.
     """
-    omega, error, window = readings.omega, readings.error, readings.window
-    combs = np.zeros(omega.size, np.bool_)
-    windows, lines_in = np.unique(np.column_stack((window, readings.middle)), axis=0, return_counts=True)
-    for length, middle in windows[lines_in >= COMB]:
-        lines = np.flatnonzero((window == length) & (readings.middle == middle))
+    seen = np.zeros(omega.size, np.bool_)
+    for one in range(omega.size):
+        if seen[one]:
+            continue
+        lines = np.flatnonzero((window == window[one]) & (middle == middle[one]))
+        seen[lines] = True
+        if lines.size < COMB:
+            continue
         lines = lines[np.argsort(omega[lines])]
-        gaps, sure = np.diff(omega[lines]), np.hypot(error[lines][1:], error[lines][:-1])
-        equal = np.abs(np.diff(gaps)) < np.maximum(SAME_ERRORS * np.hypot(sure[1:], sure[:-1]), UNEQUAL * gaps[1:])
-        runs = np.flatnonzero(np.diff(np.concatenate(([False], equal, [False])).astype(np.int8)))
-        for begin, end in zip(runs[::2], runs[1::2], strict=True):
-            gap = gaps[begin : end + 1].mean()
-            low, high = omega[lines[begin]] - BESIDE * gap, omega[lines[end + 1]] + BESIDE * gap
-            around = (omega > low) & (omega < high)
-            shorter = around & (window < length) & (window * gap < 2.0 * np.pi)
-            if shorter.any():
-                best = np.flatnonzero(shorter)[error[shorter].argmin()]
-                comb = lines[around[lines]]
-                combs[comb] |= np.abs(omega[comb] - omega[best]) > COVERED * error[best]
-    return combs
+        gaps = np.diff(omega[lines])
+        begin = 0
+        while begin < gaps.size - 1:
+            # Lines from `begin` to `end` + 1 are at equal distances.
+            end = begin
+            while end < gaps.size - 1 and _equal(gaps, error[lines], end):
+                end += 1
+            if end > begin:
+                _mark_comb(omega, error, window, lines, begin, end, combs)
+            begin = max(end, begin + 1)
 
 
-def _chosen(readings: Readings) -> IndexArray:
-    """Which readings of one instant are kept: none that is near to one of a longer, or nearer, window."""
-    omega, error, window = readings.omega, readings.error, readings.window
-    kept = []
-    open_ = ~_modulated(readings)
-    while open_.any():
-        best = int(open_.argmax())
-        kept.append(best)
-        reach = np.maximum(SAME_BINS * 2.0 * np.pi / window, SAME_ERRORS * np.hypot(error, error[best]))
-        near = np.abs(omega - omega[best]) < reach
-        open_ &= ~near
-        open_[best] = False
-    return np.array(sorted(kept, key=lambda k: omega[k]))
+@njit(cache=True, nogil=True)
+def _equal(gaps: Array, error: Array, k: int) -> bool:
+    """Whether two neighbouring distances of lines are equal, as far as is known."""
+    square = error[k] ** 2 + 2.0 * error[k + 1] ** 2 + error[k + 2] ** 2
+    off = abs(gaps[k + 1] - gaps[k])
+    return not math.isnan(square) and off < max(SAME_ERRORS * math.sqrt(square), UNEQUAL * gaps[k + 1])
+
+
+@njit(cache=True, nogil=True)
+def _mark_comb(
+    omega: Array, error: Array, window: IndexArray, lines: IndexArray, begin: int, end: int, combs: BoolArray
+) -> None:
+    """Mark the lines of one comb, and those beside it."""
+    first, last = omega[lines[begin]], omega[lines[end + 1]]
+    gap = (last - first) / (end + 1 - begin)
+    low, high = first - BESIDE * gap, last + BESIDE * gap
+    best = -1
+    for k in range(omega.size):
+        shorter = window[k] < window[lines[0]] and window[k] * gap < 2.0 * math.pi
+        if shorter and low < omega[k] < high and (best < 0 or error[k] < error[best]):
+            best = k
+    for k in lines:
+        if best >= 0 and low < omega[k] < high and abs(omega[k] - omega[best]) > COVERED * error[best]:
+            combs[k] = True
+
+
+@njit(cache=True, nogil=True)
+def _keep(omega: Array, error: Array, window: IndexArray, middle: Array, bounds: IndexArray, kept: BoolArray) -> None:
+    """Which readings of each instant are kept: none that is near to one of a longer, or nearer, window."""
+    for row in range(bounds.size - 1):
+        here = slice(bounds[row], bounds[row + 1])
+        w, e, of = omega[here], error[here], window[here]
+        closed = np.zeros(w.size, np.bool_)
+        _mark_combs(w, e, of, middle[here], closed)
+        for best in range(w.size):
+            if closed[best]:
+                continue
+            kept[bounds[row] + best] = True
+            for k in range(best, w.size):
+                reach = SAME_ERRORS * math.hypot(e[k], e[best])
+                near = abs(w[k] - w[best]) < max(SAME_BINS * 2.0 * math.pi / of[k], reach)
+                closed[k] |= near and not math.isnan(reach)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 
@@ -34,8 +33,6 @@ def columns_bytes(table: Mapping[str, NDArray[Any]], style: str, units: Mapping[
 
 def _cells(values: NDArray[Any]) -> list[Any]:
     """A column of a text file: an empty field where there is no finite number."""
-    if values.dtype == bool:
-        return values.astype(int).tolist()
-    if values.dtype.kind != "f":
-        return values.tolist()
-    return [f"{value:.12g}" if math.isfinite(value) else "" for value in values.tolist()]
+    if values.dtype.kind == "f":
+        return [f"{value:.12g}" if math.isfinite(value) else "" for value in values.tolist()]
+    return list((values.astype(int) if values.dtype == bool else values).tolist())
