@@ -1,6 +1,6 @@
 """Is a row of a track right that is called valid? Random signals, asked for too few, enough and too many tones.
 
-    python benchmarks/track_honesty.py [--signals 1000] [--seed 1] [--show]
+    python benchmarks/track_honesty.py [--signals 1000] [--seed 1] [--show] [--method NAME]
 
 Signals of 1000 to 8000 samples: none to five tones over 60 dB, a quarter of them 3 to 12 bins beside another, steady,
 drifting, decaying or with a step of phase, frequency or amplitude, some with harmonics; white or coloured noise 10 to
@@ -8,6 +8,8 @@ drifting, decaying or with a step of phase, frequency or amplitude, some with ha
 by more than 3.3 of its standard errors and more than .001 of the frequency. A row could be right if the bound of Cramer
 and Rao for the stretch between two events of the signal (rate of change unknown) is below the accuracy, its tone is no
 weaker than six standard errors of its amplitude and three bins of the stretch from any other.
+
+With ``--method`` rows of an online estimator are judged, as ``ctid track`` gives them.
 
 Then: coverage of the standard errors and their size beside the bound, for one to three steady tones in white and
 coloured noise.
@@ -21,8 +23,12 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ctid_cli.errors import DataError
+from ctid_cli.frequency.automatic import choose_settings
+from ctid_cli.frequency.estimator_rows import track_record
+from ctid_cli.frequency.inputs import MOST_TONES
 from ctid_cli.frequency.record_tones import follow_tones
 from ctid_cli.frequency.record_track import USUAL_ACCURACY, RecordTrack
+from ctid_cli.kinds import ONLINE
 
 ROWS = 60
 KINDS = ("steady", "steady", "steady", "drift", "decay", "phase step", "frequency step", "amplitude step")
@@ -147,16 +153,25 @@ def judged(signal: Signal, track: RecordTrack) -> tuple[int, int, int, int]:
     return valid, wrong, int(complete.sum()), int((complete & hit).sum())
 
 
-def honesty(signals: int, seed: int, show: bool) -> None:
+def tracked(signal: Signal, tones: int | None, method: str | None) -> RecordTrack:
+    """The track of a signal, without a method or with one."""
+    every = (signal.samples.size - 1.0) / (ROWS - 1)
+    if method is None:
+        return follow_tones(signal.samples, 1.0, tones, every=every)[0]
+    settings = choose_settings(signal.samples, 1.0, min(MOST_TONES, max(1, tones or 0)), method=method)
+    return track_record(signal.samples, 1.0, settings, every=every)
+
+
+def honesty(signals: int, seed: int, show: bool, method: str | None) -> None:
     """The table of the first question."""
     print(f"{'asked for':12} {'valid rows':>10} {'wrong':>7} {'':8} {'could be right':>14} {'valid of them':>13}")
-    for name, more in (("one fewer", -1), ("as many", 0), ("two more", 2), ("auto", None)):
+    for name, more in (("one fewer", -1), ("as many", 0), ("two more", 2), *([] if method else [("auto", None)])):
         total = np.zeros(4, int)
         for k in range(signals):
             signal = random_signal(np.random.default_rng([seed, k]))
             asked = None if more is None else max(0, len(signal.tones) + more)
             try:
-                track, _ = follow_tones(signal.samples, 1.0, asked, every=(signal.samples.size - 1.0) / (ROWS - 1))
+                track = tracked(signal, asked, method)
             except DataError:
                 continue
             one = judged(signal, track.of_accuracy(None))
@@ -197,10 +212,12 @@ def main() -> None:
     parser.add_argument("--signals", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--show", action="store_true", help="name the signals with wrong rows")
+    parser.add_argument("--method", choices=ONLINE, help="judge the rows of an online estimator")
     given = parser.parse_args()
     began = time.process_time()
-    honesty(given.signals, given.seed, given.show)
-    efficiency(max(1, given.signals // 4), given.seed)
+    honesty(given.signals, given.seed, given.show, given.method)
+    if given.method is None:
+        efficiency(max(1, given.signals // 4), given.seed)
     print(f"{time.process_time() - began:.0f} CPU s")
 
 

@@ -64,6 +64,9 @@ KINDS: dict[str, dict[str, str]] = {
     },
 }
 
+#: Estimators of frequencies that take one sample after the other; the others take whole records.
+ONLINE = tuple(kind for kind in KINDS["frequency_estimator"] if kind not in ("esprit", "nonlinear_least_squares"))
+
 
 def resolve(section: str, kind: str) -> type[Any]:
     """The class that a kind names."""

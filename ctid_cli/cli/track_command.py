@@ -12,7 +12,7 @@ from ctid_cli.cli._common import From, Json, TimeColumn, To, answer, given_comma
 from ctid_cli.cli._progress import RecordProgress
 from ctid_cli.cli.track_mains import Mains, track_mains
 from ctid_cli.errors import UsageError
-from ctid_cli.kinds import KINDS
+from ctid_cli.kinds import ONLINE
 
 if TYPE_CHECKING:
     from ctid_cli.frequency.record_track import Procedure, RecordTrack
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     Method = str
 else:
-    Method = Literal[("automatic", *KINDS["frequency_estimator"])]
+    Method = Literal[("automatic", *ONLINE)]
 
 
 @guarded
@@ -28,7 +28,9 @@ def track(
     context: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="SIGNAL", help="Recorded signal (.csv, .mat, .wav, .flac).")],
     tones: Annotated[str, typer.Option("--tones", metavar="N", help="Number of sinusoids, or auto.")] = "auto",
-    method: Annotated[Method, typer.Option("--method", help="How the frequencies are estimated.")] = "automatic",
+    method: Annotated[
+        Method, typer.Option("--method", help="An online estimator in place of the windows.")
+    ] = "automatic",
     time: TimeColumn = None,
     signal: Annotated[str | None, typer.Option("--signal", metavar="NAME", help="Column or channel to use.")] = None,
     interval: Annotated[float | None, typer.Option("--interval", metavar="SECONDS", help="Sampling interval.")] = None,
@@ -100,9 +102,6 @@ def track(
     record = reading.read(file)
     asked = Asked(_tones(tones), None if method == "automatic" else method, every, window, accuracy)
     found, procedure = _follow(record, asked)
-    if accuracy is not None and not found.states_errors:
-        what = f"the method {procedure.method} states no standard errors to compare with --accuracy"
-        raise UsageError(f"{what}; leave --accuracy or --method out")
     found = with_lines_left(found.of_accuracy(accuracy), record.samples, record.interval)
     files = [data, figure, result]
     content = track_object(record, procedure, found, accuracy)

@@ -1,4 +1,4 @@
-"""Settings for the frequencies of a recorded signal, chosen from the record alone, with the reasons."""
+"""Settings of an online estimator for a recorded signal, chosen from the record alone, with the reasons."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,19 +9,17 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.decimation import PIECE, Decimation, low_pass, without_low
+from ctid_cli.frequency.esprit import Esprit
 from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES
 from ctid_cli.frequency.spectrum import Peaks, find_peaks
 from ctid_cli.frequency.spikes import find_spikes, spikes_told
 from ctid_cli.frequency.windows import estimate_window
-from ctid_cli.kinds import KINDS, resolve
+from ctid_cli.kinds import ONLINE, resolve
 from ctid_cli.signals.checks import require_choice, require_integer, require_positive
 
-#: Estimators that take windows of the record, and those that integrate; the others delay.
-BATCH = ("esprit", "nonlinear_least_squares")
-INTEGRATING = ("adaptive_observer", "filter_regression")
 #: Samples in a period of the highest tone, and how many tones more than the wanted ones may share the band, for
-#: estimators that take windows, that integrate, and for the others, that delay.
-SAMPLING = dict.fromkeys(BATCH, (4, MOST_TONES)) | dict.fromkeys(INTEGRATING, (60, 0))
+#: estimators that integrate, and for the others, that delay.
+INTEGRATING = dict.fromkeys(("adaptive_observer", "filter_regression"), (60, 0))
 DELAYING = (12, 2)
 #: Fewest samples for each tone.
 SAMPLES_PER_TONE = 8
@@ -30,7 +28,7 @@ CONSTANT = 1e-12
 #: Powers of smaller samples would vanish.
 SMALLEST_SAMPLE = 1e-60
 #: Tones of the record of less than this fraction of the weakest wanted one (amplitudes) disturb nobody.
-HARMLESS = 0.2
+HARMLESS = 0.05
 #: A constant part of less than this fraction disturbs nobody either.
 HARMLESS_OFFSET = 0.02
 #: The low-pass keeps so much more than the highest tone, and stops another tone if that is so many times higher.
@@ -43,15 +41,14 @@ HIGH_PASS_SHARE = 0.1
 #: What the filters leave in their stop bands [dB].
 STOP_BAND = 60.0
 LOW_STOP_BAND = 40.0
-#: Gaps shorter than this fraction of the shortest period are bridged. A filter would widen the others, so nonlinear
-#: least squares go without one if no more than so many samples could be thinned to one.
+#: Gaps shorter than this fraction of the shortest period are bridged.
 BRIDGED = 0.05
-MOST_UNTHINNED = 10
-#: A window begins with so many beats of its two closest tones, and doubles until so large a share of so many windows is
-#: certain; it never exceeds this fraction of the record, unless the record is shorter than those beats.
+#: A window begins with so many beats of its two closest tones, and doubles until the frequencies change by no more than
+#: this share from window to window, at so many places of the record, or else is the one where they change least; it
+#: never exceeds this fraction of the record, unless the record is shorter than those beats.
 BEATS = 3.0
 DOUBLINGS = 4
-CERTAIN_SHARE = 0.9
+STILL = 3e-4
 TRIALS = 8
 LARGEST_SHARE = 1.0 / 3.0
 #: Samples of a window for each tone that is estimated.
@@ -101,22 +98,22 @@ class _Band:
 
 
 def choose_settings(
-    samples: Array, interval: float, tones: int, *, method: str = "esprit", window: float | None = None
+    samples: Array, interval: float, tones: int, *, method: str, window: float | None = None
 ) -> Settings:
-    """Choose everything that an estimator needs.
+    """Choose everything that an online estimator needs.
 
     The tones are the strongest peaks of the median spectrum of the record's segments. A low-pass whose stop band begins
     before what would fold onto them, and before the next strong tone, allows to keep only some samples in each period
     of the highest tone. Tones that no filter can keep away are estimated too. The delay h of the regressions is the one
     at which noise moves the wanted tones least, below ``pi/(1.1 w_max)`` (frequencies become ambiguous at pi/w_max),
-    with a prefilter of 2 h. Windows begin with three beats of the closest tones and are doubled until nearly all
-    estimates are certain.
+    with a prefilter of 2 h. The memory begins with three beats of the closest tones and is doubled until frequencies
+    in windows as long, by ESPRIT, hardly differ from window to window.
     """
     spikes = find_spikes(samples)
     samples = np.where(spikes, np.nan, samples)
     require_integer("tones", tones, 1, MOST_TONES)
     require_positive("interval", interval, "s")
-    require_choice("method", method, tuple(KINDS["frequency_estimator"]))
+    require_choice("method", method, ONLINE)
     if window is not None:
         require_positive("window", window, "s")
     refuse_unusable(samples, SAMPLES_PER_TONE * tones, f" for {tones} tones")
@@ -127,21 +124,17 @@ def choose_settings(
     offset = _offset(samples, float(peaks.amplitudes[:tones][-1]))
     bridge = int(BRIDGED * 2.0 * np.pi / (peaks.omega[:tones].max() * interval))
     gaps = bool((~np.isfinite(samples)).any())
-    band = _choose_band(samples.size * interval, interval, tones, peaks, method, bridge, gaps)
+    band = _choose_band(samples.size * interval, interval, tones, peaks, method, bridge)
     thinned = band.decimation.apply(samples, offset)
     thin = interval * band.decimation.factor
     if np.isfinite(thinned).sum() < SAMPLES_PER_TONE * tones:
         filtered = f"{band.decimation.weights.size * interval:.4g} s of filter"
         raise DataError(f"the record is too short or has too many gaps: {seconds} for {filtered}; use a longer one")
-    batch = method in BATCH
-    length, sentence = _choose_window(thinned, thin, tones, band, method if batch else "esprit", window)
+    length = _choose_window(thinned, thin, tones, band, window)
     options, how = _options(method, band, tones, thin, length * thin)
     estimator = resolve("frequency_estimator", method)(tones=band.expected.size, **options)
     reasons = [*_preparation(peaks, tones, offset, bridge * interval if gaps else 0.0), *band.sentences]
-    if how:
-        reasons.append(how)
-    reasons.append(sentence if batch else f"Amplitudes are found from the last {length * thin:.4g} s before each row.")
-    reasons += spikes_told(spikes)
+    reasons += [how, f"Amplitudes are found from the last {length * thin:.4g} s before each row.", *spikes_told(spikes)]
     warnings = tuple(_doubts(peaks, tones, interval))
     return Settings(estimator, tones, band.expected, offset, band.decimation, thin, length, tuple(reasons), warnings)
 
@@ -200,16 +193,14 @@ def _offset(samples: Array, weakest: float) -> float:
     return mean if abs(mean) > HARMLESS_OFFSET * weakest else 0.0
 
 
-def _choose_band(
-    duration: float, interval: float, tones: int, peaks: Peaks, kind: str, bridge: int, gaps: bool
-) -> _Band:
+def _choose_band(duration: float, interval: float, tones: int, peaks: Peaks, kind: str, bridge: int) -> _Band:
     omega, wanted = peaks.omega, peaks.omega[:tones]
     low, top = float(wanted.min()), float(wanted.max())
     weakest = float(peaks.amplitudes[:tones][-1])
     if wanted.size < tones:
         top += peaks.resolution
     top = min(top, np.pi / interval / PASS)
-    per_period, most_spares = SAMPLING.get(kind, DELAYING)
+    per_period, most_spares = INTEGRATING.get(kind, DELAYING)
     factor = max(1, int(2.0 * np.pi / (per_period * top * interval)))
     pass_edge = PASS * top
     stop_edge = min(2.0 * np.pi / (factor * interval) - pass_edge, np.pi / interval)
@@ -219,10 +210,7 @@ def _choose_band(
     above = disturbing & (omega >= STOP * top)
     stop_edge = float(np.min(omega[above], initial=stop_edge))
     sentences, weights = [], np.ones(1)
-    unfiltered = gaps and kind == "nonlinear_least_squares" and factor <= MOST_UNTHINNED
-    if unfiltered:
-        factor = 1
-    elif (factor > 1 or above.any()) and stop_edge > pass_edge:
+    if (factor > 1 or above.any()) and stop_edge > pass_edge:
         weights = low_pass(pass_edge, stop_edge, STOP_BAND, interval)
         edges = f"below {pass_edge / (2.0 * np.pi):.4g} Hz and stops what is above {stop_edge / (2.0 * np.pi):.4g} Hz"
         sentences.append(f"A low-pass of {weights.size * interval:.3g} s keeps what is {edges}.")
@@ -231,7 +219,7 @@ def _choose_band(
         disturbing &= ~above
     high_pass = 2.0 * np.pi * (LOW_STOP_BAND - 7.95) / (2.285 * 2.0 * np.pi * (LOW_PASS - LOW_STOP) * low)
     below = disturbing & (omega <= LOW_PASS * low)
-    if not unfiltered and below.any() and high_pass < HIGH_PASS_SHARE * duration:
+    if below.any() and high_pass < HIGH_PASS_SHARE * duration:
         weights = without_low(weights, LOW_STOP * low, LOW_PASS * low, LOW_STOP_BAND, interval)
         edge = f"{LOW_STOP * low / (2.0 * np.pi):.4g} Hz"
         sentences.append(f"A high-pass of {high_pass:.3g} s keeps away what is below {edge}.")
@@ -247,46 +235,51 @@ def _choose_band(
     return _Band(expected, amplitudes, Decimation(weights, factor, bridge), sentences)
 
 
-def _choose_window(
-    thinned: Array, thin: float, tones: int, band: _Band, kind: str, window: float | None
-) -> tuple[int, str]:
-    """Samples in a window, and why."""
+def _choose_window(thinned: Array, thin: float, tones: int, band: _Band, window: float | None) -> int:
+    """Samples that the estimator should remember."""
     least = WINDOW_SAMPLES_PER_TONE * band.expected.size
     if window is not None:
         length = round(min(window / thin, thinned.size + 1.0))
         if not least <= length <= thinned.size:
             allowed = f"from {least * thin:.4g} s to {thinned.size * thin:.4g} s"
             raise ValueError(f"window must be {allowed}, not {window:g}.")
-        return length, f"Windows of {length * thin:.4g} s, as asked for."
+        return length
     # Smallest distance of a wanted tone from any other, from zero, and from its own image above Nyquist [rad/s].
     wanted = band.expected[:tones]
     distance = np.abs(wanted[:, None] - np.concatenate(([0.0], band.expected)))
     distance[np.arange(tones), 1 + np.arange(tones)] = np.inf
     closest = float(min(distance.min(), 2.0 * (np.pi / thin - wanted.max())))
     length = max(least, int(np.ceil(BEATS * 2.0 * np.pi / (closest * thin))))
-    lengths = [length << k for k in range(DOUBLINGS + 1) if length << k <= LARGEST_SHARE * thinned.size]
-    if length >= LARGEST_SHARE * thinned.size:
-        length = min(length, thinned.size)
-        return length, f"Windows of {length * thin:.4g} s: there is no room for longer ones."
-    estimator = resolve("frequency_estimator", kind)(tones=band.expected.size)
-    best, best_share = length, -1.0
-    for length in lengths:
-        firsts = np.linspace(0, thinned.size - length, TRIALS).astype(int)
-        parts = [thinned[first : first + length] for first in firsts]
-        share = float(np.mean([not estimate_window(estimator, y, thin, band.expected, tones).flags for y in parts]))
-        if share > best_share:
-            best, best_share = length, share
-        if share >= CERTAIN_SHARE:
+    best, least_change = min(length, thinned.size), np.inf
+    for _ in range(DOUBLINGS + 1):
+        if length > LARGEST_SHARE * thinned.size:
             break
-    periods = best * thin * float(wanted.min()) / (2.0 * np.pi)
-    why = f"the frequencies are certain in {100 * best_share:.0f} % of those tried"
-    return best, f"Windows of {best * thin:.4g} s, {periods:.3g} periods of the lowest tone: {why}."
+        change = _change(thinned, thin, tones, band, length)
+        if change < least_change:
+            best, least_change = length, change
+        if change <= STILL:
+            break
+        length *= 2
+    return best
+
+
+def _change(thinned: Array, thin: float, tones: int, band: _Band, length: int) -> float:
+    """By what share frequencies change over half a window: the median of the tones that change most."""
+    firsts = np.linspace(0, thinned.size - length - length // 2, TRIALS).astype(int)
+    estimator = Esprit(tones=band.expected.size)
+    found = [
+        [
+            estimate_window(estimator, thinned[k:][:length], thin, band.expected, tones).omega
+            for k in (first, first + length // 2)
+        ]
+        for first in firsts
+    ]
+    changes = [np.abs(after - before).max() / before.min() if before.min() > 0.0 else np.inf for before, after in found]
+    return float(np.median(np.where(np.isnan(changes), np.inf, changes)))
 
 
 def _options(kind: str, band: _Band, wanted: int, thin: float, window: float) -> tuple[dict[str, Any], str]:
     """Options of an estimator for windows of a length [s], and a sentence about them."""
-    if kind in BATCH:
-        return {}, ""
     expected = np.sort(band.expected)
     start: dict[str, Any] = {"initial_frequencies": tuple(expected)}
     low, top = float(expected[0]), float(expected[-1])

@@ -1,4 +1,4 @@
-"""The rows of a track, by any of the estimators of frequencies."""
+"""The rows of a track by an online estimator, each compared with what the record shows around its instant."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
@@ -8,19 +8,17 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.automatic import Settings
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.record_track import Procedure, RecordTrack
+from ctid_cli.frequency.record_tones import USUAL_ROWS, follow_tones
+from ctid_cli.frequency.record_track import MOST_ASKED, Procedure, RecordTrack
 from ctid_cli.frequency.spikes import without_spikes
-from ctid_cli.frequency.windows import WindowEstimate, estimate_window, sinusoids_of, wanted_tones
+from ctid_cli.frequency.windows import WindowEstimate, sinusoids_of, wanted_tones
 
-#: Rows of a track if nobody says how many.
-USUAL_ROWS = 1000
-#: Windows overlap by half if nobody says otherwise, and by more where they would be fewer than this.
-OVERLAP = 0.5
-FEWEST_WINDOWS = 100
-#: A window whose middle part, this fraction of it, is missing says nothing of its instant.
-MIDDLE = 0.1
-#: Samples that an online estimator takes between two reports of progress.
+#: Samples that an estimator takes between two reports of progress.
 PIECE = 50_000
+#: Doubts of an estimator that a reading settles.
+SETTLED = Flag.UNCERTAIN | Flag.INCONSISTENT
+#: The error of a row is at least this share of its distance from the reading.
+FAR = 0.5
 
 
 def track_record(
@@ -31,37 +29,73 @@ def track_record(
     every: float | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> RecordTrack:
-    """Follow the frequencies of a recorded signal."""
+    """Follow the frequencies of a recorded signal; a row is valid if a reading of its instant confirms it."""
+    rows = online_rows(samples, interval, settings, every=every, on_progress=on_progress)
+    readings = follow_tones(samples, interval, MOST_ASKED, at=rows.t, on_progress=on_progress)[0]
+    return confirmed(rows, readings, settings.window_seconds)
+
+
+def online_rows(
+    samples: Array,
+    interval: float,
+    settings: Settings,
+    *,
+    every: float | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> RecordTrack:
+    """What an online estimator finds in a record, as it judges itself."""
     thinned = settings.decimation.apply(without_spikes(samples), settings.offset)
-    thin, online = settings.interval, settings.estimator.online
-    wanted_step = samples.size * interval / USUAL_ROWS
-    if every is not None:
-        wanted_step = every
-    elif not online:
-        wanted_step = max(wanted_step, min(OVERLAP * settings.window_seconds, thinned.size * thin / FEWEST_WINDOWS))
+    thin, lag = settings.interval, settings.lag * interval
+    wanted_step = samples.size * interval / USUAL_ROWS if every is None else every
     step = max(1, round(min(wanted_step / thin, float(thinned.size))))
     rows = []
-    for place, found, part, middle in (_online if online else _windows)(
-        thinned, settings, step, on_progress or (lambda done, total: None)
-    ):
+    for place, found, part in _follow(thinned, settings, step, on_progress or (lambda done, total: None)):
         # An estimate of the newest sample is one of an instant that the filter has not reached.
-        ahead = settings.lag * interval if online else 0.0
-        rows.append((place, found, *sinusoids_of(part, thin, found.omega, found.everything, middle * thin + ahead)))
+        instant = (part.size - 1) * thin + lag
+        rows.append((place, found, *sinusoids_of(part, thin, found.omega, found.everything, instant)))
     omega = np.array([found.omega for _, found, _, _ in rows])
     flags = np.array([int(found.flags) for _, found, _, _ in rows], np.uint16)
     with np.errstate(invalid="ignore"):
         gain = settings.decimation.gain(omega.ravel(), interval).reshape(omega.shape)
         amplitudes = np.where(gain > 0.0, np.array([row[2] for row in rows]) / np.where(gain > 0.0, gain, 1.0), np.nan)
-    # The middle of the filter lies before its newest sample; an online estimate is that of the newest sample.
-    t = np.array([place for place, _, _, _ in rows]) * thin + settings.lag * interval
-    if online:
-        t += settings.lag * interval
-    return RecordTrack.of(
-        *(t, omega, flags, step * thin),
-        amplitudes=amplitudes,
-        phase=np.array([row[3] for row in rows]),
-        window=np.full(omega.shape, np.nan if online else settings.window_seconds),
+    # The middle of the filter lies before its newest sample, whose instant is that of the estimate.
+    t = np.array([place for place, _, _, _ in rows]) * thin + 2.0 * lag
+    phase = np.array([row[3] for row in rows])
+    return RecordTrack.of(t, omega, flags, step * thin, amplitudes=amplitudes, phase=phase)
+
+
+def confirmed(rows: RecordTrack, readings: RecordTrack, memory: float) -> RecordTrack:
+    """Rows of an estimator that remembers so long [s], as readings at the same instants see them.
+
+    A tone is confirmed by the reading nearest to it, if it is the tone nearest to that and no farther away than the
+    memory tells apart; what made the estimator doubt it is then settled. Its error is that of the reading and the usual
+    distance from it, over a memory to both sides.
+    """
+    apart = np.abs(rows.omega[:, :, None] - readings.omega[:, None, :])
+    apart = np.where(np.isnan(apart), np.inf, apart)
+    nearest = apart.argmin(axis=2)
+    distance = apart.min(axis=2)
+    mutual = np.take_along_axis(apart.argmin(axis=1), nearest, axis=1) == np.arange(rows.omega.shape[1])
+    found = mutual & (distance <= 2.0 * np.pi / memory)
+    distance = np.where(found, distance, np.nan)
+    usual = _usual(distance, max(1, round(memory / rows.every)))
+    error = np.hypot(np.take_along_axis(readings.error, nearest, axis=1), np.maximum(usual, FAR * distance))
+    theirs = np.where(found, np.take_along_axis(readings.flags, nearest, axis=1), int(Flag.UNCONFIRMED))
+    own = np.where(found, rows.flags.astype(np.int64) & ~int(SETTLED), rows.flags)
+    flags = own | np.where(np.isfinite(rows.omega), theirs, 0)
+    return replace(rows, error=np.where(found, error, np.nan), flags=flags.astype(np.uint16))
+
+
+def _usual(distance: Array, reach: int) -> Array:
+    """Root mean square over so many rows before and after each, NaN where there is none."""
+    known = np.isfinite(distance)
+    sums, counts = (
+        np.cumsum(np.pad(each, ((1, 0), (0, 0))), axis=0) for each in (np.where(known, distance, 0.0) ** 2, known)
     )
+    places = np.arange(distance.shape[0])
+    low, high = np.maximum(places - reach, 0), np.minimum(places + reach + 1, distance.shape[0])
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt((sums[high] - sums[low]) / (counts[high] - counts[low])))
 
 
 def procedure_of(settings: Settings, interval: float) -> Procedure:
@@ -79,25 +113,10 @@ def procedure_of(settings: Settings, interval: float) -> Procedure:
     return Procedure(estimator.kind, estimator.online, settings.reasons, settings.warnings, chosen)
 
 
-_Follow = Iterator[tuple[float, WindowEstimate, Array, float]]
-
-
-def _windows(thinned: Array, settings: Settings, step: int, tell: Callable[[int, int], None]) -> _Follow:
-    """Middle of each window, what is estimated, the samples that its amplitudes are found from, the middle of these."""
-    length, total = settings.window, thinned.size
-    middle = max(1, int(MIDDLE * length))
-    for first in range(0, total - length + 1, step):
-        part = thinned[first : first + length]
-        found = estimate_window(settings.estimator, part, settings.interval, settings.expected, settings.tones)
-        if not np.isfinite(part[(length - middle) // 2 :][:middle]).any():
-            found = replace(found, flags=found.flags | Flag.GAP)
-        yield first + 0.5 * (length - 1), found, part, 0.5 * (length - 1)
-        tell(first + length, total)
-    tell(total, total)
-
-
-def _online(thinned: Array, settings: Settings, step: int, tell: Callable[[int, int], None]) -> _Follow:
-    """Every so many samples what is estimated, the samples that its amplitudes are found from, the newest of these."""
+def _follow(
+    thinned: Array, settings: Settings, step: int, tell: Callable[[int, int], None]
+) -> Iterator[tuple[float, WindowEstimate, Array]]:
+    """Every so many samples what is estimated, and the samples before that its amplitudes are found from."""
     tracker = settings.estimator.start(settings.interval)
     for first in range(0, thinned.size, PIECE):
         track = tracker.run(thinned[first : first + PIECE], fft=True)
@@ -107,5 +126,5 @@ def _online(thinned: Array, settings: Settings, step: int, tell: Callable[[int, 
             begin = max(0, place + 1 - settings.window)
             if found.flags & (Flag.STARTING | Flag.GAP | Flag.CHANGED):
                 begin = place + 1
-            yield float(place), found, thinned[begin : place + 1], float(place - begin)
+            yield float(place), found, thinned[begin : place + 1]
         tell(last, thinned.size)

@@ -29,6 +29,7 @@ class Flag(IntFlag):
     UNRESOLVED = 2048
     INACCURATE = 4096
     ABSENT = 8192
+    UNCONFIRMED = 16384
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -58,6 +59,7 @@ MEANINGS: dict[Flag, str] = {
     Flag.UNRESOLVED: "Another tone is so near that no window tells the two apart; use a longer record.",
     Flag.INACCURATE: "The standard error is larger than the accuracy that was asked for; allow more with --accuracy.",
     Flag.ABSENT: "The tone is not there, or not beyond doubt, at this instant.",
+    Flag.UNCONFIRMED: "No window around this instant in which nothing changes shows such a tone.",
 }
 
 # The bits as plain integers, as compiled code wants them.

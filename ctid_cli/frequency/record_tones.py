@@ -54,6 +54,7 @@ def follow_tones(
     *,
     every: float | None = None,
     window: float | None = None,
+    at: Array | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> tuple[RecordTrack, Procedure]:
     """The strongest tones of a recorded signal, or all of them, ascending in frequency, and how they were found.
@@ -61,7 +62,8 @@ def follow_tones(
     In windows of all lengths, doubled from 64 samples to the whole record, decaying chirps are fitted one by one until
     the residual, whitened, shows no further line. At each instant each tone is read from the longest window in which
     nothing speaks against it: no line left near it, no change within the window, no other tone too close. Missing
-    samples are NaN; ``every`` [s] is the time from row to row, ``window`` [s] the longest window. Raises DataError for
+    samples are NaN; ``every`` [s] is the time from row to row, or ``at`` [s] holds the instants of the rows, ascending;
+    ``window`` [s] is the longest window. Raises DataError for
     a signal that is too short, constant, or shows no tone.
     """
     require_positive("interval", interval, "s")
@@ -78,7 +80,8 @@ def follow_tones(
     thin = interval * decimation.factor
     longest = _longest(window, thin, thinned.size)
     step = (samples.size * interval / USUAL_ROWS if every is None else every) / thin
-    places = np.arange(0.0, thinned.size - 0.5, max(step, 1.0))
+    delay = 0.5 * (decimation.weights.size - 1) * interval
+    places = np.arange(0.0, thinned.size - 0.5, max(step, 1.0)) if at is None else (at - delay) / thin
     found = readings_at(thinned, places, MOST_LINES, longest, on_progress)
     paths = paths_of(found, places)
     if not paths and tones is None:
@@ -91,8 +94,7 @@ def follow_tones(
     omega, flags = _frequencies(found, wanted, alone, count, thin)
     others: dict[str, Any] = _others(found, wanted, omega.shape, thin, scale, decimation)
     others["missing"] = tuple(_missing(found, path, places.size, thin, scale) for path in lost)
-    t = places * thin + 0.5 * (decimation.weights.size - 1) * interval
-    track = RecordTrack.of(t, omega, flags, max(step, 1.0) * thin, **others)
+    track = RecordTrack.of(places * thin + delay, omega, flags, max(step, 1.0) * thin, **others)
     used = {"interval": thin, "kept_of": decimation.factor, "filter_samples": decimation.weights.size}
     sentences = (*_counted(paths, count, tones), *reasons, *spikes_told(spikes), *_windows_used(found, wanted, thin))
     highest = max((float(np.median(found.omega[path])) for path in wanted), default=0.0) / (2.0 * np.pi * thin)
@@ -102,7 +104,7 @@ def follow_tones(
 
 def _thinning(samples: Array, interval: float, tones: int | None) -> tuple[Decimation, list[str]]:
     """A filter, and how many samples are left out after it, where the strongest tones need few of many samples."""
-    fewest = FEWEST_OF_ALL if tones is None else FEWEST_KEPT
+    fewest = FEWEST_OF_ALL if tones in (None, MOST_ASKED) else FEWEST_KEPT
     if samples.size < 2 * fewest or tones == 0:
         return Decimation(np.ones(1)), []
     peaks = find_peaks(samples, interval, tones or MOST_ASKED, LOOKED_AT)

@@ -127,5 +127,6 @@ def _described(found: Readings, path: IndexArray, places: Array, step: float) ->
     known = MEDIAN_EFFICIENCY * np.minimum(FLOOR_BINS, 0.5 * window)
     gain = known * np.log1p(0.5 * (found.amplitude[path] / found.amplitude_error[path]) ** 2 / known)
     worth = gain > 0.5 * NUMBERS * np.log(window) + np.log(np.maximum(1.0, places[-1] / window))
-    lasting = places[found.row[path[-1]]] - places[found.row[path[0]]] + 2.0 * step >= np.minimum(window, places[-1])
+    long_enough = np.minimum(window, places[-1] - places[0])
+    lasting = places[found.row[path[-1]]] - places[found.row[path[0]]] + 2.0 * step >= long_enough
     return bool((sure & worth & lasting).any())

@@ -1,19 +1,16 @@
-"""Batch estimators over windows of a record."""
+"""Estimates of windows, of which only some tones are wanted."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.amplitudes import fit_sinusoids
+from ctid_cli.frequency.esprit import Esprit
 from ctid_cli.frequency.flags import CERTAIN_FRACTION, Flag
-from ctid_cli.frequency.nonlinear_least_squares import NonlinearLeastSquares
 from ctid_cli.frequency.tracking import FrequencyEstimate
 
-#: A window with a larger fraction of missing samples has no estimate.
-MOST_MISSING = 0.5
 #: An estimate within this fraction of an expected frequency is probably the one of that tone.
 NEAR = 0.05
 
@@ -27,20 +24,16 @@ class WindowEstimate(FrequencyEstimate):
     everything: Array
 
 
-def estimate_window(estimator: Any, samples: Array, interval: float, expected: Array, wanted: int) -> WindowEstimate:
+def estimate_window(estimator: Esprit, samples: Array, interval: float, expected: Array, wanted: int) -> WindowEstimate:
     """Estimate the frequencies of one window, and keep those of the tones that are wanted."""
     none = np.full(wanted, np.nan)
-    missing = ~np.isfinite(samples)
-    if missing.any() and (not isinstance(estimator, NonlinearLeastSquares) or missing.mean() > MOST_MISSING):
+    if not np.isfinite(samples).all():
         return WindowEstimate(none, Flag.GAP, none, np.empty(0))
     result = WindowEstimate(none, Flag.UNDETERMINED, none, np.empty(0))
     # A tone that only shares the band need not be there in every window.
     for count in range(estimator.tones, wanted - 1, -1):
-        fewer = replace(estimator, tones=count)
-        if missing.any():
-            fewer = replace(fewer, initial_frequencies=tuple(np.sort(expected[:count])))
         try:
-            found = fewer.estimate(samples, interval)
+            found = replace(estimator, tones=count).estimate(samples, interval)
         except DataError:
             continue
         result = wanted_tones(found, expected, wanted)

@@ -72,7 +72,7 @@ def track_warnings(track: RecordTrack, procedure: Procedure) -> list[str]:
         return [*procedure.warnings, *missing_lines(track), NO_TONE]
     share = invalid_rows(track)
     if procedure.online and not track.valid.any():
-        share.insert(1, "A record is easier for the methods that take it window by window: try --method automatic.")
+        share.append("Windows with samples on both sides of each instant show more of a record: leave --method out.")
     return [*procedure.warnings, *missing_lines(track), *share]
 
 

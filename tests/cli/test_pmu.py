@@ -47,7 +47,7 @@ def test_three_phases_as_json(ctid, mains, tmp_path):
         (("--pmu", 60, "--tones", 2), "--tones does not go together with --pmu"),
         (("--pmu", 60, "--window", 2), "--window does not go together with --pmu"),
         (("--pmu", 60, "--every", 2), "--every does not go together with --pmu"),
-        (("--pmu", 60, "--method", "esprit"), "--method does not go together with --pmu"),
+        (("--pmu", 60, "--method", "drem_window"), "--method does not go together with --pmu"),
         (("--pmu-class", "M"), "--pmu-class belongs to synchrophasors; add --pmu 50 or --pmu 60"),
         (("--reporting-rate", 50), "--reporting-rate belongs to synchrophasors"),
         (("--pmu", 55), "50 or 60 Hz, not 55"),

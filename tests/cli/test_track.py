@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from scipy.io import wavfile
 
-from ctid_cli.kinds import KINDS
+from ctid_cli.kinds import ONLINE
 
 T = 0.002 * np.arange(3000)
 
@@ -31,7 +31,7 @@ def record(tmp_path):
 
 def test_names_of_the_methods(ctid):
     text = ctid("track", "--help").stdout
-    assert all(name in text for name in ("automatic", *KINDS["frequency_estimator"]))
+    assert all(name in text for name in ("automatic", *ONLINE))
 
 
 def test_table_track_and_figure(ctid, record, tmp_path):
@@ -107,7 +107,7 @@ def test_missing_samples_are_flagged(ctid, tmp_path):
         (T, np.random.default_rng(1).standard_normal(T.size), ("--tones", "auto"), "no tone stands out"),
         (T**1.1, signal(), (), "clock is not regular"),
         (T, signal(), ("--tones", 21), "--tones must be a number from 0 to 20, or auto"),
-        (T, signal(), ("--tones", 9, "--method", "esprit"), "tones must be an integer from 1 to 8"),
+        (T, signal(), ("--tones", 9, "--method", "drem_window"), "tones must be an integer from 1 to 8"),
         (T, signal(), ("--every", -1), "--every"),
         (T, signal(), ("--window", 1000), "the longest window must be from"),
         (T, signal(), ("--rate", 0), "--rate"),
@@ -134,7 +134,7 @@ def test_mistakes_are_one_sentence(ctid, tmp_path, t, y, options, message):
 
 
 @pytest.mark.parametrize("every", [50, 1e308])
-@pytest.mark.parametrize("method", ["automatic", "esprit", "restarting_least_squares"])
+@pytest.mark.parametrize("method", ["automatic", "restarting_least_squares"])
 def test_rows_farther_apart_than_the_record_is_long_are_one(ctid, record, tmp_path, method, every):
     done = ctid("track", record, "--tones", 2, "--every", every, "--method", method, "--out", tmp_path)
     assert len(pd.read_csv(tmp_path / "track.csv")) == 1
@@ -169,8 +169,8 @@ def test_an_online_method_that_finds_nothing_says_what_to_try(ctid, tmp_path):
     y = signal() + 3.0 * np.random.default_rng(1).standard_normal(T.size)
     options = ("--tones", 2, "--method", "drem_finite_time", "--out", tmp_path)
     text = ctid("track", write(tmp_path / "a.csv", T, y), *options).stdout
-    assert "No row is valid" in text
-    assert "--method automatic" in text
+    assert "No row of tone 1 is valid" in text
+    assert "leave --method out" in " ".join(text.split())
 
 
 def test_an_unknown_unit_of_time(ctid, tmp_path):
@@ -200,7 +200,7 @@ def test_a_page_is_made_of_a_track_and_its_record(ctid, record, tmp_path):
         (("--tones", -1), "--tones must be a number from 0 to 20"),
         (("--tones", 21), "--tones must be a number from 0 to 20"),
         (("--tones", 2, "--accuracy", 0), "--accuracy must be a positive number of hertz"),
-        (("--tones", 2, "--method", "esprit", "--accuracy", 0.1), "esprit states no standard errors"),
+        (("--tones", 2, "--method", "esprit"), "'esprit' is not one of"),
     ],
 )
 def test_what_cannot_be_asked_for(ctid, record, tmp_path, options, message):

@@ -161,3 +161,44 @@ def test_extreme_amplitudes_give_no_wrong_number(options, scale):
         track = options.start(INTERVAL).run(scale * CLEAN)
     if track.valid.any():
         assert np.abs(track.omega[track.valid] - TRUTH).max() < 0.1
+
+
+STREAM = 0.004 * np.arange(4000)
+ENDS = STREAM >= 10.0
+SINE = np.sin(75.0 * STREAM + 0.4)
+#: What may happen to a tone of 75 rad/s at 10 s; the gap ends there.
+EVENTS = {
+    "a small spike": SINE + (np.arange(STREAM.size) == 2500),
+    "a spike": SINE + 10.0 * (np.arange(STREAM.size) == 2500),
+    "a huge spike": SINE + 1e6 * (np.arange(STREAM.size) == 2500),
+    "a gap": np.where((STREAM > 9.8) & ~ENDS, np.nan, SINE),
+    "10 degrees": np.sin(75.0 * STREAM + 0.4 + 0.17 * ENDS),
+    "90 degrees": np.sin(75.0 * STREAM + 0.4 + 1.57 * ENDS),
+    "another frequency": np.sin(75.0 * STREAM + 0.4 + 3.0 * ENDS * (STREAM - 10.0)),
+    "twice the amplitude": SINE + ENDS * SINE,
+    "another tone": SINE + 0.3 * ENDS * np.sin(94.0 * STREAM),
+    "a weak tone": SINE + 0.1 * ENDS * np.sin(94.0 * STREAM),
+    "a tone far away": SINE + 0.5 * ENDS * np.sin(190.0 * STREAM),
+}
+DELAYS = {"h": 0.024, "prefilter": 0.048}
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("event", EVENTS)
+@pytest.mark.parametrize(
+    "options",
+    [RestartingLeastSquares(tones=1, memory=0.4, **DELAYS), DremWindow(tones=1, d=0.008, memory=0.4, **DELAYS)],
+    ids=lambda options: options.kind,
+)
+def test_in_a_stream_an_event_makes_valid_estimates_wrong_for_a_stated_time_only(options, event, seed):
+    # All samples that the memory, the delays and the prefilter hold are then from after the event.
+    until = options.memory + options.prefilter + 2 * options.h
+    y = EVENTS[event] + 0.007 * np.random.default_rng(seed).standard_normal(STREAM.size)
+    track = options.start(0.004).run(y)
+    true = np.where(ENDS & ("frequency" in event), 78.0, 75.0)
+    error = np.abs(track.omega[:, 0] - true)
+    assert not (track.valid & (error > 0.1 * true)).any()
+    beyond = track.valid & (error > track.uncertainty[:, 0]) & (error > 1e-3 * true)
+    assert not beyond[STREAM > 10.0 + until].any()
+    assert track.valid[-500:].mean() > 0.9
+    assert track.valid[1000:2400].all()

@@ -1,11 +1,12 @@
 """Lines that the tones of a track leave over."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from ctid_cli.frequency.automatic import choose_settings
-from ctid_cli.frequency.estimator_rows import track_record
 from ctid_cli.frequency.left_over import with_lines_left
+from ctid_cli.frequency.record_tones import follow_tones
 from ctid_cli.frequency.record_track import MissingLine, RecordTrack
 
 INTERVAL = 0.002
@@ -14,7 +15,7 @@ NOISE = 0.01 * np.random.default_rng(0).standard_normal(T.size)
 
 
 def tracked(y, tones):
-    return with_lines_left(track_record(y, INTERVAL, choose_settings(y, INTERVAL, tones)), y, INTERVAL)
+    return with_lines_left(replace(follow_tones(y, INTERVAL, tones)[0], missing=()), y, INTERVAL)
 
 
 def test_a_second_tone_that_nobody_asked_for_is_named():

@@ -44,7 +44,7 @@ def test_noise_steps_and_pulses_are_no_spikes():
     assert not find_spikes(np.full(100, 3.0)).any()
 
 
-@pytest.mark.parametrize("method", ["esprit", "restarting_least_squares"])
+@pytest.mark.parametrize("method", ["drem_window", "restarting_least_squares"])
 @pytest.mark.parametrize("size", [10.0, 1e6])
 def test_one_spike_moves_no_row_of_a_track(method, size):
     t = 0.002 * np.arange(3000)

@@ -35,7 +35,7 @@ def chosen():
     t = 0.002 * np.arange(2000)
     y = 2 * np.sin(2 * np.pi * 10 * t) + 0.5 * np.sin(2 * np.pi * 30 * t)
     signal = SampledSignal(y, 0.002, 5.0, "string.csv", "y", "t", "s", "Pa", ("A note.",))
-    return signal, procedure_of(choose_settings(y, 0.002, 2), 0.002)
+    return signal, procedure_of(choose_settings(y, 0.002, 2, method="drem_window"), 0.002)
 
 
 def some_invalid():
@@ -107,7 +107,7 @@ def test_csv_and_hdf5_hold_the_same():
 
 def test_object_has_its_keys(chosen):
     content = track_object(*chosen, make_track())
-    assert content["method"] == "esprit"
+    assert content["method"] == "drem_window"
     assert content["tones"][1]["frequency_hz"] == pytest.approx(30.0)
     assert content["settings"]["estimator"]["tones"] == 2
     assert {"warnings", "notes", "chosen", "rows", "every", "missing"} <= content.keys()
