@@ -1,6 +1,7 @@
 """From a start to an estimate of a sum of submodels with its covariance: what additive SRIVC and CLSRIVC share."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,7 +71,7 @@ def estimate_submodels(
     """
     p, y = problem.size, problem.data.y_used
     whole = problem.with_fixed(np.concatenate((theta, np.zeros(problem.filter.free))))
-    radius = radius_in_loop(problem, problem.model(whole)) if problem.filter.loop.closed else 0.0
+    radius = radius_in_loop(problem, problem.model(whole)) if problem.loop.closed else 0.0
     if radius > 1.0 and problem.data.y.size * np.log(radius) > np.log(LARGEST_GROWTH):
         raise DataError(
             "the start makes an unstable loop with the controller: its poles reach the magnitude "
@@ -85,8 +86,9 @@ def estimate_submodels(
 
     result = run("refine", problem, whole, steps)
     if result is None or result.status is not Status.CONVERGED:
-        result = _better(result, run("refine_again", problem.with_other_hold(), whole, steps))
-    if result is not None and result.status is Status.MAX_ITERATIONS and not problem.filter.loop.closed:
+        otherwise_held = replace(problem, data=problem.data._replace(y_foh=not problem.data.y_foh))
+        result = _better(result, run("refine_again", otherwise_held, whole, steps))
+    if result is not None and result.status is Status.MAX_ITERATIONS and not problem.loop.closed:
         # Slow on its way to a minimum: near it the cost may guard the steps, and Gauss-Newton is faster.
         result = _better(result, run("refine_guarded", problem, result.theta, steps._replace(rule=GUARDED)))
     values: dict[str, Any] = {"iterations": history.steps, "history": history}
@@ -126,7 +128,7 @@ def _covariance(problem: AdditiveProblem, theta: Array, equations: Equations, ki
 
 def radius_in_loop(problem: AdditiveProblem, model: AdditiveModel) -> float:
     """Spectral radius of the sampled loop of a model with the controller [-]; NaN in open loop."""
-    loop, interval = problem.filter.loop, problem.data.interval
+    loop, interval = problem.loop, problem.data.interval
     if not loop.closed or interval == 0.0:
         return float("nan")
     return loop_radius(model, DiscreteController(loop.numerator, loop.denominator), interval)

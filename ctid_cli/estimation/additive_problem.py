@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
@@ -52,34 +53,22 @@ def loop_data(record: Record, instruments: Instruments) -> LoopData:
     return LoopData(reference, numerator, denominator, record.loop.enters == "controller")
 
 
+@dataclass(frozen=True, eq=False)
 class AdditiveProblem:
     """Parameters of a sum of submodels: ``theta = (a_1 … a_n, b_0 … b_m)`` of each submodel in turn."""
 
-    def __init__(
-        self,
-        data: FilterData,
-        terms: Sequence[Term],
-        delay: float,
-        loop: LoopData = OPEN_LOOP,
-        initial_state: InitialState = "rest",
-        fixed: Mapping[int, float] | None = None,
-    ) -> None:
-        self.data = data
-        self.terms = tuple(terms)
-        self.delay = delay
-        self.initial_state: InitialState = initial_state
-        self.filter = SubmodelFilter(data, terms, delay, loop, initial_state)
-        #: Parameters that are known, by their places, and their values.
-        self.fixed = dict(fixed or {})
+    data: FilterData
+    terms: tuple[Term, ...]
+    delay: float
+    loop: LoopData = OPEN_LOOP
+    initial_state: InitialState = "rest"
+    #: Parameters that are known, by their places, and their values.
+    fixed: Mapping[int, float] = field(default_factory=dict)
 
-    def with_other_hold(self) -> AdditiveProblem:
-        """The same problem with the other interpolation of the output in the regressors."""
-        data = self.data._replace(y_foh=not self.data.y_foh)
-        return AdditiveProblem(data, self.terms, self.delay, self.filter.loop, self.initial_state, self.fixed)
-
-    def with_known(self, fixed: Mapping[int, float]) -> AdditiveProblem:
-        """The same problem with other known parameters."""
-        return AdditiveProblem(self.data, self.terms, self.delay, self.filter.loop, self.initial_state, fixed)
+    @cached_property
+    def filter(self) -> SubmodelFilter:
+        """What makes second moments of the record."""
+        return SubmodelFilter(self.data, self.terms, self.delay, self.loop, self.initial_state)
 
     @property
     def tangent(self) -> Array:

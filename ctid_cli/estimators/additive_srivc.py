@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice, permutations
 from typing import ClassVar
@@ -215,7 +215,7 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         if not problem.fixed:
             return estimate_submodels(problem, start.theta, steps, *noise)
         # From the start, and from what all parameters together would be.
-        free = estimate_submodels(problem.with_known({}), start.theta, steps, "white", 0)
+        free = estimate_submodels(replace(problem, fixed={}), start.theta, steps, "white", 0)
         near = [_nearest(theta, self.terms, problem.fixed) for theta in (free.theta, start.theta)]
         found = [estimate_submodels(problem, theta, steps, *noise) for theta in near]
         return min(found, key=lambda one: np.nan_to_num(one.values["cost"], nan=np.inf))

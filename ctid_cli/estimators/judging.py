@@ -6,6 +6,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
+from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
 from ctid_cli.estimators.delay_profile import DelayProfile, FittedSamples, MeasuredFit, samples_at
 from ctid_cli.estimators.hold_comparison import OtherHold, best_other_hold, decisive, otherwise_held
@@ -87,7 +88,7 @@ def other_hold(options: Options, laid_out: LaidOut, fit: MeasuredFit, records: S
         return None
     try:
         held = otherwise_held(records[0])
-        other = own.prepare(held).fit(own._start_at(submodels))
+        other = own.prepare(held).fit(Start(model=own._factors(submodels)))
     except DataError:
         return None
     return OtherHold(held.input.hold, decisive(fit.cost, other.cost, fit, records))

@@ -20,6 +20,7 @@ from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
 from ctid_cli.estimators.delay_profile import FittedSamples, MeasuredFit
 from ctid_cli.filtering.filter_data import used_samples
 from ctid_cli.filtering.free_response import free_response
+from ctid_cli.filtering.submodels import OPEN_LOOP
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Term
@@ -84,7 +85,9 @@ class LaidOutSubmodels:
     def errors_of(self, theta: Array, estimated: bool) -> AppliedModel:
         """Errors of a given model, with its own best initial state if that is estimated."""
         problem = self.problem
-        rows = replace_initial(problem).filter.rows(theta[: problem.size])
+        # A free response is projected out below.
+        alone = replace(problem, initial_state="rest") if problem.initial_state == "estimated" else problem
+        rows = alone.filter.rows(theta[: problem.size])
         if rows is None:
             raise DataError(f"{named(self.record)}the response of the model is not finite on this record")
         error: Array = np.asarray(rows[2], dtype=float)
@@ -96,13 +99,6 @@ class LaidOutSubmodels:
             state = np.asarray(np.linalg.lstsq(columns, error)[0], dtype=float)
             error = np.asarray(error - columns @ state, dtype=float)
         return AppliedModel((error,), (used_samples(problem.data, self.record),), (state,), (self.offset,), (psi,))
-
-
-def replace_initial(problem: AdditiveProblem) -> AdditiveProblem:
-    """The same problem without a free response."""
-    if problem.initial_state != "estimated":
-        return problem
-    return AdditiveProblem(problem.data, problem.terms, problem.delay, problem.filter.loop)
 
 
 @dataclass(frozen=True)
@@ -240,46 +236,28 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         uncertainty = fit.uncertainty(self.covariance, self.bootstrap_draws)
         return replace(fit, covariance=uncertainty.widened())
 
-    def _slopes(self, model: AdditiveModel, size: int) -> Array:
-        """Derivatives of the coefficients of the fraction to the parameters, transposed, shape (p, n + m + 1)."""
-        jacobian = unfactored_jacobian(model)
-        kept = [*range(self.poles), *range(jacobian.shape[0] - self.zeros - 1, jacobian.shape[0])]
-        slopes = np.zeros((size, len(kept)))
-        slopes[: jacobian.shape[1]] = jacobian[kept].T
-        return slopes
-
     # --- what a fit is judged by -----------------------------------------------------------------------
-
-    def _start_at(self, fit: SubmodelsFit) -> Start:
-        """A start at an estimate."""
-        return Start(model=self._factors(fit))
 
     def _factors(self, fit: SubmodelsFit) -> AdditiveModel:
         """The submodels of an estimate."""
         return fit.additive or AdditiveModel.from_theta(_single(fit), self.terms, self.delay)
 
     def _samples_of(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> FittedSamples:
-        """What a fit says of each used sample, from its parameters."""
-        return self._samples(self._factors(fit), fit.initial_states[0], laid_out)
-
-    def _samples(self, model: AdditiveModel, state: Array, laid_out: LaidOutSubmodels) -> FittedSamples:
-        """Residuals and sensitivities, those of a monic fraction by its coefficients."""
-        problem = laid_out.problem
-        ordered = AdditiveProblem(problem.data, model.terms, self.delay, problem.filter.loop, problem.initial_state)
-        rows = ordered.filter.rows(np.concatenate((model.theta, state)))
+        """What a fit says of each used sample, from its parameters; of a monic fraction by its coefficients."""
+        model, problem = self._factors(fit), laid_out.problem
+        ordered = replace(problem, terms=model.terms)
+        rows = ordered.filter.rows(np.concatenate((model.theta, fit.initial_states[0])))
         assert rows is not None
         psi, size = rows[0], ordered.size
         if not self.factored:
-            slopes = self._slopes(model, size)
-            psi = np.column_stack((psi[:, :size] @ np.linalg.inv(slopes.T), psi[:, size:]))
+            jacobian = unfactored_jacobian(model, self.zeros)
+            psi = np.column_stack((psi[:, :size] @ np.linalg.inv(jacobian), psi[:, size:]))
         return FittedSamples((rows[2],), (psi,), (used_samples(problem.data, laid_out.record),), None)
 
     def _apply(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> AppliedModel:
         """The model on another record."""
         model = self._factors(fit)
-        problem = laid_out.problem
-        ordered = AdditiveProblem(problem.data, model.terms, self.delay, initial_state=problem.initial_state)
-        submodels = Submodels(laid_out.record, ordered)
+        submodels = Submodels(laid_out.record, replace(laid_out.problem, terms=model.terms, loop=OPEN_LOOP))
         return replace(laid_out, submodels=submodels).errors_of(model.theta, self.initial_state == "estimate")
 
     def _lowered(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> dict[str, float]:

@@ -169,10 +169,8 @@ class Srivc(Estimator[Iteration, Fit]):
             problem, AdditiveModel([single]).theta, steps, self.covariance, self.bootstrap_draws
         )
         additive = problem.model(estimate.theta)
-        jacobian = unfactored_jacobian(additive)
-        # The numerator has all its powers there, and the highest of them are zero.
-        kept = [*range(self.poles), *range(jacobian.shape[0] - self.zeros - 1, jacobian.shape[0])]
-        covariance = jacobian[kept] @ estimate.values["covariance"] @ jacobian[kept].T
+        jacobian = unfactored_jacobian(additive, self.zeros)
+        covariance = jacobian @ estimate.values["covariance"] @ jacobian.T
         values = {**estimate.values, "covariance": covariance}
         return Fit(model=unfactored(additive), parameter_names=structure.names, **values)
 

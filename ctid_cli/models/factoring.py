@@ -29,12 +29,12 @@ def unfactored(model: AdditiveModel) -> TransferFunction:
     return TransferFunction(numerator[::-1], denominator[::-1], model.delay)
 
 
-def unfactored_jacobian(model: AdditiveModel) -> Array:
+def unfactored_jacobian(model: AdditiveModel, zeros: int | None = None) -> Array:
     r"""Derivatives of the coefficients of :func:`unfactored` with respect to the parameters of the sum.
 
     With ``Q_i`` and ``R_i`` the denominator and numerator of the sum of all other submodels, the fraction
     ``(B_i Q_i + p^l A_i R_i) / (p^l A_i Q_i)`` is linear in the coefficients of ``A_i`` and ``B_i``; making it monic
-    adds the quotient rule.
+    adds the quotient rule. The numerator is that of :func:`unfactored`, or has the given number of zeros.
     """
     numerator, denominator = _joined(model.submodels)
     n = model.order
@@ -52,8 +52,9 @@ def unfactored_jacobian(model: AdditiveModel) -> Array:
     from_a, from_b = np.array(columns_a).T, np.array(columns_b).T
     jacobian_a = (from_a - np.outer(denominator, from_a[n]) / leading) / leading
     jacobian_b = (from_b - np.outer(numerator, from_a[n]) / leading) / leading
-    length = n + 1 if any(submodel.relative_degree == 0 for submodel in model.submodels) else n
-    return np.concatenate((jacobian_a[:n][::-1], jacobian_b[:length][::-1]))
+    if zeros is None:
+        zeros = n if any(submodel.relative_degree == 0 for submodel in model.submodels) else n - 1
+    return np.concatenate((jacobian_a[:n][::-1], jacobian_b[: zeros + 1][::-1]))
 
 
 def factored(model: TransferFunction, terms: Sequence[Term] | None = None) -> AdditiveModel:
