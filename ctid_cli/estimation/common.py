@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Generic, Literal, TypeVar, get_args, get_origi
 
 import numpy as np
 
-from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.delay_search import Descent
 from ctid_cli.estimation.iteration import Equations, Iterated, Problem
@@ -209,17 +209,6 @@ def history_of(stage: str, problem: Problem, result: Iterated | Descent | None) 
     return [history_entry(stage, k, problem, row[:-1], float(row[-1])) for k, row in enumerate(path)]
 
 
-def covariance_of(equations: Equations, free: IndexArray, count: int, status: Status) -> tuple[Array, Status]:
-    """Covariance of the free parameters for white noise, NaN for the others, and the status that it leaves."""
-    covariance = np.full(equations.hessian.shape, np.nan)
-    if not free.size:
-        return covariance, status
-    block = np.ix_(free, free)
-    covariance[block] = white_noise_covariance(equations.hessian[block], equations.squared_error, count)
-    singular = status is Status.CONVERGED and bool(np.isnan(covariance[block]).any())
-    return covariance, Status.SINGULAR if singular else status
-
-
 def quality(equations: Equations, spread: float, count: int) -> dict[str, Any]:
     """Cost, agreement and conditioning by the names of `Fit`; ``spread`` is ``sum (y - mean y)^2``."""
     r2 = 1.0 - equations.squared_error / spread
@@ -256,13 +245,18 @@ def finish(
         found = found._replace(hessian=found.hessian[:size, :size])
         # A delay at its bound is no minimum: it has no standard error, and the others hold for that delay.
         accurate = 0 if status is Status.LEAST_SQUARES else size - int(status is Status.DELAY_AT_BOUND)
-        covariance, status = covariance_of(found, np.arange(accurate), y.size, status)
+        covariance = np.full((size, size), np.nan)
+        known = covariance[:accurate, :accurate]
+        if accurate:
+            known[:] = white_noise_covariance(found.hessian[:accurate, :accurate], found.squared_error, y.size)
+            if status is Status.CONVERGED and np.isnan(known).any():
+                status = Status.SINGULAR
         if kind != "white" and accurate:
             rows = standard_rows(problem.data, a, b, delay)
             psi = (rows[:, problem.structure.sensitivity_rows] * problem.structure.signs)[:, :accurate]
             errors, regular = rows[:, problem.structure.error_row], problem.data.interval > 0.0
             uncertainty = estimate_uncertainty([psi], [errors], kind, draws, regular=regular)
-            covariance[:accurate, :accurate] = uncertainty.widened()
+            known[:] = uncertainty.widened()
         spread = float(np.sum((y - y.mean()) ** 2))
         values = {"covariance": covariance, "status": status, **quality(found, spread, y.size)}
     else:

@@ -1,7 +1,7 @@
 """The least output error with some parameters at known values: their columns leave the normal equations."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -103,26 +103,13 @@ def with_known(
             theta, squared, done = search.descend(theta, free, MOST if stage == STAGES else ON_THE_WAY)
         ends.append((squared, theta, done))
     squared, theta, done = min(ends, key=lambda end: end[0])
-    return _optimum(refinement, layout, theta, squared, done, free_optimum, search.evaluations, [e[0] for e in ends])
-
-
-def _optimum(
-    refinement: Refinement,
-    layout: Layout,
-    theta: Array,
-    squared: float,
-    done: bool,
-    free_optimum: Optimum,
-    evaluations: int,
-    ends: Sequence[float],
-) -> Optimum:
-    """The result in the form of a search without known parameters."""
     structure, n = layout.structure, layout.structure.poles
     low, high = refinement.measured.treatment.delay_bounds
     delay = float(theta[structure.size - 1]) if structure.delay else low
     own = [layout.own_of(theta, k) for k in range(layout.experiments)]
     states = np.array([state if state.size else np.zeros(n) for state, _ in own])
-    return Optimum(
+    return replace(
+        free_optimum,
         numerator=theta[n : n + structure.zeros + 1],
         denominator=np.concatenate(([1.0], theta[:n])),
         delay=delay,
@@ -137,7 +124,6 @@ def _optimum(
         delay_at_bound=structure.delay and delay in (low, high),
         pinned=False,
         tried=len(ends),
-        agree=int(np.count_nonzero(np.array(ends) <= squared * (1 + AGREE))),
-        evaluations=free_optimum.evaluations + evaluations,
-        box=free_optimum.box,
+        agree=sum(end[0] <= squared * (1 + AGREE) for end in ends),
+        evaluations=free_optimum.evaluations + search.evaluations,
     )

@@ -30,8 +30,7 @@ from numpy.typing import NDArray
 from ctid_cli.arrays import Array, ComplexArray, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.spectra import record_spectra
-from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, beginning
 
 #: Longer records are searched in their first samples only: poles need not be exact, and the work stays bounded.
 LONGEST_STRETCH = 8192
@@ -100,7 +99,7 @@ class Lines:
 def spectral_lines(record: Record, delay: float, integrators: int = 0, direct: bool = False) -> Lines | None:
     """Spectra from which poles can be found."""
     try:
-        stretch = _beginning(record)
+        stretch = beginning(record, LONGEST_STRETCH)
         spectra = record_spectra(stretch, delay, np.inf, delay, keep_mean=False)
     except DataError:
         return None
@@ -118,15 +117,6 @@ def spectral_lines(record: Record, delay: float, integrators: int = 0, direct: b
     if not clear.size:
         return lines
     return lines.lowest(int(min(max(HEADROOM * edges[clear[-1] + 1], FEWEST_LINES), count)))
-
-
-def _beginning(record: Record) -> Record:
-    """The first samples of a long record."""
-    if record.n_samples <= LONGEST_STRETCH:
-        return record
-    early = record.input.t <= record.t[LONGEST_STRETCH - 1]
-    held = HeldSignal(record.input.t[early], record.input.values[early], record.input.hold)
-    return Record(record.t[:LONGEST_STRETCH], record.y[:LONGEST_STRETCH], held)
 
 
 def local_weights(lines: Lines) -> Array:

@@ -22,6 +22,7 @@ from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.submodels import InitialState
 from ctid_cli.inference.derived import additive_derived
 from ctid_cli.inference.fit import Fit
+from ctid_cli.inference.quantile import normal_quantile
 from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Term, names_of
@@ -82,7 +83,7 @@ class AdditiveFit(Fit):
             With standard errors by the delta method, see
             :func:`~ctid_cli.inference.derived.additive_derived`.
         """
-        return additive_derived(self.additive, self.covariance, level=level)
+        return additive_derived(self.additive, self.covariance, lambda _: normal_quantile(level))
 
 
 @dataclass(frozen=True)

@@ -45,26 +45,14 @@ class MeasuredFit(FilledLater, Fit):
 
     Parameters
     ----------
-    model : TransferFunction
-        The estimate: monic denominator, descending powers, delay [s].
-    parameter_names : tuple of str
-        Names of the free parameters, in the order of ``covariance``.
-    covariance : ndarray, shape (p, p)
-        Asymptotic covariance for white residuals; NaN where it is not defined.
-    status : Status
-        How the iterations ended.
+    model, parameter_names, covariance, status, r2, count, condition_number
+        As in :class:`~ctid_cli.inference.fit.Fit`.
     cost : float
         Mean squared output error over the used samples, or twice the mean of another loss [output unit^2].
     fit_percent : float
         ``100 (1 - ||y - x|| / ||y - mean y||)`` over the used samples of all experiments, means by experiment [%].
-    r2 : float
-        ``1 - ||y - x||^2 / ||y - mean y||^2`` [-].
-    count : int
-        Number of samples used.
     iterations : int
         Evaluations of the cost and of its gradient in the refinement.
-    condition_number : float
-        Of the scaled ``sum psi psi'`` [-].
     history : tuple of IterationRecord
         Empty.
     theta : ndarray, shape (p,)
@@ -148,10 +136,10 @@ class MeasuredFit(FilledLater, Fit):
         """The fit by least squares that has the same law: itself, or with the pseudo-errors of its loss."""
         if self.weighting is None:
             return self
-        law = _linear(self.weighting, self.residuals, self.sensitivities, self.used)
+        law = FittedSamples(self.residuals, self.sensitivities, self.used, self.weighting).linear
         count = sum(eps.size for eps in law.residuals)
         cost = sum(float(eps @ eps) for eps in law.residuals) / count
-        return replace(self, **law._asdict(), count=count, cost=cost, weighting=None)
+        return replace(self, **law._asdict(), count=count, cost=cost)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -292,8 +280,7 @@ def fitted(
     measured = refinement.measured
     layout, theta = refinement.parameters(found)
     samples = samples_at(refinement, found.model, theta, None if robust is None else robust.losses)
-    residuals = samples.residuals
-    law = _linear(samples.weighting, residuals, samples.sensitivities, samples.used)
+    residuals, law = samples.residuals, samples.linear
     hessian = np.sum([psi.T @ psi for psi in law.sensitivities], axis=0)
     each = zip(law.sensitivities, law.residuals, strict=True)
     gradient = np.sum([psi.T @ eps for psi, eps in each], axis=0)
@@ -338,6 +325,19 @@ class FittedSamples(NamedTuple):
     used: tuple[BoolArray, ...]
     weighting: Weighting | None
 
+    @property
+    def linear(self) -> "FittedSamples":
+        """Least squares of the same law: pseudo-errors, and samples that count for nothing as if they were missing."""
+        if self.weighting is None:
+            return self
+        kept = [weights > 0.0 for weights in self.weighting.weights]
+        left = [use.copy() for use in self.used]
+        for use, keep in zip(left, kept, strict=True):
+            use[use] = keep
+        errors = tuple(e[keep] for e, keep in zip(self.weighting.pseudo_errors, kept, strict=True))
+        slopes = tuple(psi[keep] for psi, keep in zip(self.sensitivities, kept, strict=True))
+        return FittedSamples(errors, slopes, tuple(left), None)
+
 
 def samples_at(
     refinement: Refinement, model: TransferFunction, theta: Array, losses: Sequence[Loss] | None
@@ -352,32 +352,6 @@ def samples_at(
     each = zip(refinement.measured.outputs, refinement.problem.records, errors, strict=True)
     errors = tuple(y - (data.y_used - eps) for y, data, eps in each)
     return FittedSamples(errors, psi, used, weighted(losses, errors, layout.size))
-
-
-class LinearLaw(NamedTuple):
-    """Errors, sensitivities and samples of least squares that have the same law as an estimate."""
-
-    residuals: tuple[Array, ...]
-    sensitivities: tuple[Array, ...]
-    used: tuple[BoolArray, ...]
-
-
-def _linear(
-    weighting: Weighting | None, residuals: Sequence[Array], psi: Sequence[Array], used: Sequence[BoolArray]
-) -> LinearLaw:
-    """Pseudo-errors where there are weights; samples that count for nothing are as if they were missing."""
-    if weighting is None:
-        return LinearLaw(tuple(residuals), tuple(psi), tuple(used))
-    kept = [weights > 0.0 for weights in weighting.weights]
-    left = [use.copy() for use in used]
-    for use, keep in zip(left, kept, strict=True):
-        use[use] = keep
-    errors = zip(weighting.pseudo_errors, kept, strict=True)
-    return LinearLaw(
-        tuple(eps[keep] for eps, keep in errors),
-        tuple(block[keep] for block, keep in zip(psi, kept, strict=True)),
-        tuple(left),
-    )
 
 
 def _tangent(layout: Layout, found: Optimum) -> Array:

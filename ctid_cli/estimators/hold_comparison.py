@@ -14,7 +14,7 @@ from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.inference.input_moves import input_moves
 from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.signals.held import HeldSignal, Hold
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, beginning
 from ctid_cli.signals.regularity import regular_interval
 
 #: Samples of all records on which the holds are compared.
@@ -75,16 +75,6 @@ def _least(refinement: Refinement, fit: MeasuredFit, records: Sequence[Record]) 
     measured = MeasuredRecords(records, refinement.structure, refinement.measured.treatment)
     found = local_minimum(measured.problem, fit.model.poles, fit.model.delay, measured.treatment.delay_bounds)
     return found.squared_error, found.point.delay.seconds
-
-
-def beginning(record: Record, samples: int) -> Record:
-    """The first samples, with the input until then."""
-    if record.n_samples <= samples:
-        return record
-    t = record.t[:samples]
-    known = record.input.t <= t[-1]
-    signal = HeldSignal(record.input.t[known], record.input.values[known], record.input.hold)
-    return Record(t, record.y[:samples], signal, name=record.name)
 
 
 def otherwise_held(record: Record) -> Record:

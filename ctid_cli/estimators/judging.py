@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
@@ -110,8 +109,4 @@ def derived(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool) -> tuple[Unc
         size = fit.model.denominator.size + sum(name.startswith("b") for name in fit.parameter_names) - 1
         held = fit.tangent[:size] if fit.held_poles else None
         return derived_parameters(fit.model, covariance[:size, :size], uncertainty.quantile, held)
-
-    def reach(first: int, gradient: Array) -> float:
-        return uncertainty.quantile(np.concatenate((np.zeros(first), gradient)))
-
-    return additive_derived(fit.additive, covariance, reach=reach)
+    return additive_derived(fit.additive, covariance, uncertainty.quantile)

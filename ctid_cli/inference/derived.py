@@ -57,28 +57,27 @@ def derived_parameters(
 
 
 def additive_derived(
-    model: AdditiveModel,
-    covariance: Array,
-    *,
-    level: float = 0.95,
-    reach: Callable[[int, Array], float] | None = None,
+    model: AdditiveModel, covariance: Array, quantile: Quantile = normal_interval
 ) -> tuple[UncertainValue, ...]:
     r"""What users read off the submodels of a sum, as :func:`derived_parameters`.
 
     Each quantity depends on the parameters of its own submodel alone, so a pole is undetermined only where it cannot
     be told from another one of the same submodel. With ``A = 1 + a_1 p + … + a_n p^n``, a pole moves by
-    ``dp/da_k = -p^k/A'(p)``. Intervals are those of the normal distribution, or reach as many standard errors as is
-    told of a gradient and the place of its first parameter.
+    ``dp/da_k = -p^k/A'(p)``.
     """
     found: list[UncertainValue] = []
     first = 0
     for number, (submodel, term) in enumerate(zip(model.submodels, model.terms, strict=True), 1):
         own = slice(first, first + term.size)
-        quantile: Quantile = (lambda _: normal_quantile(level)) if reach is None else partial(reach, first)
-        rows = _of_submodel(submodel, covariance[own, own], quantile)
+        rows = _of_submodel(submodel, covariance[own, own], partial(_behind, quantile, first))
         found += [replace(row, name=f"g{number}_{row.name}") for row in rows]
         first = own.stop
     return tuple(found)
+
+
+def _behind(quantile: Quantile, first: int, gradient: Array) -> float:
+    """Standard errors to each side of a quantity that does not depend on the first parameters."""
+    return quantile(np.concatenate((np.zeros(first), gradient)))
 
 
 def _of_submodel(submodel: Submodel, covariance: Array, quantile: Quantile) -> list[UncertainValue]:

@@ -306,22 +306,11 @@ def _finished(
     _require_some(lines, record)
     factor = hold_factor(hold, lines.frequencies, interval)
     power = np.abs(factor) ** 2
-    response, variance = lines.response / factor, lines.variance / power
-    bias = images(hold, lines.frequencies, response, variance, interval)
-    notes = [*lines.notes, _of_hold(hold, lines.frequencies, bias, np.abs(response)), *_of_record(record)]
     distortion = None if lines.distortion is None else lines.distortion / power
-    return FrequencyResponse(
-        lines.frequencies,
-        response,
-        variance,
-        lines.freedom,
-        lines.coherence,
-        distortion,
-        bias,
-        method,
-        hold,
-        tuple(notes),
-    )
+    held = lines._replace(response=lines.response / factor, variance=lines.variance / power, distortion=distortion)
+    bias = images(hold, held.frequencies, held.response, held.variance, interval)
+    notes = (*held.notes, _of_hold(hold, held.frequencies, bias, np.abs(held.response)), *_of_record(record))
+    return FrequencyResponse(*held[:6], bias, method, hold, notes)
 
 
 def _of_hold(hold: Hold, frequencies: Array, bias: Array, gain: Array) -> str:

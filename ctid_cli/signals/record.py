@@ -206,3 +206,13 @@ class Record:
         if self.interval is None or self.input.t.size != self.t.size:
             return False
         return bool(np.abs(self.input.t - self.t).max() <= REGULARITY * self.interval)
+
+
+def beginning(record: Record, samples: int) -> Record:
+    """The first samples, with the input until then."""
+    if record.n_samples <= samples:
+        return record
+    t = record.t[:samples]
+    known = record.input.t <= t[-1]
+    signal = HeldSignal(record.input.t[known], record.input.values[known], record.input.hold)
+    return Record(t, record.y[:samples], signal, name=record.name)

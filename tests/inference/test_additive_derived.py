@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.inference.derived import additive_derived, derived_parameters
+from ctid_cli.inference.quantile import normal_quantile
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import factored, factored_jacobian, unfactored, unfactored_jacobian
 
@@ -100,7 +101,8 @@ def test_known_second_order_quantities_in_closed_form():
     gain = rows["g2_static_gain"]
     assert (gain.estimate, gain.standard_error) == pytest.approx((1.0, 3e-4))
     assert gain.high - gain.low == pytest.approx(2 * 1.959964 * 3e-4, rel=1e-6)
-    narrow = by_name(TWO_MODES, np.diag([0.01, 0.02, 0.03, 1e-4, 2e-4, 3e-4]) ** 2, level=0.5)["g2_static_gain"]
+    covariance = np.diag([0.01, 0.02, 0.03, 1e-4, 2e-4, 3e-4]) ** 2
+    narrow = by_name(TWO_MODES, covariance, quantile=lambda _: normal_quantile(0.5))["g2_static_gain"]
     assert narrow.high - narrow.low == pytest.approx(2 * 0.674490 * 3e-4, rel=1e-6)
 
 

@@ -44,10 +44,6 @@ class SearchOptions:
     seed: int = 0
 
 
-#: Nothing but the coefficients, from rest.
-PLAIN = SearchOptions()
-
-
 @dataclass(frozen=True, eq=False)
 class Optimum:
     """The least output error that was found."""
@@ -85,7 +81,7 @@ class Optimum:
         return TransferFunction(self.numerator, self.denominator, self.delay)
 
 
-def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, options: SearchOptions = PLAIN) -> Optimum:
+def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, options: SearchOptions) -> Optimum:
     """Least sum of squared output errors of a structure and of all that it contains.
 
     As many zeros as poles need a known delay. Free responses begin at the first used sample of each record.

@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from ctid_cli.arrays import ComplexArray
 from ctid_cli.estimation.optimum.best_model import Optimum, optimum
-from ctid_cli.estimation.optimum.box import Point, point_of
+from ctid_cli.estimation.optimum.box import Point
 from ctid_cli.estimation.optimum.search import Judged
 from ctid_cli.estimation.optimum.starts import SAME, Nest
 
@@ -69,21 +70,13 @@ class Ladder(Nest):
     def _with_poles(self, poles: int, zeros: int, new_zeros: int, added: int) -> list[Point]:
         """The best pole or pair beside those of a smaller model, by elimination alone."""
         smaller = self.optima(poles, zeros)[0].point
-        return self._beside_poles(smaller.poles, smaller.delay.seconds, new_zeros, added)[:1]
+        return self._best_beside(smaller.poles, smaller.delay.seconds, new_zeros, added, 1)
 
     def _alone(self, zeros: int, poles: int) -> list[Point]:
         """The best single poles, or single pairs, at the delay of the smallest model or in the middle of the range."""
         delay = 0.5 * sum(self.box.delays) if poles == 1 else self.optima(1, 0)[0].point.delay.seconds
-        return self._beside_poles(np.zeros(0, dtype=complex), delay, zeros, poles)[: REFINED + 1]
+        return self._best_beside(np.zeros(0, dtype=complex), delay, zeros, poles, REFINED + 1)
 
-    def _beside_poles(self, roots: np.ndarray, delay: float, zeros: int, added: int) -> list[Point]:
-        descent, found = self.descent(zeros), []
-        w = np.geomspace(self.box.slowest, self.box.fastest, (POLES if added == 1 else PAIRS) + 2)[1:-1]
-        for speed in w.tolist():
-            for zeta in (1.0,) if added == 1 else DAMPINGS:
-                pole = speed * complex(-zeta, np.sqrt(1 - zeta * zeta))
-                new = [complex(-speed)] if added == 1 else [pole, pole.conjugate()]
-                point = point_of(np.concatenate((roots, new)), delay, self.box)
-                found.append((descent.value(point).squared_error, point))
-        self.evaluations += descent.evaluations
-        return [point for _, point in sorted(found, key=lambda entry: entry[0])]
+    def _best_beside(self, roots: ComplexArray, delay: float, zeros: int, added: int, most: int) -> list[Point]:
+        found = self._beside_poles(roots, delay, zeros, added, POLES if added == 1 else PAIRS, DAMPINGS)
+        return [point for _, point in found[:most]]

@@ -70,7 +70,7 @@ class Nest:
             points = [] if poles > 1 else self._alone(0, 1)
             for added in range(1, min(poles - 1, 2) + 1):
                 before = self._spine(poles - added).point
-                points += self._extended(poles - 1, [(before.poles, before.delay.seconds)], added)
+                points += self._extended(poles - 1, before.poles, before.delay.seconds, added)
             points = self._along_delay(poles - 1, points)
             descent = self.descent(poles - 1)
             self._spines[poles] = min(map(descent.descend, points), key=lambda local: local.squared_error)
@@ -80,7 +80,7 @@ class Nest:
     def _alone(self, zeros: int, poles: int) -> list[Point]:
         """The best single poles, or single pairs."""
         middle = 0.5 * (self.box.delays[0] + self.box.delays[1])
-        return self._extended(zeros, [(np.zeros(0, dtype=complex), middle)], poles, DENSER, MORE)
+        return self._extended(zeros, np.zeros(0, dtype=complex), middle, poles, DENSER, MORE)
 
     def ends(self, poles: int, zeros: int) -> list[float]:
         """Squared errors at which the searches for a structure have ended."""
@@ -147,28 +147,32 @@ class Nest:
     def _grown(self, poles: int, zeros: int, new_zeros: int, added: int) -> list[Point]:
         """The best of a smaller structure with poles added, for another numerator."""
         point = self.optima(poles, zeros)[0].point
-        return self._extended(new_zeros, [(point.poles, point.delay.seconds)], added)
+        return self._extended(new_zeros, point.poles, point.delay.seconds, added)
 
     def _extended(
-        self, zeros: int, seeds: Sequence[tuple[ComplexArray, float]], added: int, denser: int = 1, more: int = 1
+        self, zeros: int, roots: ComplexArray, delay: float, added: int, denser: int = 1, more: int = 1
     ) -> list[Point]:
-        """The best few of all poles, or pairs, added to given ones, by elimination alone."""
-        descent = self.descent(zeros)
-        found: list[tuple[float, Array, Point]] = []
-        for roots, delay in seeds:
-            for w in np.geomspace(self.box.slowest, self.box.fastest, denser * FREQUENCIES + 2)[1:-1].tolist():
-                for zeta in DAMPINGS if added == 2 else (1.0,):
-                    pole = w * complex(-zeta, np.sqrt(1 - zeta * zeta))
-                    new = [pole, pole.conjugate()] if added == 2 else [complex(-w)]
-                    point = point_of(np.concatenate((roots, new)), delay, self.box)
-                    where = np.array([np.log(w), np.log(zeta)])
-                    found.append((descent.value(point).squared_error, where, point))
-        self.evaluations += descent.evaluations
+        """The best few of all poles, or pairs, added to given ones."""
         chosen: list[tuple[Array, Point]] = []
-        for _, where, point in sorted(found, key=lambda entry: entry[0]):
+        for where, point in self._beside_poles(roots, delay, zeros, added, denser * FREQUENCIES, DAMPINGS):
             if len(chosen) < more * REFINED and all(np.abs(where - other).max() > APART for other, _ in chosen):
                 chosen.append((where, point))
         return [point for _, point in chosen]
+
+    def _beside_poles(
+        self, roots: ComplexArray, delay: float, zeros: int, added: int, count: int, dampings: Sequence[float]
+    ) -> list[tuple[Array, Point]]:
+        """Poles, or pairs of some dampings, added to given ones, the best first by elimination alone; and where."""
+        descent = self.descent(zeros)
+        found: list[tuple[float, Array, Point]] = []
+        for w in np.geomspace(self.box.slowest, self.box.fastest, count + 2)[1:-1].tolist():
+            for zeta in dampings if added == 2 else (1.0,):
+                pole = w * complex(-zeta, np.sqrt(1 - zeta * zeta))
+                new = [pole, pole.conjugate()] if added == 2 else [complex(-w)]
+                point = point_of(np.concatenate((roots, new)), delay, self.box)
+                found.append((descent.value(point).squared_error, np.array([np.log(w), np.log(zeta)]), point))
+        self.evaluations += descent.evaluations
+        return [(where, point) for _, where, point in sorted(found, key=lambda entry: entry[0])]
 
     def _along_delay(self, zeros: int, points: list[Point]) -> list[Point]:
         """Further starts at the minima of the profile over the delay, for the poles of the best start."""
