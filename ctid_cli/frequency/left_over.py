@@ -10,6 +10,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.frequency.record_track import MissingLine, RecordTrack
 from ctid_cli.frequency.spectrum import MOST_MISSING, SHORTEST_SEGMENT, median_spectrum, significant
+from ctid_cli.frequency.spikes import without_spikes
 from ctid_cli.frequency.synthesis import synthesised
 
 #: A spectrum is a median over about so many half-overlapping segments of at most so many samples.
@@ -31,7 +32,7 @@ class LeftOver(NamedTuple):
 
     signal: Array
     residual: Array
-    #: Where not all tones are known, or the sample is missing, shape (N,).
+    #: Where not all tones are known, or the sample is missing or a spike, shape (N,).
     unknown: BoolArray
     #: Samples in a segment of the spectra.
     size: int
@@ -42,6 +43,7 @@ class LeftOver(NamedTuple):
 
 def left_over(samples: Array, interval: float, track: RecordTrack) -> LeftOver | None:
     """What the tones of a track leave; None where their rows are nowhere known for a segment."""
+    samples = without_spikes(samples)
     present = np.isfinite(samples)
     centred = samples - float(np.mean(samples[present]))
     left = centred - synthesised(track, interval * np.arange(samples.size, dtype=np.float64))

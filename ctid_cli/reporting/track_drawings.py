@@ -8,6 +8,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.record_track import RecordTrack
+from ctid_cli.frequency.spikes import without_spikes
 from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, Drawing, outline, plain
 from ctid_cli.reporting.track_residual import Spectra
 from ctid_cli.signals.sampled_signal import SampledSignal
@@ -46,7 +47,7 @@ def signal_drawing(signal: SampledSignal, track: RecordTrack) -> Drawing:
         upper.plot(*outline(t, signal.samples), color=DARK, linewidth=0.6)
         upper.set_ylabel(f"{plain(signal.column)} [{plain(signal.unit)}]" if signal.unit else plain(signal.column))
         top = highest_shown(track, signal.interval)
-        levels, ends = _spectrogram(signal.samples, signal.interval, track, top)
+        levels, ends = _spectrogram(without_spikes(signal.samples), signal.interval, track, top)
         first, last = signal.start + ends[0], signal.start + ends[1]
         image = lower.imshow(
             levels,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctid_cli.frequency.left_over import with_lines_left
+from ctid_cli.frequency.left_over import left_over, with_lines_left
 from ctid_cli.frequency.record_tones import follow_tones
 from ctid_cli.frequency.record_track import MissingLine, RecordTrack
 
@@ -40,3 +40,12 @@ def test_a_method_that_names_lines_itself_is_believed():
 def test_where_nothing_is_known_nothing_is_named():
     track = RecordTrack.of(T[:3], np.full((3, 1), 100.0), np.zeros(3, np.uint16), INTERVAL)
     assert with_lines_left(track, NOISE, INTERVAL).missing == ()
+
+
+def test_a_spike_is_not_what_the_tones_leave():
+    y = np.sin(2 * np.pi * 60.0 * T) + NOISE
+    track, _ = follow_tones(y, INTERVAL, 1)
+    y[4000] = 1e6
+    left = left_over(y, INTERVAL, track)
+    assert left.unknown[4000]
+    assert np.abs(left.residual[~left.unknown]).max() < 0.1
