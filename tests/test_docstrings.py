@@ -49,12 +49,11 @@ def public_callables():
     for section in KINDS:
         for kind, member in classes(section).items():
             if member.__name__ not in ctid_cli.__all__:
-                yield from members_of(kind, member)
+                yield kind, member
     for contract in (BatchEstimator, ContinuousModel, ContinuousNoise, Excitation, Noise, Sampling):
         yield from members_of(contract.__name__, contract)
-    for member in (ContinuousPid, Recorder, Relay):  # options of sections without a kind
-        yield from members_of(member.__name__, member)
-    for member in (MeasuredSource, Piece, SumOfSinusoids, Tone, *written_sections()):  # sections without a kind
+    without_kind = (ContinuousPid, MeasuredSource, Piece, Recorder, Relay, SumOfSinusoids, Tone, *written_sections())
+    for member in without_kind:
         yield member.__name__, member
 
 

@@ -94,18 +94,7 @@ class ContinuousPid:
         return not (self.kp or self.integral_gain or self.derivative_gain)
 
     def discrete(self, interval: float) -> DiscreteController:
-        """The controller that acts at every sample.
-
-        Parameters
-        ----------
-        interval : float
-            Sampling interval h [s].
-
-        Returns
-        -------
-        DiscreteController
-            With a pole at 1 only if there is integral action, and one of the filter only if there is derivative action.
-        """
+        """The controller that acts at every sample, with the poles of those actions only that it has."""
         # s = rise / fall.
         if self.discretisation == "tustin":
             rise, fall = np.array([2.0, -2.0]), interval * np.ones(2)

@@ -43,7 +43,6 @@ class Chirp(Excitation):
     """
 
     kind: ClassVar[str] = "chirp"
-    #: No random number is drawn.
     deterministic: ClassVar[bool] = True
 
     first_frequency: float

@@ -48,7 +48,7 @@ class ContinuousNoise(ABC):
             Noise [output unit].
         """
 
-    def _variance(self, noise_free: Array | None) -> float | None:
+    def _variance(self, noise_free: Array) -> float | None:
         """Variance that is asked for, absolutely or by a ratio [output unit^2]; None if the level is another one."""
         return self.variance if self.snr_db is None else variance_at(self.snr_db, noise_free)
 
@@ -132,11 +132,10 @@ class OneOverFNoise(ContinuousNoise):
 
     Examples
     --------
-    >>> import numpy as np
     >>> from ctid_cli.signals.drifts import OneOverFNoise
-    >>> noise = OneOverFNoise(lowest_frequency=0.1, highest_frequency=100.0, variance=4.0)
-    >>> noise.autocovariance_at([0.0, 1.0]).round(3)
-    array([4.   , 1.168])
+    >>> corners, shares = OneOverFNoise(lowest_frequency=0.1, highest_frequency=100.0, variance=4.0).processes()
+    >>> corners.round(2)
+    array([  0.1 ,   0.32,   1.  ,   3.16,  10.  ,  31.62, 100.  ])
     """
 
     kind: ClassVar[str] = "one_over_f"
@@ -161,38 +160,11 @@ class OneOverFNoise(ContinuousNoise):
         require_one_level(self)
 
     def processes(self) -> tuple[Array, Array]:
-        """Corner frequencies [rad/s], and the share of each process in the variance [-].
-
-        Returns
-        -------
-        corners : ndarray, shape (K,)
-            Corner frequencies [rad/s], ascending.
-        shares : ndarray, shape (K,)
-            Shares of the variance; their sum is 1.
-        """
+        """Corner frequencies [rad/s], ascending, and the share of each process in the variance [-]."""
         decades = math.log10(self.highest_frequency / self.lowest_frequency)
         corners = np.geomspace(self.lowest_frequency, self.highest_frequency, math.ceil(PER_DECADE * decades) + 1)
         shares = (corners / corners[0]) ** (1 - self.exponent)
         return corners, shares / shares.sum()
-
-    def autocovariance_at(self, distances: Array, noise_free: Array | None = None) -> Array:
-        """Covariance of two samples by the time between them.
-
-        Parameters
-        ----------
-        distances : array_like, shape (M,)
-            Times between the samples [s].
-        noise_free : ndarray, shape (N,), optional
-            The output without noise [output unit]; needed with a signal-to-noise ratio.
-
-        Returns
-        -------
-        ndarray, shape (M,)
-            Covariance [output unit^2].
-        """
-        corners, shares = self.processes()
-        decays = np.exp(-np.outer(np.abs(distances), corners))
-        return np.asarray(self._scale(noise_free) ** 2 * (decays @ shares))
 
     def generate_at(self, times: Array, noise_free: Array, rng: np.random.Generator) -> Array:
         """The sum of the processes; their first states are drawn from the stationary distribution."""
@@ -204,12 +176,9 @@ class OneOverFNoise(ContinuousNoise):
         for first in range(0, times.size, BLOCK):
             part = intervals[first : first + BLOCK]
             parts.append(_relax(part, corners, np.sqrt(shares), rng.standard_normal((part.size, corners.size)), state))
-        return self._scale(noise_free) * np.concatenate(parts)
-
-    def _scale(self, noise_free: Array | None) -> float:
         variance = self._variance(noise_free)
         assert variance is not None
-        return math.sqrt(variance)
+        return math.sqrt(variance) * np.concatenate(parts)
 
 
 @njit(cache=True, nogil=True)

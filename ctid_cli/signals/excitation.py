@@ -219,7 +219,6 @@ class Step(Excitation):
     """
 
     kind: ClassVar[str] = "step"
-    #: No random number is drawn.
     deterministic: ClassVar[bool] = True
 
     amplitude: float = 1.0
@@ -265,7 +264,6 @@ class InputFile(Excitation):
     """
 
     kind: ClassVar[str] = "file"
-    #: No random number is drawn.
     deterministic: ClassVar[bool] = True
 
     file: str

@@ -1,38 +1,19 @@
 """Clocks that are not regular: by mean and spread, with jitter, with samples missing, and at random."""
 
-from dataclasses import dataclass, field
-from typing import ClassVar, get_args
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
-from ctid_cli.signals.checks import (
-    require_choice,
-    require_integer,
-    require_not_negative,
-    require_positive,
-    require_share,
-)
+from ctid_cli.signals.checks import require_not_negative, require_share
 from ctid_cli.signals.missing import check_loss, ticks_between
-from ctid_cli.signals.sampling import InputRecord, Sampling, UniformIntervals, from_zero
+from ctid_cli.signals.sampling import InputRecord, OfInterval, UniformIntervals, from_zero
 
 
 @dataclass(frozen=True)
-class _AroundAnInterval(Sampling):
-    """What irregular clocks with a mean interval have in common."""
-
-    interval: float
-    samples: int = field(metadata={"geometric": True})
-
-    def __post_init__(self) -> None:
-        require_positive("interval", self.interval, "s")
-        require_integer("samples", self.samples, 2)
-        require_choice("input_record", self.input_record, get_args(InputRecord))
-
-
-@dataclass(frozen=True)
-class IrregularSampling(_AroundAnInterval):
+class IrregularSampling(OfInterval):
     """Samples at independent random intervals around a mean, from 0 s.
 
     Parameters
@@ -67,7 +48,7 @@ class IrregularSampling(_AroundAnInterval):
 
 
 @dataclass(frozen=True)
-class JitteredSampling(_AroundAnInterval):
+class JitteredSampling(OfInterval):
     """Samples near the ticks of a regular clock, from 0 s; the errors of the instants do not add up.
 
     Parameters
@@ -108,7 +89,7 @@ class JitteredSampling(_AroundAnInterval):
 
 
 @dataclass(frozen=True)
-class MissingSamples(_AroundAnInterval):
+class MissingSamples(OfInterval):
     """Samples at the ticks of a regular clock, some of which are missing, one by one or in bursts, from 0 s.
 
     Parameters
@@ -159,7 +140,7 @@ class MissingSamples(_AroundAnInterval):
 
 
 @dataclass(frozen=True)
-class PoissonSampling(_AroundAnInterval):
+class PoissonSampling(OfInterval):
     """Samples at the instants of a Poisson process, from 0 s: at any time the next one is equally likely.
 
     Parameters

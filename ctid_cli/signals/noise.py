@@ -72,7 +72,8 @@ class Noise:
     @property
     def _given_innovation_variance(self) -> float | None:
         """Variance of the innovations [output unit^2], where the level says it."""
-        raise NotImplementedError
+        deviation: float | None = getattr(self, "standard_deviation", None)
+        return None if deviation is None else deviation**2
 
     def innovation_variance_of(self, noise_free: Array | None = None) -> float:
         """Variance of the innovations.
@@ -242,10 +243,6 @@ class WhiteNoise(Noise):
     def __post_init__(self) -> None:
         require_one_level(self)
 
-    @property
-    def _given_innovation_variance(self) -> float | None:
-        return None if self.standard_deviation is None else self.standard_deviation**2
-
 
 @dataclass(frozen=True)
 class OutlierNoise(Noise):
@@ -287,26 +284,9 @@ class OutlierNoise(Noise):
         require_one_level(self)
 
     def generate(self, noise_free: Array, rng: np.random.Generator) -> Array:
-        """Noise for one record; which samples are outliers is drawn from a stream of its own.
-
-        Parameters
-        ----------
-        noise_free : ndarray, shape (N,)
-            The output without noise [output unit]; only its length matters without a signal-to-noise ratio.
-        rng : numpy.random.Generator
-            Source of N standard normal numbers, and of the stream that says which are outliers.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Noise [output unit].
-        """
+        """Noise for one record; which samples are outliers is drawn from a stream of its own."""
         outliers = rng.spawn(1)[0].random(noise_free.size) < self.share
         return super().generate(noise_free, rng) * np.where(outliers, self.size, 1.0)
-
-    @property
-    def _given_innovation_variance(self) -> float | None:
-        return None if self.standard_deviation is None else self.standard_deviation**2
 
     @property
     def _unit_variance(self) -> float:

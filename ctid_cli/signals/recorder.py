@@ -55,38 +55,14 @@ class Recorder:
         check_loss(self.missing, self.mean_burst)
 
     def rounded(self, output: Array) -> Array:
-        """The output in steps of the resolution.
-
-        Parameters
-        ----------
-        output : ndarray, shape (N,)
-            Measured output [output unit].
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            The nearest multiples of the resolution [output unit].
-        """
+        """The output in steps of the resolution."""
         if self.resolution == 0.0:
             return output
         # Without a minus before zero, which would be written to files.
         return np.asarray(self.resolution * np.rint(output / self.resolution) + 0.0)
 
     def with_losses(self, output: Array, rng: np.random.Generator) -> Array:
-        """The output with NaN where it is missing.
-
-        Parameters
-        ----------
-        output : ndarray, shape (N,)
-            Measured output [output unit].
-        rng : numpy.random.Generator
-            Source of the losses.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Output, or NaN [output unit].
-        """
+        """The output with NaN where it is missing; losses are drawn."""
         if self.missing == 0.0:
             return output
         ticks = from_zero(ticks_between(rng, output.size - 1, self.missing, self.mean_burst))

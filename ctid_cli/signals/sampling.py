@@ -35,9 +35,9 @@ class Sampling(ABC):
     input_record: InputRecord
 
     @property
+    @abstractmethod
     def mean_interval(self) -> float:
         """Expected interval between samples [s]."""
-        return float(getattr(self, "interval"))  # noqa: B009 - most schemes have one
 
     @abstractmethod
     def times(self, rng: np.random.Generator) -> Array:
@@ -56,7 +56,25 @@ class Sampling(ABC):
 
 
 @dataclass(frozen=True)
-class RegularSampling(Sampling):
+class OfInterval(Sampling):
+    """What schemes have in common that are given by an interval, of a clock or on average."""
+
+    interval: float
+    samples: int = field(metadata={"geometric": True})
+
+    def __post_init__(self) -> None:
+        require_positive("interval", self.interval, "s")
+        require_integer("samples", self.samples, 2)
+        require_choice("input_record", self.input_record, get_args(InputRecord))
+
+    @property
+    def mean_interval(self) -> float:
+        """Expected interval between samples [s]."""
+        return float(self.interval)
+
+
+@dataclass(frozen=True)
+class RegularSampling(OfInterval):
     """Samples at equal intervals, from 0 s.
 
     Parameters
@@ -80,14 +98,7 @@ class RegularSampling(Sampling):
     #: No random number is drawn.
     deterministic: ClassVar[bool] = True
 
-    interval: float
-    samples: int = field(metadata={"geometric": True})
     input_record: InputRecord = "sampled"
-
-    def __post_init__(self) -> None:
-        require_positive("interval", self.interval, "s")
-        require_integer("samples", self.samples, 2)
-        require_choice("input_record", self.input_record, get_args(InputRecord))
 
     def times(self, rng: np.random.Generator) -> Array:
         """The clock; nothing is drawn."""

@@ -1,21 +1,21 @@
 """Samples that a sensor sends when its output has moved."""
 
 import math
-from dataclasses import dataclass, field
-from typing import ClassVar, get_args
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.signals.checks import require_choice, require_integer, require_positive
+from ctid_cli.signals.checks import require_positive
 from ctid_cli.signals.held import COINCIDENCE
-from ctid_cli.signals.sampling import InputRecord, Sampling
+from ctid_cli.signals.sampling import InputRecord, OfInterval
 
 
 @dataclass(frozen=True)
-class SendOnDelta(Sampling):
+class SendOnDelta(OfInterval):
     """Samples when the measured output has moved by a threshold since the last one, from 0 s.
 
     Parameters
@@ -43,17 +43,13 @@ class SendOnDelta(Sampling):
     #: No random number is drawn.
     deterministic: ClassVar[bool] = True
 
-    interval: float
-    samples: int = field(metadata={"geometric": True})
     delta: float
     longest_interval: float | None = None
     input_record: InputRecord = "exact"
 
     def __post_init__(self) -> None:
-        require_positive("interval", self.interval, "s")
-        require_integer("samples", self.samples, 2)
+        super().__post_init__()
         require_positive("delta", self.delta, "output unit")
-        require_choice("input_record", self.input_record, get_args(InputRecord))
         if self.longest_interval is not None:
             require_positive("longest_interval", self.longest_interval, "s")
             if self.longest_interval < self.interval:
@@ -61,38 +57,11 @@ class SendOnDelta(Sampling):
                 raise OptionError("longest_interval", f"longest_interval {shorter}; raise it.")
 
     def times(self, rng: np.random.Generator) -> Array:
-        """Instants of the looks; nothing is drawn.
-
-        Parameters
-        ----------
-        rng : numpy.random.Generator
-            Not used.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Instants [s], the first 0.
-        """
+        """Instants of the looks; nothing is drawn."""
         return self.interval * np.arange(self.samples, dtype=float)
 
     def sent(self, output: Array) -> IndexArray:
-        """Which looks make a sample.
-
-        Parameters
-        ----------
-        output : ndarray, shape (N,)
-            Measured output at the looks [output unit].
-
-        Returns
-        -------
-        ndarray of int, shape (M,)
-            Numbers of the looks, the first 0.
-
-        Raises
-        ------
-        DataError
-            If there is no second sample.
-        """
+        """Numbers of the looks that make a sample, the first 0; a DataError says that there is no second one."""
         longest = math.inf if self.longest_interval is None else self.longest_interval / self.interval
         found = _sent(output, self.delta, int(min(longest * (1 + COINCIDENCE), output.size)))
         if found.size < 2:

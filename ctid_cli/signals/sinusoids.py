@@ -164,20 +164,7 @@ class UniformDisturbance:
         require_positive("half_width", self.half_width, "signal unit")
 
     def generate(self, undisturbed: Array, rng: np.random.Generator) -> Array:
-        """Disturbance of one record.
-
-        Parameters
-        ----------
-        undisturbed : ndarray, shape (N,)
-            The signal without it [signal unit]; only its length matters.
-        rng : numpy.random.Generator
-            Source of the samples.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Disturbance [signal unit].
-        """
+        """Disturbance of one record; of the signal without it only the length matters."""
         return self.half_width * rng.uniform(-1.0, 1.0, undisturbed.size)
 
 
@@ -214,18 +201,7 @@ class SineDisturbance:
         require_finite("phase", self.phase, "rad")
 
     def at(self, times: ArrayLike) -> Array:
-        """The disturbance.
-
-        Parameters
-        ----------
-        times : array_like, shape (N,)
-            Instants [s].
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Disturbance [signal unit].
-        """
+        """The disturbance at some instants."""
         return self.amplitude * np.sin(self.frequency * np.asarray(times, dtype=float) + self.phase)
 
 

@@ -30,7 +30,6 @@ class Steps(Excitation):
     """
 
     kind: ClassVar[str] = "steps"
-    #: No random number is drawn.
     deterministic: ClassVar[bool] = True
 
     times: tuple[float, ...]
@@ -82,7 +81,6 @@ class Doublets(Excitation):
     """
 
     kind: ClassVar[str] = "doublets"
-    #: No random number is drawn.
     deterministic: ClassVar[bool] = True
 
     width: float
