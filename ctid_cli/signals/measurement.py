@@ -86,15 +86,10 @@ def read_measurement(
     other = None if reference is None else table.named(reference)
     columns, notes = _choose(table, {"time": time, "input": input, "output": output}, other)
     unit = {role: split_header(name)[1] for role, name in columns.items()}
-    t, u, y = (table.numbers(columns[role]) for role in ROLES)
+    u, y = table.numbers(columns["input"]), table.numbers(columns["output"])
     label = unit["time"] or "s"
-    if t.size == 1 and y.size > 1:
-        interval = table.lone_interval(columns["time"], float(t[0]))
-        t = interval * np.arange(y.size, dtype=float)
-        note = f"{columns['time']!r} is one number: it was taken as the sampling interval"
-        notes.append(f"{note}, {interval:g} {label}, from 0 {label} on.")
-    for name, values in ((columns["time"], t), (columns["input"], u)):
-        table.require_as_many(name, values, columns["output"], y)
+    t = _instants(table, columns["time"], label, columns["output"], y, notes)
+    table.require_as_many(columns["input"], u, columns["output"], y)
     table.check_times(columns["time"], t, label)
     first, last = _window(table, t, start, stop, label)
     if last - first < t.size:
@@ -124,15 +119,29 @@ def read_table(path: str | os.PathLike[str], otherwise: str) -> Table:
     raise DataError(f"{os.fspath(path)}: files ending in {extension} are not read; {otherwise}")
 
 
-def _choose(table: Table, asked: Mapping[Role, str | None], reference: str | None) -> tuple[dict[Role, str], list[str]]:
-    """The column of each role, and what was assumed."""
-    chosen = {role: table.named(wanted) for role in ROLES if (wanted := asked[role]) is not None}
+def _instants(table: Table, name: str, unit: str, other: str, others: Array, notes: list[str]) -> Array:
+    """The instants of another column, of which one number may be there in their place: their interval."""
+    t = table.numbers(name)
+    if t.size == 1 and others.size > 1:
+        interval = table.lone_interval(name, float(t[0]))
+        t = interval * np.arange(others.size, dtype=float)
+        note = f"{name!r} is one number: it was taken as the sampling interval"
+        notes.append(f"{note}, {interval:g} {unit}, from 0 {unit} on.")
+    table.require_as_many(name, t, other, others)
+    return t
+
+
+def _choose(
+    table: Table, asked: Mapping[Role, str | None], reference: str | None = None
+) -> tuple[dict[Role, str], list[str]]:
+    """The column of each role that is asked for, and what was assumed."""
+    chosen = {role: table.named(wanted) for role, wanted in asked.items() if wanted is not None}
     refuse_nameless(table)
-    for role in ROLES:
+    for role in asked:
         if role not in chosen and (found := _recognised(table, role, chosen)) is not None:
             chosen[role] = found
-    notes = _take_by_position(table, chosen)
-    for one, other in itertools.combinations(ROLES, 2):
+    notes = _take_by_position(table, chosen, tuple(asked))
+    for one, other in itertools.combinations(asked, 2):
         if chosen[one] == chosen[other]:
             raise DataError(f"{table.head}: {chosen[one]!r} cannot be both the {one} and the {other}")
     for role, name in chosen.items():
@@ -145,16 +154,16 @@ def _choose(table: Table, asked: Mapping[Role, str | None], reference: str | Non
     return chosen, notes
 
 
-def _take_by_position(table: Table, chosen: dict[Role, str]) -> list[str]:
+def _take_by_position(table: Table, chosen: dict[Role, str], roles: tuple[Role, ...]) -> list[str]:
     """Take the columns of the roles that are still open in their order, where no name contradicts; say so."""
-    missing = [role for role in ROLES if role not in chosen]
+    missing = [role for role in roles if role not in chosen]
     if not missing:
         return []
     left = [name for name in table.names if name not in chosen.values()]
     # A column with a usual name is not put in another place than its name says.
-    named = any(table.leaf(name).lower() in names for name in left for names in USUAL_NAMES.values())
-    if table.lines is None or len(table.names) != 3 or len(left) != len(missing) or named:
-        _refuse_unrecognised(table, missing[0], chosen)
+    named = any(table.leaf(name).lower() in USUAL_NAMES[role] for name in left for role in roles)
+    if table.lines is None or len(table.names) != len(roles) or len(left) != len(missing) or named:
+        _refuse_unrecognised(table, missing[0], chosen, roles)
     chosen.update(zip(missing, left, strict=True))
     taken = [f"{chosen[role]!r} as the {role}" for role in missing]
     return [f"Columns were taken by their position: {listed(taken)}."]
@@ -177,12 +186,11 @@ def _recognised(table: Table, role: Role, chosen: Mapping[Role, str]) -> str | N
     return None
 
 
-def _refuse_unrecognised(table: Table, role: Role, chosen: Mapping[Role, str]) -> NoReturn:
+def _refuse_unrecognised(table: Table, role: Role, chosen: Mapping[Role, str], roles: tuple[Role, ...]) -> NoReturn:
     refuse_one_column(table)
-    if len(table.names) < len(ROLES) and not table.hint:
-        raise DataError(
-            f"{table.head}: {listing(table)} and nothing else; a record needs a time, an input and an output"
-        )
+    if len(table.names) < len(roles) and not table.hint:
+        needs = "a record needs a time, an input and an output" if "output" in roles else "an input needs a time too"
+        raise DataError(f"{table.head}: {listing(table)} and nothing else; {needs}")
     usual = " or ".join(map(repr, USUAL_NAMES[role][:2]))
     other = "other " if any(table.leaf(name).lower() in USUAL_NAMES[role] for name in chosen.values()) else ""
     message = f"{table.head}: no {other}{table.noun} is called {usual}; {listing(table)}"
@@ -231,26 +239,8 @@ def read_input(
     """An input to simulate with, from a file whose other columns do not matter."""
     require_choice("hold", hold, get_args(Hold))
     table = read_table(path, "export the input as comma-separated text (.csv) whose first line names the columns")
-    roles: dict[Role, str | None] = {"time": time, "input": input}
-    chosen = {role: table.named(wanted) for role, wanted in roles.items() if wanted is not None}
-    refuse_nameless(table)
-    for role in roles:
-        if role not in chosen and (found := _recognised(table, role, chosen)) is not None:
-            chosen[role] = found
-    missing = [role for role in roles if role not in chosen]
-    left = [name for name in table.names if name not in chosen.values()]
-    if missing and len(table.names) == len(roles) == len(missing) + len(chosen) and len(left) == len(missing):
-        chosen.update(zip(missing, left, strict=True))
-    elif missing:
-        refuse_one_column(table)
-        what = f"{table.head}: no {table.noun} is called {' or '.join(map(repr, USUAL_NAMES[missing[0]][:2]))}"
-        raise DataError(f"{what}; {listing(table)}. Say which one is the {missing[0]} (option {missing[0]})")
-    if chosen["time"] == chosen["input"]:
-        raise DataError(f"{table.head}: {chosen['time']!r} cannot be both the time and the input")
+    chosen, _ = _choose(table, {"time": time, "input": input})
     unit = {role: split_header(name)[1] for role, name in chosen.items()}
-    t, u = table.numbers(chosen["time"]), table.numbers(chosen["input"])
-    if t.size == 1 and u.size > 1:
-        t = table.lone_interval(chosen["time"], float(t[0])) * np.arange(u.size, dtype=float)
-    table.require_as_many(chosen["time"], t, chosen["input"], u)
-    table.check_times(chosen["time"], t, unit["time"] or "s")
+    u, label = table.numbers(chosen["input"]), unit["time"] or "s"
+    t = table.check_times(chosen["time"], _instants(table, chosen["time"], label, chosen["input"], u, []), label)
     return MeasuredInput(HeldSignal(t, table.check_input(chosen["input"], u), hold), unit["time"], unit["input"])
