@@ -22,6 +22,7 @@ from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.journal import open_journal
 from ctid_cli.storage.journal_reader import FILE_NAME, Row, read_journal, row_digest
 from ctid_cli.storage.manifest import Key, Manifest, Slot, shard_of, slots
+from ctid_cli.storage.packing import CLOCKS, keys, results
 from ctid_cli.storage.provenance import canonical_text, now
 from ctid_cli.storage.store import read_sealed_alone, seal
 from ctid_cli.storage.stored import Stored
@@ -120,15 +121,17 @@ def _add_sealed(runs: Stored, found: Salvage) -> None:
         return
     numbers = {origin: number for number, origin in found.origins.items()}
     by_estimator = {estimator: origin for origin in runs.origins for estimator in origin.estimators}
-    for key, result in runs.results.items():
+    table, count = runs.table, runs.table.count
+    wall, cpu = ([None if time != time else time for time in table.read(clock).tolist()] for clock in CLOCKS)
+    stored = zip(keys(table, 0, count), results(table, 0, count), wall, cpu, strict=True)
+    for key, result, seconds, cpu_seconds in stored:
         origin = by_estimator.get(key.estimator_hash) or (runs.origins[0] if len(runs.origins) == 1 else None)
         if key in found.rows or origin is None:
             continue
         if origin not in numbers:
             numbers[origin] = max(numbers.values(), default=0) + 1
             found.origins[numbers[origin]] = origin
-        times = (runs.seconds.get(key), runs.cpu_seconds.get(key))
-        found.rows[key] = Row(key, canonical_json(result), "", *times, 0, numbers[origin])
+        found.rows[key] = Row(key, canonical_json(result), "", seconds, cpu_seconds, 0, numbers[origin])
 
 
 def repair(folder: Path, results: Path) -> Repair:

@@ -157,7 +157,7 @@ def read_stored(folder: Path) -> Stored:
         if stored is not None:
             return stored
         log.check()
-        return Stored.of(log.manifest(), *_planned(log))
+        return Stored(log.manifest(), *_planned(log))
 
 
 @contextmanager
@@ -203,7 +203,7 @@ def read_sealed_alone(folder: Path) -> Stored:
 
     runs = open_sealed(folder / SEALED)
     table = TimedTable(runs.table, folder / TIMINGS)
-    return Stored.of(runs.manifest, runs.origins, table)
+    return Stored(runs.manifest, runs.origins, table)
 
 
 def _read_sealed_beside(folder: Path, log: JournalReader) -> Stored | None:
@@ -223,7 +223,7 @@ def _read_sealed_beside(folder: Path, log: JournalReader) -> Stored | None:
     times = log.files().get(TIMINGS)
     if times is not None and _digest_of_times(folder) not in times:
         return None
-    return Stored.of(runs.manifest, runs.origins, TimedTable(runs.table, folder / TIMINGS))
+    return Stored(runs.manifest, runs.origins, TimedTable(runs.table, folder / TIMINGS))
 
 
 def _digest_of_times(folder: Path) -> str:
@@ -273,7 +273,7 @@ def find_estimate(results: Path, prefix: str) -> FoundEstimate:
             continue
         for number in first_with(stored.table, prefix):
             (name,) = decoded(stored.table.read("id", number, number + 1))
-            alone = Stored.of(stored.manifest, stored.origins, Window(stored.table, number, number + 1))
+            alone = Stored(stored.manifest, stored.origins, Window(stored.table, number, number + 1))
             matches.setdefault(name, FoundEstimate(folder, alone))
     if not matches:
         raise UsageError(f"no id in {results} begins with {prefix!r}{in_use}; 'ctid export' lists all ids")

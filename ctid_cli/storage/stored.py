@@ -6,7 +6,7 @@ However many they are: columns are arrays, read when they are asked for, and row
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, overload
@@ -17,8 +17,8 @@ from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.errors import StorageError
 from ctid_cli.storage import columns
 from ctid_cli.storage.identity import Origin, are_mixed
-from ctid_cli.storage.manifest import Key, Manifest, Slot, found_values, row_columns, slots, true_values
-from ctid_cli.storage.packing import CLOCKS, Packed, PackedTable, decoded, keys, results, unpacked
+from ctid_cli.storage.manifest import Key, Manifest, found_values, row_columns, true_values
+from ctid_cli.storage.packing import decoded, keys, results, unpacked
 from ctid_cli.storage.pieces import ROWS, AnyArray, Table, ranges
 from ctid_cli.storage.summary import judged
 
@@ -39,33 +39,21 @@ class Stored:
 
     manifest: Manifest
     origins: tuple[Origin, ...]
-    results: Mapping[Key, dict[str, Any]]
-    #: Time that each took [s], by key, and processor time.
-    seconds: Mapping[Key, float | None]
-    cpu_seconds: Mapping[Key, float | None] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, manifest: Manifest, origins: tuple[Origin, ...], table: Table) -> Stored:
-        """Those in a table, which is only read as far as is needed."""
-        return cls(manifest, origins, _InTable(table), *(_InTable(table, clock) for clock in CLOCKS))
+    #: The estimates in arrays, in the order of the sealed file, which are only read as far as is needed.
+    table: Table
 
     @property
     def mixed(self) -> bool:
         """Whether several versions of the code, or platforms, computed what is compared here."""
         return are_mixed(self.origins)
 
-    def slots(self) -> list[Slot]:
-        """Places of the stored estimates, in the order of the sealed file."""
-        return [slot for slot in slots(self.manifest) if slot.key in self.results]
-
     @cached_property
-    def table(self) -> Table:
-        """The estimates in arrays, in the order of the sealed file."""
-        if isinstance(self.results, _InTable):
-            return self.results.table
-        wall, cpu = self.seconds, self.cpu_seconds
-        rows = (Packed(s, self.results[s.key], wall.get(s.key), cpu.get(s.key)) for s in self.slots())
-        return PackedTable(self.manifest, rows)
+    def results(self) -> dict[Key, dict[str, Any]]:
+        """All results by key: for those who want all of them, which are not many then."""
+        found: dict[Key, dict[str, Any]] = {}
+        for start, stop in ranges(self.table.count):
+            found |= zip(keys(self.table, start, stop), results(self.table, start, stop), strict=True)
+        return found
 
     @cached_property
     def _read(self) -> dict[str, AnyArray]:
@@ -310,34 +298,6 @@ class Rows(Sequence[dict[str, Any]]):
                 ordered = {column.name: row[column.name] for column in row_columns(stored.manifest)}
                 judgement = None if converged is None else bool(converged[k])
                 yield ordered | swept | {"converged": judgement, "true_delay": truth}
-
-
-class _InTable(Mapping[Key, Any]):
-    """Results, or times, of a table by key: for those who want all of them, which are not many then."""
-
-    def __init__(self, table: Table, clock: str = "") -> None:
-        self.table, self._clock = table, clock
-
-    @cached_property
-    def _all(self) -> dict[Key, Any]:
-        found: dict[Key, Any] = {}
-        for start, stop in ranges(self.table.count):
-            if self._clock:
-                values = self.table.read(self._clock, start, stop).tolist()
-                rows: list[Any] = [None if value != value else value for value in values]
-            else:
-                rows = results(self.table, start, stop)
-            found |= zip(keys(self.table, start, stop), rows, strict=True)
-        return found
-
-    def __getitem__(self, key: Key) -> Any:
-        return self._all[key]
-
-    def __iter__(self) -> Iterator[Key]:
-        return iter(self._all)
-
-    def __len__(self) -> int:
-        return len(self._all)
 
 
 def first_with(table: Table, prefix: str) -> list[int]:

@@ -5,7 +5,7 @@ import pytest
 from ctid_cli.reporting.results import Results
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import Key
-from ctid_cli.storage.store import Stored
+from tests.storage.made_results import MadeResults
 
 
 def make_estimate(delay, status="CONVERGED", numerator=(8.0,), denominator=(1.0, 2.8, 4.0), **more):
@@ -106,8 +106,6 @@ def make_results(tmp_path):
             for (snr, start), values in found.items()
             for replicate, value in enumerate(values)
         }
-        seconds = dict.fromkeys(results, 0.02)
-        stored = Stored(manifest, tuple(Origin(str(k), "x", ()) for k in range(origins)), results, seconds)
-        return Results(tmp_path, stored)
+        return Results(tmp_path, MadeResults(manifest, results, tuple(Origin(str(k), "x", ()) for k in range(origins))))
 
     return make

@@ -6,9 +6,8 @@ from ctid_cli.reporting.expected_accuracy import long_record_variances
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
-from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import Key, true_values
-from ctid_cli.storage.store import Stored
+from tests.storage.made_results import MadeResults
 
 #: Two modes, two numbers of samples, and an estimator of each form.
 TWO_MODES = """\
@@ -64,7 +63,7 @@ def results_of(plan, found, folder):
             for replicate, value in enumerate(found.get((part.name, cell.source.sampling.samples), ())):
                 if value is not None:
                     results[Key(cell.hash, replicate, part.hash, start)] = value
-    return Results(folder, Stored(manifest, (Origin("c", "p", ()),), results, dict.fromkeys(results, 0.02)))
+    return Results(folder, MadeResults(manifest, results))
 
 
 def ideal_results(plan, folder, *, bias=None, width=None, seed=1):

@@ -9,9 +9,8 @@ from ctid_cli.reporting.tables import experiment_report
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.columns import failed
-from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import slots
-from ctid_cli.storage.store import Stored
+from tests.storage.made_results import MadeResults
 
 SPEC = """\
 experiment: made
@@ -59,8 +58,7 @@ def results(tmp_path):
             for slot in slots(manifest)
             if slot.key.replicate < len(values[slot.estimator["name"]])
         }
-        stored = Stored(manifest, (Origin("1", "x", ()),), found, dict.fromkeys(found, 0.25))
-        return Results(tmp_path, stored)
+        return Results(tmp_path, MadeResults(manifest, found, seconds=0.25))
 
     return make
 

@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from tests.reporting.ideal_results import TWO_MODES, estimate, ideal_results, plan_of, results_of
+from tests.storage.made_results import MadeResults
 
 NAMES = ("g1_a1", "g1_a2", "g1_b0", "g2_a1", "g2_a2", "g2_b0")
 TRUTH = np.array([0.25, 0.25, 3.0, 0.01, 0.025, 1.0])
@@ -228,7 +228,7 @@ def test_theory_is_found_for_results_of_an_earlier_version(plan, tmp_path):
         key._replace(data_hash=f"old {key.data_hash}", estimator_hash=f"old {key.estimator_hash}"): value
         for key, value in results.stored.results.items()
     }
-    older = Results(tmp_path, replace(results.stored, manifest=manifest, results=stored, seconds={}))
+    older = Results(tmp_path, MadeResults(manifest, stored))
     assert parameter_errors(parameter_estimates(older)) == before
     assert all(row.theory is not None for row in before)
 

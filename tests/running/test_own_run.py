@@ -93,8 +93,8 @@ def test_workers_run_it_failures_stay_alone_and_changed_code_is_not_mixed_in(fol
     assert capfd.readouterr().out == ""
     stored = read_stored(tmp_path / "out")
     results = {
-        (row["estimator"], row.get("mischief"), row["replicate"]): stored.results[slot.key]
-        for slot, row in zip(stored.slots(), stored.rows(), strict=True)
+        (row["estimator"], row.get("mischief"), row["replicate"]): result
+        for result, row in zip(stored.results.values(), stored.rows(), strict=True)
     }
     first = [job.cell.dataset(job.replicate).record.y[0] for job in jobs(plan)]
     bad = [k for k, y in enumerate(first) if y > 0]

@@ -73,7 +73,7 @@ def test_packing_and_reading_hold_few_estimates(monkeypatch: pytest.MonkeyPatch)
         return unpacked(table, column, start, stop)
 
     monkeypatch.setattr("ctid_cli.storage.stored.unpacked", counted)
-    assert sum(1 for _ in Stored.of(manifest, (ORIGIN,), table).every()) == 240
+    assert sum(1 for _ in Stored(manifest, (ORIGIN,), table).every()) == 240
     assert max(read) <= 7
 
 
@@ -81,14 +81,14 @@ def test_packing_and_reading_hold_few_estimates(monkeypatch: pytest.MonkeyPatch)
 def test_pieces_give_the_same_file_and_rows_as_all_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     manifest, in_pieces = filled(11)
     write_sealed(manifest, (ORIGIN,), in_pieces, tmp_path / "pieces.h5")
-    rows = Stored.of(manifest, (ORIGIN,), in_pieces).rows()
-    assert Stored.of(manifest, (ORIGIN,), open_sealed(tmp_path / "pieces.h5").table).every()[3]["id"] == rows[3]["id"]
+    rows = Stored(manifest, (ORIGIN,), in_pieces).rows()
+    assert Stored(manifest, (ORIGIN,), open_sealed(tmp_path / "pieces.h5").table).every()[3]["id"] == rows[3]["id"]
     for module in (pieces, packing):
         monkeypatch.setattr(module, "ROWS", 8192)
     _, at_once = filled(11)
     write_sealed(manifest, (ORIGIN,), at_once, tmp_path / "once.h5")
     assert (tmp_path / "pieces.h5").read_bytes() == (tmp_path / "once.h5").read_bytes()
-    assert Stored.of(manifest, (ORIGIN,), at_once).rows() == rows
+    assert Stored(manifest, (ORIGIN,), at_once).rows() == rows
     with h5py.File(tmp_path / "once.h5") as file:
         assert file["estimates/message"].dtype.itemsize == max(len(row["message"]) for row in rows)
 
@@ -99,7 +99,7 @@ def test_columns_at_some_places_are_those_of_the_whole(monkeypatch: pytest.Monke
     # Blocks have 22 or 11 rows: once that is many, once few.
     for rows in (7, 8192):
         monkeypatch.setattr("ctid_cli.storage.stored.ROWS", rows)
-        stored = Stored.of(manifest, (ORIGIN,), table)
+        stored = Stored(manifest, (ORIGIN,), table)
         for name in ("delay", "numerator", "status", "delay"):
             for some in places:
                 chosen = np.array(some)
@@ -109,9 +109,9 @@ def test_columns_at_some_places_are_those_of_the_whole(monkeypatch: pytest.Monke
 
 def test_a_row_alone_is_what_it_is_among_others() -> None:
     manifest, table = filled(11)
-    rows = Stored.of(manifest, (ORIGIN,), table).rows()
+    rows = Stored(manifest, (ORIGIN,), table).rows()
     for k in (0, 3, 64):
-        alone = Stored.of(manifest, (ORIGIN,), pieces.Window(table, k, k + 1))
+        alone = Stored(manifest, (ORIGIN,), pieces.Window(table, k, k + 1))
         assert alone.rows() == [rows[k]]
         assert alone.blocks[0].last == 1
 
@@ -147,7 +147,7 @@ def test_times_belong_to_ids_whatever_their_order(
 
 def test_found_values_are_those_of_single_rows() -> None:
     manifest, table = filled(11)
-    stored = Stored.of(manifest, (ORIGIN,), table)
+    stored = Stored(manifest, (ORIGIN,), table)
     names = ("a1", "b0", "b1", "delay")
     values, errors = stored.every().found(names)
     from ctid_cli.storage.manifest import found_values
