@@ -146,7 +146,6 @@ def run(
     the file, or for example --set limits.wall_seconds=600, ends single estimates that take too much.
     """
     from ctid_cli.running.engine import preview, run_experiment
-    from ctid_cli.running.shard_plan import shard_plan
     from ctid_cli.running.stopping import StopAt
     from ctid_cli.storage.shards import Shard
 
@@ -157,7 +156,7 @@ def run(
     folders = [out / plan.experiment for plan in plans]
     part = None if shard is None else Shard.read(shard)
     if part is not None:
-        plans, folders = [shard_plan(plan, part) for plan in plans], [out / part.folder(p.experiment) for p in plans]
+        plans, folders = [plan.part(part) for plan in plans], [out / part.folder(p.experiment) for p in plans]
     require_within(out, *folders)
     how: dict[str, Any] = {"fresh": fresh, "allow_mixed": allow_mixed, "retry": [kind.upper() for kind in retry or ()]}
     if dry_run:

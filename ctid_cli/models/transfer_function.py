@@ -84,6 +84,12 @@ class TransferFunction(ContinuousModel):
         return sorted_roots(self.numerator)
 
     @property
+    def parameters(self) -> dict[str, float]:
+        """Coefficients by name, without the 1 of the denominator: ``a1 …``, then ``b0 …``, in descending powers."""
+        found = {f"a{k}": float(value) for k, value in enumerate(self.denominator[1:], start=1)}
+        return found | {f"b{k}": float(value) for k, value in enumerate(self.numerator)}
+
+    @property
     def is_stable(self) -> bool:
         """Whether every pole lies strictly in the left half-plane."""
         return bool((self.poles.real < 0).all())

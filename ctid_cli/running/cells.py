@@ -6,7 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, overload
 
+from ctid_cli.errors import UsageError
 from ctid_cli.storage.manifest import Key, Manifest
+from ctid_cli.storage.shards import Shard
 
 if TYPE_CHECKING:
     from ctid_cli.models.additive import Term
@@ -89,6 +91,8 @@ class Plan:
     #: Number of data sets of each data cell.
     replicates: tuple[int, ...]
     spec_hash: str
+    #: Whose data sets are computed; None for all.
+    shard: Shard | None = None
 
     @property
     def experiment(self) -> str:
@@ -101,18 +105,19 @@ class Plan:
         return max(self.replicates)
 
     def tasks(self) -> list[Task]:
-        """The data sets."""
+        """The data sets, those of the shard if it is one."""
+        shard, cells = self.shard, len(self.data_cells)
         return [
             Task(cell, replicate)
             for replicate in range(self.runs)
             for cell, own in enumerate(self.replicates)
-            if replicate < own
+            if replicate < own and (shard is None or shard.has(cell, replicate, cells))
         ]
 
     @property
     def data_sets(self) -> int:
         """Number of data sets."""
-        return sum(self.replicates)
+        return sum(self.replicates) if self.shard is None else len(self.tasks())
 
     @property
     def estimates_each(self) -> int:
@@ -127,6 +132,17 @@ class Plan:
     def with_replicates(self, replicates: Sequence[int]) -> Plan:
         """The plan with other numbers of data sets."""
         return replace(self, replicates=tuple(replicates))
+
+    def part(self, shard: Shard) -> Plan:
+        """The part of the plan that one shard computes."""
+        section = self.spec.monte_carlo
+        if section is not None and section.until is not None:
+            raise UsageError(
+                f"{self.experiment}: monte_carlo.until decides on all data sets together, and no shard sees those of "
+                f"the others; give their number, for example --runs {section.most}. After the merge, ctid run without "
+                "--shard and --runs takes as many of them as the precision needs"
+            )
+        return replace(self, shard=shard)
 
     def keys(self, task: Task) -> list[tuple[Key, EstimatorCell, StartPoint]]:
         """The estimates wanted of a data set."""
@@ -180,6 +196,7 @@ class Plan:
                 for cell in self.estimators
             ],
             "starts": {start.label: start.initial_delay for start in self.starts},
+            **({} if self.shard is None else {"shard": [self.shard.number, self.shard.of]}),
         }
 
 

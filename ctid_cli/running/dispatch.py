@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+from ctid_cli.running.events import WorkerDied
 from ctid_cli.running.executor import Begun, Computed, Done, Executor, Hindered, Lost, Message
 from ctid_cli.running.job import Job
 from ctid_cli.running.job_order import JobQueue
@@ -30,14 +31,6 @@ PATIENCE = 4
 PAUSE, LONGEST_PAUSE = 0.2, 1.0
 #: An estimate that takes so long is mentioned, and again after twice the time [s].
 SLOW = 600.0
-
-
-@dataclass(frozen=True)
-class Died:
-    """A worker process died; what it was at is computed once more."""
-
-    estimates: int
-    reason: str
 
 
 @dataclass(frozen=True)
@@ -63,7 +56,7 @@ class Unable:
     reason: str
 
 
-Event = Computed | Died | GivenUp | Slow | Unable | None
+Event = Computed | WorkerDied | GivenUp | Slow | Unable | None
 
 
 def run_jobs(jobs: Iterable[Job], executor: Executor, stopping: Callable[[], bool]) -> Iterator[Event]:
@@ -174,7 +167,7 @@ class _Dispatch:
         if lost.cause == "chance":
             others = [*others, *blamed]
         elif lost.cause == "machine":
-            yield Died(len(blamed), lost.reason)
+            yield WorkerDied(len(blamed), lost.reason)
             yield from self._hinder(job, blamed, lost.reason)
         elif lost.cause == "crash":
             yield from self._suspect(job, blamed, lost.reason)
@@ -191,7 +184,7 @@ class _Dispatch:
             yield Computed(job, [Outcome(key, failed(message, "CRASHED"), None) for key in convicted])
         suspects = [key for key in blamed if key not in self._suspected]
         if suspects:
-            yield Died(len(suspects), reason)
+            yield WorkerDied(len(suspects), reason)
         self._suspected.update(suspects)
         self._alone.extend(_part(job, [key]) for key in suspects)
 

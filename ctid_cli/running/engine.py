@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 from ctid_cli.errors import DataError, MachineError, StorageError, UsageError
 from ctid_cli.running import events
 from ctid_cli.running.cell_precision import CellPrecision, as_needed, stored_precisions
-from ctid_cli.running.dispatch import Died, GivenUp, Slow, Unable, run_jobs
+from ctid_cli.running.dispatch import GivenUp, Slow, Unable, run_jobs
 from ctid_cli.running.executor import Computed, Executor
 from ctid_cli.running.hindrances import advice
 from ctid_cli.running.job import Job
@@ -271,11 +271,11 @@ class _Run:
                 if key.start in estimator["starts"] and key.replicate < cell["replicates"]:
                     yield Slot(key, cell, estimator)
 
-    def _note(self, item: Died | GivenUp | Slow | Unable, stopping: StopRequest) -> None:
+    def _note(self, item: events.WorkerDied | GivenUp | Slow | Unable, stopping: StopRequest) -> None:
         """Take note of what is not a result."""
         match item:
-            case Died():
-                self.on_event(events.WorkerDied(item.estimates, item.reason))
+            case events.WorkerDied():
+                self.on_event(item)
             case GivenUp():
                 self.given_up += len(item.keys)
                 self.hindrance = item.reason

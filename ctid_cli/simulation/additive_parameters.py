@@ -27,9 +27,7 @@ def additive_parameters(fit: Any, terms: Sequence[Term] | None) -> tuple[dict[st
             jacobian = factored_jacobian(fit.model, model)
     except (DataError, np.linalg.LinAlgError):
         return None, {}
-    a, b = fit.model.denominator, fit.model.numerator
-    coefficients = [f"a{k}" for k in range(1, a.size)] + [f"b{k}" for k in range(b.size)]
-    names = list(fit.parameter_names)
+    coefficients, names = list(fit.model.parameters), list(fit.parameter_names)
     errors = np.full(len(model.names), np.nan)
     # A leading zero is no coefficient of the model, though it is a parameter: the powers would not match.
     if set(names) - {"delay"} == set(coefficients):

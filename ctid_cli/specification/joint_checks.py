@@ -238,17 +238,8 @@ def _success_complaints(spec: Spec) -> Iterator[Complaint]:
         elif name == "delay_relative_error":
             if 0.0 in np.atleast_1d(spec.system.delay):
                 yield path, f"a relative error needs a true delay above zero; {other}"
-        elif zero := [key for key, value in _true_parameters(spec).items() if value == 0.0]:
+        elif zero := [key for key, value in variants(spec.system)[0].options.parameters.items() if value == 0.0]:
             yield path, f"a relative error needs true parameters other than zero, and {zero[0]} is zero; leave it out"
-
-
-def _true_parameters(spec: Spec) -> dict[str, float]:
-    """Parameters of one of ctid's systems by name, without its delay."""
-    model = variants(spec.system)[0].options
-    if isinstance(model, AdditiveModel):
-        return dict(zip(model.names, model.theta.tolist(), strict=True))
-    named = {f"b{k}": float(value) for k, value in enumerate(model.numerator)}
-    return named | {f"a{k}": float(value) for k, value in enumerate(model.denominator[1:], start=1)}
 
 
 def _truth_complaints(path: KeyPath, truth: Mapping[str, Any], rule: str) -> Iterator[Complaint]:

@@ -59,6 +59,8 @@ class Section(BaseModel):
     elsewhere: ClassVar[Mapping[str, str]] = {}
     #: Whether the option dataclass is one that the user wrote.
     own: ClassVar[bool] = False
+    #: What to say of a section that gives nothing; empty if it may.
+    if_empty: ClassVar[str] = ""
 
     @pydantic.model_serializer(mode="wrap")
     def _as_before(self, handler: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -117,7 +119,8 @@ class Section(BaseModel):
 
     def complaints(self) -> Iterator[Complaint]:
         """What is wrong with the section although every value, and the option dataclass if any, is right by itself."""
-        yield from ()
+        if self.if_empty and all(getattr(self, name) is None for name in type(self).model_fields):
+            yield (), self.if_empty
 
     def build(self) -> Any:
         """The options that the section describes, where nothing is swept."""

@@ -20,7 +20,6 @@ from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.signals.recorder import Recorder
 from ctid_cli.simulation.dataset import MeasuredSource, located
 from ctid_cli.specification.fields import LATER, MAX_WHOLE, Positive, Text, matching
-from ctid_cli.specification.limits_section import LimitsSection
 from ctid_cli.specification.loop_section import LoopSection
 from ctid_cli.specification.messages import Complaint, wrong
 from ctid_cli.specification.option_sections import EstimatorSection, ExcitationSection, NoiseSection
@@ -66,13 +65,10 @@ class UntilSection(Section):
         Largest half-width of the 95 % interval of every root mean square error, as a fraction of the error [-]
     """
 
+    if_empty = "give percent_half_width, rmse_relative or both; for example {rmse_relative: 0.05}"
+
     percent_half_width: Annotated[Positive | None, Field(lt=50.0)] = None
     rmse_relative: Annotated[Positive | None, Field(lt=1.0)] = None
-
-    def complaints(self) -> Iterator[Complaint]:
-        """Say that nothing is asked for."""
-        if self.percent_half_width is None and self.rmse_relative is None:
-            yield (), "give percent_half_width, rmse_relative or both; for example {rmse_relative: 0.05}"
 
 
 class MonteCarloSection(Section):
@@ -136,6 +132,11 @@ class SuccessSection(Section):
         Frequencies must settle so soon after the start and after their last step [s]
     """
 
+    if_empty = (
+        "give delay_relative_error, fit_percent, parameter_relative_error, band, by or several of them, or leave the "
+        "section out"
+    )
+
     delay_relative_error: Positive | None = None
     fit_percent: Annotated[float, Field(le=100.0, allow_inf_nan=False)] | None = None
     parameter_relative_error: Annotated[Positive | None, LATER] = None
@@ -143,11 +144,30 @@ class SuccessSection(Section):
     by: Annotated[Positive | None, LATER] = None
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say that nothing is asked for."""
-        if all(getattr(self, name) is None for name in type(self).model_fields):
-            yield (), f"give {', '.join(type(self).model_fields)} or several of them, or leave the section out"
+        """Say that nothing is asked for, or by when but not what."""
+        yield from super().complaints()
         if self.by is not None and self.band is None:
             yield ("by",), "is the time of settling into a band; add band [rad/s]"
+
+
+class LimitsSection(Section):
+    """What one estimate may take; what takes more is ended and counts as a failure of its estimator.
+
+    Parameters
+    ----------
+    cpu_seconds : float, optional
+        Most processor time of an estimate [s]; no limit by default
+    wall_seconds : float, optional
+        Most time of an estimate, asleep or at work [s]; no limit by default
+    memory_mb : float, optional
+        Most memory of an estimate beyond what its process held before [MB]; no limit by default
+    """
+
+    if_empty = "give cpu_seconds, wall_seconds, memory_mb or several of them; for example {wall_seconds: 600}"
+
+    cpu_seconds: Positive | None = None
+    wall_seconds: Positive | None = None
+    memory_mb: Positive | None = None
 
 
 class Spec(Section):

@@ -76,10 +76,7 @@ class StartsSection(Section):
         own
     """
 
+    if_empty = "give initial_delay, parameters or both, or leave the section out"
+
     initial_delay: Annotated[list[float | UniformStart], _DELAYS, _LISTED] | None = None
     parameters: Annotated[Annotated[list[RelativeStart | GivenStart], _PARAMETERS, _LISTED] | None, LATER] = None
-
-    def complaints(self) -> Iterator[Complaint]:
-        """Say that there is no start."""
-        if self.initial_delay is None and self.parameters is None:
-            yield (), "give initial_delay, parameters or both, or leave the section out"

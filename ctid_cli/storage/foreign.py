@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
 from ctid_cli.storage.manifest import Manifest
@@ -13,6 +13,8 @@ from ctid_cli.written_files import EXPERIMENT
 MAX_ESTIMATES = 100_000_000
 #: Letters of a name.
 MAX_NAME = 1000
+
+Check = Callable[[Any, str], Any]
 
 
 def read_json(text: str) -> Any:
@@ -26,53 +28,31 @@ def read_json(text: str) -> Any:
 
 def require_manifest(found: Any) -> Manifest:
     """The plan in a file, if it has the form of one; a ValueError says what has not."""
-    plan = _mapping(found, "the plan")
-    name = _text(plan, "experiment")
-    if not re.fullmatch(EXPERIMENT, name):
+    plan = _with_parts(found, "the plan", _PLAN)
+    if not re.fullmatch(EXPERIMENT, plan["experiment"]):
         raise ValueError("its experiment has a name that none may have")
-    _count(plan, "runs")
     if plan.get("seed") is not None:
-        _count(plan, "seed")
-    _text(plan, "spec_hash")
-    spec = _mapping(plan.get("spec"), "the specification")
+        _count(plan["seed"], "seed")
     _require_shard(plan.get("shard", [1, 1]))
     # A rule may be none, but it must be there.
-    _require_success(plan["success"])
-    _require_success(spec.get("success"))
-    starts = _mapping(plan.get("starts"), "the starts")
+    for rule in (plan["success"], plan["spec"].get("success")):
+        _require_success(rule)
+    starts = plan["starts"]
     if not all(start is None or isinstance(start, str) or _is_number(start) for start in starts.values()):
         raise ValueError("a start is no number")
-    cells, estimators = _parts(plan, "data_cells"), _parts(plan, "estimators")
-    for cell in cells:
-        _require_cell(cell)
-    for estimator in estimators:
-        _require_estimator(estimator, starts)
-    total = sum(cell["replicates"] for cell in cells) * sum(len(item["starts"]) for item in estimators)
+    for cell in _listed(plan, "data_cells", _CELL):
+        if cell["content"].get("system") is not None:
+            _mapping(cell["content"]["system"], "the system")
+    for estimator in _listed(plan, "estimators", _ESTIMATOR):
+        wanted = estimator.get("starts")
+        if not (isinstance(wanted, list) and wanted and all(isinstance(start, str) for start in wanted)):
+            raise ValueError("an estimator has no starts")
+        if not set(wanted) <= set(starts):
+            raise ValueError("a start is not described")
+    total = sum(cell["replicates"] for cell in plan["data_cells"]) * sum(len(e["starts"]) for e in plan["estimators"])
     if total > MAX_ESTIMATES:
         raise ValueError(f"{total} planned estimates are too many")
     return plan
-
-
-def _require_cell(cell: Mapping[str, Any]) -> None:
-    _text(cell, "hash")
-    _count(cell, "replicates")
-    _mapping(cell.get("swept"), "what is swept")
-    content = _mapping(cell.get("content"), "a data cell")
-    system = content.get("system")
-    if system is not None:
-        _mapping(system, "the system")
-
-
-def _require_estimator(estimator: Mapping[str, Any], starts: Mapping[str, Any]) -> None:
-    for key in ("name", "kind", "hash"):
-        _text(estimator, key)
-    _mapping(estimator.get("swept"), "what is swept")
-    _mapping(estimator.get("content"), "an estimator")
-    wanted = estimator.get("starts")
-    if not (isinstance(wanted, list) and wanted and all(isinstance(start, str) for start in wanted)):
-        raise ValueError("an estimator has no starts")
-    if not set(wanted) <= set(starts):
-        raise ValueError("a start is not described")
 
 
 def _require_shard(shard: Any) -> None:
@@ -87,11 +67,18 @@ def _require_success(rule: Any) -> None:
         raise ValueError("the success rule holds something else than numbers")
 
 
-def _parts(plan: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
-    parts = plan.get(key)
-    if not isinstance(parts, list) or not parts:
-        raise ValueError(f"there are no {key.replace('_', ' ')}")
-    return [_mapping(part, key.replace("_", " ")) for part in parts]
+def _listed(plan: Mapping[str, Any], key: str, parts: Mapping[str, Check]) -> list[dict[str, Any]]:
+    found, what = plan.get(key), key.replace("_", " ")
+    if not isinstance(found, list) or not found:
+        raise ValueError(f"there are no {what}")
+    return [_with_parts(part, what, parts) for part in found]
+
+
+def _with_parts(value: Any, what: str, parts: Mapping[str, Check]) -> dict[str, Any]:
+    found = _mapping(value, what)
+    for key, check in parts.items():
+        check(found.get(key), key)
+    return found
 
 
 def _mapping(value: Any, what: str) -> dict[str, Any]:
@@ -100,18 +87,21 @@ def _mapping(value: Any, what: str) -> dict[str, Any]:
     return value
 
 
-def _text(part: Mapping[str, Any], key: str) -> str:
-    value = part.get(key)
+def _text(value: Any, what: str) -> None:
     if not isinstance(value, str) or not 0 < len(value) <= MAX_NAME:
-        raise ValueError(f"{key} is no text")
-    return value
+        raise ValueError(f"{what} is no text")
 
 
-def _count(part: Mapping[str, Any], key: str) -> None:
-    value = part.get(key)
+def _count(value: Any, what: str) -> None:
     if type(value) is not int or not 0 <= value < 2**63:
-        raise ValueError(f"{key} is no whole number")
+        raise ValueError(f"{what} is no whole number")
 
 
 def _is_number(value: Any) -> bool:
     return type(value) in (int, float) and math.isfinite(value)
+
+
+#: What every plan, data cell and estimator has.
+_PLAN = {"experiment": _text, "runs": _count, "spec_hash": _text, "spec": _mapping, "starts": _mapping}
+_CELL = {"hash": _text, "replicates": _count, "swept": _mapping, "content": _mapping}
+_ESTIMATOR = {"name": _text, "kind": _text, "hash": _text, "swept": _mapping, "content": _mapping}

@@ -168,9 +168,7 @@ def true_values(cell: Mapping[str, Any]) -> dict[str, float]:
     if "additive" in system:
         values = AdditiveModel([Submodel(**item) for item in system["additive"]]).sorted().parameters
     elif "denominator" in system:
-        model = TransferFunction(system["numerator"], system["denominator"])
-        values = {f"a{k}": float(value) for k, value in enumerate(model.denominator[1:], start=1)}
-        values |= {f"b{k}": float(value) for k, value in enumerate(model.numerator)}
+        values = TransferFunction(system["numerator"], system["denominator"]).parameters
     else:
         return dict(system.get("truth") or {})
     return values | {"delay": float(system.get("delay") or 0.0)}

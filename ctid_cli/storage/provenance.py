@@ -3,8 +3,10 @@
 import json
 import os
 import platform
+import subprocess
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -59,23 +61,10 @@ def public_sessions(folder: Path) -> list[dict[str, Any]]:
 
 
 def git_commit(root: Path) -> str | None:
-    """Commit of a checkout, read without git, which need not be installed."""
-    try:
-        folder = root / ".git"
-        if folder.is_file():
-            folder = (root / folder.read_text(encoding="utf-8").removeprefix("gitdir:").strip()).resolve()
-        head = (folder / "HEAD").read_text(encoding="utf-8").strip()
-        if not head.startswith("ref: "):
-            return head
-        name = head.removeprefix("ref: ")
-        shared = folder / "commondir"
-        common = (folder / shared.read_text(encoding="utf-8").strip()).resolve() if shared.exists() else folder
-        for place in (folder, common):
-            if (place / name).exists():
-                return (place / name).read_text(encoding="utf-8").strip()
-        for line in (common / "packed-refs").read_text(encoding="utf-8").splitlines():
-            if line.endswith(f" {name}"):
-                return line.split()[0]
-    except (OSError, UnicodeError):
-        pass
+    """Commit of a checkout; None where there is none, or no git."""
+    # An installed package may lie in a folder of some other repository.
+    if (root / ".git").exists():
+        with suppress(OSError, subprocess.CalledProcessError):
+            asked = ["git", "-C", str(root), "rev-parse", "HEAD"]
+            return subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
     return None

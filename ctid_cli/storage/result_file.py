@@ -12,6 +12,7 @@ from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError
 from ctid_cli.signals.files import require_file
 from ctid_cli.simulation.dataset import file_sha256
+from ctid_cli.storage.foreign import read_json
 
 #: Bytes of the largest file that is read; ten thousand draws of a bootstrap need less.
 MAX_BYTES = 200_000_000
@@ -96,7 +97,7 @@ def _json_of(file: str, kind: ResultKind) -> Any:
     if (size := os.stat(file).st_size) > MAX_BYTES:
         raise DataError(f"{file}: {size} bytes are too many for a {kind.noun}; at most {MAX_BYTES} are read")
     try:
-        return json.loads(Path(file).read_text(encoding="utf-8"), parse_constant=_no_constant)
+        return read_json(Path(file).read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"{file}: the file cannot be read: {error.strerror or error}") from None
     except (ValueError, RecursionError) as error:
@@ -117,10 +118,6 @@ def require(what: str, right: bool) -> None:
 def refuse(file: str, kind: ResultKind, what: str) -> NoReturn:
     """Say what is wrong with a file, and what writes such files."""
     raise DataError(f"{file} {what}; {kind.command} writes such a file")
-
-
-def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no JSON number")
 
 
 def _what_else(content: Any, kind: ResultKind) -> str:

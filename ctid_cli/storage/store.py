@@ -43,6 +43,8 @@ from ctid_cli.written_files import replace_file
 if TYPE_CHECKING:
     import pandas as pd
 
+    from ctid_cli.storage.sealed import OpenSealed
+
 #: A data cell and an estimator by their hashes.
 Part = tuple[str, str]
 
@@ -132,18 +134,11 @@ def seal(folder: Path, log: Journal) -> tuple[int, str]:
 
 def _sealed_before(folder: Path, log: JournalReader) -> tuple[int, str] | None:
     """What the journal was sealed to, if it and its times are there as they were written and nothing came after."""
-    from ctid_cli.storage.sealed import open_sealed
-
-    if log.sealed() is None:
-        return None
-    try:
-        # Its bytes have a checksum of their own.
-        runs = open_sealed(folder / SEALED)
-    except CtidError:
-        return None
-    times = log.files().get(TIMINGS)
-    known = times is not None and _digest_of_times(folder) in times
-    return (runs.table.count, runs.checksum) if runs.has_head and known and runs.checksum == log.sealed() else None
+    with suppress(CtidError):
+        runs = _sealed_beside(folder, log)
+        if runs is not None and runs.has_head and TIMINGS in log.files():
+            return runs.table.count, runs.checksum
+    return None
 
 
 def read_stored(folder: Path) -> Stored:
@@ -153,9 +148,8 @@ def read_stored(folder: Path) -> Stored:
             return read_sealed_alone(folder)
         if not log.is_large:
             log.check()
-        stored = _read_sealed_beside(folder, log)
-        if stored is not None:
-            return stored
+        if runs := _sealed_beside(folder, log):
+            return _timed(runs, folder)
         log.check()
         return Stored(log.manifest(), *_planned(log))
 
@@ -201,12 +195,14 @@ def read_sealed_alone(folder: Path) -> Stored:
     """The estimates in the sealed file, whatever else there is."""
     from ctid_cli.storage.sealed import open_sealed
 
-    runs = open_sealed(folder / SEALED)
-    table = TimedTable(runs.table, folder / TIMINGS)
-    return Stored(runs.manifest, runs.origins, table)
+    return _timed(open_sealed(folder / SEALED), folder)
 
 
-def _read_sealed_beside(folder: Path, log: JournalReader) -> Stored | None:
+def _timed(runs: OpenSealed, folder: Path) -> Stored:
+    return Stored(runs.manifest, runs.origins, TimedTable(runs.table, folder / TIMINGS))
+
+
+def _sealed_beside(folder: Path, log: JournalReader) -> OpenSealed | None:
     """The sealed file of a journal, if that was sealed to it, and its times are what was written."""
     from ctid_cli.storage.sealed import open_sealed
 
@@ -220,18 +216,10 @@ def _read_sealed_beside(folder: Path, log: JournalReader) -> Stored | None:
     # Another file, however intact, is not what this journal was sealed to.
     if runs.checksum != log.sealed():
         return None
-    times = log.files().get(TIMINGS)
-    if times is not None and _digest_of_times(folder) not in times:
-        return None
-    return Stored(runs.manifest, runs.origins, TimedTable(runs.table, folder / TIMINGS))
-
-
-def _digest_of_times(folder: Path) -> str:
-    try:
-        with (folder / TIMINGS).open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError:
-        return ""
+    noted, digest = log.files().get(TIMINGS), ""
+    with suppress(OSError), (folder / TIMINGS).open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return runs if noted is None or digest in noted else None
 
 
 def load_estimates(folder: Path) -> pd.DataFrame:
@@ -299,8 +287,8 @@ def experiment_status(folder: Path) -> ExperimentStatus:
                 return _status(folder, stored.manifest, *_counted(stored), None, stored.mixed, None)
             log.check()
             manifest, running = log.manifest(), _running(folder) if log.live else None
-            sealed = _read_sealed_beside(folder, log)
-            if sealed is not None:
+            if runs := _sealed_beside(folder, log):
+                sealed = _timed(runs, folder)
                 distinct = len(np.unique(sealed.column("id"))) if shares_estimates(manifest) else sealed.table.count
                 done, failed, aside = *_counted(sealed), log.count() - distinct
             else:

@@ -193,7 +193,9 @@ class FakePlan:
     """Same surface as the real plan: cells of several noise levels, estimators, starts, runs."""
 
     terms = None
+    shard: Shard | None = None
     manifest, runs, tasks, distinct_each = Plan.manifest, Plan.runs, Plan.tasks, Plan.distinct_each
+    data_sets = Plan.data_sets
 
     def __init__(
         self,
@@ -228,10 +230,6 @@ class FakePlan:
         self.spec_hash = content_hash(content)
         self.spec = FakeSpec(content | ({"limits": limits} if limits else {}), text)
 
-    @property
-    def data_sets(self) -> int:
-        return len(self.tasks())
-
     def with_replicates(self, replicates: Sequence[int]) -> FakePlan:
         other = copy(self)
         other.replicates = tuple(replicates)
@@ -239,10 +237,8 @@ class FakePlan:
 
     def part(self, number: int, of: int) -> FakePlan:
         """One of several shards."""
-        other, shard, cells = copy(self), Shard(number, of), len(self.data_cells)
-        tasks = [task for task in self.tasks() if shard.has(task.cell, task.replicate, cells)]
-        other.tasks = lambda: tasks  # type: ignore[method-assign]
-        other.manifest = lambda: self.manifest() | {"shard": [number, of]}  # type: ignore[method-assign]
+        other = copy(self)
+        other.shard = Shard(number, of)
         return other
 
     def keys(self, task: Task) -> list[tuple[Key, FakeEstimatorCell, FakeStartPoint]]:

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from ctid_cli.running import dispatch
-from ctid_cli.running.dispatch import Died, GivenUp, Slow, Unable, run_jobs
+from ctid_cli.running.dispatch import GivenUp, Slow, Unable, run_jobs
+from ctid_cli.running.events import WorkerDied
 from ctid_cli.running.executor import Begun, Computed, Done, Hindered, Lost, Message
 from ctid_cli.running.job import Job
 from ctid_cli.running.retry import Stock
@@ -97,7 +98,7 @@ def test_a_death_counts_when_it_comes_again_alone() -> None:
     found, others = run(executor)
     assert found.keys() == EVERY
     assert {key for key, status in found.items() if status} == {"r0_u"}
-    assert others == [Died(1, "why")] * 2
+    assert others == [WorkerDied(1, "why")] * 2
     assert (["r0_u"], True) in [(starts, alone) for starts, alone, _ in executor.taken]
     assert all(len(starts) == 1 for starts, alone, _ in executor.taken if alone)
 

@@ -18,7 +18,6 @@ from ctid_cli.errors import DamageError, RefusedError, UsageError
 from ctid_cli.reporting.overview import overview_text, status_text
 from ctid_cli.running.engine import preview, run_experiment
 from ctid_cli.running.plan import build_plan
-from ctid_cli.running.shard_plan import shard_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.columns import failed
 from ctid_cli.storage.journal_reader import read_journal
@@ -236,7 +235,7 @@ def test_a_killed_shard_goes_on_and_merges(tmp_path: Path) -> None:
 def test_shards_of_a_plan_are_its_data_sets(tmp_path: Path) -> None:
     (tmp_path / "spec.yaml").write_text(SPEC, encoding="utf-8")
     full = build_plan(load_spec(tmp_path / "spec.yaml"))
-    shards = [shard_plan(full, Shard(number, 3)) for number in (1, 2, 3)]
+    shards = [full.part(Shard(number, 3)) for number in (1, 2, 3)]
     dealt = [{key for task in shard.tasks() for key, _, _ in shard.keys(task)} for shard in shards]
     assert [{slot.key for slot in slots(shard.manifest())} for shard in shards] == dealt
     assert set().union(*dealt) == {slot.key for slot in slots(full.manifest())}
@@ -248,5 +247,5 @@ def test_a_precision_cannot_be_reached_by_shards(tmp_path: Path) -> None:
     (tmp_path / "spec.yaml").write_text(text, encoding="utf-8")
     spec = load_spec(tmp_path / "spec.yaml")
     with pytest.raises(UsageError, match=r"decides on all data sets together.* --runs 400"):
-        shard_plan(build_plan(spec), Shard(1, 3))
-    assert len(shard_plan(build_plan(spec, runs=6), Shard(1, 3)).tasks()) == 4
+        build_plan(spec).part(Shard(1, 3))
+    assert len(build_plan(spec, runs=6).part(Shard(1, 3)).tasks()) == 4

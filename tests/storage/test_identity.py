@@ -203,23 +203,14 @@ def test_numeric_platform_follows_the_kernels_in_use() -> None:
         assert "unknown" not in here
 
 
-def test_commit_is_read_without_git(tmp_path: Path) -> None:
-    commit = "0123456789abcdef0123456789abcdef01234567"
+def test_the_commit_is_that_of_the_checkout_itself(tmp_path: Path) -> None:
     assert git_commit(tmp_path) is None
-    git = tmp_path / ".git"
-    (git / "refs" / "heads").mkdir(parents=True)
-    (git / "HEAD").write_text("ref: refs/heads/main\n")
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=one", "-c", "user.email=one@example.org"]
+    subprocess.run([*git, "init", "-q"], check=True)
     assert git_commit(tmp_path) is None
-    (git / "packed-refs").write_text(f"# pack-refs\n{commit} refs/heads/main\n")
-    assert git_commit(tmp_path) == commit
-    (git / "refs" / "heads" / "main").write_text("f" * 40 + "\n")
-    assert git_commit(tmp_path) == "f" * 40
-    (git / "HEAD").write_text(commit + "\n")
-    assert git_commit(tmp_path) == commit
-    tree = tmp_path / "worktree"
-    (git / "worktrees" / "w").mkdir(parents=True)
-    (git / "worktrees" / "w" / "HEAD").write_text("ref: refs/heads/main\n")
-    (git / "worktrees" / "w" / "commondir").write_text("../..\n")
-    tree.mkdir()
-    (tree / ".git").write_text(f"gitdir: {git / 'worktrees' / 'w'}\n")
-    assert git_commit(tree) == "f" * 40
+    subprocess.run([*git, "commit", "-q", "--allow-empty", "-m", "first"], check=True)
+    found = subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True)
+    assert git_commit(tmp_path) == found.stdout.strip()
+    # A folder in it is no checkout, and one without git tells nothing.
+    (tmp_path / "inside").mkdir()
+    assert git_commit(tmp_path / "inside") is None
