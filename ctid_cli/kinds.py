@@ -6,6 +6,13 @@ Names lead to classes of every floor, so that nothing is imported before it is a
 import importlib
 from typing import Any
 
+_NOISES = {
+    "white": "ctid_cli.signals.noise:WhiteNoise",
+    "arma": "ctid_cli.signals.noise:ArmaNoise",
+    "random_walk": "ctid_cli.signals.drifts:RandomWalk",
+    "one_over_f": "ctid_cli.signals.drifts:OneOverFNoise",
+    "outliers": "ctid_cli.signals.noise:OutlierNoise",
+}
 #: Section, or what stands in it, to the kinds that it may have, to where the class of each is: ``module:Class``.
 KINDS: dict[str, dict[str, str]] = {
     "excitation": {
@@ -28,21 +35,11 @@ KINDS: dict[str, dict[str, str]] = {
         "poisson": "ctid_cli.signals.irregular:PoissonSampling",
         "send_on_delta": "ctid_cli.signals.send_on_delta:SendOnDelta",
     },
-    "noise": {
-        "white": "ctid_cli.signals.noise:WhiteNoise",
-        "arma": "ctid_cli.signals.noise:ArmaNoise",
-        "random_walk": "ctid_cli.signals.drifts:RandomWalk",
-        "one_over_f": "ctid_cli.signals.drifts:OneOverFNoise",
-        "outliers": "ctid_cli.signals.noise:OutlierNoise",
-    },
+    "noise": _NOISES,
     "disturbance": {
         "uniform": "ctid_cli.signals.sinusoids:UniformDisturbance",
         "sine": "ctid_cli.signals.sinusoids:SineDisturbance",
-        "white": "ctid_cli.signals.noise:WhiteNoise",
-        "arma": "ctid_cli.signals.noise:ArmaNoise",
-        "random_walk": "ctid_cli.signals.drifts:RandomWalk",
-        "one_over_f": "ctid_cli.signals.drifts:OneOverFNoise",
-        "outliers": "ctid_cli.signals.noise:OutlierNoise",
+        **_NOISES,
     },
     "estimator": {
         "svf": "ctid_cli.estimators.svf:Svf",

@@ -141,6 +141,15 @@ class OwnNoise(Noise):
 
 
 @dataclass(frozen=True)
+class OwnClockedNoise(OwnNoise):
+    """A noise of one's own that asks for the instants of the samples."""
+
+    def generate_at(self, times: Array, noise_free: Array, rng: np.random.Generator) -> Array:
+        """What is added to the output."""
+        return _samples(self.options, "generate", (noise_free, times, rng), noise_free.size, missing=True)
+
+
+@dataclass(frozen=True)
 class OwnSystem:
     """A system of one's own, linear or not."""
 

@@ -12,8 +12,14 @@ from pydantic import PlainValidator, WithJsonSchema
 from ctid_cli.errors import CtidError
 from ctid_cli.kinds import KINDS
 from ctid_cli.own_code import OwnCodeError, find_class, find_entry_point, reason
-from ctid_cli.simulation.own_clocked_noise import OwnClockedNoise
-from ctid_cli.simulation.own_components import OwnEstimation, OwnExcitation, OwnNoise, OwnSampling, OwnSystem
+from ctid_cli.simulation.own_components import (
+    OwnClockedNoise,
+    OwnEstimation,
+    OwnExcitation,
+    OwnNoise,
+    OwnSampling,
+    OwnSystem,
+)
 from ctid_cli.specification.fields import ByShape, Number, Text
 from ctid_cli.specification.messages import Complaint, several_wrong
 from ctid_cli.specification.sections import RefusedOptionsError, Section, section_for, variants

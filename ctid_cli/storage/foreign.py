@@ -21,7 +21,7 @@ def read_json(text: str) -> Any:
     """JSON without the numbers that it has no words for."""
 
     def refuse(constant: str) -> NoReturn:
-        raise ValueError(f"{constant} is no number of JSON")
+        raise ValueError(f"{constant} is no JSON number")
 
     return json.loads(text, parse_constant=refuse)
 
