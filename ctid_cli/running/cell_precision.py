@@ -5,7 +5,6 @@ run that was interrupted, or that has other workers, decides the same; so does o
 needs, of an earlier plan.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import count, takewhile
@@ -64,7 +63,7 @@ def stored_precisions(manifest: Manifest, log: JournalReader) -> tuple[CellPreci
     """The same from what a journal holds."""
     if _asked(manifest) is None:
         return ()
-    return cell_precisions(manifest, {row.key: json.loads(row.result) for row in log.rows()})
+    return cell_precisions(manifest, {row.key: row.content for row in log.rows()})
 
 
 def as_needed(plan: Plan, log: JournalReader) -> Plan:

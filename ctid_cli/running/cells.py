@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any
 
 from ctid_cli.errors import UsageError
 from ctid_cli.storage.manifest import Key, Manifest
@@ -47,13 +47,7 @@ class DataCells(Sequence[DataCell]):
     def __len__(self) -> int:
         return len(self._made)
 
-    @overload
-    def __getitem__(self, item: int) -> DataCell: ...
-    @overload
-    def __getitem__(self, item: slice) -> list[DataCell]: ...
-    def __getitem__(self, item: int | slice) -> DataCell | list[DataCell]:
-        if isinstance(item, slice):
-            return [self[k] for k in range(*item.indices(len(self)))]
+    def __getitem__(self, item: int) -> DataCell:  # type: ignore[override]  # nobody takes a part of them
         found = self._made[item]
         if found is None:
             found = self._made[item] = self._make(item % len(self))
@@ -98,6 +92,11 @@ class Plan:
     def experiment(self) -> str:
         """Name of the experiment."""
         return self.spec.experiment
+
+    @property
+    def monte_carlo(self) -> Mapping[str, Any]:
+        """The section on the number of data sets and their seed; empty where nothing is random."""
+        return self.spec.canonical().get("monte_carlo") or {}
 
     @property
     def runs(self) -> int:
@@ -176,7 +175,7 @@ class Plan:
         return {
             "experiment": self.experiment,
             "runs": self.runs,
-            "seed": (canonical.get("monte_carlo") or {}).get("seed"),
+            "seed": self.monte_carlo.get("seed"),
             "spec_hash": self.spec_hash,
             "spec": canonical,
             "success": canonical.get("success"),

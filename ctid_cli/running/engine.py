@@ -362,7 +362,7 @@ def preview(
         return _ready(needed, folder, found.stock)
     # Of a million data sets, counting is quicker than naming.
     counts = (needed.data_sets, needed.data_sets * needed.distinct_each, 0, 0)
-    return events.PlanReady(plan.experiment, folder, *counts, at_most=_monte_carlo(plan).get("at_most"))
+    return events.PlanReady(plan.experiment, folder, *counts, at_most=plan.monte_carlo.get("at_most"))
 
 
 def _ready(plan: Plan, folder: Path, stock: Stock) -> events.PlanReady:
@@ -371,7 +371,7 @@ def _ready(plan: Plan, folder: Path, stock: Stock) -> events.PlanReady:
     stored, again = planned.count_in(stock.keys), planned.count_in(stock.again)
     reused = stored - again
     counts = (Todo(plan, stock).data_sets, len(planned) - reused, reused, len(stock.keys) - stored)
-    at_most = _monte_carlo(plan).get("at_most")
+    at_most = plan.monte_carlo.get("at_most")
     return events.PlanReady(plan.experiment, folder, *counts, at_most=at_most, again=again)
 
 
@@ -404,10 +404,6 @@ def _look(
                 return _Found(plan, Stock())
             stock = take_stock(log, retry, Limits.of(plan.spec.canonical()))
             return _Found(as_needed(plan, log), stock, log.state())
-
-
-def _monte_carlo(plan: Plan) -> dict[str, Any]:
-    return plan.spec.canonical().get("monte_carlo") or {}
 
 
 def _check_first_records(todo: Todo) -> None:

@@ -67,8 +67,7 @@ def check_components(
     makes_data = bool(_parts(cell.source))
     if not wanted and not makes_data:
         return False
-    seed = (plan.spec.canonical().get("monte_carlo") or {}).get("seed")
-    job = Job(cell, task.replicate, seed, tuple(wanted), plan.terms)
+    job = Job(cell, task.replicate, plan.monte_carlo.get("seed"), tuple(wanted), plan.terms)
     found: Look = in_worker(look, job, limits=limits or Limits(), stopping=stopping) or Look()
     if found.wrong:
         raise SpecError([plan.spec.problem(path, message) for path, message in found.wrong])

@@ -39,8 +39,7 @@ class Todo:
     def jobs(self) -> Iterator[Job]:
         """Their jobs."""
         plan = self._plan
-        seed = (plan.spec.canonical().get("monte_carlo") or {}).get("seed")
-        terms = plan.terms
+        seed, terms = plan.monte_carlo.get("seed"), plan.terms
         for task in plan.tasks():
             if not self._missing[task.cell][task.replicate]:
                 continue

@@ -1,7 +1,7 @@
 """The section for what closes a loop around the system."""
 
 from collections.abc import Iterator
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.pid import ContinuousPid
@@ -40,8 +40,20 @@ class PidSection(Section):
     ki: _Gain = 0.0
     kd: _Gain = 0.0
 
+    def build(self) -> DiscreteController:
+        """The controller."""
+        return DiscreteController.from_pid(**self.model_dump())
 
-class PidControllerSection(Section):
+
+class ControllerSection(Section):
+    """A controller in the form of its one key."""
+
+    def build(self) -> Any:
+        """The controller."""
+        return self.part(*type(self).model_fields)
+
+
+class PidControllerSection(ControllerSection):
     """A discrete-time controller by its gains per sample.
 
     Parameters
@@ -55,12 +67,8 @@ class PidControllerSection(Section):
 
     pid: PidSection
 
-    def build(self) -> DiscreteController:
-        """The controller."""
-        return DiscreteController.from_pid(**self.pid.model_dump())
 
-
-class ContinuousPidControllerSection(Section):
+class ContinuousPidControllerSection(ControllerSection):
     """A controller by its gains in continuous time, which do not depend on the sampling interval.
 
     Parameters
@@ -74,13 +82,8 @@ class ContinuousPidControllerSection(Section):
 
     continuous_pid: Annotated[Section, Options(ContinuousPid)]
 
-    def build(self) -> ContinuousPid:
-        """The controller."""
-        found: ContinuousPid = self.part("continuous_pid")
-        return found
 
-
-class RelayControllerSection(Section):
+class RelayControllerSection(ControllerSection):
     """A relay, which makes the loop oscillate by itself.
 
     Parameters
@@ -93,11 +96,6 @@ class RelayControllerSection(Section):
     elsewhere = _other_forms("relay")
 
     relay: Annotated[Section, Options(Relay)]
-
-    def build(self) -> Relay:
-        """The controller."""
-        found: Relay = self.part("relay")
-        return found
 
 
 _OfCoefficients = section_for(DiscreteController)

@@ -93,7 +93,7 @@ class Journal(JournalReader):
         """Note that a run begins, and where the estimates of each estimator will come from."""
         with self._transaction():
             self._replan(manifest)
-            known = {origin: number for number, origin in self._known_origins().items()}
+            known = {origin: number for number, origin in self.known_origins().items()}
             for estimator, origin in origins.items():
                 if origin not in known:
                     number = known[origin] = self._next("origins")

@@ -64,6 +64,12 @@ class Row(NamedTuple):
             return True
         return self.checksum == _text_digest("\n".join([*map(str, self.key), self.result]))
 
+    @property
+    def content(self) -> dict[str, Any]:
+        """Its result; as a text it takes a fifth of the memory."""
+        found: dict[str, Any] = json.loads(self.result)
+        return found
+
     def digest(self) -> str:
         """Checksum of all of it."""
         return row_digest("estimates", *self.key, self.result, *self[3:])
@@ -94,25 +100,6 @@ class Tally:
 
     def __str__(self) -> str:
         return f"{self.count} {self.mark:032x}"
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """A stored estimate."""
-
-    #: Its result as JSON, which takes a fifth of the memory.
-    text: str
-    #: Time it took, and processor time [s].
-    seconds: float | None
-    cpu_seconds: float | None
-    session: int
-    origin: Origin
-
-    @property
-    def result(self) -> dict[str, Any]:
-        """Its result."""
-        found: dict[str, Any] = json.loads(self.text)
-        return found
 
 
 class JournalReader:
@@ -149,7 +136,7 @@ class JournalReader:
 
     def made(self) -> set[tuple[str, str, Origin]]:
         """Data cells and estimators of the stored estimates, and where these come from."""
-        known = self._known_origins()
+        known = self.known_origins()
         rows = self._rows(f"SELECT DISTINCT data_hash, estimator_hash, origin FROM {self._estimates}")
         return {(data, estimator, known[origin]) for data, estimator, origin in rows}
 
@@ -157,7 +144,8 @@ class JournalReader:
     def _estimates(self) -> str:
         return "estimates" if self._format > 1 else _WITH_RUNS
 
-    def _known_origins(self) -> dict[int, Origin]:
+    def known_origins(self) -> dict[int, Origin]:
+        """Where estimates may come from, by number."""
         rows = self._checked("origins", "number, code_version, platform, packages")
         with self._guard():
             return {number: Origin.of(code, machine, json.loads(packages)) for number, code, machine, packages in rows}
@@ -175,21 +163,22 @@ class JournalReader:
         self._require_count(len(found))
         return found
 
-    def entries(self) -> dict[Key, Entry]:
-        """Every stored estimate."""
-        origins = self._known_origins()
+    def entries(self) -> dict[Key, Row]:
+        """Every stored estimate, for many of them without checksums, and with keys whose texts are those of others."""
+        known = self.known_origins()
         with self._guard():
-            return {
-                _shared(row.key): Entry(row.result, row.seconds, row.cpu_seconds, row.session, origins[row.origin])
-                for row in self.rows()
-            }
+            # An origin that is lost is damage.
+            rows = (row for row in self.rows() if known[row.origin])
+            return {(key := _shared(row.key)): row._replace(key=key, checksum="") for row in rows}
 
     def rows(self) -> Iterator[Row]:
         """Every stored estimate, compared with its checksum; at the end, all of them with their tally."""
         tally = Tally()
-        for row in self.unchecked_rows():
-            tally.add(self._intact(row).checksum)
-            yield row
+        with self._guard():
+            for values in self._connection.execute(f"SELECT {self._selected} FROM {self._estimates}"):
+                row = self._intact(Row(Key(*values[:4]), *values[4:]))
+                tally.add(row.checksum)
+                yield row
         self._require(tally)
 
     def _require(self, tally: Tally) -> None:
@@ -197,12 +186,6 @@ class JournalReader:
         self._require_count(tally.count)
         if self._meta(TALLY) not in (None, str(tally)):
             raise DamageError(f"{self.path} is damaged: its estimates are not those that were written")
-
-    def unchecked_rows(self) -> Iterator[Row]:
-        """Every row of the table of estimates."""
-        with self._guard():
-            for row in self._connection.execute(f"SELECT {self._selected} FROM {self._estimates}"):
-                yield Row(Key(*row[:4]), *row[4:])
 
     @property
     def _selected(self) -> str:
@@ -297,7 +280,7 @@ class JournalReader:
             yield from ((key, status) for key, status, _ in self.stock())
             return
         for row in self.rows():
-            yield row.key, _status(row)
+            yield row.key, row.content["status"]
 
     def stock(self) -> Iterator[tuple[Key, str, int]]:
         """Every stored estimate with its status and the run that it comes from, its numbers not taken apart.
@@ -306,7 +289,7 @@ class JournalReader:
         """
         if self._format < CHECKED:
             for row in self.rows():
-                yield row.key, _status(row), row.session
+                yield row.key, row.content["status"], row.session
             return
         tally = Tally()
         chosen = f"SELECT {KEY}, json_extract(result, '$.status'), session, checksum FROM estimates"
@@ -336,7 +319,7 @@ class JournalReader:
 
     def origins_of(self, made: Iterable[tuple[str, int]]) -> tuple[Origin, ...]:
         """The origins that estimators and numbers of origins mean."""
-        known = self._known_origins()
+        known = self.known_origins()
         with self._guard():
             return gathered((estimator, known[origin]) for estimator, origin in made)
 
@@ -413,10 +396,6 @@ def format_of(connection: sqlite3.Connection, path: Path) -> int:
 def _shared(key: Key) -> Key:
     """A key whose texts are those of others."""
     return Key(sys.intern(key.data_hash), key.replicate, sys.intern(key.estimator_hash), sys.intern(key.start))
-
-
-def _status(row: Row) -> str:
-    return str(json.loads(row.result)["status"])
 
 
 def row_digest(table: str, *values: object) -> str:

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 from itertools import islice
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import RefusedError, StorageError, UsageError
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.identity import Origin, are_mixed
 from ctid_cli.storage.journal import Journal, open_journal
-from ctid_cli.storage.journal_reader import FILE_NAME, Entry, JournalReader
+from ctid_cli.storage.journal_reader import FILE_NAME, JournalReader, Row
 from ctid_cli.storage.manifest import Key, Manifest, Outcome, shard_of, slots, whole
 from ctid_cli.storage.pieces import ROWS
 from ctid_cli.storage.shards import Shard, owner, ranges
@@ -40,8 +40,21 @@ class Source:
 
     folder: Path
     manifest: Manifest
-    entries: Mapping[Key, Entry]
+    entries: Mapping[Key, Row]
     sessions: Sequence[Mapping[str, Any]]
+    #: Where the entries come from, by the number that they have.
+    origins: Mapping[int, Origin]
+
+    @classmethod
+    def of(cls, folder: Path, log: JournalReader, plan: Manifest) -> Self:
+        """What a journal holds of a plan."""
+        planned, entries = {slot.key for slot in slots(whole(plan))}, log.entries()
+        chosen = {key: entries[key] for key in entries if key in planned}
+        return cls(folder, plan, chosen, log.sessions(), log.known_origins())
+
+    def origin_of(self, entry: Row) -> Origin:
+        """Where an entry comes from."""
+        return self.origins[entry.origin]
 
     @property
     def shard(self) -> Shard | None:
@@ -92,9 +105,7 @@ def read_source(folder: Path) -> Source:
     """What a folder holds of its latest plan, each row compared with its checksum."""
     with _reading(folder) as log:
         log.check()
-        manifest, entries = log.manifest(), log.entries()
-        planned = {slot.key for slot in slots(whole(manifest))}
-        return Source(folder, manifest, {key: entries[key] for key in entries if key in planned}, log.sessions())
+        return Source.of(folder, log, log.manifest())
 
 
 def merge_all(
@@ -163,22 +174,20 @@ def _present(target: Path, plan: Manifest, read: Sequence[Source], *, allow_mixe
     """What the folder that is merged into holds of the plan."""
     if not target.exists():
         return []
-    origins = {key.estimator_hash: entry.origin for source in read for key, entry in source.entries.items()}
+    origins = {key.estimator_hash: source.origin_of(entry) for source in read for key, entry in source.entries.items()}
     with place.lock(target, shared=True):
         if origins:
             place.check_free(target, plan, origins, allow_mixed=allow_mixed)
         with place.reading_journal(target) as log:
-            if log is None:
-                return []
-            planned, entries = {slot.key for slot in slots(plan)}, log.entries()
-            return [Source(target, plan, {key: entries[key] for key in entries if key in planned}, log.sessions())]
+            return [] if log is None else [Source.of(target, log, plan)]
 
 
 def _check_origins(sources: Sequence[Source]) -> None:
     """Refuse what other code or another processor has computed than the rest."""
     seen: dict[str, tuple[Origin, Path]] = {}
     for source in sources:
-        for estimator, origin in sorted({(key.estimator_hash, entry.origin) for key, entry in source.entries.items()}):
+        made = {(key.estimator_hash, source.origin_of(entry)) for key, entry in source.entries.items()}
+        for estimator, origin in sorted(made):
             # All share what makes their data; those of one estimator share what makes the estimates too.
             other, folder = seen.get(estimator) or next(iter(seen.values()), (origin, source.folder))
             if other.shared != origin.shared or (estimator in seen and other != origin):
@@ -191,15 +200,15 @@ def _check_origins(sources: Sequence[Source]) -> None:
             seen.setdefault(estimator, (origin, source.folder))
 
 
-def _new_entries(present: Sequence[Source], read: Sequence[Source]) -> dict[Key, tuple[Source, Entry]]:
+def _new_entries(present: Sequence[Source], read: Sequence[Source]) -> dict[Key, tuple[Source, Row]]:
     """What is to be stored, and where it comes from."""
-    found: dict[Key, tuple[Source, Entry]] = {}
+    found: dict[Key, tuple[Source, Row]] = {}
     for source in (*present, *read):
         for key, entry in source.entries.items():
             other, stored = found.setdefault(key, (source, entry))
-            if stored.text == entry.text or stored.result == entry.result:
+            if stored.result == entry.result or stored.content == entry.content:
                 continue
-            if any(one.result["status"] in LIMITED for one in (stored, entry)):
+            if any(one.content["status"] in LIMITED for one in (stored, entry)):
                 found[key] = max(found[key], (source, entry), key=_rank)
             else:
                 raise RefusedError(
@@ -210,13 +219,13 @@ def _new_entries(present: Sequence[Source], read: Sequence[Source]) -> dict[Key,
     return {key: value for key, value in found.items() if id(value[0]) not in ours}
 
 
-def _rank(found: tuple[Source, Entry]) -> tuple[bool, list[float], str]:
+def _rank(found: tuple[Source, Row]) -> tuple[bool, list[float], str]:
     """Which of two is better, where one exceeded a limit: a result, or else what had the higher limits."""
     source, entry = found
     session = next((one for one in source.sessions if one["session"] == entry.session), {})
     limits = session.get("limits") or {}
     allowed = [inf if (limit := limits.get(name)) is None else float(limit) for name in LIMITS]
-    return entry.result["status"] not in LIMITED, allowed, canonical_json(entry.result)
+    return entry.content["status"] not in LIMITED, allowed, canonical_json(entry.content)
 
 
 def _missing(plan: Manifest, read: Sequence[Source], keys: set[Key]) -> Iterator[str]:
@@ -248,14 +257,15 @@ def _shards(numbers: Iterable[int], of: int) -> str:
     return f"{'shard' if text.isdigit() else 'shards'} {text} of {of}"
 
 
-def _take_over(source: Source, entries: Mapping[Key, Entry], plan: Manifest, log: Journal) -> None:
+def _take_over(source: Source, entries: Mapping[Key, Row], plan: Manifest, log: Journal) -> None:
     """Store estimates of a folder, run by run, with what is known of the runs that computed them."""
     for run in source.sessions:
         own = {key: entry for key, entry in entries.items() if entry.session == run["session"]}
         if own:
             info = {name: value for name, value in run.items() if name not in _OF_SESSION}
-            number = log.begin(plan, {key.estimator_hash: e.origin for key, e in own.items()}, run["started"], info)
-            outcomes = (Outcome(key, e.result, e.seconds, e.cpu_seconds) for key, e in own.items())
+            origins = {key.estimator_hash: source.origin_of(e) for key, e in own.items()}
+            number = log.begin(plan, origins, run["started"], info)
+            outcomes = (Outcome(key, e.content, e.seconds, e.cpu_seconds) for key, e in own.items())
             while some := list(islice(outcomes, ROWS)):
                 log.add(some, number)
             if run["stopped"] is not None:

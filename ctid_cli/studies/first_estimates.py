@@ -43,7 +43,7 @@ def compute_first(study: StudyFolder, out: Path, jobs: int | None = None) -> Est
         run_experiment(plan, out / plan.experiment, jobs=jobs)
         steps = _single_steps(plan)
         for row in read_results(out, plan.experiment).rows:
-            swept = [f"{name}={row[name]}" for cell in plan.data_cells[:1] for name in cell.swept]
+            swept = [f"{name}={row[name]}" for name in plan.data_cells[0].swept]
             words = [short, *swept, row["estimator"], str(row.get("initial_delay")), str(row["replicate"])]
             compared = row["status"] in COMPARED or row["estimator"] in steps
             values = dict(_numbers({name: row.get(name) for name in QUANTITIES})) if compared else {}

@@ -195,7 +195,7 @@ class FakePlan:
     terms = None
     shard: Shard | None = None
     manifest, runs, tasks, distinct_each = Plan.manifest, Plan.runs, Plan.tasks, Plan.distinct_each
-    data_sets = Plan.data_sets
+    data_sets, monte_carlo = Plan.data_sets, Plan.monte_carlo
 
     def __init__(
         self,

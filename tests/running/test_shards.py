@@ -78,11 +78,12 @@ def test_rows_keep_their_times_and_the_runs_they_come_from(parts: list[Path], tm
     joined(parts[::-1], tmp_path / "toys")
     with read_journal(tmp_path / "toys" / "journal.sqlite") as log:
         assert log is not None
-        merged, sessions = log.entries(), log.sessions()
+        merged, sessions, origins = log.entries(), log.sessions(), log.known_origins()
     for number, part in enumerate(parts, start=1):
-        for key, entry in read_source(part).entries.items():
+        source = read_source(part)
+        for key, entry in source.entries.items():
             assert (merged[key].result, merged[key].seconds) == (entry.result, entry.seconds)
-            assert (merged[key].session, merged[key].origin) == (number, entry.origin)
+            assert (merged[key].session, origins[merged[key].origin]) == (number, source.origin_of(entry))
     assert [session["session"] for session in sessions] == [1, 2, 3]
     notes = [json.loads(file.read_text()) for file in sorted((tmp_path / "toys" / "provenance").iterdir())]
     assert [(note["session"], note["computed"]) for note in notes] == [(1, 12), (2, 12), (3, 12)]
@@ -134,7 +135,9 @@ def limited(source: Source, status: str, **limits: float) -> Source:
     (key, entry), *_ = source.entries.items()
     result = failed(f"under {sorted(limits.items())}", status)
     sessions = [{**session, "limits": limits} for session in source.sessions]
-    return replace(source, entries={**source.entries, key: replace(entry, text=json.dumps(result))}, sessions=sessions)
+    return replace(
+        source, entries={**source.entries, key: entry._replace(result=json.dumps(result))}, sessions=sessions
+    )
 
 
 def test_a_result_is_better_than_a_limit_and_a_high_limit_better_than_a_low_one(
@@ -161,7 +164,7 @@ def test_two_results_of_one_estimate_are_refused(parts: list[Path], tmp_path: Pa
     sources = [read_source(part) for part in parts]
     copy = read_source(parts[0])
     (key, entry), *_ = copy.entries.items()
-    entries = {**copy.entries, key: replace(entry, text=json.dumps(entry.result | {"delay": 1.0}))}
+    entries = {**copy.entries, key: entry._replace(result=json.dumps(entry.content | {"delay": 1.0}))}
     copy = replace(copy, entries=entries)
     with pytest.raises(RefusedError, match=f"estimate {key.id} is one thing in .* and another in"):
         merge([*sources, copy], tmp_path / "toys")
