@@ -40,7 +40,7 @@ from ctid_cli.storage.identity import Origin, are_mixed
 from ctid_cli.storage.journal import Journal, open_journal
 from ctid_cli.storage.journal_reader import FILE_NAME
 from ctid_cli.storage.manifest import Key, Outcome, Slot, assemble
-from ctid_cli.storage.planned import PlannedKeys
+from ctid_cli.storage.planned import KeySet
 from ctid_cli.storage.provenance import canonical_text, now, session_info
 from ctid_cli.storage.store import seal
 
@@ -193,7 +193,7 @@ class _Run:
     def _lay_out(self) -> None:
         """Where the estimates of the plan belong, and what there is to compute."""
         self.manifest = self.plan.manifest()
-        self.planned = PlannedKeys(self.manifest)
+        self.planned = KeySet.planned(self.manifest)
         self.cells: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
         self.estimators: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
         for parts, known in ((self.manifest["data_cells"], self.cells), (self.manifest["estimators"], self.estimators)):
@@ -367,7 +367,7 @@ def preview(
 
 def _ready(plan: Plan, folder: Path, stock: Stock) -> events.PlanReady:
     """What there is to do, in numbers."""
-    planned = PlannedKeys(plan.manifest())
+    planned = KeySet.planned(plan.manifest())
     stored, again = planned.count_in(stock.keys), planned.count_in(stock.again)
     reused = stored - again
     counts = (Todo(plan, stock).data_sets, len(planned) - reused, reused, len(stock.keys) - stored)

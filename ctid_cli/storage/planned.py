@@ -1,28 +1,45 @@
-"""Which estimates a plan asks for, and which there are, told without a list of them."""
+"""Sets of estimates told without a list of them: those that there are, and those that a plan asks for."""
 
-from collections.abc import Container, Iterator
+from collections.abc import Container
+from typing import Self
 
 import numpy as np
 
 from ctid_cli.arrays import BoolArray
-from ctid_cli.storage.manifest import Key, Manifest, shard_of
+from ctid_cli.storage.manifest import Key, Manifest, planned_parts
 
 
 class KeySet(Container[Key]):
-    """Estimates that there are: a byte for each."""
+    """Some estimates: a byte for each."""
 
     def __init__(self) -> None:
         self._there: dict[tuple[str, str, str], bytearray] = {}
 
+    @classmethod
+    def planned(cls, manifest: Manifest) -> Self:
+        """The estimates of a plan, those that two names share once."""
+        found = cls()
+        for estimator, cell, replicates in planned_parts(manifest):
+            for start in estimator["starts"]:
+                flags = found._room(cell["hash"], estimator["hash"], start, replicates[-1] + 1)
+                # A shard has some of them, and all are written at once.
+                if isinstance(replicates, range):
+                    flags[: len(replicates)] = b"\1" * len(replicates)
+                else:
+                    for replicate in replicates:
+                        flags[replicate] = 1
+        return found
+
+    def _room(self, data_hash: str, estimator_hash: str, start: str, count: int) -> bytearray:
+        """The bytes of the replicates, so many at least."""
+        flags = self._there.setdefault((data_hash, estimator_hash, start), bytearray())
+        if count > len(flags):
+            flags.extend(bytes(count - len(flags)))
+        return flags
+
     def add(self, key: Key) -> None:
         """Put one in."""
-        data, replicate, estimator, start = key
-        flags = self._there.get((data, estimator, start))
-        if flags is None:
-            flags = self._there[data, estimator, start] = bytearray()
-        if replicate >= len(flags):
-            flags.extend(bytes(replicate + 1 - len(flags)))
-        flags[replicate] = 1
+        self._room(key.data_hash, key.estimator_hash, key.start, key.replicate + 1)[key.replicate] = 1
 
     def discard(self, key: Key) -> None:
         """Take one out."""
@@ -35,66 +52,17 @@ class KeySet(Container[Key]):
         flags = self._there.get((key.data_hash, key.estimator_hash, key.start), b"")
         return key.replicate < len(flags) and bool(flags[key.replicate])
 
-    def groups(self) -> Iterator[tuple[str, str, str, bytearray]]:
-        """Data cells, estimators and starts, each with a byte for every replicate."""
-        for (data, estimator, start), flags in self._there.items():
-            yield data, estimator, start, flags
-
     def flags(self, data_hash: str, estimator_hash: str, start: str, count: int) -> BoolArray:
         """Which of the first replicates there are."""
         found = self._there.get((data_hash, estimator_hash, start), bytearray())[:count]
         return np.frombuffer(found.ljust(count, b"\0"), dtype=np.bool_)
 
-    def __len__(self) -> int:
-        return sum(map(sum, self._there.values()))
-
-    def __iter__(self) -> Iterator[Key]:
-        for (data, estimator, start), flags in self._there.items():
-            for replicate in range(len(flags)):
-                if flags[replicate]:
-                    yield Key(data, replicate, estimator, start)
-
-
-class PlannedKeys(Container[Key]):
-    """The estimates of a plan, those that two names share once."""
-
-    def __init__(self, manifest: Manifest) -> None:
-        self._shard, self._cells = shard_of(manifest), len(manifest["data_cells"])
-        #: Places of a data cell and its number of replicates; starts of an estimator.
-        self._places: dict[str, list[tuple[int, int]]] = {}
-        self._starts: dict[str, set[str]] = {}
-        for number, cell in enumerate(manifest["data_cells"]):
-            self._places.setdefault(cell["hash"], []).append((number, cell["replicates"]))
-        for estimator in manifest["estimators"]:
-            self._starts.setdefault(estimator["hash"], set()).update(estimator["starts"])
-
-    def __contains__(self, key: object) -> bool:
-        if not isinstance(key, Key) or key.start not in self._starts.get(key.estimator_hash, ()):
-            return False
-        return self._has(key.data_hash, key.replicate)
-
-    def _has(self, data_hash: str, replicate: int) -> bool:
-        return any(
-            replicate < count and (self._shard is None or self._shard.has(number, replicate, self._cells))
-            for number, count in self._places.get(data_hash, ())
-        )
-
-    def count_in(self, keys: KeySet) -> int:
-        """How many of some estimates are asked for."""
-        found = 0
-        for data, estimator, start, flags in keys.groups():
-            if start not in self._starts.get(estimator, ()):
-                continue
-            there = flags[: max((count for _, count in self._places.get(data, ())), default=0)]
-            if self._shard is None:
-                found += sum(there)
-            else:
-                found += sum(self._has(data, replicate) for replicate, flag in enumerate(there) if flag)
-        return found
+    def count_in(self, keys: "KeySet") -> int:
+        """How many of some estimates are in this set."""
+        # As long numbers, whose bits are counted at once.
+        pairs = ((flags, self._there.get(place, b"")) for place, flags in keys._there.items())
+        both = (int.from_bytes(one, "little") & int.from_bytes(other, "little") for one, other in pairs)
+        return sum(number.bit_count() for number in both)
 
     def __len__(self) -> int:
-        most = {name: max(count for _, count in places) for name, places in self._places.items()}
-        sets = sum(most.values())
-        if self._shard is not None:
-            sets = sum(self._has(name, replicate) for name, count in most.items() for replicate in range(count))
-        return sets * sum(map(len, self._starts.values()))
+        return sum(flags.count(1) for flags in self._there.values())

@@ -34,7 +34,7 @@ from ctid_cli.storage.manifest import (
 )
 from ctid_cli.storage.packing import Packed, PackedTable, decoded, keys
 from ctid_cli.storage.pieces import Pieces, Window
-from ctid_cli.storage.planned import PlannedKeys
+from ctid_cli.storage.planned import KeySet
 from ctid_cli.storage.provenance import as_text
 from ctid_cli.storage.stored import Stored, first_with
 from ctid_cli.storage.timings import TimedTable, times_table
@@ -316,7 +316,7 @@ def _counted_in(log: JournalReader, manifest: Manifest) -> tuple[Counter[Part], 
     """The same in a journal, and how many the plan does not ask for."""
     done: Counter[Part] = Counter()
     failed: Counter[Part] = Counter()
-    planned, aside = PlannedKeys(manifest), 0
+    planned, aside = KeySet.planned(manifest), 0
     for key, status in log.statuses():
         if key not in planned:
             aside += 1

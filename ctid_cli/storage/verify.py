@@ -12,7 +12,7 @@ from ctid_cli.errors import CtidError, DamageError
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.folder import CANONICAL, PROVENANCE, RUNNING, SEALED, SPEC, TIMINGS
 from ctid_cli.storage.journal_reader import FILE_NAME, JournalReader
-from ctid_cli.storage.planned import PlannedKeys
+from ctid_cli.storage.planned import KeySet
 from ctid_cli.storage.repair import salvage
 from ctid_cli.storage.sealed import open_sealed
 from ctid_cli.written_files import is_leftover
@@ -86,7 +86,7 @@ def verify(folder: Path) -> Verification:
 
 def _journal(log: JournalReader) -> Finding:
     log.check(fully=True)
-    sessions, planned = log.sessions(), PlannedKeys(log.manifest())
+    sessions, planned = log.sessions(), KeySet.planned(log.manifest())
     # Reading compares each with its checksum.
     there = Counter(row.key in planned for row in log.rows())
     message = f"{there[True]} of {len(planned)} estimates"
@@ -100,7 +100,7 @@ def _what_can_be_read(folder: Path) -> str:
     found = salvage(folder)
     if found.manifest is None or not found.rows:
         return "Nothing of it can be read"
-    planned = len(PlannedKeys(found.manifest))
+    planned = len(KeySet.planned(found.manifest))
     missing = len({slot.key for slot in found.missing()})
     return f"{planned - missing} of {planned} estimates can be read; 'ctid repair' saves them into a new folder"
 
