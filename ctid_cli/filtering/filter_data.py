@@ -65,31 +65,21 @@ def filter_data(
     signal = record.input.periodic_lines if periodic else record.input.lines
     slack = 1e-9 * (record.interval or 0.0)
     use = record.valid & (record.t >= record.input.t[0] + start - slack)
+    t, y, interval = record.t, record.bridged_y, (record.interval or 0.0) if record.input_on_grid else 0.0
+    same = bool(np.array_equal(signal.t, t))
     if signal is not record.input and record.input_on_grid:
         points = np.zeros(signal.t.size, dtype=bool)
         points[::FINER] = use
-        return FilterData(
-            t=plain_array(signal.t),
-            y=plain_array(np.interp(signal.t, record.t, record.bridged_y)),
-            use=points,
-            tu=plain_array(signal.t),
-            u=plain_array(signal.values),
-            input_foh=True,
-            y_foh=hold_output == "foh",
-            interval=(record.interval or 0.0) / FINER,
-            common_clock=False,
-        )
-    on_grid = record.input_on_grid and signal is record.input
-    same = signal.t.size == record.t.size and bool(np.array_equal(signal.t, record.t))
+        t, y, use, interval, same = signal.t, np.interp(signal.t, t, y), points, interval / FINER, False
     return FilterData(
-        t=plain_array(record.t),
-        y=plain_array(record.bridged_y),
+        t=plain_array(t),
+        y=plain_array(y),
         use=use,
         tu=plain_array(signal.t),
         u=plain_array(signal.values),
         input_foh=signal.hold == "foh",
         y_foh=hold_output == "foh",
-        interval=(record.interval or 0.0) if on_grid else 0.0,
+        interval=interval,
         common_clock=same,
     )
 

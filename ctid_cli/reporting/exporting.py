@@ -11,7 +11,7 @@ from ctid_cli.reporting.estimate import as_object
 from ctid_cli.storage import columns
 from ctid_cli.storage.manifest import swept_names
 from ctid_cli.storage.pieces import ranges
-from ctid_cli.storage.store import frame_of
+from ctid_cli.storage.store import estimates_table
 from ctid_cli.storage.stored import Stored
 from ctid_cli.storage.summary import export_rows
 
@@ -24,7 +24,7 @@ def csv_lines(stored: Stored) -> Iterator[str]:
     head, swept, rows = _head(stored), _types(stored), stored.every()
     yield _written(head)
     for start, stop in ranges(len(rows)):
-        flat = export_rows(frame_of(stored, list(rows[start:stop]), swept))
+        flat = export_rows(estimates_table(stored, list(rows[start:stop]), swept))
         yield _written(flat.reindex(columns=head.columns), header=False)
 
 
@@ -41,7 +41,7 @@ def _head(stored: Stored) -> pd.DataFrame:
             some[column.name] = {n: 0.0 for n, one in zip(stored.table.parts(column.name), there, strict=True) if one}
         elif column.type == "coefficients" and stored.table.has(column.name):
             some[column.name] = [0.0] * max(0, int(stored.column(f"{column.name}_length").max(initial=0)))
-    return export_rows(frame_of(stored, [some], dict.fromkeys(swept_names(stored.manifest), "object"))).iloc[:0]
+    return export_rows(estimates_table(stored, [some], dict.fromkeys(swept_names(stored.manifest), "object"))).iloc[:0]
 
 
 def _types(stored: Stored) -> dict[str, Any]:

@@ -151,7 +151,7 @@ def run_experiment(
         if found.state is None or log.state() != found.state:
             found = _Found(as_needed(plan, log), take_stock(log, retry, limits))
         run = _Run(found.plan, folder, log, found.stock, origins, on_event, computing)
-        stack.callback(run.cleanup)
+        stack.callback(place.retract, folder)
         run.start({"jobs": workers, "limits": asdict(limits)})
         run.compute(stopping)
         while run.needs_more() and not stopping():
@@ -347,9 +347,6 @@ class _Run:
             hindrance=self.hindrance,
             culprits=self.culprits,
         )
-
-    def cleanup(self) -> None:
-        place.retract(self.folder)
 
 
 def preview(

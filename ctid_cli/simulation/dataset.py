@@ -81,8 +81,8 @@ class DataSet:
             "standard_errors": fit.standard_errors | errors,
             "cost": fit.cost,
             "fit_percent": fit.fit_percent,
-            "validation_fit_percent": self._validation_fit_percent(model),
-            "fresh_fit_percent": self._fresh_fit_percent(model),
+            "validation_fit_percent": _fit_percent(model, self.validation, "y"),
+            "fresh_fit_percent": _fit_percent(model, self._fresh_record, "noise_free"),
             "iterations": None if fit.iterations is None else int(fit.iterations),
             "search_delay": None if search is None else search.point,
             "switches": None if search is None else len(search.switches),
@@ -92,23 +92,6 @@ class DataSet:
     @cached_property
     def _fresh_record(self) -> Record | None:
         return None if self.fresh is None else self.fresh()
-
-    def _fresh_fit_percent(self, model: Any) -> float | None:
-        from ctid_cli.inference.diagnostics import fit_percent
-
-        record = self._fresh_record
-        if record is None or record.noise_free is None or model is None:
-            return None
-        return float(fit_percent(record.noise_free, _simulated(model, record.input, record.t)))
-
-    def _validation_fit_percent(self, model: Any) -> float | None:
-        from ctid_cli.inference.diagnostics import fit_percent
-
-        record = self.validation
-        if record is None or model is None:
-            return None
-        simulated = _simulated(model, record.input, record.t)
-        return float(fit_percent(record.y[record.valid], simulated[record.valid]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,6 +261,17 @@ def _simulated(system: TransferFunction | AdditiveModel | OwnSystem, applied: He
     if isinstance(system, AdditiveModel):
         return simulate_additive(system, applied, times)
     return simulate(system, applied, times)
+
+
+def _fit_percent(model: Any, record: Record | None, output: str) -> float | None:
+    """Fit of a model to an output of a record [%], where there are all three."""
+    from ctid_cli.inference.diagnostics import fit_percent
+
+    wanted: Array | None = getattr(record, output, None)
+    if model is None or record is None or wanted is None:
+        return None
+    there = np.isfinite(wanted)
+    return float(fit_percent(wanted[there], _simulated(model, record.input, record.t)[there]))
 
 
 def joined(folder: Path, file: str) -> str:

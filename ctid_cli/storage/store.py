@@ -227,15 +227,16 @@ def load_estimates(folder: Path) -> pd.DataFrame:
     return estimates_table(read_stored(folder))
 
 
-def estimates_table(stored: Stored) -> pd.DataFrame:
-    """Stored estimates as a table, with the units of its columns."""
-    return frame_of(stored, stored.rows())
+def estimates_table(
+    stored: Stored, some: Sequence[Mapping[str, Any]] | None = None, swept: dict[str, Any] | None = None
+) -> pd.DataFrame:
+    """Stored estimates as a table, with the units of its columns.
 
-
-def frame_of(stored: Stored, rows: Sequence[Mapping[str, Any]], swept: dict[str, Any] | None = None) -> pd.DataFrame:
-    """Some of them as a table; types of swept fields are given where not all estimates are there to tell them."""
+    Of some of them, the types of swept fields are given, where not all estimates are there to tell them.
+    """
     import pandas as pd
 
+    rows = stored.rows() if some is None else some
     # Where there is no system, the columns of one would be empty.
     left_out = "systems" if is_of_signal(stored.manifest) else ""
     own = {column.name: column.dtype for column in row_columns(stored.manifest) if column.of != left_out}
