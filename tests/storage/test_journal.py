@@ -88,7 +88,7 @@ def test_what_was_added_is_read_back_exactly(tmp_path: Path) -> None:
         assert read.origins() == (ORIGIN,)
         assert read.origins()[0].estimators == ("estimator",)
         entries = read.entries()
-        assert {key.replicate: entry.result["delay"] for key, entry in entries.items()} == {
+        assert {key.replicate: entry.content["delay"] for key, entry in entries.items()} == {
             0: 8.0,
             1: 25 / 3,
             2: 26 / 3,
@@ -214,7 +214,7 @@ def test_an_estimate_that_is_added_again_takes_the_place_of_the_first(tmp_path: 
     log.close()
     with read_journal(log.path) as read:
         assert read is not None
-        assert [entry.result["delay"] for entry in read.entries().values()] == [8.0, 5.0, 8.0]
+        assert [entry.content["delay"] for entry in read.entries().values()] == [8.0, 5.0, 8.0]
 
 
 def test_what_cannot_be_stored_as_a_whole_is_not_stored(tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ def place(made: Path, tmp_path: Path) -> Path:
 def test_the_sealed_file_holds_what_the_journal_holds(place: Path) -> None:
     with read_journal(place / "journal.sqlite") as log:
         assert log is not None
-        journalled = {key: entry.result for key, entry in log.entries().items()}
+        journalled = {key: entry.content for key, entry in log.entries().items()}
         assert log.sealed() == read_sealed(place / "runs.h5").checksum
     assert read_sealed(place / "runs.h5").results == journalled
 
