@@ -66,8 +66,6 @@ class FakeData:
     true_model: None = None
 
     result_of = DataSet.result_of
-    _validation_fit_percent = DataSet._validation_fit_percent
-    _fresh_fit_percent = DataSet._fresh_fit_percent
     _fresh_record: ClassVar[None] = None
 
 

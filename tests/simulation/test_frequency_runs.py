@@ -10,7 +10,6 @@ import h5py
 import numpy as np
 import pytest
 
-from ctid_cli.errors import SpecError
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.frequency.tracking import FrequencyTrack
@@ -26,10 +25,11 @@ from ctid_cli.simulation.frequency_measures import (
     thinned,
     unpack_track,
 )
-from ctid_cli.specification.load import load_spec, spec_from_canonical
+from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.store import load_estimates, read_stored, read_tracks
 from ctid_cli.storage.summary import export_rows
 from tests.running.fakes import outcomes_of
+from tests.specification.written import load, problems
 
 SPEC = """\
 experiment: frequencies
@@ -46,19 +46,6 @@ tracks: {interval: 0.05, window: [25, 30]}
 monte_carlo: {runs: 2, seed: 1}
 """
 SYSTEM = "system: {numerator: [1], denominator: [1, 1]}\nexcitation: {kind: gaussian}\n"
-
-
-def load(tmp_path, text=SPEC, *overrides):
-    file = tmp_path / "spec.yaml"
-    file.write_text(text, encoding="utf-8")
-    return load_spec(file, overrides)
-
-
-def problems(tmp_path, text, *overrides):
-    with pytest.raises(SpecError) as error:
-        load(tmp_path, text, *overrides)
-    return error.value.problems
-
 
 #: (what is replaced, by what, line, key, part of the message); the only problem of the specification.
 BROKEN = {
@@ -116,7 +103,7 @@ def test_mistakes_are_named_with_their_place(tmp_path, case):
 )
 def test_what_is_unwise_is_a_warning(tmp_path, old, new, key, message):
     always = "estimators.esprit.kind: gives one estimate of the whole record, in which a frequency steps"
-    assert [warning.partition(": ")[2] for warning in load(tmp_path).warnings] == [always]
+    assert [warning.partition(": ")[2] for warning in load(tmp_path, SPEC).warnings] == [always]
     text = SPEC.replace(old, new).replace("averaging: 0.05", "averaging: 0.04")
     (first, second) = load(tmp_path, text).warnings
     assert f": {key}: " in first
@@ -148,7 +135,7 @@ def test_no_disturbance_has_three_spellings(tmp_path):
 
 
 def test_what_is_measured_belongs_to_the_identity_and_the_time_limit_does_not(tmp_path):
-    (cell,) = build_plan(load(tmp_path)).data_cells
+    (cell,) = build_plan(load(tmp_path, SPEC)).data_cells
     for override, same in (("success.by=9", True), ("success.band=0.02", False), ("tracks.window=[20, 30]", False)):
         (other,) = build_plan(load(tmp_path, SPEC, override)).data_cells
         assert (other.hash == cell.hash) is same
@@ -194,7 +181,7 @@ def test_a_packed_track_is_the_track():
 
 
 def test_results_are_sealed_and_read_back(tmp_path):
-    plan = build_plan(load(tmp_path))
+    plan = build_plan(load(tmp_path, SPEC))
     folder = tmp_path / "out"
     summary = run_experiment(plan, folder, jobs=1)
     assert (summary.computed, summary.failed) == (4, 0)
@@ -262,7 +249,7 @@ def test_killed_and_resumed_gives_the_same_bytes_with_all_its_tracks(tmp_path):
 
 def test_a_sealed_file_alone_has_the_tracks_and_the_measures(tmp_path):
     folder = tmp_path / "out"
-    run_experiment(build_plan(load(tmp_path)), folder, jobs=1)
+    run_experiment(build_plan(load(tmp_path, SPEC)), folder, jobs=1)
     tracks, rows = read_tracks(folder), read_stored(folder).rows()
     (folder / "journal.sqlite").unlink()
     again = read_stored(folder).rows()

@@ -5,12 +5,12 @@ import json
 import pytest
 
 from ctid_cli.canonical import canonical_json
-from ctid_cli.errors import SpecError
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.running.plan import build_plan
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.sampling import geometric_sizes
-from ctid_cli.specification.load import load_spec, spec_from_canonical
+from ctid_cli.specification.load import spec_from_canonical
+from tests.specification.written import changed, load, problems
 
 CLOSED = """\
 experiment: additive/one
@@ -40,25 +40,6 @@ estimators:
 """
 
 RECORD = "t,u,y,r\n" + "".join(f"{k / 10},{(k // 5) % 2},{(k * 7) % 11},{(k // 3) % 2}\n" for k in range(50))
-
-
-def load(tmp_path, text, *overrides):
-    file = tmp_path / "spec.yaml"
-    file.write_text(text, encoding="utf-8")
-    return load_spec(file, overrides)
-
-
-def problems(tmp_path, text, *overrides):
-    with pytest.raises(SpecError) as error:
-        load(tmp_path, text, *overrides)
-    return error.value.problems
-
-
-def changed(text, *changes):
-    for old, new in changes:
-        assert text.count(old) == 1, old
-        text = text.replace(old, new)
-    return text
 
 
 MODE = "{numerator: [3], denominator: [0.25, 0.25, 1]}"

@@ -17,6 +17,7 @@ from ctid_cli.errors import SpecError, UsageError
 from ctid_cli.kinds import KINDS, classes
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import json_schema, load_spec, spec_from_canonical
+from tests.specification.written import changed, load, problems
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
@@ -49,27 +50,6 @@ estimators:
 """
 
 RECORD = "t,u,y\n" + "".join(f"{k / 10},{(k // 5) % 2},{(k * 7) % 11}\n" for k in range(50))
-
-
-def load(tmp_path, text, *overrides):
-    file = tmp_path / "spec.yaml"
-    file.write_text(text, encoding="utf-8")
-    return load_spec(file, overrides)
-
-
-def problems(tmp_path, text, *overrides):
-    with pytest.raises(SpecError) as error:
-        load(tmp_path, text, *overrides)
-    found = error.value.problems
-    assert all(p.file in (str(tmp_path / "spec.yaml"), "--set") for p in found)
-    return found
-
-
-def changed(text, *changes):
-    for old, new in changes:
-        assert text.count(old) == 1, old
-        text = text.replace(old, new)
-    return text
 
 
 #: (what is replaced, by what, line, column, key, part of the message); the only problem of the specification.
