@@ -35,9 +35,10 @@ def filled(path: Path, count: int = 3) -> Journal:
 
 def before_format_4(log: Journal) -> None:
     """Take away what older formats did not have."""
+    rows = list(log.rows())
     for table in ("meta", "origins", "sessions"):
         log._connection.execute(f"ALTER TABLE {table} DROP COLUMN checksum")
-    for row in list(log.unchecked_rows()):
+    for row in rows:
         text = "\n".join([*map(str, row.key), row.result])
         values = (hashlib.sha256(text.encode()).hexdigest()[:32], row.key.replicate)
         log._connection.execute("UPDATE estimates SET checksum = ? WHERE replicate = ?", values)
