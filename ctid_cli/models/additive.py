@@ -16,10 +16,9 @@ from ctid_cli.models.transfer_function import (
     TransferFunction,
     checked_delay,
     polynomials,
-    set_fields,
     sorted_roots,
 )
-from ctid_cli.signals.checks import require_integer
+from ctid_cli.signals.checks import freeze, require_integer
 
 #: Poles nearer to each other than this fraction of their magnitude count as one: a double root of rounded coefficients
 #: comes out as two that lie 1e-8 apart.
@@ -116,7 +115,7 @@ class Submodel(ContinuousModel):
         if b.size > a.size + integrators:
             counts = f"more zeros ({b.size - 1}) than poles ({a.size - 1 + integrators})"
             raise DataError(f"a submodel with {counts} has no response to a jump", "numerator")
-        set_fields(self, numerator=b / a[-1], denominator=a / a[-1], integrators=int(integrators))
+        freeze(self, numerator=b / a[-1], denominator=a / a[-1], integrators=int(integrators))
 
     def term(self) -> Term:
         """Structure of the submodel.
@@ -216,7 +215,7 @@ class AdditiveModel(ContinuousModel):
         if not terms:
             raise DataError("an additive model needs at least one submodel")
         _require_identifiable(terms)
-        set_fields(self, submodels=terms, delay=checked_delay(delay))
+        freeze(self, submodels=terms, delay=checked_delay(delay))
 
     @classmethod
     def from_theta(cls, theta: ArrayLike, terms: Sequence[Term], delay: float = 0.0) -> AdditiveModel:

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
-from ctid_cli.models.transfer_function import monic, polynomials, set_fields, sorted_roots
-from ctid_cli.signals.checks import require_finite, require_positive
+from ctid_cli.models.transfer_function import monic, polynomials, sorted_roots
+from ctid_cli.signals.checks import freeze, require_finite, require_positive
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class DiscreteController:
         if b.size > a.size:
             counts = f"more zeros ({b.size - 1}) than poles ({a.size - 1})"
             raise DataError(f"a controller with {counts} would need samples of the future; give fewer numerator terms")
-        set_fields(self, numerator=b, denominator=a)
+        freeze(self, numerator=b, denominator=a)
 
     @classmethod
     def from_pid(cls, kp: float, ki: float, kd: float) -> DiscreteController:

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
+from ctid_cli.signals.checks import freeze
 
 
 class ContinuousModel(ABC):
@@ -61,7 +62,7 @@ class TransferFunction(ContinuousModel):
 
     def __init__(self, numerator: ArrayLike, denominator: ArrayLike, delay: float = 0.0) -> None:
         b, a = monic(*polynomials(numerator, denominator, "the transfer function", "s"))
-        set_fields(self, numerator=b, denominator=a, delay=checked_delay(delay))
+        freeze(self, numerator=b, denominator=a, delay=checked_delay(delay))
 
     @property
     def order(self) -> int:
@@ -135,11 +136,3 @@ def checked_delay(delay: float) -> float:
     if not (np.isfinite(delay) and delay >= 0):
         raise DataError(f"a delay must be a finite number of seconds, zero or more; got {delay}")
     return float(delay)
-
-
-def set_fields(instance: object, **values: object) -> None:
-    """Set the fields of a frozen instance; arrays can no longer be written to."""
-    for name, value in values.items():
-        if isinstance(value, np.ndarray):
-            value.setflags(write=False)
-        object.__setattr__(instance, name, value)

@@ -80,11 +80,12 @@ def require_increasing(name: str, t: Array) -> None:
         raise DataError(f"{name} must increase strictly; samples {k} and {k + 1} are at {t[k]:g} and {t[k + 1]:g} s")
 
 
-def freeze(owner: object, **arrays: Array) -> None:
-    """Give a frozen dataclass arrays that nobody can change."""
-    for name, array in arrays.items():
-        array.setflags(write=False)
-        object.__setattr__(owner, name, array)
+def freeze(owner: object, **values: object) -> None:
+    """Set fields of a frozen dataclass; arrays can no longer be written to."""
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+        object.__setattr__(owner, name, value)
 
 
 def _is_number(value: object) -> bool:

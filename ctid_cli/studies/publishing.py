@@ -88,7 +88,8 @@ def publish(found: StudyResults, claims: Sequence[Claim], target: Path) -> None:
     lines = io.StringIO()
     csv.writer(lines, lineterminator="\n").writerows([COLUMNS, *(claim.cells for claim in claims)])
     texts["claims.csv"] = lines.getvalue()
-    texts["environment.json"] = json.dumps({"commit": commit, "sessions": _sessions(found)}, indent=2) + "\n"
+    sessions = {short: public_sessions(results.folder) for short, results in found.experiments.items()}
+    texts["environment.json"] = json.dumps({"commit": commit, "sessions": sessions}, indent=2) + "\n"
     files = {Path(name): text.encode() for name, text in texts.items()}
     for number in found.study.figures:
         files[Path("figures") / f"figure_{number}.svg"] = StudyFigure(found.study, number).svg(found.out)
@@ -97,10 +98,6 @@ def publish(found: StudyResults, claims: Sequence[Claim], target: Path) -> None:
     for name, content in files.items():
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         write_file(target / name, content)
-
-
-def _sessions(found: StudyResults) -> dict[str, list[dict[str, object]]]:
-    return {short: public_sessions(results.folder) for short, results in found.experiments.items()}
 
 
 def against_published(claims: Sequence[Claim], folder: Path) -> list[Claim]:
