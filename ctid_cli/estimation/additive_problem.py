@@ -12,7 +12,6 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.common import named
 from ctid_cli.estimation.iteration import Equations, inadmissible
 from ctid_cli.estimation.stability import is_hurwitz, reflect_unstable
 from ctid_cli.filtering.filter_data import FilterData, plain_array
@@ -22,7 +21,7 @@ from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, named
 
 #: Where instruments come from: the measured input, or the noise-free loop of the model.
 Instruments = Literal["open_loop", "closed_loop"]

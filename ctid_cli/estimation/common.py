@@ -24,7 +24,7 @@ from ctid_cli.inference.uncertainty import DRAWS, Covariance, estimate_uncertain
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_choice, require_integer, require_not_negative, require_positive
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, named
 
 #: Draws without which the 95 % quantile of a bootstrap means nothing.
 LEAST_DRAWS = 40
@@ -156,11 +156,6 @@ def checked_bounds(bounds: tuple[float, float], known_allowed: bool = False) -> 
 
 
 # --- records ---------------------------------------------------------------------------------------
-
-
-def named(record: Record) -> str:
-    """How a message about a record begins."""
-    return f"{record.name}: " if record.name else ""
 
 
 def check_record(record: Record, data: FilterData, parameters: int, free_response: bool = False) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ctid_cli.arrays import BoolArray
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.common import check_greatest_delay, check_record, named
+from ctid_cli.estimation.common import check_greatest_delay, check_record
 from ctid_cli.estimation.optimum.best_model import SearchOptions, problem_of
 from ctid_cli.estimation.optimum.pilot import liveliest_parts
 from ctid_cli.estimation.optimum.projection import Problem
@@ -21,7 +21,7 @@ from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.faults import outliers
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, Offset, OutputHold
 
 

@@ -18,7 +18,6 @@ import numpy as np
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation import pole_relocation
-from ctid_cli.estimation.common import named
 from ctid_cli.estimation.iteration import GUARDED, Steps, iterate, solve_scaled
 from ctid_cli.estimation.sampled_problem import at_known_delay, least_squares_start
 from ctid_cli.filtering.filter_data import FilterData, filter_data
@@ -26,7 +25,7 @@ from ctid_cli.filtering.free_response import free_response, free_response_size
 from ctid_cli.filtering.submodels import SubmodelFilter
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, named
 
 #: Noise levels within this factor of each other are not worth a second search with other weights.
 NEARLY_WHITE = 2.0

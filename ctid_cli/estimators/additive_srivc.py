@@ -14,7 +14,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.additive_estimate import SubmodelEstimate, estimate_submodels, radius_in_loop
 from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
-from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_record, named
+from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_record
 from ctid_cli.estimation.fixed import Fixed, places_of
 from ctid_cli.estimation.iteration import RULES, StepRule, Steps
 from ctid_cli.estimation.modal_start import ModalStart, automatic_start
@@ -27,7 +27,7 @@ from ctid_cli.inference.uncertain_value import UncertainValue
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Term, names_of
 from ctid_cli.models.factoring import unfactored
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import OutputHold
 
 #: Orders of the submodels that are tried to find the one that known parameters belong to.

@@ -183,13 +183,8 @@ def identify(
         laid_out = laid_out.near(fit.residuals, fit.weighting)
     residuals = np.concatenate(fit.residuals)
     output = np.concatenate([record.y[use] for record, use in zip(records, fit.used, strict=True)])
-    answer = answer_test(
-        judging.answering(options, prepared.laid_out),
-        fit.used,
-        options.delay_bounds,
-        free_response=options.initial_state == "estimate",
-        periodic=options.initial_state == "periodic",
-    )
+    answering = judging.answering(options, prepared.laid_out)
+    answer = answer_test(answering, fit.used, options.delay_bounds, options.initial_state)
     squared_error = float(residuals @ residuals) if fit.weighting is None else fit.cost * fit.count
     tests = tests_of(options, linear, records, answer)
     uncertainty = fit.uncertainty(covariance, bootstrap_draws, progress)

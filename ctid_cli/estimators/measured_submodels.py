@@ -12,7 +12,7 @@ from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.additive_estimate import radius_in_loop
 from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments
-from ctid_cli.estimation.common import Estimator, Start, named
+from ctid_cli.estimation.common import Estimator, Start
 from ctid_cli.estimation.fixed import Fixed
 from ctid_cli.estimation.measured_records import without_means
 from ctid_cli.estimation.profile_refinement import AppliedModel
@@ -26,7 +26,7 @@ from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, LossKind, Offset
 
 

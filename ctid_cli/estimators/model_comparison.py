@@ -7,7 +7,6 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, UsageError
-from ctid_cli.estimation.common import named
 from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
 from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
 from ctid_cli.estimators import judging
@@ -17,7 +16,7 @@ from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.parametric import Parametric
 from ctid_cli.inference.residuals import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, Offset
 
 

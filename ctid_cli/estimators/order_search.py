@@ -363,14 +363,8 @@ class _Search:
     @cached_property
     def answer(self) -> AnswerTest:
         """Whether there is anything to model."""
-        treatment = self.measured.treatment
-        return answer_test(
-            self.measured.records,
-            self.measured.used(),
-            treatment.delay_bounds,
-            free_response=treatment.initial_state == "estimate",
-            periodic=treatment.initial_state == "periodic",
-        )
+        measured, treatment = self.measured, self.measured.treatment
+        return answer_test(measured.records, measured.used(), treatment.delay_bounds, treatment.initial_state)
 
     def result(self, orders: Sequence[FittedOrder]) -> OrderSearch:
         """All of them."""

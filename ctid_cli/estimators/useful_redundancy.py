@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, initial_delay, named
+from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, initial_delay
 from ctid_cli.estimation.delay_grid import scan
 from ctid_cli.estimation.delay_search import Descent, Minimum
 from ctid_cli.estimation.filter_search import LARGEST_STEP, LATTICE, FilterPath, FilterSearch
@@ -23,7 +23,7 @@ from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import OutputHold
 
 #: How hard to work at each trial delay.

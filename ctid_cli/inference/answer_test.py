@@ -16,6 +16,7 @@ from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import InitialState
 
 #: Probability that noise is taken for an answer.
 LEVEL = 0.05
@@ -75,9 +76,7 @@ def answer_test(
     records: Sequence[Record],
     used: Sequence[BoolArray],
     delays: tuple[float, float],
-    *,
-    free_response: bool = False,
-    periodic: bool = False,
+    initial_state: InitialState = "rest",
 ) -> AnswerTest:
     """Test the answer of the outputs to the inputs, at the used samples of records of one system.
 
@@ -87,7 +86,7 @@ def answer_test(
     compared with that of each series of noise. Samples count in their order: on an irregular clock the noise is taken
     as stationary in it.
     """
-    rng = np.random.default_rng(SEED)
+    rng, periodic, free = np.random.default_rng(SEED), initial_state == "periodic", initial_state == "estimate"
     outputs = [_Output.of(record, use, periodic, rng) for record, use in zip(records, used, strict=True)]
     longest = max((output.t[:, 0] for output in outputs), key=len)
     shares, testable = np.zeros((2, SERIES + 1)), False
@@ -95,7 +94,7 @@ def answer_test(
     for pole in poles:
         count = int(np.clip(abs(pole) * np.ptp(delays) + 1, FEWEST_DELAYS, MOST_DELAYS))
         grid = np.unique(np.linspace(*delays, count))
-        as_they_are, new = zip(*(output.beside_own(pole, grid, free_response) for output in outputs), strict=True)
+        as_they_are, new = zip(*(output.beside_own(pole, grid, free) for output in outputs), strict=True)
         best = _better(as_they_are, shares[0])
         for output, part in zip(outputs, as_they_are, strict=True):
             answer = part.responses[:, best.response] * best.slope

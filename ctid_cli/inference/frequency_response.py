@@ -17,7 +17,7 @@ from ctid_cli.inference.response_lines import ResponseLines, hold_factor, images
 from ctid_cli.inference.welch_response import welch
 from ctid_cli.signals.checks import require_choice, require_integer
 from ctid_cli.signals.held import Hold
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.regularity import REGULARITY
 from ctid_cli.signals.treatment import ResponseMethod
 
@@ -219,7 +219,7 @@ def estimate_frequency_response(
         raise DataError("there is no record to estimate a frequency response from")
     for record in every:
         if input_moves(record).kind == "constant":
-            raise DataError(f"{_named(record)}the input is constant: it excites no frequency")
+            raise DataError(f"{named(record)}the input is constant: it excites no frequency")
     first, hold = every[0], every[0].input.hold
     odd = next((sentence for record in every if (sentence := _not_on_one_clock(record))), None)
     if odd is not None:
@@ -260,7 +260,7 @@ def _on_any_clock(
     if method not in ("auto", "local-polynomial") or more:
         wanted = "several records are taken as realisations" if more else f"--method {method}"
         raise DataError(
-            f"{_named(record)}{wanted} on one regular clock, but {reason}; use --method local-polynomial, one record "
+            f"{named(record)}{wanted} on one regular clock, but {reason}; use --method local-polynomial, one record "
             "at a time"
         )
     late = min(_begins(record), 0.5 * record.duration)
@@ -290,7 +290,7 @@ def _later(lines: ResponseLines, delay: float) -> ResponseLines:
 def _require_some(lines: ResponseLines, record: Record) -> None:
     if lines.frequencies.size < FEWEST:
         raise DataError(
-            f"{_named(record)}the input excites too few frequencies for a response over frequency; record an input that"
+            f"{named(record)}the input excites too few frequencies for a response over frequency; record an input that"
             " switches often, a multisine or a chirp"
         )
 
@@ -367,8 +367,4 @@ def _require_alike(records: list[Record], period: int | None) -> None:
     for record in records[1:]:
         same = abs((record.interval or 0.0) - (first.interval or 0.0)) <= REGULARITY * (first.interval or 0.0)
         if not same or record.input.hold != first.input.hold:
-            raise DataError(f"{_named(record)}its clock or hold is not that of {first.name or 'the first record'}")
-
-
-def _named(record: Record) -> str:
-    return f"{record.name}: " if record.name else ""
+            raise DataError(f"{named(record)}its clock or hold is not that of {first.name or 'the first record'}")

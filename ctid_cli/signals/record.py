@@ -216,3 +216,8 @@ def beginning(record: Record, samples: int) -> Record:
     known = record.input.t <= t[-1]
     signal = HeldSignal(record.input.t[known], record.input.values[known], record.input.hold)
     return Record(t, record.y[:samples], signal, name=record.name)
+
+
+def named(record: Record) -> str:
+    """How a message about a record begins."""
+    return f"{record.name}: " if record.name else ""

@@ -77,21 +77,21 @@ def test_one_step_in_noise_is_seen():
     assert all(outcome(record_of(u, 0.94 * x + 0.33 * noise(rng, 300, COLOURS[2]))).seen for _ in range(6))
 
 
-@pytest.mark.parametrize("free_response", [False, True])
-def test_the_share_is_that_of_least_squares(free_response):
+@pytest.mark.parametrize("initial_state", ["rest", "estimate"])
+def test_the_share_is_that_of_least_squares(initial_state):
     rng = np.random.default_rng(43)
     record = answering(rng, 100)
     t, y, best = record.t, record.y - record.y.mean(), 0.0
     for pole in module._poles(1.0, 99.0):
         denominator = np.real(np.poly([pole, pole.conjugate()] if np.imag(pole) else [pole]))
         beside = [np.ones(100)]
-        if free_response and pole:
+        if initial_state == "estimate" and pole:
             beside += [np.exp(pole * t).real] + [np.exp(pole * t).imag] * bool(np.imag(pole))
         left = y - np.column_stack(beside) @ np.linalg.lstsq(np.column_stack(beside), y, rcond=None)[0]
         columns = np.column_stack([*beside, simulate(TransferFunction([1.0], denominator, 4.0), record.input, t)])
         rest = y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
         best = max(best, 1 - float(rest @ rest) / float(left @ left))
-    found = outcome(record, delays=(4.0, 4.0), free_response=free_response)
+    found = outcome(record, delays=(4.0, 4.0), initial_state=initial_state)
     assert found.explained == pytest.approx(best, rel=1e-6)
 
 
@@ -158,10 +158,10 @@ def test_free_responses_and_steady_states():
     twice = simulate(FIRST_ORDER, HeldSignal(np.arange(200.0), np.append(u, u)), np.arange(200.0))
     steady = record_of(u, twice[100:] + 0.01 * noise(rng, 100))
     assert outcome(steady).explained < 0.5
-    assert outcome(steady, periodic=True).explained > 0.95
+    assert outcome(steady, initial_state="periodic").explained > 0.95
     # A free response is none to the input, however large.
     falling = record_of(next(inputs(rng, 100)), 50.0 * np.exp(-t / 12.0) + noise(rng, 100))
-    assert not outcome(falling, free_response=True).seen
+    assert not outcome(falling, initial_state="estimate").seen
 
 
 def test_outliers_hide_no_answer():
