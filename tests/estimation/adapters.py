@@ -13,12 +13,6 @@ def steps(*, max_iterations, tolerance, variant="guarded", halvings=HALVINGS):
     return Steps(max_iterations, tolerance, {**RULES, "gauss_newton": GAUSS_NEWTON}[variant], halvings)
 
 
-def scaled_solve(matrix, right, rows, columns):
-    """The solution, or None."""
-    solved, solution = iteration.solve_scaled(matrix, right, rows, columns, right.size)
-    return solution if solved else None
-
-
 def delay_step(equations, least_curvature=delay_search.LEAST_CURVATURE):
     """The step where the coefficients are at their minimum, or None."""
     step = delay_search.delay_step(equations, least_curvature)

@@ -8,7 +8,7 @@ from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
-from tests.estimation.adapters import CoefficientProblem, DelayProblem, iterate, scaled_solve
+from tests.estimation.adapters import CoefficientProblem, DelayProblem, iterate
 from tests.estimators.records import CASE_1, CASE_2, make_record, theta_of
 
 DEGREES = {CASE_1: Structure(2, 0), CASE_2: Structure(4, 1)}
@@ -168,22 +168,6 @@ def test_a_last_step_that_was_mirrored_is_no_convergence(error, status, variant)
 
 def test_start_that_is_not_admissible_gives_nothing():
     assert iterate(Fixed([]), np.zeros(1), max_iterations=10, tolerance=1e-8, variant="guarded") is None
-
-
-def test_scaling_solves_what_plain_elimination_would_lose():
-    # Columns of very different units: the solution to full accuracy.
-    rng = np.random.default_rng(0)
-    base = rng.standard_normal((3, 3))
-    units = np.array([1e-150, 1.0, 1e120])
-    x = scaled_solve(base * np.outer(units, units), units, units**2, units**2)
-    np.testing.assert_allclose(x, np.linalg.solve(base, np.ones(3)) / units, rtol=1e-9)
-
-
-def test_singular_equations_have_no_solution():
-    ones = np.ones(2)
-    assert scaled_solve(np.ones((2, 2)), ones, ones, ones) is None
-    assert scaled_solve(np.eye(2), ones, np.array([1.0, 0.0]), ones) is None
-    assert scaled_solve(np.full((2, 2), np.nan), ones, ones, ones) is None
 
 
 class Scalar:

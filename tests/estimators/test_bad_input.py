@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
+from ctid_cli.estimation.common import Start
 from ctid_cli.estimators.srivc import Srivc
 from ctid_cli.estimators.svf import Svf
 from ctid_cli.estimators.td_srivc import TdSrivc
@@ -112,6 +113,13 @@ def test_delay_bounds_beyond_the_record_are_refused(estimator):
         estimator(2, 0, (0, 15)).fit(record_of(T, U, Y))
     with pytest.raises(DataError, match=r"usable samples for 4 parameters"):
         estimator(2, 0, (0, 9.7)).fit(record_of(T, U, Y))
+
+
+@pytest.mark.parametrize("estimator", [TdSrivc(2, 0, (2, 12)), UsefulRedundancy(2, 0, (2, 12), bandwidth=2.02)])
+@pytest.mark.parametrize("delay", [1.0, 13.0, -2.0, np.nan])
+def test_starts_outside_the_bounds_are_refused(estimator, delay):
+    with pytest.raises(DataError, match=f"initial delay, {delay:g} s, lies outside the bounds 2 to 12 s"):
+        estimator.fit(make_record(n=1000), Start(delay))
 
 
 def test_lowpass_beyond_the_clock_is_refused():

@@ -1,15 +1,19 @@
 """An estimate does not depend on the units, nor on the clock on the wall."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimators.srivc import Srivc
+from ctid_cli.estimators.svf import Svf
 from ctid_cli.estimators.td_srivc import TdSrivc
+from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
+from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
-from tests.estimators.records import CASE_1, CASE_2, make_record
+from tests.estimators.records import CASE_1, CASE_2, assert_same_model, make_record
 
 RECORDS = {
     (model, regular): make_record(model, snr_db=10, regular=regular, n=1500, clock_period=0.5)
@@ -90,3 +94,38 @@ def test_samples_that_are_not_used_do_not_matter(case, seed):
     changed, _ = fit(case[0], Record(record.t, y, record.input))
     for name, value in REFERENCE[case][0].parameters.items():
         np.testing.assert_allclose(changed.parameters[name], value, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "start"),
+    [(Srivc(2, 0, 8.0, 1.0), None), (TdSrivc(2, 0, (0, 15), svf_cutoff=1.0, tolerance=1e-10), Start(7.5))],
+)
+def test_missing_outputs_are_as_good_as_absent_ones(estimator, start):
+    # A linear hold bridges a gap by the same line either way, so every number agrees.
+    record = make_record(snr_db=15, regular=False)
+    gone = np.zeros(record.n_samples, bool)
+    gone[np.random.default_rng(0).choice(record.n_samples, 400, replace=False)] = True
+    with_nan = Record(record.t, np.where(gone, np.nan, record.y), record.input)
+    absent = Record(record.t[~gone], record.y[~gone], record.input)
+    one, two = (estimator.fit(each, start) for each in (with_nan, absent))
+    assert one.count == two.count < record.n_samples
+    assert_same_model(one.model, two.model, 1e-9 if start else 1e-10)
+    np.testing.assert_allclose(one.cost, two.cost, rtol=1e-10)
+    assert one.iterations == two.iterations
+
+
+@pytest.mark.parametrize(
+    ("estimator", "start"),
+    [
+        (Svf(2, 0, 8.0, 1.0), None),
+        (Srivc(2, 0, 8.0, 1.0), None),
+        (TdSrivc(2, 0, (0, 15), Lowpass(0.4), 1.0), Start(7.0)),
+        (UsefulRedundancy(2, 0, (0, 15), 2.02, svf_cutoff=1.0), Start(7.0)),
+    ],
+)
+def test_nothing_of_the_record_changes(estimator, start):
+    record = make_record(snr_db=15, n=1500)
+    before = [a.copy() for a in (record.t, record.y, record.input.t, record.input.values)]
+    estimator.fit(record, start)
+    after = (record.t, record.y, record.input.t, record.input.values)
+    assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))

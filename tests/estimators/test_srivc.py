@@ -99,20 +99,6 @@ def test_hold_of_the_output_does_not_move_the_estimate(regular, variant):
     assert fits[0].history[0].denominator != fits[1].history[0].denominator
 
 
-def test_missing_outputs_are_as_good_as_absent_ones():
-    # A linear hold bridges a gap by the same line either way, so every number agrees.
-    record = make_record(snr_db=15, regular=False)
-    gone = np.zeros(record.n_samples, bool)
-    gone[np.random.default_rng(0).choice(record.n_samples, 400, replace=False)] = True
-    with_nan = Record(record.t, np.where(gone, np.nan, record.y), record.input)
-    absent = Record(record.t[~gone], record.y[~gone], record.input)
-    one, two = (Srivc(**options(CASE_1)).fit(r) for r in (with_nan, absent))
-    assert one.count == two.count < make_record().n_samples
-    assert_same_model(one.model, two.model, 1e-10)
-    assert one.cost == pytest.approx(two.cost, rel=1e-10)
-    assert one.iterations == two.iterations
-
-
 def test_first_order_system_without_delay():
     # Relative degree one: the derivative of the output has a direct part.
     t = 0.1 * np.arange(600)
@@ -130,15 +116,6 @@ def test_start_is_ignored_and_preparing_is_fitting(estimator):
     for start in (None, Start(), Start(delay=3.0)):
         assert prepared.fit(start).parameters == fit.parameters
     assert estimator.start_from != "delay"
-
-
-def test_nothing_of_the_record_changes():
-    record = make_record(snr_db=15)
-    before = [a.copy() for a in (record.t, record.y, record.input.t, record.input.values)]
-    for estimator in (Svf(**options(CASE_1)), Srivc(**options(CASE_1))):
-        estimator.fit(record)
-    after = (record.t, record.y, record.input.t, record.input.values)
-    assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
 
 
 def test_too_few_iterations_say_so():

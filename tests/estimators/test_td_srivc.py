@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimators.srivc import Srivc
 from ctid_cli.estimators.td_srivc import TdSrivc
@@ -196,29 +195,3 @@ def test_delay_that_the_data_do_not_determine_is_no_success(variant):
 def test_too_few_iterations_say_so():
     fit = TdSrivc(2, 0, (0, 15), max_iterations=1, variant="plain").fit(make_record(snr_db=15), Start(7.0))
     assert fit.status is Status.MAX_ITERATIONS
-
-
-def test_start_outside_the_bounds_is_refused():
-    prepared = TdSrivc(2, 0, (2, 12)).prepare(make_record(n=500))
-    for delay in (1.0, 13.0, np.nan):
-        with pytest.raises(DataError, match=f"initial delay, {delay:g} s, lies outside the bounds 2 to 12 s"):
-            prepared.fit(Start(delay))
-
-
-def test_nothing_of_the_record_changes():
-    record = make_record(snr_db=15, n=1500)
-    before = [a.copy() for a in (record.t, record.y, record.input.t, record.input.values)]
-    TdSrivc(**options(CASE_1, lowpass=Lowpass(0.4))).fit(record, Start(7.0))
-    after = (record.t, record.y, record.input.t, record.input.values)
-    assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
-
-
-def test_missing_outputs_are_as_good_as_absent_ones():
-    record = make_record(snr_db=15, regular=False)
-    gone = np.zeros(record.n_samples, bool)
-    gone[np.random.default_rng(0).choice(record.n_samples, 400, replace=False)] = True
-    with_nan = Record(record.t, np.where(gone, np.nan, record.y), record.input)
-    absent = Record(record.t[~gone], record.y[~gone], record.input)
-    one, two = (TdSrivc(**options(CASE_1, tolerance=1e-10)).fit(r, Start(7.5)) for r in (with_nan, absent))
-    assert one.count == two.count
-    assert_same_model(one.model, two.model, 1e-9)
