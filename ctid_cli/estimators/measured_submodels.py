@@ -61,19 +61,12 @@ class SubmodelsFit(MeasuredFit):
 
 
 @dataclass(frozen=True, eq=False)
-class LaidOutSubmodels:
+class LaidOutSubmodels(Submodels):
     """A measured record laid out for submodels."""
 
-    record: Record
-    submodels: Submodels
     #: Means that were subtracted.
     input_offset: float
     offset: float
-
-    @property
-    def problem(self) -> AdditiveProblem:
-        """What is solved."""
-        return self.submodels.problem
 
     def free_columns(self, theta: Array) -> Array:
         """Free responses of a model at the used samples, a column for each of their coefficients."""
@@ -189,11 +182,11 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         if len(several) != 1:
             raise DataError("submodels are estimated from one record; give one file")
         record, u0, y0 = without_means(several[0]) if self.offset == "remove" else (several[0], 0.0, 0.0)
-        return LaidOutSubmodels(record, self.estimator._lay_out(record), u0, y0)
+        return LaidOutSubmodels(record, self.estimator._lay_out(record).problem, u0, y0)
 
     def _estimate(self, laid_out: LaidOutSubmodels, start: Start | None) -> SubmodelsFit:
         problem = laid_out.problem
-        model, method = laid_out.submodels.start
+        model, method = laid_out.start
         if start is not None and start.model is not None:
             model, method = start.model, "The start was given."
         found = self.estimator._iterate(problem, model)
@@ -257,8 +250,8 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
     def _apply(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> AppliedModel:
         """The model on another record."""
         model = self._factors(fit)
-        submodels = Submodels(laid_out.record, replace(laid_out.problem, terms=model.terms, loop=OPEN_LOOP))
-        return replace(laid_out, submodels=submodels).errors_of(model.theta, self.initial_state == "estimate")
+        open_loop = replace(laid_out.problem, terms=model.terms, loop=OPEN_LOOP)
+        return replace(laid_out, problem=open_loop).errors_of(model.theta, self.initial_state == "estimate")
 
     def _lowered(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> dict[str, float]:
         """Sums of squared errors if an initial state or an offset were estimated too, to first order."""

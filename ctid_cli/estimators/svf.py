@@ -1,7 +1,7 @@
 """Least squares with a state-variable filter."""
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Estimator, Start, check_proper, check_record, finish, history_entry
@@ -14,15 +14,8 @@ from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import OutputHold
 
 
-class Equation(NamedTuple):
-    """A filtered record, and the cut-off of the filter [rad/s]."""
-
-    problem: SampledProblem
-    svf_cutoff: float
-
-
 @dataclass(frozen=True)
-class Svf(Estimator[Equation, Fit]):
+class Svf(Estimator[tuple[SampledProblem, float], Fit]):
     """Least-squares estimate with the state-variable filter ``1/(p + svf_cutoff)^poles``.
 
     Parameters
@@ -66,15 +59,16 @@ class Svf(Estimator[Equation, Fit]):
         super().__post_init__()
         check_proper(self.poles, self.zeros)
 
-    def _lay_out(self, record: Record) -> Equation:
+    def _lay_out(self, record: Record) -> tuple[SampledProblem, float]:
+        """A filtered record, and the cut-off of the filter [rad/s]."""
         data = filter_data(record, self.delay, self.hold_output)
         structure = Structure(self.poles, self.zeros)
         check_record(record, data, structure.size)
-        return Equation(at_known_delay(data, structure), cutoffs_of(record, self.svf_cutoff)[0])
+        return at_known_delay(data, structure), cutoffs_of(record, self.svf_cutoff)[0]
 
-    def _estimate(self, equation: Equation, start: Start | None) -> Fit:
-        problem = equation.problem
-        theta = least_squares_start(problem.data, problem.structure, self.delay, equation.svf_cutoff)
+    def _estimate(self, laid_out: tuple[SampledProblem, float], start: Start | None) -> Fit:
+        problem, svf_cutoff = laid_out
+        theta = least_squares_start(problem.data, problem.structure, self.delay, svf_cutoff)
         if theta is None:
             raise DataError(Status.SINGULAR.value)
         squared_error = problem.equations(theta).squared_error
