@@ -10,11 +10,12 @@ import threading
 import time
 import warnings
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from ctid_cli.running.job import Began, run_job
 from ctid_cli.running.limits import Usage, usage
-from ctid_cli.running.progress import ProgressWriter
+from ctid_cli.running.progress import write_entry
 
 _PR_SET_PDEATHSIG = 1
 
@@ -37,17 +38,15 @@ class Mark:
 def compute(path: str, packed: bytes) -> None:
     """Compute a job, and write what comes of it to its file; nothing is to be done where that is there already."""
     try:
-        progress = ProgressWriter(path)
+        Path(path).touch(exist_ok=False)
     except FileExistsError:
         return
-    try:
-        progress.write(Received(os.getpid()))
+    with open(path, "ab") as progress:
+        write_entry(progress, Received(os.getpid()))
         # Code of one's own is imported here.
         _, job, limits = pickle.loads(packed)
         for entry in run_job(job, limits):
-            progress.write(Mark(entry, usage("self")) if isinstance(entry, Began) else entry)
-    finally:
-        progress.close()
+            write_entry(progress, Mark(entry, usage("self")) if isinstance(entry, Began) else entry)
 
 
 def call(path: str, packed: bytes) -> Any:
