@@ -85,13 +85,11 @@ def _published_origin(published: Path, study: str) -> Iterator[str]:
         environment = json.loads((published / "environment.json").read_text(encoding="utf-8"))
     except OSError:
         return
-    # Older ones are the sessions themselves.
-    of_experiments = environment.get("sessions", environment)
-    sessions = [session for own in of_experiments.values() for session in own]
+    sessions = [session for own in environment["sessions"].values() for session in own]
     computed = sum(session["computed"] for session in sessions)
     last = max(session["stopped"] or session["started"] for session in sessions)
-    where = f" from commit {environment['commit']}" if "commit" in environment else ""
-    yield f"Published{where}: {computed} estimates in {count(len(sessions), 'session')} until {last}."
+    made = f"{computed} estimates in {count(len(sessions), 'session')} until {last}"
+    yield f"Published from commit {environment['commit']}: {made}."
     packages = sessions[-1]["packages"].items()
     yield "Made with " + ", ".join(f"{name} {version}" for name, version in packages) + "."
     if remark := made_by(published, study):

@@ -13,6 +13,7 @@ from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
+from tests.filtering.plants import parts, with_delay
 
 INTERVAL = 0.05
 TWO_MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
@@ -29,16 +30,6 @@ LOOPS = {
     "gain and gain": (AdditiveModel([Submodel([2.0], [1.0])]), DiscreteController([0.4], [1.0])),
     "fraction": (TransferFunction([2.0], [1.0, 3.0, 0.0]), DiscreteController([0.5], [1.0])),
 }
-
-
-def parts(model):
-    return [s.transfer_function() for s in model.submodels] if isinstance(model, AdditiveModel) else [model]
-
-
-def with_delay(model, delay):
-    if isinstance(model, AdditiveModel):
-        return AdditiveModel(model.submodels, delay)
-    return TransferFunction(model.numerator, model.denominator, delay)
 
 
 def plant_of_python_control(model, interval):

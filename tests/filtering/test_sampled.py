@@ -13,17 +13,10 @@ from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
+from tests.filtering.plants import FOUR_MODES, parts, with_delay
 
 INTERVAL = 0.05
 FLEXIBLE = Submodel([1.0], [0.025, 0.01, 1.0])
-FOUR_MODES = AdditiveModel(
-    [
-        Submodel([3.0], [0.501354, 0.250677, 1.0]),
-        Submodel([0.4], [0.0999191, 0.0299757, 1.0]),
-        Submodel([0.2], [0.0300104, 0.0102035, 1.0]),
-        Submodel([0.05], [0.00999499, 0.00999499, 1.0]),
-    ]
-)
 MODELS = {
     "four modes": FOUR_MODES,
     "integrator with a lag": AdditiveModel([Submodel([1.0], [0.5, 1.0], 1), FLEXIBLE]),
@@ -34,16 +27,6 @@ MODELS = {
     "repeated poles": TransferFunction([1.0, 2.0], [1.0, 6.0, 12.0, 8.0]),
     "unstable": TransferFunction([1.0], [1.0, -0.2, 1.0]),
 }
-
-
-def parts(model):
-    return [s.transfer_function() for s in model.submodels] if isinstance(model, AdditiveModel) else [model]
-
-
-def with_delay(model, delay):
-    if isinstance(model, AdditiveModel):
-        return AdditiveModel(model.submodels, delay)
-    return TransferFunction(model.numerator, model.denominator, delay)
 
 
 def response(matrices, u):

@@ -9,16 +9,9 @@ from ctid_cli.errors import DataError
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import factored, factored_jacobian, unfactored, unfactored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
+from tests.filtering.plants import FOUR_MODES
 
 TWO_MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])], delay=0.3)
-FOUR_MODES = AdditiveModel(
-    [
-        Submodel([3.0], [0.501354, 0.250677, 1.0]),
-        Submodel([0.4], [0.0999191, 0.0299757, 1.0]),
-        Submodel([0.2], [0.0300104, 0.0102035, 1.0]),
-        Submodel([0.05], [0.00999499, 0.00999499, 1.0]),
-    ]
-)
 BEAM = AdditiveModel(
     [
         Submodel([gain], [1 / (2 * np.pi * hertz) ** 2, 2 * damping / (2 * np.pi * hertz), 1.0])
