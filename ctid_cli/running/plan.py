@@ -16,15 +16,13 @@ from ctid_cli.simulation.frequency_measures import Measuring
 from ctid_cli.simulation.frequency_runs import FrequencyEstimation, SignalSource
 from ctid_cli.simulation.own_components import OwnSystem
 from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, replaced, variants
-from ctid_cli.specification.spec import MonteCarloSection, Spec
+from ctid_cli.specification.spec import OF_DATA, MonteCarloSection, Spec
 from ctid_cli.specification.start_points import NO_START, start_points
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.storage.columns import reserved_names
 
 #: Data sets that one experiment may ask for; beyond this its plan alone would fill the memory.
 MAX_DATA_SETS = 1_000_000
-#: Sections that data are simulated from.
-_SIMULATED = ("system", "excitation", "loop", "sampling", "noise", "recorder", "signal", "disturbance")
 
 
 def build_plan(spec: Spec, runs: int | None = None) -> Plan:
@@ -37,7 +35,7 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
         spec = replaced(spec, ("monte_carlo",), section)
         count, first = section.most, section.first
     # Of a measured record only those of its loop.
-    parts = {name: found for name in _SIMULATED if (found := variants(getattr(spec, name)))}
+    parts = {name: found for name in OF_DATA if (found := variants(getattr(spec, name)))}
     cells = math.prod(map(len, parts.values()))
     for number, most, what in ((cells, MAX_COMBINATIONS, "data cells"), (cells * count, MAX_DATA_SETS, "data sets")):
         if number > most:

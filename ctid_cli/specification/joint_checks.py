@@ -20,7 +20,7 @@ from ctid_cli.simulation.dataset import LoopOptions, located
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import MAX_COMBINATIONS, Section, Variant, case_count, over, variants
 from ctid_cli.specification.signal_checks import signal_complaints, world_complaints
-from ctid_cli.specification.spec import Spec
+from ctid_cli.specification.spec import OF_DATA, Spec
 from ctid_cli.specification.start_points import additive_form
 from ctid_cli.specification.start_sections import RelativeStart, StartsSection, UniformStart
 from ctid_cli.specification.yaml_source import KeyPath
@@ -57,8 +57,7 @@ class Extent:
 
 def too_many_cases(spec: Spec) -> str:
     """Why not even the combinations of a specification can be looked at; empty if they can."""
-    parts = (spec.system, spec.excitation, spec.loop, spec.sampling, spec.noise, spec.recorder, spec.signal)
-    cells = math.prod(map(case_count, (*parts, spec.disturbance)))
+    cells = math.prod(case_count(getattr(spec, name)) for name in OF_DATA)
     estimators = sum(map(case_count, spec.estimators.values()))
     if cells > MAX_COMBINATIONS:
         return f"the lists combine to {cells} data cells, which are too many; at most {MAX_COMBINATIONS} are allowed"

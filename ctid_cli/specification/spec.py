@@ -37,6 +37,8 @@ _EXPERIMENT = matching(
 _NAME = matching("[A-Za-z0-9_-]{1,60}", "a name has letters, digits, '-' and '_', at most 60 of them")
 
 _SIMULATED = ("system", "excitation", "sampling")
+#: Sections that data are simulated from; their lists combine to data cells.
+OF_DATA = ("system", "excitation", "loop", "sampling", "noise", "recorder", "signal", "disturbance")
 #: Sections that belong to the identification of systems.
 _OF_SYSTEMS = ("system", "excitation", "loop", "noise", "recorder", "data", "starts")
 
