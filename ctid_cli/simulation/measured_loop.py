@@ -53,19 +53,12 @@ def unexplained(record: Record, r: Array, controller: DiscreteController, enters
     at_controller = enters == "controller"
     u, driven = record.input.values, (r if at_controller else 0.0) - record.y
     own = u if at_controller else u - r
-    count = u.size - a.size + 1
-    moves, made = (_filtered(c, x, count) for c, x in ((a, own), (b, driven)))
+    # From the first instant on at which all samples of the polynomials are there.
+    moves, made = np.convolve(own, a, "valid"), np.convolve(driven, b, "valid")
     left = moves - made
     present = np.isfinite(left)
     scale = float(np.mean(moves[present] ** 2)) if present.any() else 0.0
     return float(np.sqrt(np.mean(left[present] ** 2) / scale)) if scale > 0 else float("inf")
-
-
-def _filtered(coefficients: Array, x: Array, count: int) -> Array:
-    """A polynomial in q on a signal, from the first instant on at which all its samples are there."""
-    size = coefficients.size
-    shifted = [c * x[size - 1 - k : size - 1 - k + count] for k, c in enumerate(coefficients.tolist())]
-    return np.asarray(np.sum(shifted, axis=0))
 
 
 def _check_units(measured: Measurement, loop: LoopOptions) -> None:

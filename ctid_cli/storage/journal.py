@@ -112,7 +112,7 @@ class Journal(JournalReader):
         # Not sorted: the order of swept fields and starts is that of the specification.
         text = json.dumps(manifest, allow_nan=False)
         if self._meta("manifest") != text:
-            self._set_meta("manifest", text)
+            self._insert("meta", "manifest", text)
             self._connection.execute("DELETE FROM meta WHERE name = ?", (SEALED,))
 
     def add(self, outcomes: Iterable[Outcome], session: int) -> None:
@@ -150,18 +150,18 @@ class Journal(JournalReader):
             where = " AND ".join(f"{name} = ?" for name in KEY.split(", "))
             query = f"SELECT checksum FROM estimates WHERE {where}"
             for (earlier,) in self._connection.execute(query, row.key).fetchall():
-                tally.remove(earlier)
+                tally.add(earlier, -1)
             tally.add(checksum)
             values = (*row.key, row.result, checksum, row.seconds, row.session, row.origin, row.cpu_seconds)
             self._connection.execute("INSERT OR REPLACE INTO estimates VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", values)
         self._connection.execute("DELETE FROM meta WHERE name = ?", (SEALED,))
-        self._set_meta(TALLY, str(tally))
+        self._insert("meta", TALLY, str(tally))
         return tally
 
     def mark_sealed(self, checksum: str) -> None:
         """Note that the sealed file holds the present estimates of the present plan."""
         with self._transaction():
-            self._set_meta(SEALED, checksum)
+            self._insert("meta", SEALED, checksum)
 
     def end(self, session: int, stopped: str, reason: str) -> None:
         """Note that a run ends."""
@@ -195,7 +195,7 @@ class Journal(JournalReader):
             for table in ("meta", "origins", "sessions"):
                 for *row, _ in execute(f"SELECT * FROM {table}").fetchall():
                     self._insert(table, *row)
-            self._set_meta(TALLY, str(self._tally))
+            self._insert("meta", TALLY, str(self._tally))
 
     def close(self) -> None:
         """Close the file; closing cannot lose what was acknowledged, so it does not complain."""
@@ -212,9 +212,6 @@ class Journal(JournalReader):
     def _next(self, table: str) -> int:
         (number,) = self._connection.execute(f"SELECT coalesce(max(number), 0) + 1 FROM {table}").fetchone()
         return int(number)
-
-    def _set_meta(self, name: str, value: str) -> None:
-        self._insert("meta", name, value)
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:

@@ -82,9 +82,9 @@ class Tally:
     count: int = 0
     mark: int = 0
 
-    def add(self, checksum: str) -> None:
-        """Count an estimate."""
-        self.count += 1
+    def add(self, checksum: str, count: int = 1) -> None:
+        """Count an estimate, or with -1 count it no more."""
+        self.count += count
         self.mark ^= int(checksum, 16)
 
     def add_all(self, checksums: str) -> None:
@@ -92,11 +92,6 @@ class Tally:
         halves = np.frombuffer(bytes.fromhex(checksums), dtype=">u8").reshape(-1, 2)
         self.count += len(halves)
         self.mark ^= int.from_bytes(np.bitwise_xor.reduce(halves, axis=0).astype(">u8").tobytes(), "big")
-
-    def remove(self, checksum: str) -> None:
-        """Count one no more."""
-        self.count -= 1
-        self.mark ^= int(checksum, 16)
 
     def __str__(self) -> str:
         return f"{self.count} {self.mark:032x}"

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ctid_cli.reporting.results import read_results
+from ctid_cli.running.cells import Plan
 from ctid_cli.running.engine import run_experiment
 from ctid_cli.studies.catalogue import StudyFolder
 from ctid_cli.written_files import write_file
@@ -40,8 +41,7 @@ def compute_first(study: StudyFolder, out: Path, jobs: int | None = None) -> Est
     for short, overrides in study.first.items():
         plan = study.plan(short, ["monte_carlo.runs=1", *overrides])
         run_experiment(plan, out / plan.experiment, jobs=jobs)
-        # What takes one step from where it starts is compared whether it converged or not.
-        steps = {cell.name for cell in plan.estimators if cell.content.get("max_iterations") == 1}
+        steps = _single_steps(plan)
         for row in read_results(out, plan.experiment).rows:
             swept = [f"{name}={row[name]}" for name in plan.data_cells[0].swept]
             words = [short, *swept, row["estimator"], str(row.get("initial_delay")), str(row["replicate"])]
@@ -49,6 +49,11 @@ def compute_first(study: StudyFolder, out: Path, jobs: int | None = None) -> Est
             values = dict(_numbers({name: row.get(name) for name in QUANTITIES})) if compared else {}
             found[" ".join(words)] = {"status": row["status"], "values": values}
     return found
+
+
+def _single_steps(plan: Plan) -> set[str]:
+    """Estimators that take one step from where they start, which is compared whether it converged or not."""
+    return {cell.name for cell in plan.estimators if cell.content.get("max_iterations") == 1}
 
 
 def _numbers(content: Any, name: str = "") -> Iterator[tuple[str, float]]:
