@@ -77,9 +77,7 @@ def lock(folder: Path, *, shared: bool = False, patience: float = PATIENCE) -> I
                     raise InUseError(f"{folder} was moved by another process just now; run the command again")
                 break
             except BlockingIOError:
-                if time.monotonic() > deadline:
-                    raise InUseError(f"{folder} is in use by {_owner(folder)}; wait until it ends") from None
-                time.sleep(0.05)
+                _wait(folder, deadline)
             except OSError as error:
                 raise StorageError(_unlockable(folder, error)) from error
         if not shared:
@@ -143,9 +141,13 @@ def retract(folder: Path) -> None:
             (folder / RUNNING).unlink(missing_ok=True)
 
 
-def _owner(folder: Path) -> str:
-    running = who_runs(folder)
-    return f"process {running['pid']} on {running['host']}" if running else "another process"
+def _wait(folder: Path, deadline: float) -> None:
+    """Give the process that has a folder a moment more, if there is time."""
+    if time.monotonic() > deadline:
+        running = who_runs(folder)
+        owner = f"process {running['pid']} on {running['host']}" if running else "another process"
+        raise InUseError(f"{folder} is in use by {owner}; wait until it ends") from None
+    time.sleep(0.05)
 
 
 def who_runs(folder: Path) -> dict[str, Any] | None:
@@ -223,9 +225,7 @@ def reading_journal(folder: Path) -> Iterator[JournalReader | None]:
                 return
             except _NotYetError:
                 # A run is just opening the journal, or closing it.
-                if time.monotonic() > deadline:
-                    raise InUseError(f"{folder} is in use by {_owner(folder)}; wait until it ends") from None
-                time.sleep(0.05)
+                _wait(folder, deadline)
 
 
 class _NotYetError(Exception):
