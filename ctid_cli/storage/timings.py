@@ -12,7 +12,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import StorageError
 from ctid_cli.storage.packing import CLOCKS, PackedTable, decoded
-from ctid_cli.storage.pieces import AnyArray, Table, ranges
+from ctid_cli.storage.pieces import AnyArray, Table, Window, ranges
 
 #: Bytes of the file that are taken apart at once.
 AT_ONCE = 1_000_000
@@ -39,25 +39,21 @@ def times_table(table: PackedTable, *, shared: bool) -> bytes:
     return content.getvalue()
 
 
-class TimedTable:
+class TimedTable(Window):
     """A sealed table with the times that belong to it, read when they are asked for; NaN where they are not known."""
 
     def __init__(self, table: Table, path: Path) -> None:
-        self._table, self._path = table, path
-        self.count = table.count
+        super().__init__(table, 0, table.count)
+        self._path = path
 
     def has(self, name: str) -> bool:
         """Whether there is such an array."""
-        return name in CLOCKS or self._table.has(name)
-
-    def parts(self, name: str) -> list[str]:
-        """Names of the columns of an array that has several."""
-        return self._table.parts(name)
+        return name in CLOCKS or super().has(name)
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> AnyArray:
         """Some rows of an array."""
         if name not in CLOCKS:
-            return self._table.read(name, start, stop)
+            return super().read(name, start, stop)
         if stop is not None and stop - start <= FEW and "_times" not in self.__dict__:
             ids = self._table.read("id", start, stop)
             return _times(_lines(self._path, ids.tolist()), ids)[name]
