@@ -240,7 +240,8 @@ def test_killed_and_resumed_gives_the_same_bytes_with_all_its_tracks(tmp_path):
     stored = len(read_tracks(place))
     assert 2 <= stored < 25, "of every data set that was stored, from the journal"
     resumed = run_experiment(build_plan(spec), place, jobs=1)
-    assert resumed.reused >= 2 * stored
+    # The other estimates of a data set may not have been stored when it was killed.
+    assert resumed.reused >= stored
     assert resumed.reused + resumed.computed == 50
     run_experiment(build_plan(spec), tmp_path / "undisturbed", jobs=2)
     assert (place / "runs.h5").read_bytes() == (tmp_path / "undisturbed" / "runs.h5").read_bytes()
