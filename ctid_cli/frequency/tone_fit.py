@@ -5,13 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.frequency.moments import factorise, substitute
+from ctid_cli.frequency.tone_equations import NUMBERS, Work, make_equations, work_for
 
-#: Numbers of a tone: cosine and sine amplitude, and over half a window logarithmic growth, phase, curvature of phase.
-NUMBERS = 5
 #: Of them only so many are free in the first steps: what curves is fitted when what turns is nearly right.
 STRAIGHT = 4
 #: Largest logarithmic growth over half a window, and phase bent over half a window [rad].
@@ -29,8 +27,6 @@ DAMPING = 1e-4
 RAISED = 10.0
 LOWERED = 0.1
 MOST_DAMPING = 1e6
-#: Tones that are so many bins apart do not disturb each other's steps.
-FAR = 8.0
 #: Added to the diagonal before a covariance is found, as a share of it.
 RIDGE = 1e-13
 
@@ -44,131 +40,22 @@ class Windows(NamedTuple):
     used: IndexArray
     #: Numbers of the tones, shape (R, n, 5).
     numbers: Array
-    #: Inverse of the scaled normal matrix, tones first and the constant last, shape (R, 5 n + 1, 5 n + 1).
-    inverse: Array
+    #: Variances of the numbers in units of the noise: the diagonal of the inverse normal matrix, shape (R, n, 5).
+    variances: Array
     #: Whether the iteration ended at a minimum, shape (R,).
     converged: BoolArray
 
 
 def windows_at(first: IndexArray, most_tones: int) -> Windows:
     """Windows without a tone yet."""
-    rows, size = first.size, NUMBERS * most_tones + 1
+    rows = first.size
     return Windows(
         first=np.ascontiguousarray(first, dtype=np.int64),
         used=np.zeros(rows, np.int64),
         numbers=np.zeros((rows, most_tones, NUMBERS)),
-        inverse=np.zeros((rows, size, size)),
+        variances=np.zeros((rows, most_tones, NUMBERS)),
         converged=np.zeros(rows, np.bool_),
     )
-
-
-@njit(cache=True, nogil=True)
-def _starts(
-    tones: Array, length: int, z: NDArray[np.complex128], q: NDArray[np.complex128], p: NDArray[np.complex128]
-) -> None:
-    """Phasor of each tone at the first sample, its factor from there to the next, and the factor of that factor."""
-    du = 2.0 / (length - 1)
-    for k in range(tones.shape[0]):
-        growth, turn, bend = tones[k, 2], tones[k, 3], tones[k, 4]
-        z[k] = np.exp(complex(-growth, -turn + bend))
-        # phi(u + du) - phi(u) = turn du + bend (2 u du + du^2), at u = -1
-        q[k] = np.exp(complex(growth * du, turn * du + bend * (du * du - 2.0 * du)))
-        p[k] = np.exp(complex(0.0, 2.0 * bend * du * du))
-
-
-@njit(cache=True, nogil=True)
-def _left_over(y: Array, tones: Array, constant: float, out: Array) -> float:
-    """What the tones leave of a window; its sum of squares."""
-    length, n = y.size, tones.shape[0]
-    z, q, p = np.empty(n, np.complex128), np.empty(n, np.complex128), np.empty(n, np.complex128)
-    _starts(tones, length, z, q, p)
-    total = 0.0
-    for i in range(length):
-        r = y[i] - constant
-        for k in range(n):
-            r -= tones[k, 0] * z[k].real + tones[k, 1] * z[k].imag
-            z[k] *= q[k]
-            q[k] *= p[k]
-        out[i] = r
-        if not math.isnan(r):
-            total += r * r
-    return total
-
-
-@njit(cache=True, nogil=True)
-def _neighbours(tones: Array, free: int, pairs: IndexArray) -> tuple[int, int]:
-    """Pairs of tones that disturb each other, each with itself too, and the number of tones that the constant disturbs.
-
-    Those tones are listed in the last row of ``pairs``.
-    """
-    n = tones.shape[0]
-    count, low = 0, 0
-    for a in range(n):
-        wide = FAR * math.pi + 2.0 * abs(tones[a, 4])
-        if abs(tones[a, 3]) < wide:
-            pairs[2, low] = a
-            low += 1
-        for b in range(a + 1):
-            if abs(tones[a, 3] - tones[b, 3]) < wide + 2.0 * abs(tones[b, 4]):
-                pairs[0, count], pairs[1, count] = a, b
-                count += 1
-    return count, low
-
-
-@njit(cache=True, nogil=True)
-def _normal_equations(y: Array, tones: Array, constant: float, free: int, work: Array, pairs: IndexArray) -> float:
-    """``sum psi psi'`` and ``sum psi r`` of the free numbers, and the sum of squares of what is left.
-
-    Products of tones that are far from each other are left out: they vary so fast that their sums are nearly nothing.
-    """
-    gram, right, rows = work[0], work[2, 0], work[3]
-    length, n = y.size, tones.shape[0]
-    size = free * n + 1
-    last = size - 1
-    count, low = _neighbours(tones, free, pairs)
-    z, q, p = np.empty(n, np.complex128), np.empty(n, np.complex128), np.empty(n, np.complex128)
-    _starts(tones, length, z, q, p)
-    gram[:size, :size] = 0.0
-    right[:size] = 0.0
-    total = 0.0
-    step = 2.0 / (length - 1)
-    for i in range(length):
-        u = step * i - 1.0
-        r = y[i] - constant
-        for k in range(n):
-            real, imag = z[k].real, z[k].imag
-            s = tones[k, 0] * real + tones[k, 1] * imag
-            turned = tones[k, 1] * real - tones[k, 0] * imag
-            r -= s
-            row = rows[k]
-            row[0] = real
-            row[1] = imag
-            if free >= STRAIGHT:
-                row[2] = u * s
-                row[3] = u * turned
-            if free == NUMBERS:
-                row[4] = u * u * turned
-            z[k] *= q[k]
-            q[k] *= p[k]
-        if math.isnan(r):
-            continue
-        total += r * r
-        gram[last, last] += 1.0
-        right[last] += r
-        for k in range(n):
-            for a in range(free):
-                right[free * k + a] += rows[k, a] * r
-        for j in range(low):
-            k = pairs[2, j]
-            for a in range(free):
-                gram[last, free * k + a] += rows[k, a]
-        for j in range(count):
-            one, two = pairs[0, j], pairs[1, j]
-            for a in range(free):
-                value = rows[one, a]
-                for b in range(a + 1 if one == two else free):
-                    gram[free * one + a, free * two + b] += value * rows[two, b]
-    return total
 
 
 @njit(cache=True, nogil=True)
@@ -182,23 +69,40 @@ def _solve(factor: Array, scales: Array, right: Array, step: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
+def _pack(work: Work, place: int, tones: int, free: int) -> None:
+    """Choose the equations of the first numbers of each tone, and of the constant."""
+    size = free * tones + 1
+    right = work.vectors[0]
+    for a in range(size):
+        from_a = NUMBERS * (a // free) + a % free if a < size - 1 else NUMBERS * tones
+        right[a] = work.right[place, from_a]
+        for b in range(a + 1):
+            from_b = NUMBERS * (b // free) + b % free if b < size - 1 else NUMBERS * tones
+            work.packed[a, b] = work.gram[place, from_a, from_b]
+
+
+@njit(cache=True, nogil=True)
 def _iterate(
-    y: Array, tones: Array, constant: float, free: int, most: int, work: Array, pairs: IndexArray, residual: Array
-) -> tuple[float, bool]:
-    """Levenberg-Marquardt steps; the constant and whether they ended at a minimum. ``tones`` is changed in place."""
+    y: Array, tones: Array, constant: float, free: int, most: int, work: Work, place: int
+) -> tuple[float, int, bool]:
+    """Levenberg-Marquardt steps, of whose first numbers the equations are known.
+
+    The constant, the place of the equations, and whether the steps ended at a minimum; ``tones`` is changed in place.
+    """
     n = tones.shape[0]
     size = free * n + 1
-    gram, factor = work[0], work[1]
-    right, scales, step = work[2, 0], work[2, 1, :size], work[2, 2]
+    right, step, scales = work.vectors[0], work.vectors[1], work.vectors[2, :size]
     trial = np.empty_like(tones)
     damping = DAMPING
-    cost = _normal_equations(y, tones, constant, free, work, pairs)
     for _ in range(most):
+        _pack(work, place, n, free)
+        cost = work.cost[place]
+        refused = False
         while True:
             if damping > MOST_DAMPING:
-                return constant, True
-            if factorise(gram, damping, factor, scales):
-                _solve(factor, scales, right, step)
+                return constant, place, True
+            if factorise(work.packed, damping, work.factor, scales):
+                _solve(work.factor, scales, right, step)
                 largest, turned = 0.0, 0.0
                 for k in range(n):
                     for j in range(NUMBERS):
@@ -215,29 +119,28 @@ def _iterate(
                 for a in range(size):
                     gain += step[a] * right[a]
                 # So small a share of the standard errors matters to nobody, nor does rounding.
-                if gain <= SMALL * cost / gram[size - 1, size - 1] or largest <= SMALLEST:
-                    return constant, True
-                # A longer step may land on any of the minima.
+                if gain <= SMALL * cost / work.packed[size - 1, size - 1] or largest <= SMALLEST:
+                    return constant, place, True
+                # A longer step may land on any of the minima. Nearly every first step is taken, and its equations are
+                # those of the next one; after one that was not they are made when they are needed.
                 if turned < MOST_TURNED:
-                    reached = _left_over(y, trial, level, residual)
-                    if reached <= cost:
+                    if make_equations(y, trial, level, work, 1 - place, not refused) <= cost:
+                        if refused:
+                            make_equations(y, trial, level, work, 1 - place, True)
                         tones[:] = trial
                         constant = level
+                        place = 1 - place
                         damping = max(damping * LOWERED, 1e-12)
                         break
+                    refused = True
             damping *= RAISED
-        cost = _normal_equations(y, tones, constant, free, work, pairs)
-    return constant, False
+    return constant, place, False
 
 
 @njit(cache=True, nogil=True)
 def fit_windows(samples: Array, length: int, windows: Windows, chosen: IndexArray, residuals: Array) -> None:
     """Fit the tones of some windows, beginning with the numbers that they have; what is left goes to ``residuals``."""
-    most = windows.numbers.shape[1]
-    full = NUMBERS * most + 1
-    work = np.empty((4, max(full, NUMBERS), max(full, NUMBERS)))
-    pairs = np.empty((3, most * (most + 1) // 2 + 1), np.int64)
-    residual = np.empty(length)
+    work = work_for(windows.numbers.shape[1], length)
     for row in chosen:
         y = samples[windows.first[row] : windows.first[row] + length]
         n = windows.used[row]
@@ -253,19 +156,29 @@ def fit_windows(samples: Array, length: int, windows: Windows, chosen: IndexArra
             windows.converged[row] = False
             residuals[row] = np.nan
             continue
-        constant, done = _iterate(y, tones, constant, 2, 1, work, pairs, residual)
-        constant, done = _iterate(y, tones, constant, STRAIGHT, 4, work, pairs, residual)
-        constant, done = _iterate(y, tones, constant, NUMBERS, ITERATIONS, work, pairs, residual)
+        place = 0
+        make_equations(y, tones, constant, work, place, True)
+        constant, place, done = _iterate(y, tones, constant, 2, 1, work, place)
+        constant, place, done = _iterate(y, tones, constant, STRAIGHT, 4, work, place)
+        constant, place, done = _iterate(y, tones, constant, NUMBERS, ITERATIONS, work, place)
         windows.converged[row] = done
-        size = NUMBERS * n + 1
-        _normal_equations(y, tones, constant, NUMBERS, work, pairs)
-        _left_over(y, tones, constant, residuals[row])
-        scales = work[2, 1, :size]
-        if factorise(work[0], RIDGE, work[1], scales):
-            for a in range(size):
-                work[2, 0, :size] = 0.0
-                work[2, 0, a] = 1.0
-                _solve(work[1], scales, work[2, 0], work[2, 2])
-                windows.inverse[row, a, :size] = work[2, 2, :size]
-        else:
-            windows.inverse[row, :size, :size] = np.nan
+        for i in range(length):
+            residuals[row, i] = np.nan if math.isnan(y[i]) else work.left[place, i]
+        _pack(work, place, n, NUMBERS)
+        _variances(work, NUMBERS * n + 1, windows.variances[row])
+
+
+@njit(cache=True, nogil=True)
+def _variances(work: Work, size: int, variances: Array) -> None:
+    """Diagonal of the inverse of the equations: squares of the columns of the inverse of their factor."""
+    scales, column = work.vectors[2, :size], work.vectors[1]
+    known = factorise(work.packed, RIDGE, work.factor, scales)
+    for a in range(size - 1):
+        total = 0.0
+        for i in range(a, size if known else a):
+            value = 1.0 if i == a else 0.0
+            for k in range(a, i):
+                value -= work.factor[i, k] * column[k]
+            column[i] = value / work.factor[i, i]
+            total += column[i] * column[i]
+        variances[a // NUMBERS, a % NUMBERS] = total / (scales[a] * scales[a]) if known else np.nan

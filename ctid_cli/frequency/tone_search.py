@@ -159,14 +159,13 @@ def _tested(residuals: Array, windows: Windows, rows: IndexArray) -> _Tests:
 
 def _rows(windows: Windows, tests: _Tests, length: int) -> ToneRows:
     half = 0.5 * (length - 1)
-    rows, most = windows.numbers.shape[:2]
+    most = windows.numbers.shape[1]
     empty = np.arange(most) >= windows.used[:, None]
     cosine, sine, growth, turn, bend = (np.where(empty, np.nan, windows.numbers[:, :, j]) for j in range(NUMBERS))
-    variances = np.diagonal(windows.inverse, axis1=1, axis2=2)[:, : NUMBERS * most].reshape(rows, most, NUMBERS)
     noise = np.where(empty, np.nan, tests.left.noise(np.where(empty, 0.0, turn / half)))
     amplitude = np.hypot(cosine, sine)
     with np.errstate(invalid="ignore", divide="ignore"):
-        errors = np.sqrt(noise[:, :, None] * variances)
+        errors = np.sqrt(noise[:, :, None] * windows.variances)
         # A sin(phi) of unit square is left by a phase of 1 rad: half of the square of the tone, twice its demodulation.
         per_unit = np.sqrt(noise) / amplitude * TURNED_BY_CUBE / half
         bent, uncertain = 2.0 * tests.cube / (length / 7.0) * per_unit, np.sqrt(2.0 / (length / 7.0)) * per_unit

@@ -40,7 +40,7 @@ def test_the_fit_is_that_of_scipy(missing):
     # Iterations end a small part of a standard error before the minimum.
     assert np.abs(windows.numbers[0].ravel() - peer.x[:10]).max() < 0.02 * errors[:10].max()
     left_over = np.nansum(residuals**2) / (400 - missing - 11)
-    own = np.sqrt(left_over * np.diag(windows.inverse[0]))
+    own = np.sqrt(left_over * windows.variances[0].ravel())
     # Covariances of the linearised model; distant tones are taken as apart.
     assert own[[2, 3, 4, 7, 8, 9]] == pytest.approx(errors[[2, 3, 4, 7, 8, 9]], rel=0.03)
     assert residuals[0][np.isfinite(y)] == pytest.approx(left(peer.x), abs=0.02)
