@@ -31,7 +31,7 @@ class Work(NamedTuple):
     packed: Array
     factor: Array
     vectors: Array
-    #: Of a chunk: sensitivities, phasors and their factors, whether there is a sample, and two rows for products.
+    #: Of a chunk: sensitivities, phasors and their factors; whether there is a sample, two rows for products, and u.
     sensitivities: Array
     phasors: Array
     rows: Array
@@ -53,7 +53,7 @@ def work_for(tones: int, length: int) -> Work:
         np.zeros((3, size)),
         np.empty((size, chunk)),
         np.empty((4 * max(tones, 1), chunk)),
-        np.empty((3, chunk)),
+        np.empty((4, chunk)),
         np.empty((3, tones * (tones + 1) // 2 + 1), np.int64),
     )
 
@@ -140,8 +140,8 @@ def _take_tone(tone: Array, phasors: Array, there: Array, signal: Array, turned:
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def _sensitivities(phasors: Array, there: Array, signal: Array, turned: Array, u: float, du: float, rows: Array) -> None:
-    """Derivatives of a tone with respect to its numbers, from the chunk's first instant on."""
+def _sensitivities(phasors: Array, there: Array, signal: Array, turned: Array, u: Array, rows: Array) -> None:
+    """Derivatives of a tone with respect to its numbers."""
     of_cosine, of_sine, of_growth, of_turn, of_bend = rows[0], rows[1], rows[2], rows[3], rows[4]
     count = signal.size
     for j in range(count):
@@ -149,11 +149,11 @@ def _sensitivities(phasors: Array, there: Array, signal: Array, turned: Array, u
     for j in range(count):
         of_sine[j] = there[j] * phasors[1, j]
     for j in range(count):
-        of_growth[j] = (u + du * j) * signal[j]
+        of_growth[j] = u[j] * signal[j]
     for j in range(count):
-        of_turn[j] = (u + du * j) * turned[j]
+        of_turn[j] = u[j] * turned[j]
     for j in range(count):
-        of_bend[j] = (u + du * j) * of_turn[j]
+        of_bend[j] = u[j] * of_turn[j]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
@@ -175,6 +175,12 @@ def _turn(phasors: Array, further: complex, scratch: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
+def _advance(values: Array, by: float) -> None:
+    for j in range(values.size):
+        values[j] += by
+
+
+@njit(cache=True, nogil=True)
 def make_equations(y: Array, tones: Array, constant: float, work: Work, place: int, products: bool) -> float:
     """``sum psi psi'`` and ``sum psi r`` of all numbers, unless only what is left, and its sum of squares, are wanted.
 
@@ -189,8 +195,10 @@ def make_equations(y: Array, tones: Array, constant: float, work: Work, place: i
     gram[: last + 1, : last + 1] = 0.0
     right[: last + 1] = 0.0
     total = 0.0
-    du = 2.0 / (length - 1)
     chunk = work.rows.shape[1]
+    u = work.rows[3]
+    for j in range(chunk):
+        u[j] = 2.0 * j / (length - 1) - 1.0
     for first in range(0, length, chunk):
         here = min(chunk, length - first)
         there, signal, turned = work.rows[0, :here], work.rows[1, :here], work.rows[2, :here]
@@ -200,12 +208,11 @@ def make_equations(y: Array, tones: Array, constant: float, work: Work, place: i
             phasors = work.phasors[4 * k : 4 * k + 4]
             _take_tone(tones[k], phasors, there, signal, turned, left)
             if products:
-                _sensitivities(
-                    phasors, there, signal, turned, du * first - 1.0, du, rows[NUMBERS * k : NUMBERS * k + NUMBERS]
-                )
+                _sensitivities(phasors, there, signal, turned, u, rows[NUMBERS * k : NUMBERS * k + NUMBERS])
             if first + chunk < length:
                 _turn(phasors, further[k], work.rows[1])
         total += _product(left, left, here)
+        _advance(u, 2.0 * chunk / (length - 1))
         if not products:
             continue
         gram[last, last] += _sum(there, here)

@@ -6,7 +6,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.frequency.tone_rows import Readings
-from ctid_cli.frequency.tone_tests import FLOOR_BINS, MEDIAN_EFFICIENCY
+from ctid_cli.frequency.tone_tests import MEDIAN_EFFICIENCY
+from ctid_cli.frequency.whitening import FLOOR_BINS
 
 #: A reading goes on with a tone if it is no more than so many standard errors, or bins of the shorter window, off.
 GATE_ERRORS = 5.0

@@ -6,7 +6,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.frequency.tone_fit import NUMBERS, Windows, fit_windows, windows_at
-from ctid_cli.frequency.tone_tests import Left, Line, find_changes, strongest_line, whiten
+from ctid_cli.frequency.tone_tests import Line, find_changes, strongest_line
+from ctid_cli.frequency.whitening import Left, whiten
 
 #: Noise alone shows a line, or a change, in this share of the windows.
 LEVEL = 5e-4

@@ -7,23 +7,10 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.frequency.whitening import PADDING, SMALLEST_FLOOR, Left, floor_bins, periodogram, running_floor
 
-#: Highest order of the autoregressive model that whitens what is left, and samples for each: colour, not lines.
-WHITENING_ORDER = 4
-SAMPLES_PER_ORDER = 128
-#: Points of a periodogram for each bin of an unpadded one.
-PADDING = 2
-#: The floor beneath an ordinate is the running median of so many bins, and no more than half of them all.
-FLOOR_BINS = 101
-#: Ordinates higher than so many times the floor are cut before the floor's colour is modelled.
-CUT = 5.0
-ROUNDS = 3
-#: A floor is never divided by less.
-SMALLEST_FLOOR = 1e-300
 #: A tapered spectrum so high above its floor shows a line, whatever the colour of the noise.
 LINE_HEIGHT = 2e4
-#: A whitening filter is taken to let at least this share through.
-SMALLEST_GAIN = 1e-12
 #: The running median is as sure as the mean of so many bins for each of its own.
 MEDIAN_EFFICIENCY = 0.48
 #: Independent ordinates in a padded periodogram, for each sample.
@@ -31,113 +18,12 @@ INDEPENDENT = 0.8
 #: Lines that join together with the strongest one: how many, bins between them, the share of its ordinate that they
 #: exceed, and how far, times, they are above the height that noise exceeds with a chance.
 FURTHER = 4
-LOBES = 8.0
+LOBES = 8
 SIDE_LOBE = 0.1
 SURELY = 1.5
 LEAST_CHANCE = 1e-7
 #: A change is looked for in the middle of the window, without this share at each end.
 ENDS = 0.05
-
-
-class Left(NamedTuple):
-    """What is left of windows of one length, whitened."""
-
-    #: Whitened residuals of mean square 1 where they are noise; zero where a sample is missing, shape (R, L).
-    white: Array
-    #: Prediction-error filter of each window, shape (R, p + 1).
-    filters: Array
-    #: Mean square of the innovations, shape (R,).
-    innovations: Array
-    #: Where the tapered spectrum has its largest ordinate, as a share of all, and how high that is above the floor
-    #: before any whitening, shape (R,).
-    peak: Array
-    peak_height: Array
-
-    def noise(self, turn: Array) -> Array:
-        """Noise at some phases from sample to sample [rad] of each window: mean square of equally strong white noise.
-
-        Both shapes (R, n).
-        """
-        lags = np.arange(self.filters.shape[1])
-        response = (self.filters[:, None, :] * np.exp(-1j * turn[:, :, None] * lags)).sum(axis=2)
-        return np.asarray(self.innovations[:, None] / np.abs(response) ** 2)
-
-
-def whiten(residuals: Array, fitted: IndexArray) -> Left:
-    """Whiten rows of residuals, from which ``fitted`` numbers each were fitted, by autoregressive models.
-
-    The models are those of the floor: lines are cut from the spectrum before they are made.
-    """
-    length = residuals.shape[1]
-    there = np.isfinite(residuals)
-    present = there.sum(axis=1)
-    values = np.where(there, residuals, 0.0)
-    taper = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
-    power = np.abs(np.fft.rfft(values * taper, PADDING * length, axis=1)) ** 2
-    orders = min(WHITENING_ORDER, max(1, length // SAMPLES_PER_ORDER))
-    cosines = np.cos(np.outer(np.arange(orders + 1), np.linspace(0.0, np.pi, power.shape[1])))
-    weights = np.full(power.shape[1], 2.0)
-    weights[[0, -1]] = 1.0
-    peak = power.argmax(axis=1)
-    floor = np.take_along_axis(running_floor(power), peak[:, None], axis=1)[:, 0]
-    height = power[np.arange(peak.size), peak] / np.maximum(floor, SMALLEST_FLOOR)
-    shape = np.ones_like(power)
-    for _ in range(ROUNDS):
-        cut = np.minimum(power, CUT * shape * running_floor(power / shape))
-        filters = _prediction_errors((cut * weights) @ cosines.T, present)
-        # |A|^2 is the cosine series of the filter's own correlation.
-        own = np.stack([(filters[:, k:] * filters[:, : orders + 1 - k]).sum(axis=1) for k in range(orders + 1)])
-        own[1:] *= 2.0
-        shape = 1.0 / np.maximum(own.T @ cosines, SMALLEST_GAIN)
-    white = values.copy()
-    for lag in range(1, orders + 1):
-        white[:, lag:] += filters[:, lag, None] * values[:, : length - lag]
-    white[~there] = 0.0
-    order = (filters != 0.0).sum(axis=1) - 1
-    squares = (white**2).sum(axis=1) / np.maximum(present - fitted - order, 1)
-    white /= np.sqrt(np.where(squares > 0.0, squares, 1.0))[:, None]
-    return Left(white, filters, squares, peak / (power.shape[1] - 1), height)
-
-
-def running_floor(power: Array) -> Array:
-    """Running median of rows of ordinates, as the mean of exponential variables, shape (R, M)."""
-    size = power.shape[1]
-    half = floor_bins(size) * PADDING // 2
-    hop = max(1, half // 2)
-    count = -(-size // hop) + 1
-    padded = np.pad(power, ((0, 0), (half, half + (count - 1) * hop + 1 - size)), mode="reflect")
-    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=1)[:, ::hop, ::PADDING]
-    medians = np.median(around, axis=2)
-    place = np.arange(size) / hop
-    below = place.astype(int)
-    share = place - below
-    found = (1.0 - share) * medians[:, below] + share * medians[:, below + 1]
-    return np.asarray(found / np.log(2.0))
-
-
-def floor_bins(size: int) -> int:
-    """Unpadded bins in one running median of so many ordinates."""
-    return min(FLOOR_BINS, size // PADDING // 2) // 2 * 2 + 1
-
-
-def _prediction_errors(covariances: Array, count: IndexArray) -> Array:
-    """Prediction-error filters by Levinson's recursion, each of the order with the least AICc, shape (R, p + 1)."""
-    rows, most = covariances.shape[0], covariances.shape[1] - 1
-    filters = np.zeros((rows, most + 1))
-    filters[:, 0] = 1.0
-    scale = np.where(covariances[:, 0] > 0.0, covariances[:, 0], 1.0)
-    r = covariances / scale[:, None]
-    error = np.ones(rows)
-    best, best_score = filters.copy(), np.zeros(rows)
-    for order in range(1, most + 1):
-        mirrored = filters[:, :order][:, ::-1]
-        reflection = np.clip(-(mirrored * r[:, 1 : order + 1]).sum(axis=1) / error, -0.999, 0.999)
-        filters[:, 1 : order + 1] += reflection[:, None] * mirrored
-        error = error * (1.0 - reflection**2)
-        score = count * np.log(error) + 2.0 * order * count / np.maximum(count - order - 2, 1)
-        better = score < best_score
-        best[better], best_score[better] = filters[better], score[better]
-    return best
 
 
 class Line(NamedTuple):
@@ -160,35 +46,61 @@ class Line(NamedTuple):
 def strongest_line(left: Left) -> Line:
     """The strongest line of each row, in the ratio of the periodogram to its running median."""
     rows, length = left.white.shape
-    ordinates = np.abs(np.fft.rfft(left.white, PADDING * length, axis=1)) ** 2
-    ratio = ordinates / np.maximum(running_floor(ordinates), SMALLEST_FLOOR)
-    ratio[:, :PADDING] = 0.0
-    place = ratio.argmax(axis=1)
-    height = ratio[np.arange(rows), place]
+    ordinates = periodogram(left.white)
+    floor = running_floor(ordinates)
     # The floor is uncertain: a ratio of exponential variables.
     sure = MEDIAN_EFFICIENCY * floor_bins(ordinates.shape[1])
+    least = SURELY * sure * (LEAST_CHANCE ** (-1.0 / sure) - 1.0)
+    place, height, top = np.empty(rows, np.int64), np.empty(rows), np.empty(rows)
+    others = np.full((rows, FURTHER), -1)
+    _find_lines(ordinates, floor.medians, floor.hop, least, place, height, top, others)
     one = (1.0 + height / sure) ** -sure
     chance = -np.expm1(INDEPENDENT * length * np.log1p(-np.minimum(one, 1.0 - 1e-16)))
     turn = 2.0 * np.pi / (PADDING * length)
     omega = place * turn
-    further, energies = np.full((rows, FURTHER), np.nan), np.zeros((rows, FURTHER))
-    bins, top = np.arange(ordinates.shape[1]), ordinates.max(axis=1)
-    near = np.abs(bins - place[:, None]) < LOBES * PADDING
-    for k in range(FURTHER):
-        left_over = np.where(near, 0.0, ratio)
-        other = left_over.argmax(axis=1)
-        surely = left_over[np.arange(rows), other] > SURELY * sure * (LEAST_CHANCE ** (-1.0 / sure) - 1.0)
-        surely &= ordinates[np.arange(rows), other] > SIDE_LOBE * top
-        if not surely.any():
-            break
-        further[surely, k] = other[surely] * turn
-        energies[surely, k] = ordinates[surely, other[surely]] / length
-        near |= np.abs(bins - other[:, None]) < LOBES * PADDING
+    further = np.where(others >= 0, others * turn, np.nan)
+    energies = np.where(others >= 0, np.take_along_axis(ordinates, np.maximum(others, 0), axis=1) / length, 0.0)
     # The models of the noise have taken the skirts of a very strong line for its colour.
     plain = left.peak_height > LINE_HEIGHT
     chance, omega = np.where(plain, 0.0, chance), np.where(plain, np.pi * left.peak, omega)
-    energy = np.where(plain, left.peak_height, ordinates.max(axis=1) / length)
+    energy = np.where(plain, left.peak_height, top / length)
     return Line(chance, omega, np.where(plain, left.peak_height, height), energy, further, energies)
+
+
+@njit(cache=True, nogil=True)
+def _find_lines(
+    ordinates: Array,
+    medians: Array,
+    hop: int,
+    least: float,
+    place: IndexArray,
+    height: Array,
+    top: Array,
+    others: IndexArray,
+) -> None:
+    """Where each row is highest over its floor, how high, and the largest ordinate; and further lines that are sure.
+
+    Those are higher over the floor than ``least``, and no side lobes.
+    """
+    size = ordinates.shape[1]
+    ratio = np.empty(size)
+    ramp = np.arange(hop) / hop
+    for row in range(ordinates.shape[0]):
+        for first in range(0, size, hop):
+            own, next_ = medians[row, first // hop], medians[row, first // hop + 1]
+            for j in range(min(hop, size - first)):
+                floor = own + ramp[j] * (next_ - own)
+                ratio[first + j] = ordinates[row, first + j] / max(floor, SMALLEST_FLOOR)
+        ratio[:PADDING] = 0.0
+        best = np.argmax(ratio)
+        place[row], height[row], top[row] = best, ratio[best], ordinates[row].max()
+        for k in range(others.shape[1]):
+            ratio[max(0, best - LOBES * PADDING + 1) : best + LOBES * PADDING] = 0.0
+            best = np.argmax(ratio)
+            if ratio[best] <= least:
+                break
+            if ordinates[row, best] > SIDE_LOBE * top[row]:
+                others[row, k] = best
 
 
 @njit(cache=True, nogil=True)
