@@ -181,8 +181,8 @@ def _advance(values: Array, by: float) -> None:
 
 
 @njit(cache=True, nogil=True)
-def make_equations(y: Array, tones: Array, constant: float, work: Work, place: int, products: bool) -> float:
-    """``sum psi psi'`` and ``sum psi r`` of all numbers, unless only what is left, and its sum of squares, are wanted.
+def make_equations(y: Array, tones: Array, constant: float, work: Work, place: int, wanted: int) -> float:
+    """``sum psi psi'`` and ``sum psi r`` of all numbers where any are wanted, what is left, and its sum of squares.
 
     Products of tones that are far from each other are left out: they vary so fast that their sums are nearly nothing.
     """
@@ -207,13 +207,13 @@ def make_equations(y: Array, tones: Array, constant: float, work: Work, place: i
         for k in range(n):
             phasors = work.phasors[4 * k : 4 * k + 4]
             _take_tone(tones[k], phasors, there, signal, turned, left)
-            if products:
+            if wanted:
                 _sensitivities(phasors, there, signal, turned, u, rows[NUMBERS * k : NUMBERS * k + NUMBERS])
             if first + chunk < length:
                 _turn(phasors, further[k], work.rows[1])
         total += _product(left, left, here)
         _advance(u, 2.0 * chunk / (length - 1))
-        if not products:
+        if not wanted:
             continue
         gram[last, last] += _sum(there, here)
         right[last] += _sum(left, here)

@@ -18,6 +18,8 @@ MOST_BEND = 1e4
 #: Iterations at most; stop when the step would lower the sum of squares by less than this share of one sample's, or
 #: change no phase by more than this [rad] and no amplitude by more than this share.
 ITERATIONS = 30
+#: What is free, and how many steps are taken at most, one after the other.
+STAGES = ((2, 1), (STRAIGHT, 4), (NUMBERS, ITERATIONS))
 SMALL = 1e-3
 SMALLEST = 1e-9
 #: Longest step of a phase over half a window [rad].
@@ -97,7 +99,7 @@ def _iterate(
     for _ in range(most):
         _pack(work, place, n, free)
         cost = work.cost[place]
-        refused = False
+        products = NUMBERS
         while True:
             if damping > MOST_DAMPING:
                 return constant, place, True
@@ -124,15 +126,19 @@ def _iterate(
                 # A longer step may land on any of the minima. Nearly every first step is taken, and its equations are
                 # those of the next one; after one that was not they are made when they are needed.
                 if turned < MOST_TURNED:
-                    if make_equations(y, trial, level, work, 1 - place, not refused) <= cost:
-                        if refused:
-                            make_equations(y, trial, level, work, 1 - place, True)
-                        tones[:] = trial
+                    reached = make_equations(y, trial, level, work, 1 - place, products)
+                    if reached <= cost and products == 0:
+                        products = NUMBERS
+                        reached = make_equations(y, trial, level, work, 1 - place, products)
+                    if reached <= cost:
+                        for k in range(n):
+                            for j in range(NUMBERS):
+                                tones[k, j] = trial[k, j]
                         constant = level
                         place = 1 - place
                         damping = max(damping * LOWERED, 1e-12)
                         break
-                    refused = True
+                    products = 0
             damping *= RAISED
     return constant, place, False
 
@@ -156,11 +162,10 @@ def fit_windows(samples: Array, length: int, windows: Windows, chosen: IndexArra
             windows.converged[row] = False
             residuals[row] = np.nan
             continue
-        place = 0
-        make_equations(y, tones, constant, work, place, True)
-        constant, place, done = _iterate(y, tones, constant, 2, 1, work, place)
-        constant, place, done = _iterate(y, tones, constant, STRAIGHT, 4, work, place)
-        constant, place, done = _iterate(y, tones, constant, NUMBERS, ITERATIONS, work, place)
+        place, done = 0, False
+        make_equations(y, tones, constant, work, place, NUMBERS)
+        for free, most in STAGES:
+            constant, place, done = _iterate(y, tones, constant, free, most, work, place)
         windows.converged[row] = done
         for i in range(length):
             residuals[row, i] = np.nan if math.isnan(y[i]) else work.left[place, i]

@@ -203,30 +203,37 @@ def _mark_combs(omega: Array, error: Array, window: IndexArray, middle: Array, c
     Amplitude or frequency that changes periodically makes lines at equal distances, each of them as steady as a tone.
     """
     seen = np.zeros(omega.size, np.bool_)
+    found, gaps = np.empty(omega.size, np.int64), np.empty(omega.size)
     for one in range(omega.size):
         if seen[one]:
             continue
-        lines = np.flatnonzero((window == window[one]) & (middle == middle[one]))
-        seen[lines] = True
-        if lines.size < COMB:
-            continue
-        lines = lines[np.argsort(omega[lines])]
-        gaps = np.diff(omega[lines])
+        count = 0
+        for k in range(one, omega.size):
+            if window[k] == window[one] and middle[k] == middle[one]:
+                seen[k] = True
+                place = count
+                while place and omega[found[place - 1]] > omega[k]:
+                    found[place] = found[place - 1]
+                    place -= 1
+                found[place] = k
+                count += 1
+        for k in range(count - 1):
+            gaps[k] = omega[found[k + 1]] - omega[found[k]]
         begin = 0
-        while begin < gaps.size - 1:
+        while begin < count - COMB + 1:
             # Lines from `begin` to `end` + 1 are at equal distances.
             end = begin
-            while end < gaps.size - 1 and _equal(gaps, error[lines], end):
+            while end < count - COMB + 1 and _equal(gaps, error, found, end):
                 end += 1
             if end > begin:
-                _mark_comb(omega, error, window, lines, begin, end, combs)
+                _mark_comb(omega, error, window, found[:count], begin, end, combs)
             begin = max(end, begin + 1)
 
 
 @njit(cache=True, nogil=True)
-def _equal(gaps: Array, error: Array, k: int) -> bool:
+def _equal(gaps: Array, error: Array, lines: IndexArray, k: int) -> bool:
     """Whether two neighbouring distances of lines are equal, as far as is known."""
-    square = error[k] ** 2 + 2.0 * error[k + 1] ** 2 + error[k + 2] ** 2
+    square = error[lines[k]] ** 2 + 2.0 * error[lines[k + 1]] ** 2 + error[lines[k + 2]] ** 2
     off = abs(gaps[k + 1] - gaps[k])
     return not math.isnan(square) and off < max(SAME_ERRORS * math.sqrt(square), UNEQUAL * gaps[k + 1])
 

@@ -78,12 +78,12 @@ def whiten(residuals: Array, fitted: IndexArray) -> Left:
     peak = power.argmax(axis=1)
     floor = running_floor(power)
     height = power[np.arange(peak.size), peak] / np.maximum(floor.at(peak), SMALLEST_FLOOR)
-    covariances, gain, ratio = np.empty((peak.size, WHITENING_ORDER + 1)), np.ones_like(power), power
-    for round_ in range(ROUNDS):
-        if round_:
-            ratio = np.empty_like(power)
-            _flatten(power, filters, cosine, gain, ratio)
-            floor = running_floor(ratio)
+    covariances, gain, ratio = np.empty((peak.size, WHITENING_ORDER + 1)), np.ones_like(power), np.empty_like(power)
+    _moments(power, gain, floor.medians, floor.hop, cosine, covariances)
+    filters = _prediction_errors(covariances[:, : order + 1], present)
+    for _ in range(ROUNDS - 1):
+        _flatten(power, filters, cosine, gain, ratio)
+        floor = running_floor(ratio)
         _moments(power, gain, floor.medians, floor.hop, cosine, covariances)
         filters = _prediction_errors(covariances[:, : order + 1], present)
     white = np.empty_like(values)
@@ -211,7 +211,8 @@ def _filter(
     length, order = values.shape[1], filters.shape[1] - 1
     for row in range(values.shape[0]):
         y, out, known = values[row], white[row], there[row]
-        out[:] = y
+        for i in range(length):
+            out[i] = y[i]
         for lag in range(1, order + 1):
             weight = filters[row, lag]
             for i in range(lag, length):
