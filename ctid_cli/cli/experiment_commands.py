@@ -194,7 +194,8 @@ def run(
 
 def _ask_if_large(plan: Plan, folder: Path, jobs: int | None, how: dict[str, Any]) -> None:
     """Say what a very large run will take, and ask whether it is meant."""
-    from ctid_cli.running.engine import preview, usable_processors
+    from ctid_cli.processors import usable_processors
+    from ctid_cli.running.engine import preview
     from ctid_cli.running.forecast import LARGE, forecast
 
     if plan.data_sets * plan.estimates_each <= LARGE:
@@ -218,8 +219,8 @@ def _ask_if_large(plan: Plan, folder: Path, jobs: int | None, how: dict[str, Any
 
 def _on_dask(plan: Plan, scheduler: str | None, jobs: int | None) -> Callable[[Limits], Executor]:
     """What makes an executor of workers of dask."""
+    from ctid_cli.processors import usable_processors
     from ctid_cli.running.dask_executor import DaskExecutor
-    from ctid_cli.running.engine import usable_processors
 
     def say(text: str) -> None:
         typer.echo(f"{plan.experiment}: {text}", err=True)

@@ -27,6 +27,8 @@ class Work(NamedTuple):
     right: Array
     left: Array
     cost: Array
+    #: Which of the two is that of the numbers so far, shape (1,).
+    now: IndexArray
     #: Equations of the numbers that are free, their factor, and in three rows their right side, a step, and scales.
     packed: Array
     factor: Array
@@ -48,6 +50,7 @@ def work_for(tones: int, length: int) -> Work:
         np.zeros((2, size)),
         np.empty((2, length)),
         np.zeros(2),
+        np.zeros(1, np.int64),
         np.zeros((size, size)),
         np.zeros((size, size)),
         np.zeros((3, size)),
@@ -181,8 +184,8 @@ def _advance(values: Array, by: float) -> None:
 
 
 @njit(cache=True, nogil=True)
-def make_equations(y: Array, tones: Array, constant: float, work: Work, place: int, wanted: int) -> float:
-    """``sum psi psi'`` and ``sum psi r`` of all numbers where any are wanted, what is left, and its sum of squares.
+def make_equations(y: Array, tones: Array, constant: float, work: Work, place: int) -> float:
+    """``sum psi psi'`` and ``sum psi r`` of all numbers, what is left, and its sum of squares.
 
     Products of tones that are far from each other are left out: they vary so fast that their sums are nearly nothing.
     """
@@ -207,14 +210,11 @@ def make_equations(y: Array, tones: Array, constant: float, work: Work, place: i
         for k in range(n):
             phasors = work.phasors[4 * k : 4 * k + 4]
             _take_tone(tones[k], phasors, there, signal, turned, left)
-            if wanted:
-                _sensitivities(phasors, there, signal, turned, u, rows[NUMBERS * k : NUMBERS * k + NUMBERS])
+            _sensitivities(phasors, there, signal, turned, u, rows[NUMBERS * k : NUMBERS * k + NUMBERS])
             if first + chunk < length:
                 _turn(phasors, further[k], work.rows[1])
         total += _product(left, left, here)
         _advance(u, 2.0 * chunk / (length - 1))
-        if not wanted:
-            continue
         gram[last, last] += _sum(there, here)
         right[last] += _sum(left, here)
         for a in range(last):

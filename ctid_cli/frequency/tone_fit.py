@@ -71,9 +71,9 @@ def _solve(factor: Array, scales: Array, right: Array, step: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _pack(work: Work, place: int, tones: int, free: int) -> None:
+def _pack(work: Work, tones: int, free: int) -> None:
     """Choose the equations of the first numbers of each tone, and of the constant."""
-    size = free * tones + 1
+    size, place = free * tones + 1, work.now[0]
     right = work.vectors[0]
     for a in range(size):
         from_a = NUMBERS * (a // free) + a % free if a < size - 1 else NUMBERS * tones
@@ -84,12 +84,10 @@ def _pack(work: Work, place: int, tones: int, free: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _iterate(
-    y: Array, tones: Array, constant: float, free: int, most: int, work: Work, place: int
-) -> tuple[float, int, bool]:
-    """Levenberg-Marquardt steps, of whose first numbers the equations are known.
+def _iterate(y: Array, tones: Array, constant: float, free: int, most: int, work: Work) -> tuple[float, bool]:
+    """Levenberg-Marquardt steps; the constant and whether they ended at a minimum. ``tones`` is changed in place.
 
-    The constant, the place of the equations, and whether the steps ended at a minimum; ``tones`` is changed in place.
+    The equations of the first numbers are known, and those of the last ones are when it is done.
     """
     n = tones.shape[0]
     size = free * n + 1
@@ -97,12 +95,11 @@ def _iterate(
     trial = np.empty_like(tones)
     damping = DAMPING
     for _ in range(most):
-        _pack(work, place, n, free)
-        cost = work.cost[place]
-        products = NUMBERS
+        _pack(work, n, free)
+        cost = work.cost[work.now[0]]
         while True:
             if damping > MOST_DAMPING:
-                return constant, place, True
+                return constant, True
             if factorise(work.packed, damping, work.factor, scales):
                 _solve(work.factor, scales, right, step)
                 largest, turned = 0.0, 0.0
@@ -122,25 +119,19 @@ def _iterate(
                     gain += step[a] * right[a]
                 # So small a share of the standard errors matters to nobody, nor does rounding.
                 if gain <= SMALL * cost / work.packed[size - 1, size - 1] or largest <= SMALLEST:
-                    return constant, place, True
-                # A longer step may land on any of the minima. Nearly every first step is taken, and its equations are
-                # those of the next one; after one that was not they are made when they are needed.
-                if turned < MOST_TURNED:
-                    reached = make_equations(y, trial, level, work, 1 - place, products)
-                    if reached <= cost and products == 0:
-                        products = NUMBERS
-                        reached = make_equations(y, trial, level, work, 1 - place, products)
-                    if reached <= cost:
-                        for k in range(n):
-                            for j in range(NUMBERS):
-                                tones[k, j] = trial[k, j]
-                        constant = level
-                        place = 1 - place
-                        damping = max(damping * LOWERED, 1e-12)
-                        break
-                    products = 0
+                    return constant, True
+                # A longer step may land on any of the minima. Nearly every step is taken: its equations are those of the
+                # next one.
+                if turned < MOST_TURNED and make_equations(y, trial, level, work, 1 - work.now[0]) <= cost:
+                    for k in range(n):
+                        for j in range(NUMBERS):
+                            tones[k, j] = trial[k, j]
+                    constant = level
+                    work.now[0] = 1 - work.now[0]
+                    damping = max(damping * LOWERED, 1e-12)
+                    break
             damping *= RAISED
-    return constant, place, False
+    return constant, False
 
 
 @njit(cache=True, nogil=True)
@@ -162,14 +153,12 @@ def fit_windows(samples: Array, length: int, windows: Windows, chosen: IndexArra
             windows.converged[row] = False
             residuals[row] = np.nan
             continue
-        place, done = 0, False
-        make_equations(y, tones, constant, work, place, NUMBERS)
+        make_equations(y, tones, constant, work, work.now[0])
         for free, most in STAGES:
-            constant, place, done = _iterate(y, tones, constant, free, most, work, place)
-        windows.converged[row] = done
+            constant, windows.converged[row] = _iterate(y, tones, constant, free, most, work)
         for i in range(length):
-            residuals[row, i] = np.nan if math.isnan(y[i]) else work.left[place, i]
-        _pack(work, place, n, NUMBERS)
+            residuals[row, i] = np.nan if math.isnan(y[i]) else work.left[work.now[0], i]
+        _pack(work, n, NUMBERS)
         _variances(work, NUMBERS * n + 1, windows.variances[row])
 
 

@@ -102,6 +102,8 @@ def readings_at(
             tell(done, len(lengths))
         last = samples.size - length
         first = np.unique(np.append(np.arange(0, last + 1, length // HOPS), last))
+        # Where the places are far apart, short windows between them would never be read.
+        first = first[np.searchsorted(places, first + length - 0.5) > np.searchsorted(places, first - 0.5)]
         tones = tones_of_windows(samples, length, first, most, tones)
         parts.append(_readings(tones, length, places))
     # The longest windows first, and of those of one length the one whose middle is nearest.

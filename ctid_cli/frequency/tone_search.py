@@ -8,6 +8,7 @@ from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.frequency.tone_fit import NUMBERS, Windows, fit_windows, windows_at
 from ctid_cli.frequency.tone_tests import Line, find_changes, strongest_line
 from ctid_cli.frequency.whitening import Left, whiten
+from ctid_cli.processors import in_threads
 
 #: Noise alone shows a line, or a change, in this share of the windows.
 LEVEL = 5e-4
@@ -21,8 +22,9 @@ TURNED_BY_CUBE = 1.5
 SAMPLES_PER_NUMBER = 3
 #: Tones of shorter windows are taken over if their amplitude is so many times its standard error.
 SURE = 6.0
-#: Windows that are fitted together: their residuals are in memory at once.
-BLOCK_SAMPLES = 2_000_000
+#: Samples of the windows that are fitted together, of which so much is in memory for each thread. Nothing that is found
+#: depends on it.
+BLOCK_SAMPLES = 2**17
 
 
 class ToneRows(NamedTuple):
@@ -64,7 +66,8 @@ def tones_of_windows(
     """Tones of windows of one length, in blocks; what was found in shorter windows is where the search begins."""
     most = max(1, min(most, (length // SAMPLES_PER_NUMBER - 1) // NUMBERS))
     size = max(1, BLOCK_SAMPLES // length)
-    blocks = [_block(samples, length, first[k : k + size], most, shorter) for k in range(0, first.size, size)]
+    parts = [first[k : k + size] for k in range(0, first.size, size)]
+    blocks = in_threads(lambda part: _block(samples, length, part, most, shorter), parts)
     return ToneRows(**{name: np.concatenate([getattr(block, name) for block in blocks]) for name in ToneRows._fields})
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import os
 import time
 import warnings
 from collections import defaultdict
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.errors import DataError, MachineError, StorageError, UsageError
+from ctid_cli.processors import usable_processors
 from ctid_cli.running import events
 from ctid_cli.running.cell_precision import CellPrecision, as_needed, stored_precisions
 from ctid_cli.running.dispatch import GivenUp, Slow, Unable, run_jobs
@@ -157,13 +157,6 @@ def run_experiment(
         while run.needs_more() and not stopping():
             run.compute(stopping)
         return run.finish(stopping.reason, moved, begun)
-
-
-def usable_processors() -> int:
-    """Number of processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 class _Run:
