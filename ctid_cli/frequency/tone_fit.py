@@ -120,8 +120,7 @@ def _iterate(y: Array, tones: Array, constant: float, free: int, most: int, work
                 # So small a share of the standard errors matters to nobody, nor does rounding.
                 if gain <= SMALL * cost / work.packed[size - 1, size - 1] or largest <= SMALLEST:
                     return constant, True
-                # A longer step may land on any of the minima. Nearly every step is taken: its equations are those of the
-                # next one.
+                # A longer step may land on any of the minima. Nearly every step is taken: its equations are the next.
                 if turned < MOST_TURNED and make_equations(y, trial, level, work, 1 - work.now[0]) <= cost:
                     for k in range(n):
                         for j in range(NUMBERS):

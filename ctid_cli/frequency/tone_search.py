@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
-from ctid_cli.frequency.tone_fit import NUMBERS, Windows, fit_windows, windows_at
+from ctid_cli.frequency.tone_equations import NUMBERS
+from ctid_cli.frequency.tone_fit import Windows, fit_windows, windows_at
 from ctid_cli.frequency.tone_tests import Line, find_changes, strongest_line
 from ctid_cli.frequency.whitening import Left, whiten
 from ctid_cli.processors import in_threads
