@@ -85,7 +85,10 @@ def track(
     if mains.wanted({**given, **{name: value is not None for name, value in others.items()}}):
         track_mains(file, reading, mains, style, out, as_json)
         return
+    from concurrent.futures import ThreadPoolExecutor
+
     from ctid_cli.frequency.left_over import with_lines_left
+    from ctid_cli.reporting.figures.style import load_matplotlib
     from ctid_cli.reporting.track_columns import track_bytes, track_table
     from ctid_cli.reporting.track_plot import track_drawing
     from ctid_cli.reporting.track_report import track_object, track_text
@@ -101,14 +104,18 @@ def track(
         raise UsageError(f"--accuracy must be a positive number of hertz, not {accuracy:g}")
     record = reading.read(file)
     asked = Asked(_tones(tones), None if method == "automatic" else method, every, window, accuracy)
+    load_matplotlib()
     found, procedure = _follow(record, asked)
-    found = with_lines_left(found.of_accuracy(accuracy), record.samples, record.interval)
+    track = found.of_accuracy(accuracy)
+    with ThreadPoolExecutor(1) as beside:
+        drawing = track_drawing(track, record.start, record.unit, f"{file.name}: {procedure.method}")
+        drawn = beside.submit(drawing.saved)
+        found = with_lines_left(track, record.samples, record.interval)
     files = [data, figure, result]
     content = track_object(record, procedure, found, accuracy)
-    drawn = track_drawing(found, record.start, record.unit, f"{file.name}: {procedure.method}").saved()
     text = track_file_text(found, content, file, reading, out, given_command(context))
     table = track_bytes(track_table(found, record.start), style, record.unit)
-    write_files({data: table, figure: drawn, result: text.encode() + b"\n"})
+    write_files({data: table, figure: drawn.result(), result: text.encode() + b"\n"})
     answer(
         as_json,
         lambda: content | {"written": [str(each) for each in files]},

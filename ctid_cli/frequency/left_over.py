@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ from ctid_cli.frequency.record_track import MissingLine, RecordTrack
 from ctid_cli.frequency.spectrum import MOST_MISSING, SHORTEST_SEGMENT, median_spectrum, significant
 from ctid_cli.frequency.spikes import without_spikes
 from ctid_cli.frequency.synthesis import synthesised
+from ctid_cli.processors import in_threads
 
 #: A spectrum is a median over about so many half-overlapping segments of at most so many samples.
 SEGMENTS = 16
@@ -51,13 +53,15 @@ def left_over(samples: Array, interval: float, track: RecordTrack) -> LeftOver |
     least = min(SHORTEST_SEGMENT, samples.size)
     size = min(LONGEST, max(SHORTEST_SEGMENT, 2 * samples.size // (SEGMENTS + 1)), samples.size)
     while size >= least and not unknown.all():
-        spectra = [
-            median_spectrum(np.where(unknown, 0.0, each), unknown, size, MOST_MISSING[0]) for each in (centred, left)
-        ]
+        spectra = in_threads(partial(_spectrum, unknown, size), (centred, left))
         if spectra[0] is not None and spectra[1] is not None:
             return LeftOver(centred, left, unknown, size, spectra[0], spectra[1])
         size //= 2
     return None
+
+
+def _spectrum(unknown: BoolArray, size: int, values: Array) -> Array | None:
+    return median_spectrum(np.where(unknown, 0.0, values), unknown, MOST_MISSING[0], size)
 
 
 def with_lines_left(track: RecordTrack, samples: Array, interval: float) -> RecordTrack:

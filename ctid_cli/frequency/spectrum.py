@@ -1,11 +1,13 @@
 """The tones that stand out of a record's spectrum: where to look before anything is estimated."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.frequency.medians import medians_of_columns
+from ctid_cli.processors import in_threads
 
 #: Points of the spectrum for each bin of an unpadded one.
 PADDING = 4
@@ -61,17 +63,18 @@ def find_peaks(samples: Array, interval: float, tones: int, looked_at: int = MOS
     if missing.any():
         places = np.arange(values.size)
         values = np.interp(places, places[~missing], values[~missing])
+    sizes = [min(values.size, LONGEST_SEGMENT)]
+    while sizes[-1] // 2 >= SHORTEST_SEGMENT:
+        sizes.append(sizes[-1] // 2)
     found: list[Peaks] = []
     for most_missing in MOST_MISSING:
         if found:
             break
-        size = min(values.size, LONGEST_SEGMENT)
-        while size >= min(SHORTEST_SEGMENT, values.size):
-            spectrum = median_spectrum(values, missing, size, most_missing, looked_at)
+        spectra = in_threads(partial(median_spectrum, values, missing, most_missing, looked_at=looked_at), sizes)
+        for size, spectrum in zip(sizes, spectra, strict=True):
             if spectrum is not None:
                 bins, amplitudes = significant(spectrum)
                 found.append(Peaks(2.0 * np.pi * bins / (size * interval), amplitudes, size * interval))
-            size //= 2
     if not found:
         return Peaks(np.empty(0), np.empty(0), values.size * interval)
     most = max(min(peaks.omega.size, tones) for peaks in found)
@@ -84,7 +87,7 @@ def find_peaks(samples: Array, interval: float, tones: int, looked_at: int = MOS
 
 
 def median_spectrum(
-    values: Array, missing: BoolArray, size: int, most_missing: float, looked_at: int = MOST_SAMPLES
+    values: Array, missing: BoolArray, most_missing: float, size: int, looked_at: int = MOST_SAMPLES
 ) -> Array | None:
     """Median over segments of the amplitude spectrum, with a Hann window."""
     count = max(1, min(2 * values.size // size - 1, looked_at // size))

@@ -1,6 +1,7 @@
 """The signal that the rows of a track describe."""
 
 import math
+from functools import partial
 
 import numpy as np
 from numba import njit
@@ -8,6 +9,7 @@ from numba import njit
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.record_track import RecordTrack
+from ctid_cli.processors import in_threads
 
 #: Instants that are computed at once.
 PIECE = 2**18
@@ -21,7 +23,7 @@ def synthesised(track: RecordTrack, t: Array) -> Array:
     Each row describes sinusoids whose phase is known at its instant; between two rows the signal goes over from those
     of one to those of the other. Before the first row and after the last, each is followed for half of its window.
     """
-    pieces = [_piece(track, t[first : first + PIECE]) for first in range(0, t.size, PIECE)]
+    pieces = in_threads(partial(_piece, track), [t[first : first + PIECE] for first in range(0, t.size, PIECE)])
     return np.concatenate(pieces or [np.empty(0)])
 
 

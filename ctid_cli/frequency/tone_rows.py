@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
-from ctid_cli.frequency.tone_search import LEVEL, ToneRows, tones_of_windows
+from ctid_cli.frequency.tone_search import LEVEL, ToneRows, nearest, tones_of_windows
 
 #: Shortest window [samples]; the others are twice as long as one another, up to the whole signal.
 SHORTEST = 64
@@ -97,13 +97,9 @@ def readings_at(
     parts: list[Readings] = []
     tones: ToneRows | None = None
     lengths = window_lengths(longest)
-    for done, length in enumerate(lengths):
+    for done, (length, first) in enumerate(zip(lengths, _windows(lengths, samples.size, places), strict=True)):
         if tell is not None:
             tell(done, len(lengths))
-        last = samples.size - length
-        first = np.unique(np.append(np.arange(0, last + 1, length // HOPS), last))
-        # Where the places are far apart, short windows between them would never be read.
-        first = first[np.searchsorted(places, first + length - 0.5) > np.searchsorted(places, first - 0.5)]
         tones = tones_of_windows(samples, length, first, most, tones)
         parts.append(_readings(tones, length, places))
     # The longest windows first, and of those of one length the one whose middle is nearest.
@@ -117,6 +113,22 @@ def readings_at(
     _keep(everything.omega, everything.error, everything.window, everything.middle, bounds, kept)
     everything = everything.at(np.flatnonzero(kept))
     return everything.at(np.lexsort((everything.omega, everything.row)))
+
+
+def _windows(lengths: list[int], count: int, places: Array) -> list[IndexArray]:
+    """First samples of the windows of each length that are read at any place, or that others begin from.
+
+    Where places are far apart, most of the short windows lie between them.
+    """
+    chosen: list[IndexArray] = []
+    longer: Array = np.empty(0)
+    for length in reversed(lengths):
+        first = np.unique(np.append(np.arange(0, count - length + 1, length // HOPS), count - length))
+        wanted = np.searchsorted(places, first + length - 0.5) > np.searchsorted(places, first - 0.5)
+        wanted[nearest(first + 0.5 * (length - 1), longer)] = True
+        chosen.append(first[wanted])
+        longer = np.asarray(chosen[-1] + 0.5 * (length - 1), dtype=np.float64)
+    return chosen[::-1]
 
 
 def _readings(tones: ToneRows, length: int, places: Array) -> Readings:

@@ -72,17 +72,21 @@ def tones_of_windows(
     return ToneRows(**{name: np.concatenate([getattr(block, name) for block in blocks]) for name in ToneRows._fields})
 
 
+def nearest(middles: Array, places: Array) -> IndexArray:
+    """Which of some middles, ascending, is the nearest to each place."""
+    return np.asarray(np.searchsorted(0.5 * (middles[1:] + middles[:-1]), places))
+
+
 def _begun(windows: Windows, length: int, shorter: ToneRows) -> None:
     """Put into windows the tones of the shorter windows nearest to their middles, where nothing is wrong with them."""
     half = 0.5 * (length - 1)
-    middle = windows.first + half
-    between = 0.5 * (shorter.middle[1:] + shorter.middle[:-1])
-    nearest = np.searchsorted(between, middle)
+    middle = np.asarray(windows.first + half, dtype=np.float64)
+    beginning = nearest(shorter.middle, middle)
     clean = shorter.converged & (shorter.line_chance >= LEVEL) & ~(shorter.change_chance < LEVEL).any(axis=1)
     sure = shorter.amplitude > SURE * shorter.amplitude_error
     for j in range(min(shorter.omega.shape[1], windows.numbers.shape[1])):
-        rows = np.flatnonzero((clean & sure[:, j])[nearest])
-        of, place = nearest[rows], windows.used[rows]
+        rows = np.flatnonzero((clean & sure[:, j])[beginning])
+        of, place = beginning[rows], windows.used[rows]
         omega = shorter.omega[of, j] + shorter.rate[of, j] * (middle[rows] - shorter.middle[of])
         windows.numbers[rows, place] = 0.0
         windows.numbers[rows, place, 3] = omega * half

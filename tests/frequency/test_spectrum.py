@@ -44,7 +44,7 @@ def test_gaps_are_bridged_and_segments_full_of_them_left_out():
     assert find_peaks(y, 0.01, 1).omega[0] == pytest.approx(20.0, rel=1e-3)
     missing = np.zeros(T.size, bool)
     missing[: T.size // 2] = True
-    assert median_spectrum(np.ones(T.size), missing, T.size, 0.1) is None
+    assert median_spectrum(np.ones(T.size), missing, 0.1, T.size) is None
 
 
 def test_units_of_time_and_signal_only_scale():

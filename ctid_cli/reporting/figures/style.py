@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from threading import Thread
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -53,6 +55,18 @@ LOOKS: tuple[dict[str, Any], ...] = (
 Format = Literal["svg", "png", "pdf"]
 #: What else each format would write down: when, and by which version of what.
 _METADATA: dict[Format, Any] = {"svg": {"Date": None}, "png": {"Software": None}, "pdf": {"CreationDate": None}}
+
+
+def load_matplotlib() -> None:
+    """Begin to import what draws figures; meanwhile compiled kernels go on."""
+    Thread(target=_import_matplotlib).start()
+
+
+def _import_matplotlib() -> None:
+    # Whoever draws says what is missing.
+    with suppress(ImportError):
+        import matplotlib.backends.backend_svg
+        import matplotlib.figure  # noqa: F401
 
 
 class Picture(bytes):
