@@ -154,3 +154,17 @@ def test_a_long_record_is_thinned_and_its_amplitudes_are_of_before():
 def test_what_cannot_be_followed(length, window):
     with pytest.raises(DataError, match=r"too few|longest window must be"):
         follow_tones((tone(60.0) + NOISE)[:length], INTERVAL, 1, window=window)
+
+
+def test_the_track_does_not_depend_on_blocks_or_processors(monkeypatch):
+    rng = np.random.default_rng(5)
+    y = np.cos(0.3 * np.arange(6000)) + 0.2 * np.cos(0.9 * np.arange(6000) + 2e-6 * np.arange(6000) ** 2)
+    y += 0.05 * rng.standard_normal(6000)
+    y[3000:3040] = np.nan
+    tracks = []
+    for processors, block in ((1, 2**17), (3, 2**12)):
+        monkeypatch.setattr("ctid_cli.processors.usable_processors", lambda processors=processors: processors)
+        monkeypatch.setattr("ctid_cli.frequency.tone_search.BLOCK_SAMPLES", block)
+        tracks.append(follow_tones(y, 1.0)[0])
+    for name in ("omega", "error", "amplitudes", "flags", "phase"):
+        np.testing.assert_array_equal(getattr(tracks[0], name), getattr(tracks[1], name))
