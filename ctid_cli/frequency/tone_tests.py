@@ -97,10 +97,9 @@ def _find_lines(
         for k in range(others.shape[1]):
             ratio[max(0, best - LOBES * PADDING + 1) : best + LOBES * PADDING] = 0.0
             best = np.argmax(ratio)
-            if ratio[best] <= least:
+            if ratio[best] <= least or ordinates[row, best] <= SIDE_LOBE * top[row]:
                 break
-            if ordinates[row, best] > SIDE_LOBE * top[row]:
-                others[row, k] = best
+            others[row, k] = best
 
 
 @njit(cache=True, nogil=True)
