@@ -17,6 +17,7 @@ from ctid_cli.kinds import ONLINE
 if TYPE_CHECKING:
     from ctid_cli.frequency.record_track import Procedure, RecordTrack
     from ctid_cli.signals.sampled_signal import SampledSignal
+    from ctid_cli.storage.track_file import Reading
 
     Method = str
 else:
@@ -103,6 +104,7 @@ def track(
     if accuracy is not None and not 0 < accuracy < math.inf:
         raise UsageError(f"--accuracy must be a positive number of hertz, not {accuracy:g}")
     record = reading.read(file)
+    _require_part(record, reading)
     asked = Asked(_tones(tones), None if method == "automatic" else method, every, window, accuracy)
     load_matplotlib()
     found, procedure = _follow(record, asked)
@@ -153,6 +155,16 @@ def _follow(record: SampledSignal, asked: Asked) -> tuple[RecordTrack, Procedure
     except ValueError as error:
         raise UsageError(str(error)) from None
     return found, procedure_of(settings, interval)
+
+
+def _require_part(record: SampledSignal, reading: Reading) -> None:
+    """Refuse a part that is too short, which is often one in another unit of time."""
+    from ctid_cli.frequency.record_tones import FEWEST
+
+    if record.samples.size < FEWEST and not (reading.start is None and reading.stop is None):
+        end = record.start + (record.samples.size - 1) * record.interval
+        part = f"--from and --to leave {record.samples.size} samples, from {record.start:.6g} to {end:.6g} s"
+        raise UsageError(f"{part}; there must be {FEWEST}. Both are in the unit of the file's times")
 
 
 def _tones(text: str) -> int | None:

@@ -60,6 +60,8 @@ def track_mains(
     names = [None if reading.signal is None else name.strip() for name in (reading.signal or "").split(",")]
     if len(names) not in (1, 3):
         raise UsageError(f"--signal names {len(names)} signals; synchrophasors are those of one or of three phases")
+    if len(set(names)) < len(names):
+        raise UsageError(f"--signal {reading.signal} names one signal twice; three phases are three signals")
     signals = [replace(reading, signal=name).read(file) for name in names]
     first = signals[0]
     try:

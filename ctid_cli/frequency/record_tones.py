@@ -85,7 +85,10 @@ def follow_tones(
     found = readings_at(thinned, places, MOST_LINES, longest, on_progress)
     paths = paths_of(found, places)
     if not paths and tones is None:
-        raise DataError(f"no tone stands out of {samples.size * interval:.4g} s; use a longer record, or --tones 1")
+        raise DataError(
+            f"no tone stands out of {samples.size * interval:.4g} s, in which a tone must turn several times; use a "
+            "longer record, or one with less noise"
+        )
     wanted = paths[: MOST_ASKED if tones is None else tones]
     wanted.sort(key=lambda path: float(np.median(found.omega[path])))
     count = len(wanted) if tones is None else tones
@@ -214,5 +217,8 @@ def _windows_used(found: Readings, paths: list[IndexArray], thin: float) -> Iter
 def _doubts(found: int, tones: int | None, highest: float, nyquist: float) -> Iterator[str]:
     """What the user should know before believing the tones [Hz]."""
     if tones is not None and found < tones:
-        yield f"Only {found} of {tones} tones stand out of the record: the other columns are empty."
+        if found:
+            yield f"Only {found} of {tones} tones stand out of the record: the other columns are empty."
+        else:
+            yield "No tone stands out of the record: the columns are empty."
     yield from image_doubt(highest, nyquist)

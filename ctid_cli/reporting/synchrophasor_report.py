@@ -94,7 +94,9 @@ def synchrophasor_text(signals: list[SampledSignal], track: SynchrophasorTrack) 
     end = first.start + (first.samples.size - 1) * first.interval
     what = listed(repr(signal.column) for signal in signals)
     head = f"{first.file}: {count(first.samples.size, 'sample')} of {what} from {first.start:.6g} to {end:.6g} s, "
-    lines = [wrapped(f"{head}every {first.interval:.6g} s ({1.0 / first.interval:.6g} Hz)")]
+    gaps = [f"{count(each.missing, 'sample')} of {each.column!r}" for each in signals if each.missing]
+    missing = f"; missing: {listed(gaps)}" if gaps else ""
+    lines = [wrapped(f"{head}every {first.interval:.6g} s ({1.0 / first.interval:.6g} Hz){missing}")]
     if len(signals) == 1:
         lines += [wrapped(note, "  ") for note in first.notes]
     lines += [wrapped(f"- {choice}", hanging="  ") for choice in _choices(signals, track)]

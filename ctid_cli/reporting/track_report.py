@@ -48,7 +48,8 @@ def track_text(signal: SampledSignal, procedure: Procedure, track: RecordTrack, 
     lines = [wrapped(signal_line(signal)), *(wrapped(note, "  ") for note in signal.notes)]
     reasons = [*procedure.reasons, *accuracy_words(track, accuracy)]
     lines += [wrapped(f"- {reason}", hanging="  ") for reason in reasons]
-    lines += ["", Report([tones_block(track, signal.start, signal.unit)]).draw()]
+    if tones := tones_block(track, signal.start, signal.unit):
+        lines += ["", Report([tones]).draw()]
     return "\n".join([*lines, *warning_lines(track_warnings(track, procedure))])
 
 

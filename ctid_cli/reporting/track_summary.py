@@ -15,7 +15,7 @@ from ctid_cli.text import listed
 #: A smaller share of valid rows is worth a warning.
 MOSTLY_VALID = 0.9
 NONE_VALID = "No row is valid: there are no frequencies to report."
-NO_TONE = "No tone was found: there are no frequencies to report."
+NO_TONE = "No tone was asked for (--tones 0): there are no frequencies to report."
 #: Most frequent reasons for invalid rows that are named, and tones that have reasons of their own.
 MOST_REASONS = 3
 MOST_TONES_NAMED = 4

@@ -14,7 +14,7 @@ from ctid_cli.signals.checks import require_choice
 from ctid_cli.signals.files import quoted, require_file
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.table import Table
+from ctid_cli.signals.table import Table, wrong_header
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
@@ -23,6 +23,8 @@ Offset = Literal["none", "remove"]
 
 #: Columns of the widest file, and letters of its first line.
 MAX_COLUMNS, MAX_HEADER = 10_000, 1_000_000
+#: Digits, a sign and digits again, as in 2024-03-01, 1/3/24 or 12:30.
+DATE = re.compile(r"\d[-/.]\d{1,2}[-/.]\d|\d:\d\d")
 #: What stands for a missing sample (upper and lower case alike).
 MISSING = ("", "nan", "na")
 
@@ -122,7 +124,7 @@ def _parsed(path: str | os.PathLike[str], file: str, **options: Any) -> "DataFra
     except pd.errors.EmptyDataError:
         raise DataError(f"{file}:1: the file is empty; its first line must name the columns") from None
     except pd.errors.ParserError as error:
-        _refuse_ragged(file, str(error))
+        _refuse_ragged(path, file, str(error))
     except UnicodeDecodeError:
         raise DataError(f"{file}: this is not a text file in UTF-8; export it as comma-separated UTF-8 text") from None
     except OSError as error:
@@ -160,13 +162,27 @@ def _numbers(text: "Series[str]", place: Callable[[int], str]) -> Array:
     numbers = pd.to_numeric(text, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
     wrong = np.isnan(numbers) & ~text.str.lower().isin(MISSING).to_numpy(dtype=bool)
     if wrong.any():
-        raise DataError(f"{place(int(np.argmax(wrong)))}, which is not a number")
+        k = int(np.argmax(wrong))
+        raise DataError(f"{place(k)}, which is {_instead_of_number(text.iloc[k], k)}")
     return numbers
 
 
-def _refuse_ragged(file: str, message: str) -> NoReturn:
+def _instead_of_number(text: str, row: int) -> str:
+    """What stands where a number should, and what to do about it."""
+    if DATE.search(text):
+        return "a date or a time of day; write times as numbers, such as seconds since the first sample"
+    if not row and not re.search(r"\d", text):
+        return "not a number; only the first line names columns, with units in brackets, as in t [ms]"
+    return "not a number"
+
+
+def _refuse_ragged(path: str | os.PathLike[str], file: str, message: str) -> NoReturn:
     found = re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", message)
     if found is None:
         raise DataError(f"{file}: this is not a comma-separated file ({message.strip()})") from None
+    with open(path, encoding="utf-8", errors="replace") as text:
+        first = text.readline(MAX_HEADER).rstrip("\r\n")
+    if why := wrong_header((first,) if "," not in first else ()):
+        raise DataError(f"{file}:1: {why}") from None
     expected, line, seen = found.groups()
     raise DataError(f"{file}:{line}: the line has {seen} fields where those before it have {expected}") from None

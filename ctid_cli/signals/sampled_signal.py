@@ -99,7 +99,10 @@ def read_sampled_signal(
     time_unit: str | None = "s"
     if interval is None and times is not None:
         time_unit = split_header(times)[1]
-        clock = table.numbers(times)
+        try:
+            clock = table.numbers(times)
+        except DataError as error:
+            raise DataError(f"{error}; or give the clock (--interval SECONDS or --rate HERTZ)") from None
         if clock.size == 1 and values.size > 1:
             interval, first, time_unit = table.lone_interval(times, float(clock[0])), 0.0, time_unit or "s"
             notes.append(f"{times!r} is one number and was taken as the sampling interval.")

@@ -124,7 +124,7 @@ def split_header(header: str) -> tuple[str, str | None]:
 def refuse_missing(table: Table, wanted: str) -> NoReturn:
     """Say which columns there are in place of one that there is not."""
     refuse_nameless(table)
-    parts = [f"{table.head}: there is no {table.noun} {wanted!r}; {listing(table)}", wrong_separator(table)]
+    parts = [f"{table.head}: there is no {table.noun} {wanted!r}; {listing(table)}", _header_of(table)]
     if not parts[1] and (close := closest(wanted, table.names)):
         parts.append(f"Did you mean {close!r}?")
     raise DataError(". ".join(filter(None, [*parts, table.hint])))
@@ -136,19 +136,27 @@ def refuse_nameless(table: Table) -> None:
         raise DataError(f"{table.head}: the first line holds numbers; it must name the columns, for example t,u,y")
 
 
-def wrong_separator(table: Table) -> str:
-    """What separates the columns, where it is not commas."""
-    if len(table.names) == 1 and table.lines is not None:
-        for sign, word in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces")):
-            if sign in table.names[0]:
-                return f"Its columns seem to be separated by {word}; separate them by commas"
+def wrong_header(names: tuple[str, ...]) -> str:
+    """What is wrong with a first line that is one name: a comment, or columns that are not separated by commas."""
+    if len(names) != 1:
+        return ""
+    if names[0].lstrip().startswith(("#", "%", "//")):
+        return f"The first line must name the columns, and is {quoted(names[0])}; delete what stands before the names"
+    for sign, word in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces")):
+        if sign in names[0]:
+            points = ", and write numbers with decimal points" if sign == ";" else ""
+            return f"Its columns seem to be separated by {word}; separate them by commas{points}"
     return ""
+
+
+def _header_of(table: Table) -> str:
+    return wrong_header(table.names) if table.lines is not None else ""
 
 
 def refuse_one_column(table: Table) -> None:
     """Refuse a file whose columns are not separated by commas."""
-    if separated := wrong_separator(table):
-        raise DataError(f"{table.head}: the file has one column. {separated}")
+    if why := _header_of(table):
+        raise DataError(f"{table.head}: the file has one column. {why}")
 
 
 def listing(table: Table) -> str:

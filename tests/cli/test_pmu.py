@@ -54,6 +54,7 @@ def test_three_phases_as_json(ctid, mains, tmp_path):
         (("--pmu", 50, "--signal", "va", "--reporting-rate", 60), "at 50 Hz the standard has 10, 25, 50 and 100"),
         (("--pmu", 50, "--signal", "va,vb"), "--signal names 2 signals"),
         (("--pmu", 50, "--signal", "va,vb,vx"), "vx"),
+        (("--pmu", 50, "--signal", "va,vb,va"), "--signal va,vb,va names one signal twice"),
         (("--pmu", 50, "--signal", "va", "--to", 0.03), "there is no reporting instant"),
         (("--pmu", 50, "--signal", "va", "--rate", 400), "600 Hz"),
     ],
@@ -63,6 +64,16 @@ def test_mistakes_end_in_one_sentence(ctid, mains, tmp_path, options, sentence):
     assert sentence in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert not (tmp_path / "synchrophasors.csv").exists()
+
+
+def test_missing_samples_are_told_and_there_is_no_page(ctid, mains, tmp_path):
+    lines = mains.read_text(encoding="utf-8").splitlines()
+    holes = tmp_path / "holes.csv"
+    holes.write_text("\n".join([*lines[:30], *lines[33:]]) + "\n", encoding="utf-8")
+    text = ctid("track", holes, "--signal", "va", "--pmu", 60, "--out", tmp_path).stdout
+    assert "missing: 3 samples of 'va'" in " ".join(text.split())
+    refused = ctid("report", tmp_path / "synchrophasors.csv", code=2).stderr
+    assert "is neither a fit nor a track" in refused
 
 
 def test_the_record_is_not_overwritten(ctid, mains):

@@ -114,6 +114,7 @@ def test_missing_samples_are_flagged(ctid, tmp_path):
         (T, signal(), ("--rate", 5, "--interval", 2), "one of them"),
         (T, signal(), ("--signal", "z"), "'z'"),
         (T, signal(), ("--from", 100), "no sample lies"),
+        (T, signal(), ("--from", 0.1, "--to", 0.11), "--from and --to leave 6 samples, from 0.1 to 0.11 s; there must"),
         (T, signal(), ("--from", "nan"), "--from must be an instant"),
         (T, signal(), ("--to", "inf"), "--to must be an instant"),
         (T, signal(), ("--from", 1e308), "no sample lies"),

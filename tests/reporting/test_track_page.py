@@ -74,7 +74,7 @@ def test_a_page_says_all_and_needs_nothing_but_itself():
 
 def test_a_record_without_tones_and_one_of_unknown_phases_have_pages_too():
     nothing = RecordTrack.of(ROWS, np.empty((ROWS.size, 0)), np.zeros(ROWS.size, np.uint16), 0.05)
-    assert "No tone was found" in page_of(nothing, "a.csv")
+    assert "No tone was asked for" in page_of(nothing, "a.csv")
     unknown = page_of(track(phase=np.full((ROWS.size, 1), np.nan)), "a.csv")
     assert "Nowhere are all tones known" in unknown
 

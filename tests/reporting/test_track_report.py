@@ -138,7 +138,7 @@ def test_figure_without_anything_valid():
 
 def test_a_record_without_tones_has_a_text_a_file_and_a_figure(chosen):
     track = RecordTrack.of(np.arange(3.0), np.empty((3, 0)), np.zeros(3, np.uint16), 1.0)
-    assert "No tone was found" in track_text(*chosen, track)
+    assert "No tone was asked for" in track_text(*chosen, track)
     assert track_bytes(track_table(track, 0.0), "csv") == b"t\n0\n1\n2\n"
     assert track_drawing(track, 0.0, None, "title").saved().startswith(b"<?xml")
 
