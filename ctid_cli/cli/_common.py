@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import functools
+import itertools
 import json
 import os
 import re
@@ -11,7 +12,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar, cast
 
@@ -23,6 +24,7 @@ from ctid_cli.signals.treatment import Hold
 from ctid_cli.written_files import write_file
 
 Function = TypeVar("Function", bound=Callable[..., None])
+Number = TypeVar("Number", int, float)
 
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder that holds the results.")]
 Json = Annotated[bool, typer.Option("--json", help="Write JSON to stdout instead of text.")]
@@ -93,9 +95,31 @@ def given_command(context: typer.Context) -> str:
     return shlex.join(words)
 
 
-def answer(as_json: bool, content: Callable[[], object], text: Callable[[], str]) -> None:
-    """Write the answer of a command to stdout, as one JSON object or as text."""
-    typer.echo(json.dumps(content(), allow_nan=False) if as_json else text())
+def span(text: str, number: Callable[[str], Number]) -> tuple[Number, Number] | None:
+    """The ends of ``LOW:HIGH``, or one value twice; None of anything else."""
+    low, colon, high = text.partition(":")
+    try:
+        return number(low), number(high if colon else low)
+    except ValueError:
+        return None
+
+
+def answer(
+    as_json: bool, content: Callable[[], Mapping[str, Any]], text: Callable[[], str], written: Sequence[Path] = ()
+) -> None:
+    """Write the answer of a command to stdout, as one JSON object or as text, with the files that it has written."""
+    names = list(map(str, written))
+    if as_json:
+        typer.echo(json.dumps({**content(), **({"written": names} if names else {})}, allow_nan=False))
+    else:
+        typer.echo(text() + (f"\n\nWritten: {', '.join(names)}" if names else ""))
+
+
+def refuse_overwriting(inputs: Iterable[Path], written: Iterable[Path]) -> None:
+    """Refuse to write over what is read."""
+    for file, path in itertools.product(inputs, written):
+        if file.exists() and path.exists() and file.samefile(path):
+            raise UsageError(f"{file} would be overwritten; write elsewhere (--out DIR)")
 
 
 def require_within(out: Path, *places: Path) -> None:

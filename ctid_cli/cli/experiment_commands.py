@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -50,15 +49,8 @@ _STOPPED = {
     "failures": "stopped because estimates failed, as was asked for",
     "machine": "stopped because the machine did not let estimates finish",
 }
-
-
-class Failure(StrEnum):
-    """How a stored estimate failed."""
-
-    failed = "failed"
-    timeout = "timeout"
-    crashed = "crashed"
-    memory = "memory"
+#: How a stored estimate failed.
+Failure = Literal["failed", "timeout", "crashed", "memory"]
 
 
 def load_plans(

@@ -1,12 +1,12 @@
 """From the options of ``ctid fit`` that say what the model is to the estimator of it."""
 
-import contextlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from ctid_cli.cli._common import span
 from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import Hold, InitialState, LossKind, Offset
 
@@ -150,11 +150,9 @@ def _fixed(given: Sequence[str]) -> "tuple[Fixed, ...] | None":
 
 def delay_bounds(text: str) -> tuple[float, float]:
     """The range of the delay, or a known one twice."""
-    low, colon, high = text.partition(":")
-    with contextlib.suppress(ValueError):
-        bounds = float(low), float(high if colon else low)
-        if 0 <= bounds[0] <= bounds[1] < float("inf"):
-            return bounds
+    bounds = span(text, float)
+    if bounds is not None and 0 <= bounds[0] <= bounds[1] < float("inf"):
+        return bounds
     allowed = "LOW:HIGH, a range to search, or one known VALUE, in the record's unit of time and not negative"
     raise UsageError(f"--delay must be {allowed}, for example 0:2 or 0.3; got {text!r}")
 

@@ -15,6 +15,7 @@ from ctid_cli.cli._common import (
     To,
     answer,
     guarded,
+    refuse_overwriting,
     write_files,
 )
 from ctid_cli.errors import UsageError
@@ -58,9 +59,7 @@ def frf(
     from ctid_cli.signals.measurement import read_measurement
 
     data, figure = out / "frf.csv", out / "frf.svg"
-    for file in files:
-        if any(file.exists() and written.exists() and file.samefile(written) for written in (data, figure)):
-            raise UsageError(f"{file} would be overwritten by the response; write it elsewhere (--out DIR)")
+    refuse_overwriting(files, [data, figure])
     for name, value, wanted in (("--period", period, "periodic"), ("--segment", segment, "welch")):
         if value is not None and method not in ("auto", wanted):
             raise UsageError(f"{name} belongs to --method {wanted}, not to {method}")
@@ -83,8 +82,9 @@ def frf(
     write_files({data: frf_csv(found, units), figure: frf_drawing(found, units, title).saved()})
     answer(
         as_json,
-        lambda: frf_object(found, measurements, units, [data, figure]),
-        lambda: f"{frf_text(found, measurements, units)}\n\nWritten: {data}, {figure}",
+        lambda: frf_object(found, measurements, units),
+        lambda: frf_text(found, measurements, units),
+        [data, figure],
     )
 
 

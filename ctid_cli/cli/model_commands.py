@@ -18,14 +18,16 @@ from ctid_cli.cli._common import (
     To,
     answer,
     guarded,
+    refuse_overwriting,
+    span,
     write_files,
 )
 from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import Hold, InitialState, Offset
 
 if TYPE_CHECKING:
+    from ctid_cli.reporting.figures.style import Drawing
     from ctid_cli.reporting.model_report import NamedFit
-    from ctid_cli.signals.measurement import Role
 
 FitFile = Annotated[Path, typer.Argument(metavar="FIT", help="A fit.json.")]
 FitFiles = Annotated[list[Path], typer.Argument(metavar="FIT...", help="Files that ctid fit wrote (fit.json).")]
@@ -75,7 +77,7 @@ def simulate_fit(
     band = models[0].fit.simulate(found.signal, level=level, bands=bands)
     columns = response_columns(models, [band], found.signal.values)
     drawing = response_drawing(models, [band], "output", found.signal)
-    _write_response("simulation", models, columns, drawing, level, as_json, out, [file, on])
+    _write_response("simulation", models, columns, drawing, level, as_json, out, [on])
 
 
 @model.command("step", cls=Command)
@@ -101,7 +103,7 @@ def step(
     times = np.linspace(0.0, last, 500)
     found = [each.fit.step_response(times, level=level, bands=bands) for each in models]
     drawing = response_drawing(models, found, "step response")
-    _write_response("step", models, response_columns(models, found), drawing, level, as_json, out, files)
+    _write_response("step", models, response_columns(models, found), drawing, level, as_json, out)
 
 
 @model.command("bode", cls=Command)
@@ -135,11 +137,9 @@ def bode(
 
     limits = None if band is None else _limits(band)
     models, behind = named_fits(files), None
-    columns: dict[Role, str | None] = {"time": time, "input": input, "output": output}
     if on is not None:
-        measurement = record_for(models, on, columns, hold)
-        behind = estimate_frequency_response([measurement.record])
-    elif any((*columns.values(), hold)):
+        behind = estimate_frequency_response([record_for(models, on, hold, time, input, output).record])
+    elif any((time, input, output, hold)):
         raise UsageError("--time, --input, --output and --hold are of a record; name it with --on FILE")
     if limits is None:
         own = [each.fit.frequency_response(level=level).frequencies for each in models]
@@ -148,8 +148,8 @@ def bode(
     w = np.geomspace(*limits, 500)
     found = [each.fit.frequency_response(w, level=level, bands=bands) for each in models]
     drawing = models_bode_drawing(models, found, behind)
-    inputs = [*files, *([on] if on else [])]
-    _write_response("bode", models, frequency_columns(models, found), drawing, level, as_json, out, inputs)
+    records = [] if on is None else [on]
+    _write_response("bode", models, frequency_columns(models, found), drawing, level, as_json, out, records)
 
 
 @model.command("compare", cls=Command)
@@ -178,24 +178,21 @@ def compare_fits(
         comparison_columns,
         comparison_object,
         comparison_table,
-        csv_bytes,
         named_fits,
         record_for,
     )
 
     models = named_fits(files)
-    columns: dict[Role, str | None] = {"time": time, "input": input, "output": output}
-    measurement = record_for(models, on, columns, hold, start=start, stop=stop)
+    measurement = record_for(models, on, hold, time, input, output, start, stop)
     found = compare([each.fit for each in models], measurement.record, initial_state=initial_state, offset=offset)
-    data, figure = out / "comparison.csv", out / "comparison.svg"
-    _refuse_overwriting([*files, on], [data, figure])
-    content = csv_bytes(comparison_columns(found, models, measurement.record))
-    write_files({data: content, figure: comparison_drawing(models, found, measurement).saved()})
+    columns = comparison_columns(found, models, measurement.record)
+    written = _write(out / "comparison", columns, comparison_drawing(models, found, measurement), [*files, on])
     head = f"{measurement.record.name}: {measurement.record.n_samples} samples"
     answer(
         as_json,
-        lambda: {**comparison_object(models, measurement, found), "written": [str(data), str(figure)]},
-        lambda: "\n".join([head, "", comparison_table(models, found).draw(), "", f"Written: {data}, {figure}"]),
+        lambda: comparison_object(models, measurement, found),
+        lambda: f"{head}\n\n{comparison_table(models, found).draw()}",
+        written,
     )
 
 
@@ -219,7 +216,6 @@ def residuals(
     from ctid_cli.estimators.model_comparison import compare
     from ctid_cli.reporting.model_plot import residual_drawing
     from ctid_cli.reporting.model_report import (
-        csv_bytes,
         named_fits,
         record_for,
         residual_columns,
@@ -228,17 +224,15 @@ def residuals(
     )
 
     (each,) = models = named_fits([file])
-    columns: dict[Role, str | None] = {"time": time, "input": input, "output": output}
-    measurement = record_for(models, on, columns, hold, start=start, stop=stop)
+    measurement = record_for(models, on, hold, time, input, output, start, stop)
     (one,) = compare([each.fit], measurement.record, initial_state=initial_state, offset=offset)
-    data, figure = out / "residuals.csv", out / "residuals.svg"
-    _refuse_overwriting([file, on], [data, figure])
-    content = csv_bytes(residual_columns(one, each.units))
-    write_files({data: content, figure: residual_drawing(each, one, measurement).saved()})
+    drawing = residual_drawing(each, one, measurement)
+    written = _write(out / "residuals", residual_columns(one, each.units), drawing, [file, on])
     answer(
         as_json,
-        lambda: {**residual_object(each, measurement, one), "written": [str(data), str(figure)]},
-        lambda: f"{residual_text(each, measurement, one)}\n\nWritten: {data}, {figure}",
+        lambda: residual_object(each, measurement, one),
+        lambda: residual_text(each, measurement, one),
+        written,
     )
 
 
@@ -272,54 +266,46 @@ def export_fit(
         path, text = out / f"{name}.m", each.fit.to_matlab(name, kind or "idtf", each.units.time)
     else:
         path, text = out / f"{name}_{style}.py", each.fit.to_python(name, style, pade)
-    _refuse_overwriting([file], [path])
+    refuse_overwriting([file], [path])
     write_files({path: text.encode()})
-    answer(
-        as_json,
-        lambda: {"format": style, "text": text, "written": [str(path)]},
-        lambda: f"{text}\nWritten: {path}",
-    )
+    answer(as_json, lambda: {"format": style, "text": text}, lambda: text.removesuffix("\n"), [path])
 
 
 def _write_response(
     name: str,
     models: Sequence[NamedFit],
     columns: Mapping[str, Any],
-    drawing: Any,
+    drawing: Drawing,
     level: float,
     as_json: bool,
     out: Path,
-    inputs: Sequence[Path],
+    records: Sequence[Path] = (),
 ) -> None:
     """Write a response and its figure, and answer with a part of it."""
-    from ctid_cli.reporting.model_report import csv_bytes, names_of, response_object, response_tables
+    from ctid_cli.reporting.model_report import names_of, response_object, response_tables
 
-    data, figure = out / f"{name}.csv", out / f"{name}.svg"
-    _refuse_overwriting(inputs, [data, figure])
-    write_files({data: csv_bytes(columns), figure: drawing.saved()})
+    written = _write(out / name, columns, drawing, [*(model.path for model in models), *records])
     head = f"{names_of(models)}: {100 * level:g} % bands, pointwise"
     answer(
         as_json,
-        lambda: {**response_object(models, columns, level), "written": [str(data), str(figure)]},
-        lambda: "\n\n".join(
-            [head, response_tables(columns, models, logarithmic=name == "bode"), f"Written: {data}, {figure}"]
-        ),
+        lambda: response_object(models, columns, level),
+        lambda: f"{head}\n\n{response_tables(columns, models, logarithmic=name == 'bode')}",
+        written,
     )
 
 
+def _write(stem: Path, columns: Mapping[str, Any], drawing: Drawing, inputs: Sequence[Path]) -> list[Path]:
+    """Write columns and their figure, unless one of the files would be one that was read."""
+    from ctid_cli.reporting.model_report import csv_bytes
+
+    files = data, figure = [stem.with_name(f"{stem.name}.{style}") for style in ("csv", "svg")]
+    refuse_overwriting(inputs, files)
+    write_files({data: csv_bytes(columns), figure: drawing.saved()})
+    return files
+
+
 def _limits(text: str) -> tuple[float, float]:
-    low, _, high = text.partition(":")
-    try:
-        limits = float(low), float(high)
-    except ValueError:
-        limits = 0.0, 0.0
-    if not 0 < limits[0] < limits[1] < float("inf"):
+    limits = span(text, float)
+    if limits is None or not 0 < limits[0] < limits[1] < float("inf"):
         raise UsageError(f"--band must be LOW:HIGH, two rising positive frequencies such as 0.1:50; got {text!r}")
     return limits
-
-
-def _refuse_overwriting(inputs: Sequence[Path], written: Sequence[Path]) -> None:
-    for file in inputs:
-        for path in written:
-            if file.exists() and path.exists() and file.samefile(path):
-                raise UsageError(f"{file} would be overwritten; write elsewhere (--out DIR)")

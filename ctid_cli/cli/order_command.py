@@ -7,7 +7,18 @@ from typing import Annotated
 
 import typer
 
-from ctid_cli.cli._common import From, InputColumn, InputHold, Json, OutputColumn, TimeColumn, To, guarded, write_files
+from ctid_cli.cli._common import (
+    From,
+    InputColumn,
+    InputHold,
+    Json,
+    OutputColumn,
+    TimeColumn,
+    To,
+    guarded,
+    span,
+    write_files,
+)
 from ctid_cli.cli.fit_structure import delay_bounds
 from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import InitialState, Offset
@@ -85,12 +96,8 @@ def order(
 
 
 def _range(name: str, text: str, least: int) -> tuple[int, int]:
-    low, colon, high = text.partition(":")
-    try:
-        found = int(low), int(high if colon else low)
-    except ValueError:
-        found = -1, -1
-    if not least <= found[0] <= found[1] <= 12:
+    found = span(text, int)
+    if found is None or not least <= found[0] <= found[1] <= 12:
         raise UsageError(
             f"{name} must be LOW:HIGH or one number, from {least} to 12, for example {least}:3; got {text!r}"
         )

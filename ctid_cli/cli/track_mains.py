@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from ctid_cli.cli._common import answer, write_files
+from ctid_cli.cli._common import answer, refuse_overwriting, write_files
 from ctid_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -55,8 +55,7 @@ def track_mains(
     from ctid_cli.reporting.synchrophasor_plot import synchrophasor_drawing
 
     data, figure = out / f"synchrophasors.{style}", out / "synchrophasors.svg"
-    if any(file.exists() and written.exists() and file.samefile(written) for written in (data, figure)):
-        raise UsageError(f"{file} would be overwritten; write the synchrophasors elsewhere (--out DIR)")
+    refuse_overwriting([file], [data, figure])
     names = [None if reading.signal is None else name.strip() for name in (reading.signal or "").split(",")]
     if len(names) not in (1, 3):
         raise UsageError(f"--signal names {len(names)} signals; synchrophasors are those of one or of three phases")
@@ -80,6 +79,7 @@ def track_mains(
     write_files({data: report.synchrophasor_bytes(found, style, first.unit), figure: drawn})
     answer(
         as_json,
-        lambda: report.synchrophasor_object(signals, found, [data, figure]),
-        lambda: f"{report.synchrophasor_text(signals, found)}\n\nWritten: {data}, {figure}",
+        lambda: report.synchrophasor_object(signals, found),
+        lambda: report.synchrophasor_text(signals, found),
+        [data, figure],
     )

@@ -12,7 +12,7 @@ from ctid_cli.inference.bands import FrequencyBand, PoleBand, ResponseBand
 from ctid_cli.inference.frequency_response import FrequencyResponse
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.figures.style import BAND, DARK, MARK, MIDDLE, Drawing, plain
-from ctid_cli.reporting.frf_plot import decibels, draw_points
+from ctid_cli.reporting.frf_plot import decibels, draw_points, name_axes
 from ctid_cli.reporting.identification_plot import draw_overlay, draw_profile
 from ctid_cli.signals.measurement import Measurement
 
@@ -46,10 +46,7 @@ def bode_drawing(band: FrequencyBand, found: FrequencyResponse | None, units: Un
             around = np.interp(found.frequencies, band.frequencies, band.phase)
             draw_points(gain, phase, found, "without a model", around)
         draw_bode(gain, phase, band)
-        gain.set_ylabel(f"gain [dB re 1 {plain(units.gain)}]")
-        phase.set_ylabel("phase [°]")
-        phase.set_xlabel(rf"frequency $\omega$ [rad/{plain(units.time)}]")
-        gain.legend(loc="lower left", fontsize=8)
+        name_axes(gain, phase, phase, units)
 
     return Drawing(8.0, 4.8, draw)
 

@@ -27,37 +27,32 @@ def frf_drawing(found: FrequencyResponse, units: Units, title: str) -> Drawing:
         if found.distortion is not None and found.distortion.any():
             level = np.sqrt(found.distortion)
             gain.semilogx(found.frequencies, decibels(level), "x", color=MARK, markersize=3, label="distortion")
-        gain.semilogx(
-            found.frequencies,
-            decibels(found.standard_error),
-            color=MIDDLE,
-            linewidth=0.8,
-            linestyle="--",
-            label="standard error",
-        )
-        if found.bias.any():
-            gain.semilogx(
-                found.frequencies,
-                decibels(found.bias),
-                color=LIGHT,
-                linewidth=0.8,
-                linestyle=":",
-                label="bound of the images of the hold",
-            )
-        gain.set_ylabel(f"gain [dB re 1 {plain(units.gain)}]")
-        phase.set_ylabel("phase [°]")
+        for level, color, line, label in (
+            (found.standard_error, MIDDLE, "--", "standard error"),
+            (found.bias, LIGHT, ":", "bound of the images of the hold"),
+        ):
+            if level.any():
+                look = {"color": color, "linestyle": line, "linewidth": 0.8}
+                gain.semilogx(found.frequencies, decibels(level), **look, label=label)
         coherence.semilogx(found.frequencies, found.coherence, ".", color=DARK, markersize=2.5)
         coherence.set_ylim(-0.05, 1.05)
         coherence.set_ylabel("coherence [-]")
-        coherence.set_xlabel(rf"frequency $\omega$ [rad/{plain(units.time)}]")
         gain.margins(x=0.02)
         # The bound falls for ever towards low frequencies.
         lowest = np.nanmin(decibels(np.minimum(np.abs(found.response), np.maximum(found.standard_error, 1e-12))))
         gain.set_ylim(bottom=max(gain.get_ylim()[0], float(lowest) - 12.0))
-        gain.legend(loc="lower left", fontsize=8)
+        name_axes(gain, phase, coherence, units)
         gain.set_title(plain(title), loc="left")
 
     return Drawing(7.5, 6.4, draw)
+
+
+def name_axes(gain: Any, phase: Any, lowest: Any, units: Units) -> None:
+    """The axes of a frequency response, and the legend."""
+    gain.set_ylabel(f"gain [dB re 1 {plain(units.gain)}]")
+    phase.set_ylabel("phase [°]")
+    lowest.set_xlabel(rf"frequency $\omega$ [rad/{plain(units.time)}]")
+    gain.legend(loc="lower left", fontsize=8)
 
 
 def draw_points(

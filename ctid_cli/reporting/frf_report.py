@@ -1,7 +1,7 @@
 """What ``ctid frf`` answers: a frequency response without a model as text, as an object for JSON, and as a file."""
 
 from collections.abc import Sequence
-from pathlib import Path
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.canonical import plain
 from ctid_cli.inference.frequency_response import FrequencyResponse
+from ctid_cli.reporting.column_file import columns_bytes
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.layout import Report, Table, count, number
 from ctid_cli.signals.measurement import ROLES, Measurement
@@ -47,20 +48,15 @@ def frf_columns(found: FrequencyResponse, units: Units) -> dict[str, Array]:
 
 def frf_csv(found: FrequencyResponse, units: Units) -> bytes:
     """The file of a frequency response."""
-    import pandas as pd
-
-    frame = pd.DataFrame(frf_columns(found, units))
-    return frame.to_csv(index=False, float_format="%.12g", lineterminator="\n").encode()
+    return columns_bytes(frf_columns(found, units), "csv", {})
 
 
-def frf_object(
-    found: FrequencyResponse, measurements: Sequence[Measurement], units: Units, files: Sequence[Path]
-) -> dict[str, Any]:
+def frf_object(found: FrequencyResponse, measurements: Sequence[Measurement], units: Units) -> dict[str, Any]:
     """A frequency response for ``ctid frf --json``."""
     content = {
         "files": [measurement.record.name for measurement in measurements],
         "columns": {role: getattr(measurements[0], role) for role in ROLES},
-        "units": {"time": units.time, "input": units.input, "output": units.output},
+        "units": asdict(units),
         "method": found.method,
         "hold": found.hold,
         "frequencies": found.frequencies,
@@ -72,7 +68,6 @@ def frf_object(
         "distortion": None if found.distortion is None else np.sqrt(found.distortion),
         "hold_bias": found.bias,
         "notes": [*_in_unit(found, units), *_read(measurements)],
-        "written": [str(file) for file in files],
     }
     return dict(plain(content))
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray, IntArray
+from ctid_cli.arrays import Array, BoolArray, IndexArray, IntArray
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.inference.residuals import ResidualTests
 from ctid_cli.reporting.estimate import Units
@@ -81,7 +81,7 @@ def _draw_output(axes: Any, result: Identification, measurement: Measurement, k:
 def draw_overlay(axes: Any, measurement: Measurement, use: BoolArray, residuals: Array, units: Units) -> None:
     """The measured output, and the simulated one at its used samples."""
     record = measurement.record
-    simulated = outline(*_with_gaps(record.t, use, record.y[use] - residuals))
+    simulated = curve(record.t, use, record.y[use] - residuals)
     axes.plot(*outline(record.t, record.y), color=LIGHT, linewidth=2.2, zorder=1.9, label="measured")
     axes.plot(*simulated, color=DARK, linewidth=0.9, label="simulated")
     axes.set_ylabel(plain(measurement.label("output", units.output)))
@@ -92,7 +92,7 @@ def draw_overlay(axes: Any, measurement: Measurement, use: BoolArray, residuals:
 
 def _draw_residuals(axes: Any, result: Identification, measurement: Measurement, k: int, units: Units) -> None:
     t = measurement.record.t
-    axes.plot(*outline(*_with_gaps(t, result.fit.used[k], result.fit.residuals[k])), color=DARK, linewidth=0.7)
+    axes.plot(*curve(t, result.fit.used[k], result.fit.residuals[k]), color=DARK, linewidth=0.7)
     axes.axhline(0.0, color="black", linewidth=0.6)
     axes.set_ylabel(plain(f"residual [{units.output}]"))
 
@@ -107,11 +107,11 @@ def _name_panels(upper: Any, lower: Any, measurement: Measurement, k: int, n: in
         upper.set_title(f"experiment {k + 1} of {n}", loc="left")
 
 
-def _with_gaps(t: Array, use: BoolArray, values: Array) -> tuple[Array, Array]:
-    """Values at the used instants, with breaks in the line where samples are missing."""
+def curve(t: Array, use: BoolArray | IndexArray, values: Array) -> tuple[Array, Array]:
+    """The curve of values at the used instants, with breaks in the line where samples are missing."""
     full = np.full(t.size, np.nan)
     full[use] = values
-    return t, full
+    return outline(t, full)
 
 
 def draw_autocorrelation(axes: Any, tests: Sequence[ResidualTests], experiments: int = 1) -> None:
@@ -159,15 +159,8 @@ def draw_profile(axes: Any, result: Identification, units: Units) -> None:
         whole = profile.samples >= result.fit.count
         behind = "" if whole else f" of the liveliest {profile.samples} samples"
         behind += "" if profile.cutoff is None else f" below {profile.cutoff:.3g} rad/{units.time}"
-        axes.plot(
-            profile.delays,
-            profile.costs,
-            ".-",
-            color=DARK,
-            linewidth=0.8,
-            markersize=4,
-            label=plain(f"profile{behind}"),
-        )
+        label = plain(f"profile{behind}")
+        axes.plot(profile.delays, profile.costs, ".-", color=DARK, linewidth=0.8, markersize=4, label=label)
         label = plain(f"minimum at {delay:.4g} {units.time}")
         if profile.cutoff is None and whole:
             axes.plot([delay], [result.fit.cost], "v", color="black", markersize=7, label=label)

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ctid_cli.arrays import Array
 from ctid_cli.estimators.model_comparison import ModelOnRecord
 from ctid_cli.inference.bands import FrequencyBand, ResponseBand
 from ctid_cli.inference.frequency_response import FrequencyResponse
 from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, outline, plain
 from ctid_cli.reporting.fit_drawings import draw_bode, draw_response
-from ctid_cli.reporting.frf_plot import decibels, draw_points
-from ctid_cli.reporting.identification_plot import draw_autocorrelation, draw_cross_correlation
+from ctid_cli.reporting.frf_plot import decibels, draw_points, name_axes
+from ctid_cli.reporting.identification_plot import curve, draw_autocorrelation, draw_cross_correlation
 from ctid_cli.reporting.model_report import NamedFit
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.measurement import Measurement
@@ -75,11 +74,8 @@ def models_bode_drawing(
             bottom, top = axes.get_ylim()
             low, high = min(np.nanmin(x) for x in curves), max(np.nanmax(x) for x in curves)
             axes.set_ylim(max(bottom, low - room), min(top, high + room))
-        gain.set_ylabel(f"gain [dB re 1 {plain(units.gain)}]")
-        phase.set_ylabel("phase [°]")
-        phase.set_xlabel(rf"frequency $\omega$ [rad/{plain(units.time)}]")
         gain.margins(x=0.02)
-        gain.legend(loc="lower left", fontsize=8)
+        name_axes(gain, phase, phase, units)
 
     return Drawing(7.5, 5.2, draw)
 
@@ -93,8 +89,9 @@ def comparison_drawing(models: Sequence[NamedFit], found: Sequence[ModelOnRecord
         upper.plot(*outline(record.t, record.y), color=LIGHT, linewidth=2.4, label="measured")
         for k in np.argsort([-one.fit_percent for one in found], kind="stable").tolist():
             label = f"{plain(models[k].name)}: {found[k].fit_percent:.4g} %"
-            upper.plot(*_gapped(record.t, found[k], found[k].simulated), label=label, **_line(k))
-            lower.plot(*_gapped(record.t, found[k], found[k].residuals), **_line(k) | {"linewidth": 0.7})
+            used = np.searchsorted(record.t, found[k].t)
+            upper.plot(*curve(record.t, used, found[k].simulated), label=label, **_line(k))
+            lower.plot(*curve(record.t, used, found[k].residuals), **_line(k) | {"linewidth": 0.7})
         lower.axhline(0.0, color="black", linewidth=0.6)
         upper.set_ylabel(f"{plain(split_header(measurement.output)[0])} [{plain(units.output)}]")
         lower.set_ylabel(f"residual [{plain(units.output)}]")
@@ -111,7 +108,8 @@ def residual_drawing(model: NamedFit, one: ModelOnRecord, measurement: Measureme
     def draw(figure: Figure) -> None:
         grid = figure.add_gridspec(2, 2, height_ratios=[1.0, 1.2])
         over_time = figure.add_subplot(grid[0, :])
-        over_time.plot(*_gapped(measurement.record.t, one, one.residuals), color=DARK, linewidth=0.7)
+        t = measurement.record.t
+        over_time.plot(*curve(t, np.searchsorted(t, one.t), one.residuals), color=DARK, linewidth=0.7)
         over_time.axhline(0.0, color="black", linewidth=0.6)
         over_time.set_ylabel(f"residual [{plain(model.units.output)}]")
         over_time.set_xlabel(f"{plain(split_header(measurement.time)[0])} [{plain(model.units.time)}]")
@@ -122,13 +120,6 @@ def residual_drawing(model: NamedFit, one: ModelOnRecord, measurement: Measureme
         draw_cross_correlation(figure.add_subplot(grid[1, 1]), tests)
 
     return Drawing(8.0, 5.0, draw)
-
-
-def _gapped(t: Array, one: ModelOnRecord, values: Array) -> tuple[Array, Array]:
-    """Values at the used instants of a record, with breaks in the line where there is none."""
-    full = np.full(t.size, np.nan)
-    full[np.searchsorted(t, one.t)] = values
-    return outline(t, full)
 
 
 def _thinned(band: ResponseBand) -> ResponseBand:

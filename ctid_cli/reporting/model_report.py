@@ -1,8 +1,7 @@
 """What ``ctid model`` answers: responses of stored fits, and the fits on another record, as text, JSON and files."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +14,15 @@ from ctid_cli.estimators.model_comparison import ModelOnRecord
 from ctid_cli.inference.bands import FrequencyBand, ResponseBand
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.layout import Table, number, percent
-from ctid_cli.signals.measurement import MeasuredInput, Measurement, Role, read_measurement, read_table
+from ctid_cli.reporting.layout import Table, number, percent, picked
+from ctid_cli.signals.measurement import MeasuredInput, Measurement, read_measurement, read_table
 from ctid_cli.storage.fit_file import read_fit
 from ctid_cli.text import listed, wrapped
 
 #: Rows of a printed table of a response.
 ROWS = 12
+#: What is told of the tests of residuals.
+VERDICTS = ("white", "whiteness_p_value", "uncorrelated", "cross_p_value")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,19 +77,18 @@ def require_units(
 def record_for(
     models: Sequence[NamedFit],
     file: Path,
-    columns: Mapping[Role, str | None],
     hold: Any,
+    time: str | None,
+    input: str | None,
+    output: str | None,
     start: float | None = None,
     stop: float | None = None,
 ) -> Measurement:
     """A record to look at models with: the columns of their own record where the file has them and none are named."""
-    names: Mapping[Any, str | None] = columns
-    own = models[0].columns
-    if not any(columns.values()) and set(own.values()) <= set(read_table(file, "export it as .csv").names):
-        names = own
-    hold = hold or models[0].hold
-    read = partial(read_measurement, file, hold=hold, start=start, stop=stop)
-    found = read(time=names["time"], input=names["input"], output=names["output"])
+    own, names = models[0].columns, {"time": time, "input": input, "output": output}
+    if not any(names.values()) and set(own.values()) <= set(read_table(file, "export it as .csv").names):
+        names = {role: own[role] for role in names}
+    found = read_measurement(file, **names, hold=hold or models[0].hold, start=start, stop=stop)
     require_units(found.record.name, models[0], found.time_unit, found.input_unit, found.output_unit)
     return found
 
@@ -164,17 +164,9 @@ def response_tables(columns: Mapping[str, Array], models: Sequence[NamedFit], *,
 
 def response_object(models: Sequence[NamedFit], columns: Mapping[str, Array], level: float) -> dict[str, Any]:
     """A response for ``--json``: the columns of its file."""
-    units = models[0].units
-    return dict(
-        plain(
-            {
-                "models": {model.name: str(model.path) for model in models},
-                "units": {"time": units.time, "input": units.input, "output": units.output},
-                "level": level,
-                "columns": dict(columns),
-            }
-        )
-    )
+    named = {model.name: str(model.path) for model in models}
+    content = {"models": named, "units": asdict(models[0].units), "level": level, "columns": dict(columns)}
+    return dict(plain(content))
 
 
 # --- models on a record ----------------------------------------------------------------------------
@@ -194,16 +186,11 @@ def comparison_object(
             "samples": one.count,
             "initial_state": one.initial_state,
             "offset": one.offset,
-            "white": None if one.tests is None else one.tests.white,
-            "whiteness_p_value": None if one.tests is None else one.tests.whiteness_p_value,
-            "uncorrelated": None if one.tests is None else one.tests.uncorrelated,
-            "cross_p_value": None if one.tests is None else one.tests.cross_p_value,
+            **(dict.fromkeys(VERDICTS) if one.tests is None else picked(one.tests, VERDICTS)),
         }
         for model, one in zip(models, found, strict=True)
     ]
-    units = models[0].units
-    shown = {"time": units.time, "input": units.input, "output": units.output}
-    return dict(plain({"record": measurement.record.name, "units": shown, "models": rows}))
+    return dict(plain({"record": measurement.record.name, "units": asdict(models[0].units), "models": rows}))
 
 
 def comparison_table(models: Sequence[NamedFit], found: Sequence[ModelOnRecord]) -> Table:

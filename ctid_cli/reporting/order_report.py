@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ def order_object(
     content = {
         "files": [measurement.record.name for measurement in measurements],
         "columns": {role: getattr(measurements[0], role) for role in ROLES},
-        "units": {"time": units.time, "input": units.input, "output": units.output},
+        "units": asdict(units),
         "recommended": None if best is None else {"poles": best.options.poles, "zeros": best.options.zeros},
         "reason": found.reason,
         "noise_order": found.noise.order,

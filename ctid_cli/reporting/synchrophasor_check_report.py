@@ -1,12 +1,10 @@
 """What ``ctid check pmu`` says: the worst error of every test beside its limit."""
 
-import csv
-import io
 from typing import Any
 
 from ctid_cli.frequency.synchrophasor_check import CheckedLimit, SynchrophasorCheck
 from ctid_cli.frequency.synchrophasor_limits import QUANTITIES, TESTS
-from ctid_cli.reporting.layout import Report, Table, number
+from ctid_cli.reporting.layout import Report, Table, csv_text, number, picked
 
 #: Short names of the quantities, for a table.
 _SHORT = {
@@ -25,11 +23,7 @@ _SHORT = {
 def check_object(check: SynchrophasorCheck) -> dict[str, Any]:
     """A check as JSON-able content."""
     return {
-        "passed": check.passed,
-        "nominal": check.nominal,
-        "performance_class": check.performance_class,
-        "reporting_rate": check.reporting_rate,
-        "sampling_rate": check.sampling_rate,
+        **picked(check, ("passed", "nominal", "performance_class", "reporting_rate", "sampling_rate")),
         "limits": [_row(row) for row in check.rows],
     }
 
@@ -50,11 +44,7 @@ def _row(row: CheckedLimit) -> dict[str, Any]:
 
 def check_csv(check: SynchrophasorCheck) -> bytes:
     """A check as a table for programs."""
-    rows, file = check_object(check)["limits"], io.StringIO()
-    writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return file.getvalue().encode()
+    return csv_text(check_object(check)["limits"]).encode()
 
 
 def _table(check: SynchrophasorCheck) -> Table:

@@ -1,6 +1,5 @@
 """What ``ctid track --pmu`` answers: synchrophasors of a record as text, as an object for JSON, and as columns."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -62,7 +61,7 @@ def _spread(values: Array) -> dict[str, float | None]:
     return {"median": float(np.median(values)), "lowest": float(values.min()), "highest": float(values.max())}
 
 
-def synchrophasor_object(signals: list[SampledSignal], track: SynchrophasorTrack, files: list[Path]) -> dict[str, Any]:
+def synchrophasor_object(signals: list[SampledSignal], track: SynchrophasorTrack) -> dict[str, Any]:
     """Synchrophasors for ``ctid track --pmu --json``."""
     first = signals[0]
     content = {
@@ -83,7 +82,6 @@ def synchrophasor_object(signals: list[SampledSignal], track: SynchrophasorTrack
         "warnings": synchrophasor_warnings(track),
         "notes": list(first.notes) if len(signals) == 1 else [],
         "chosen": _choices(signals, track),
-        "written": [str(file) for file in files],
     }
     return dict(plain(content))
 

@@ -78,12 +78,12 @@ def test_exchanged_phases_are_named():
 def test_object_holds_ranges_over_the_valid_rows():
     stepping = signal(step=0.5)
     found = measured(stepping)
-    content = synchrophasor_object([stepping], found, [])
+    content = synchrophasor_object([stepping], found)
     assert content["frequency_hz"]["lowest"] == pytest.approx(50.1, abs=0.02)
     assert content["magnitude"]["median"] == pytest.approx(325 / np.sqrt(2), rel=1e-4)
     assert 80 < content["valid_percent"] < 100
     assert (content["nominal"], content["performance_class"], content["reporting_rate"]) == (50, "P", 50)
-    nothing = synchrophasor_object([stepping], measured(signal(), nominal=60), [])
+    nothing = synchrophasor_object([stepping], measured(signal(), nominal=60))
     assert nothing["frequency_hz"] == {"median": None, "lowest": None, "highest": None}
     assert nothing["warnings"][0] == "No row is valid."
 

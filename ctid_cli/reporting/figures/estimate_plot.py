@@ -60,9 +60,9 @@ def _errors(estimates: ParameterEstimates, name: str) -> Array:
     return np.asarray(estimates.values[:, k] - estimates.truth[k])
 
 
-def _labelled(name: str, rows: Sequence[Row], what: str = "error of ") -> str:
+def _labelled(name: str, rows: Sequence[Row]) -> str:
     unit = next((parameter_unit(name, row["value"].names) for row in rows if name in row["value"].names), "-")
-    return f"{what}{plain(name)}" + ("" if unit == "-" else f" [{unit}]")
+    return f"error of {plain(name)}" + ("" if unit == "-" else f" [{unit}]")
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -169,11 +169,7 @@ def delays_drawing(results: Results) -> Drawing:
     def draw(figure: Figure) -> None:
         for axes, row in zip(panels_of(figure, len(shown), sharex=True, sharey=True), shown, strict=True):
             _draw_delays(axes, row, edges)
-            own = [(name, row[name]) for name in settings.names if row[name] is not None]
-            titles = dict(zip(settings.names, settings.titles, strict=True))
-            words = Settings(tuple(name for name, _ in own), tuple(titles[name] for name, _ in own), [], []).words(
-                tuple(value for _, value in own)
-            )
+            words = settings.words(tuple(row[name] for name in settings.names))
             failed = f", {row['value'].failed} failed" if row["value"].failed else ""
             axes.set_title(f"{row['method']}{failed}\n{words}".strip(), loc="left", fontsize=8)
             axes.set_xlabel("delay [s]")
@@ -199,22 +195,17 @@ def _draw_delays(axes: Axes, row: Row, edges: Array) -> None:
     axes.bar(edges[:-1], 100.0 * counts / runs, np.diff(edges), align="edge", color=DARK)
     axes.axvline(_true_delay(row), color=MARK, linewidth=0.9, linestyle="--", zorder=0.5)
     axes.set_ylim(0.0, 108.0)
-    shares = [share((delays >= edges[first]) & (delays <= edges[last])) for first, last in basins(counts)]
-    middles = [float(np.mean(_within(delays, edges[first], edges[last]))) for first, last in basins(counts)]
-    named = [
-        (found.value, f"{middle:.3g} s: {found.value:.0f} % [{found.low:.0f}, {found.high:.0f}]")
-        for found, middle in zip(shares, middles, strict=True)
-        if found.value is not None and found.value >= LEAST
-    ]
+    named = []
+    for first, last in basins(counts):
+        inside = (delays >= edges[first]) & (delays <= edges[last])
+        found, middle = share(inside), float(np.mean(delays[inside]))
+        if found.value is not None and found.value >= LEAST:
+            named.append((found.value, f"{middle:.3g} s: {found.value:.0f} % [{found.low:.0f}, {found.high:.0f}]"))
     # Where the bars leave room.
     left = counts[: BINS // 2].max() < counts[BINS // 2 :].max()
     text = "\n".join(text for _, text in sorted(named, reverse=True)[:NAMED])
     place = (0.03 if left else 0.97, 0.95)
     axes.annotate(text, place, xycoords="axes fraction", ha="left" if left else "right", va="top", fontsize=7)
-
-
-def _within(values: Array, low: float, high: float) -> Array:
-    return values[(values >= low) & (values <= high)]
 
 
 def basins(counts: Array) -> list[tuple[int, int]]:
@@ -284,11 +275,5 @@ def _legend(figure: Figure, settings: Settings, theory: bool) -> None:
         for k, method in enumerate(settings.methods)
     ]
     title = "curve: 95 % of the estimates, by theory" if theory else None
-    figure.legend(
-        handles=handles,
-        loc="outside lower center",
-        ncols=min(len(handles), 4),
-        frameon=False,
-        title=title,
-        title_fontsize=8,
-    )
+    place: dict[str, Any] = {"loc": "outside lower center", "ncols": min(len(handles), 4), "frameon": False}
+    figure.legend(handles=handles, title=title, title_fontsize=8, **place)

@@ -54,10 +54,10 @@ class Settings(NamedTuple):
         return next((row for row in rows if all(row[name] in (None, value) for name, value in at)), None)
 
     def words(self, point: Point) -> str:
-        """A point as the title of a panel."""
-        titles = (title.partition(" [") for title in self.titles)
-        named = zip(titles, map(value_text, point), strict=True)
-        return ", ".join(f"{title} {text} {unit.rstrip(']')}".strip() for (title, _, unit), text in named)
+        """A point as the title of a panel, without settings that it does not have."""
+        named = zip((title.partition(" [") for title in self.titles), point, strict=True)
+        known = ((title, value_text(value), unit) for (title, _, unit), value in named if value is not None)
+        return ", ".join(f"{title} {text} {unit.rstrip(']')}".strip() for title, text, unit in known)
 
 
 def settings_in(rows: Sequence[Row], results: Results) -> Settings:
