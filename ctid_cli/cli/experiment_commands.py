@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -49,8 +50,15 @@ _STOPPED = {
     "failures": "stopped because estimates failed, as was asked for",
     "machine": "stopped because the machine did not let estimates finish",
 }
-#: How a stored estimate failed.
-Failure = Literal["failed", "timeout", "crashed", "memory"]
+
+
+class Failure(StrEnum):
+    """How a stored estimate failed."""
+
+    failed = "failed"
+    timeout = "timeout"
+    crashed = "crashed"
+    memory = "memory"
 
 
 def load_plans(

@@ -71,7 +71,7 @@ def without_workers():
         yield
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def ctid():
     """Run a command: ``ctid("table", "1")``."""
     from ctid_cli.cli.main import app
@@ -103,16 +103,12 @@ def measured(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory):
+def done(tmp_path_factory, ctid):
     """Results folder with the tiny and the measured experiment, run once."""
-    from ctid_cli.cli.main import app
-
     folder = tmp_path_factory.mktemp("done")
     (folder / "tiny.yaml").write_text(TINY, encoding="utf-8")
     (folder / "measured.yaml").write_text(MEASURED, encoding="utf-8")
     (folder / "record.csv").write_text(record_text(), encoding="utf-8")
-    arguments = ["run", *(str(folder / f"{name}.yaml") for name in ("tiny", "measured"))]
-    result = CliRunner().invoke(app, [*arguments, "--jobs", "1", "--quiet", "--out", str(folder / "results")])
-    assert result.exit_code == 0, result.output
-    assert result.stdout == ""
+    files = folder / "tiny.yaml", folder / "measured.yaml"
+    assert ctid("run", *files, "--jobs", 1, "--quiet", "--out", folder / "results").stdout == ""
     return folder / "results"

@@ -6,7 +6,6 @@ import json
 import math
 
 import pytest
-from typer.testing import CliRunner
 
 SPEC = """\
 experiment: loop
@@ -30,15 +29,11 @@ NAMES = [f"g{k}_{name}" for k in (1, 2) for name in ("a1", "a2", "b0")]
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory):
+def results(tmp_path_factory, ctid):
     """Results folder of the experiment, run once."""
-    from ctid_cli.cli.main import app
-
     folder = tmp_path_factory.mktemp("loop")
     (folder / "spec.yaml").write_text(SPEC, encoding="utf-8")
-    arguments = ["run", str(folder / "spec.yaml"), "--jobs", "1", "--quiet", "--out", str(folder / "results")]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
+    ctid("run", folder / "spec.yaml", "--jobs", 1, "--quiet", "--out", folder / "results")
     return folder / "results"
 
 

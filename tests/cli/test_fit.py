@@ -5,27 +5,10 @@ import json
 import sys
 import time
 
-import numpy as np
 import pytest
 
-from ctid_cli import HeldSignal, TransferFunction, simulate
 from ctid_cli.cli import _progress
-
-SYSTEM = TransferFunction([3.0], [1.0, 1.2, 4.0], 0.73)
-
-
-def rows(seed=0, n=500, noise=0.02, offset=0.0):
-    rng = np.random.default_rng(seed)
-    t = 0.1 * np.arange(n)
-    u = np.repeat(rng.choice([-1.0, 1.0], n // 5), 5)
-    y = simulate(SYSTEM, HeldSignal(t, u), t) + offset + noise * rng.standard_normal(n)
-    return np.column_stack((t, u, y))
-
-
-def write(file, values, header="t,u,y"):
-    lines = [header, *(",".join(f"{value:.12g}" for value in row) for row in values)]
-    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return file
+from tests.cli.records import rows, write
 
 
 @pytest.fixture

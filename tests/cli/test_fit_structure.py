@@ -10,6 +10,7 @@ from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.filtering.sampled import simulate_additive
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
+from tests.cli.records import write
 
 STEP = 0.05
 MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
@@ -19,17 +20,12 @@ CONTROLLER = DiscreteController([0.8, -0.7], [1.0, -1.0])
 LOOP = "loop:\n  controller: {numerator: [0.8, -0.7], denominator: [1.0, -1.0]}\n"
 
 
-def write(file, columns, header):
-    np.savetxt(file, np.column_stack(columns), delimiter=",", header=header, comments="", fmt="%.12g")
-    return file
-
-
 def record(file, system, n=800, noise=0.05, seed=0):
     rng = np.random.default_rng(seed)
     t = STEP * np.arange(n)
     u = rng.standard_normal(n)
     y = simulate_additive(system, HeldSignal(t, u), t) + noise * rng.standard_normal(n)
-    return write(file, (t, u, y), "t,u,y")
+    return write(file, (t, u, y))
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import json
 import re
 
 import pytest
-from typer.testing import CliRunner
 
 SPEC = """\
 experiment: beat
@@ -26,14 +25,10 @@ SETTLING = ("settling_time_1", "settling_time_2", "settling_after_step_1", "sett
 
 
 @pytest.fixture(scope="module")
-def beat(tmp_path_factory):
-    from ctid_cli.cli.main import app
-
+def beat(tmp_path_factory, ctid):
     folder = tmp_path_factory.mktemp("beat")
     (folder / "beat.yaml").write_text(SPEC, encoding="utf-8")
-    arguments = ["run", str(folder / "beat.yaml"), "--jobs", "1", "--quiet", "--out", str(folder / "results")]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
+    ctid("run", folder / "beat.yaml", "--jobs", 1, "--quiet", "--out", folder / "results")
     return folder / "results"
 
 

@@ -7,22 +7,21 @@ import pandas as pd
 import pytest
 
 from ctid_cli import HeldSignal, TransferFunction, simulate
+from tests.cli.records import write
 
 INTERVAL = 0.1
 
 
-def write(file, u, seed=0, header="t [s],u [V],y [mm]", times=None):
+def answered(file, u, seed=0, header="t [s],u [V],y [mm]", times=None):
     t = INTERVAL * np.arange(u.size) if times is None else times
     y = simulate(TransferFunction([2.0], [1.0, 1.0]), HeldSignal(t, u), t)
     y = y + 0.1 * np.random.default_rng(seed + 100).standard_normal(t.size)
-    rows = (f"{a:.9g},{b:.9g},{c:.9g}" for a, b, c in zip(t, u, y, strict=True))
-    file.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
-    return file
+    return write(file, (t, u, y), header)
 
 
 @pytest.fixture
 def record(tmp_path):
-    return write(tmp_path / "record.csv", np.random.default_rng(0).standard_normal(1500))
+    return answered(tmp_path / "record.csv", np.random.default_rng(0).standard_normal(1500))
 
 
 def test_table_file_and_figure(ctid, record, tmp_path):
@@ -42,7 +41,7 @@ def test_table_file_and_figure(ctid, record, tmp_path):
 
 def test_periods_and_realisations(ctid, tmp_path):
     once = [np.random.default_rng(k).standard_normal(200) for k in range(3)]
-    files = [write(tmp_path / f"{k}.csv", np.tile(u, 6), k) for k, u in enumerate(once)]
+    files = [answered(tmp_path / f"{k}.csv", np.tile(u, 6), k) for k, u in enumerate(once)]
     out = ("--json", "--out", tmp_path / "out")
     content = json.loads(ctid("frf", files[0], *out).stdout)
     assert (content["method"], len(content["frequencies"])) == ("periodic", 99)
@@ -55,14 +54,14 @@ def test_periods_and_realisations(ctid, tmp_path):
 
 def test_other_methods_and_units(ctid, tmp_path):
     u = np.random.default_rng(0).standard_normal(1500)
-    file = write(tmp_path / "ms.csv", u, header="t [ms],u,y")
+    file = answered(tmp_path / "ms.csv", u, header="t [ms],u,y")
     out = ("--out", tmp_path / "out")
     text = ctid("frf", file, "--method", "welch", *out).stdout
     assert "Welch" in text
     assert "rad/ms" in text
     assert "rad/s" not in text
     assert "17 lines" in ctid("frf", file, "--width", 8, *out).stdout
-    irregular = write(tmp_path / "any.csv", u, times=np.cumsum(np.random.default_rng(1).uniform(0.05, 0.15, u.size)))
+    irregular = answered(tmp_path / "any.csv", u, times=np.cumsum(np.random.default_rng(1).uniform(0.05, 0.15, u.size)))
     assert "the clock is irregular" in ctid("frf", irregular, *out).stdout
 
 

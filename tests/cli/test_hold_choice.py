@@ -12,12 +12,13 @@ import pytest
 
 from ctid_cli import HeldSignal, TransferFunction, load_fit, simulate
 from ctid_cli.signals.measurement import read_measurement
+from tests.cli.records import write
 
 RECORDS = os.environ.get("CTID_RECORDS")
 SECOND = TransferFunction([4.0], [1.0, 0.8, 4.0])
 
 
-def write(path, hold, deviation=0.01, levels=False):
+def moved(path, hold, deviation=0.01, levels=False):
     """A record of an input that moves smoothly, or jumps."""
     rng = np.random.default_rng(2)
     t = 0.2 * np.arange(400)
@@ -26,15 +27,14 @@ def write(path, hold, deviation=0.01, levels=False):
         for k in range(1, 400):
             u[k] += 0.5 * u[k - 1]
     y = simulate(SECOND, HeldSignal(t, u, hold), t) + deviation * rng.standard_normal(400)
-    path.write_text("t,u,y\n" + "".join(f"{a:.1f},{b:.8f},{c:.8f}\n" for a, b, c in zip(t, u, y, strict=True)))
-    return path
+    return write(path, (t, u, y))
 
 
 @pytest.mark.parametrize(
     ("hold", "said"), [("foh", "Hold: foh, as --hold is not given: with 2 poles"), ("zoh", "best")]
 )
 def test_the_hold_that_made_a_record_is_taken(ctid, tmp_path, hold, said):
-    done = ctid("fit", write(tmp_path / "a.csv", hold), "--poles", 2, "--out", tmp_path)
+    done = ctid("fit", moved(tmp_path / "a.csv", hold), "--poles", 2, "--out", tmp_path)
     first = " ".join(done.stdout.split("\n\n")[0].split())
     assert first.startswith(f"Hold: {hold}")
     assert said in first
@@ -44,20 +44,20 @@ def test_the_hold_that_made_a_record_is_taken(ctid, tmp_path, hold, said):
 
 
 def test_the_structure_is_searched_with_that_hold(ctid, tmp_path):
-    done = ctid("fit", write(tmp_path / "a.csv", "foh"), "--out", tmp_path)
+    done = ctid("fit", moved(tmp_path / "a.csv", "foh"), "--out", tmp_path)
     hold, order, *_ = done.stdout.split("\n\n")
     assert hold.startswith("Hold: foh")
     assert order.startswith("Structure by an order search, as --poles is not given: 2 poles, no zero")
 
 
 def test_a_record_that_does_not_tell_is_taken_as_held(ctid, tmp_path):
-    done = ctid("fit", write(tmp_path / "a.csv", "foh", deviation=3.0), "--poles", 2, "--out", tmp_path)
+    done = ctid("fit", moved(tmp_path / "a.csv", "foh", deviation=3.0), "--poles", 2, "--out", tmp_path)
     said = " ".join(done.stdout.split())
     assert said.startswith("Hold: zoh, as --hold is not given and the record does not tell how its input was made.")
 
 
 def test_nothing_is_said_of_an_input_that_jumps(ctid, tmp_path):
-    done = ctid("fit", write(tmp_path / "a.csv", "zoh", levels=True), "--poles", 2, "--out", tmp_path)
+    done = ctid("fit", moved(tmp_path / "a.csv", "zoh", levels=True), "--poles", 2, "--out", tmp_path)
     assert "Hold:" not in done.stdout
 
 

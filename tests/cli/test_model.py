@@ -7,36 +7,25 @@ import runpy
 import numpy as np
 import pandas as pd
 import pytest
-from typer.testing import CliRunner
 
-from ctid_cli import DelayProfile, HeldSignal, Record, TransferFunction, compare, identify, load_fit, simulate
-from ctid_cli.cli.main import app
+from ctid_cli import DelayProfile, HeldSignal, Record, compare, identify, load_fit
 from ctid_cli.signals.measurement import read_measurement
-
-SYSTEM = TransferFunction([3.0], [1.0, 1.2, 4.0], 0.73)
+from tests.cli.records import rows, write
 
 
 def write_record(file, seed, n=500, header="t [s],u [V],y [mm]"):
-    rng = np.random.default_rng(seed)
-    t = 0.1 * np.arange(n)
-    u = np.repeat(rng.choice([-1.0, 1.0], n // 5), 5)
-    y = simulate(SYSTEM, HeldSignal(t, u), t) + 0.3 + 0.05 * rng.standard_normal(n)
-    lines = [header, *(",".join(f"{value:.12g}" for value in row) for row in zip(t, u, y, strict=True))]
-    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return file
+    return write(file, rows(seed, n, 0.05, 0.3), header)
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory):
+def home(tmp_path_factory, ctid):
     """Two fits to one record, another record, and an input without an output."""
     folder = tmp_path_factory.mktemp("models")
-    runner = CliRunner()
     record = write_record(folder / "record.csv", 0)
     write_record(folder / "other.csv", 1)
     (folder / "input.csv").write_text("t [s],u [V]\n0,0\n1,1\n2.5,1\n4,-2\n9,0.5\n", encoding="utf-8")
     for poles in (1, 2):
-        options = ["--poles", poles, "--delay", "0:3", "--offset", "estimate", "--out", folder / f"p{poles}"]
-        assert runner.invoke(app, ["fit", str(record), *map(str, options)]).exit_code == 0
+        ctid("fit", record, "--poles", poles, "--delay", "0:3", "--offset", "estimate", "--out", folder / f"p{poles}")
     return folder
 
 

@@ -6,26 +6,25 @@ import numpy as np
 import pytest
 
 from ctid_cli import HeldSignal, TransferFunction, simulate
+from tests.cli.records import write
 
 
-def write(file, gain, seed=0):
+def answered(file, gain, seed=0):
     rng = np.random.default_rng(seed)
     t = 0.1 * np.arange(500)
     u = np.repeat(rng.choice([-1.0, 1.0], 100), 5)
     y = gain * simulate(TransferFunction([2.0], [1.0, 1.0], 0.33), HeldSignal(t, u), t) + 0.1 * rng.standard_normal(500)
-    rows = (f"{a:.9g},{b:.9g},{c:.9g}" for a, b, c in zip(t, u, y, strict=True))
-    file.write_text("\n".join(["t [s],u [V],y [mm]", *rows]) + "\n", encoding="utf-8")
-    return file
+    return write(file, (t, u, y), "t [s],u [V],y [mm]")
 
 
 @pytest.fixture
 def record(tmp_path):
-    return write(tmp_path / "record.csv", 1.0)
+    return answered(tmp_path / "record.csv", 1.0)
 
 
 def test_recommendation_table_and_files(ctid, record, tmp_path):
     out = tmp_path / "new"
-    other = write(tmp_path / "other.csv", 1.0, 1)
+    other = answered(tmp_path / "other.csv", 1.0, 1)
     text = ctid("order", record, "--poles", "1:3", "--zeros", "0:1", "--validate", other, "--out", out).stdout
     text = " ".join(text.split())
     for part in ("record.csv: 500 samples, 5 structures", "Recommended: 1 pole, no zero.", "validation %", "--delay"):
@@ -37,7 +36,7 @@ def test_recommendation_table_and_files(ctid, record, tmp_path):
 
 
 def test_noise_has_no_order(ctid, tmp_path):
-    record = write(tmp_path / "noise.csv", 0.0)
+    record = answered(tmp_path / "noise.csv", 0.0)
     done = ctid("order", record, "--poles", "1:2", "--zeros", "0", "--delay", "0:1", "--json", "--out", tmp_path)
     content = json.loads(done.stdout)
     assert content["recommended"] is None

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from ctid_cli.kinds import KINDS
 from ctid_cli.models.pid import ContinuousPid
@@ -71,19 +70,15 @@ def specifications():
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory, without_workers):
+def results(tmp_path_factory, ctid, without_workers):
     """Results folder of all experiments, run once."""
-    from ctid_cli.cli.main import app
-
     folder = tmp_path_factory.mktemp("kinds")
     (folder / "input.csv").write_text("t,u\n0,1\n3,-1\n4,1\n11,-1\n13,1\n")
     files = []
     for name, sections in specifications():
         files.append(folder / f"{name}.yaml")
         files[-1].write_text(json.dumps(specification(name, **sections)))
-    arguments = ["run", *map(str, files), "--quiet", "--out", str(folder / "results")]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
+    ctid("run", *files, "--quiet", "--out", folder / "results")
     return folder / "results"
 
 

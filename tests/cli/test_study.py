@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 from ctid_cli.reporting.study import load_study
 from ctid_cli.running.plan import build_plan
@@ -73,10 +72,8 @@ def test_settings_that_differ_from_the_published_ones_are_noted(ctid, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def profiled(tmp_path_factory):
+def profiled(tmp_path_factory, ctid):
     """Results of one experiment of the study: the existing method, and one that takes no start and never succeeds."""
-    from ctid_cli.cli.main import app
-
     folder = tmp_path_factory.mktemp("profiled")
     content = yaml.safe_load((CONFIGS / "case1_regular.yaml").read_text(encoding="utf-8"))
     blind = {"kind": "delay_profile", "poles": 2, "zeros": 0, "delay_bounds": [0, 5]}
@@ -87,8 +84,7 @@ def profiled(tmp_path_factory):
     file = folder / "case1_regular.yaml"
     file.write_text(yaml.safe_dump(content), encoding="utf-8")
     results = folder / "results"
-    done = CliRunner().invoke(app, ["run", str(file), "--jobs", "1", "--quiet", "--out", str(results)])
-    assert done.exit_code == 0, done.output
+    ctid("run", file, "--jobs", 1, "--quiet", "--out", results)
     return results
 
 
