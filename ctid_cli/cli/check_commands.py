@@ -139,7 +139,8 @@ def check_pmu(
     says PASS or NOT PASSED; the exit code is 0 either way unless --strict is given.
     """
     from ctid_cli.frequency.synchrophasor_check import check_synchrophasors
-    from ctid_cli.reporting.synchrophasor_check_report import check_csv, check_object, check_report
+    from ctid_cli.reporting.layout import csv_text
+    from ctid_cli.reporting.synchrophasor_check_report import check_object, check_report
 
     try:
         with RecordProgress("check pmu") as tell:
@@ -148,7 +149,7 @@ def check_pmu(
         raise UsageError(str(error)) from None
     written = "" if out is None else f"\n\nWritten: {out / 'check_pmu.csv'}"
     if out is not None:
-        write_files({out / "check_pmu.csv": check_csv(found)})
+        write_files({out / "check_pmu.csv": csv_text(check_object(found)["limits"]).encode()})
     answer(as_json, lambda: check_object(found), lambda: check_report(found).draw() + written)
     if strict and not found.passed:
         raise MismatchError("the measurement does not keep all limits of its class")

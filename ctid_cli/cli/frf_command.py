@@ -53,8 +53,9 @@ def frf(
     polynomials. Writes frf.csv and frf.svg.
     """
     from ctid_cli.inference.frequency_response import estimate_frequency_response
+    from ctid_cli.reporting.column_file import columns_bytes
     from ctid_cli.reporting.frf_plot import frf_drawing
-    from ctid_cli.reporting.frf_report import frf_csv, frf_object, frf_text
+    from ctid_cli.reporting.frf_report import frf_columns, frf_object, frf_text
     from ctid_cli.reporting.identification_report import common_units
     from ctid_cli.signals.measurement import read_measurement
 
@@ -79,7 +80,8 @@ def frf(
     except ValueError as error:
         raise UsageError(str(error).replace("half_width", "--width").replace("period must", "--period must")) from None
     title = ", ".join(file.name for file in files)
-    write_files({data: frf_csv(found, units), figure: frf_drawing(found, units, title).saved()})
+    content = columns_bytes(frf_columns(found, units), "csv", {})
+    write_files({data: content, figure: frf_drawing(found, units, title).saved()})
     answer(
         as_json,
         lambda: frf_object(found, measurements, units),

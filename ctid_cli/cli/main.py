@@ -12,11 +12,10 @@ from ctid_cli.cli.experiment_commands import run, schema, validate
 from ctid_cli.cli.fit_command import fit
 from ctid_cli.cli.frf_command import frf
 from ctid_cli.cli.init_command import init
-from ctid_cli.cli.merge_command import merge
 from ctid_cli.cli.model_commands import model
 from ctid_cli.cli.order_command import order
 from ctid_cli.cli.result_commands import export, figure, report, show, status, table
-from ctid_cli.cli.storage_commands import repair, verify
+from ctid_cli.cli.storage_commands import merge, repair, verify
 from ctid_cli.cli.study_command import study
 from ctid_cli.cli.track_command import track
 

@@ -23,18 +23,24 @@ def committed_tables(study: str = DEFAULT_STUDY) -> Path | None:
     return folder / "tables.csv" if (folder / "tables.csv").is_file() else None
 
 
+def environment_of(published: Path) -> dict[str, Any] | None:
+    """The commit and the sessions that made the published results in a folder; None where there are none."""
+    try:
+        content: dict[str, Any] = json.loads((published / "environment.json").read_text(encoding="utf-8"))
+    except OSError:
+        return None
+    return content
+
+
 def made_by(published: Path, study: str = DEFAULT_STUDY) -> str:
     """Which code computed the published results in a folder, as a participle clause; empty where it is the present."""
-    try:
-        environment = json.loads((published / "environment.json").read_text(encoding="utf-8"))
-    except OSError:
+    environment = environment_of(published)
+    if environment is None:
         return ""
-    # Older ones are the sessions themselves.
-    sessions = environment.get("sessions", environment)
-    if all(_versions(own) <= _present(study, short) for short, own in sessions.items()):
+    if all(_versions(own) <= _present(study, short) for short, own in environment["sessions"].items()):
         return ""
-    commit = f" (commit {environment['commit'][:12]})" if "commit" in environment else ""
-    return f"computed by an earlier version of the code or of its numerical libraries{commit}"
+    commit = environment["commit"][:12]
+    return f"computed by an earlier version of the code or of its numerical libraries (commit {commit})"
 
 
 def _present(study: str, short: str) -> set[str]:

@@ -9,7 +9,6 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.canonical import plain
 from ctid_cli.inference.frequency_response import FrequencyResponse
-from ctid_cli.reporting.column_file import columns_bytes
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.layout import Report, Table, count, number
 from ctid_cli.signals.measurement import ROLES, Measurement
@@ -44,11 +43,6 @@ def frf_columns(found: FrequencyResponse, units: Units) -> dict[str, Array]:
     if found.distortion is not None:
         columns[f"distortion [{units.gain}]"] = np.sqrt(found.distortion)
     return columns
-
-
-def frf_csv(found: FrequencyResponse, units: Units) -> bytes:
-    """The file of a frequency response."""
-    return columns_bytes(frf_columns(found, units), "csv", {})
 
 
 def frf_object(found: FrequencyResponse, measurements: Sequence[Measurement], units: Units) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from typing import Any
 
 from ctid_cli.frequency.synchrophasor_check import CheckedLimit, SynchrophasorCheck
 from ctid_cli.frequency.synchrophasor_limits import QUANTITIES, TESTS
-from ctid_cli.reporting.layout import Report, Table, csv_text, number, picked
+from ctid_cli.reporting.layout import Report, Table, number, picked
 
 #: Short names of the quantities, for a table.
 _SHORT = {
@@ -40,11 +40,6 @@ def _row(row: CheckedLimit) -> dict[str, Any]:
         "condition": row.condition,
         "source": limit.source,
     }
-
-
-def check_csv(check: SynchrophasorCheck) -> bytes:
-    """A check as a table for programs."""
-    return csv_text(check_object(check)["limits"]).encode()
 
 
 def _table(check: SynchrophasorCheck) -> Table:

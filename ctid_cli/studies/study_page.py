@@ -1,13 +1,12 @@
 """The page of a reproduced study: its question, claims, tables and figures, from its results or as published."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import ctid_cli
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.committed import made_by
+from ctid_cli.reporting.committed import environment_of, made_by
 from ctid_cli.reporting.layout import Report, Table, count
 from ctid_cli.reporting.pages.page import inline, report_of, written
 from ctid_cli.reporting.results import experiments_in, out_option
@@ -81,9 +80,8 @@ def _figures(study: StudyFolder, out: Path, published: Path, *, own: bool) -> It
 
 def _published_origin(published: Path, study: str) -> Iterator[str]:
     """What made the published results."""
-    try:
-        environment = json.loads((published / "environment.json").read_text(encoding="utf-8"))
-    except OSError:
+    environment = environment_of(published)
+    if environment is None:
         return
     sessions = [session for own in environment["sessions"].values() for session in own]
     computed = sum(session["computed"] for session in sessions)

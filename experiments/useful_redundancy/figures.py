@@ -20,7 +20,7 @@ from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
 from ctid_cli.filtering.filter_set import FilterCheck, FilterSet, check_filters
 from ctid_cli.filtering.filter_theory import convergence_region, extrema, ideal_cost
 from ctid_cli.reporting.figures.search_plot import Landscape, costs_svg, landscape, trajectory_svg
-from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, pointed, ramp, spread, svg
+from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, Drawing, pointed, ramp, spread
 from ctid_cli.signals.record import Record
 from ctid_cli.simulation.dataset import DataSet
 from ctid_cli.studies.catalogue import find_study
@@ -87,7 +87,7 @@ def figure_1() -> bytes:
             "(white input of unit intensity, no noise)"
         )
 
-    return svg(7.5, 3.4, draw)
+    return Drawing(7.5, 3.4, draw).saved()
 
 
 def figure_2() -> bytes:
@@ -115,7 +115,7 @@ def figure_2() -> bytes:
             "The paper states that every error below 15 s is served; there is one gap"
         )
 
-    return svg(7.5, 5.8, draw)
+    return Drawing(7.5, 5.8, draw).saved()
 
 
 def _draw_costs(axes: Any, filters: FilterSet, path: list[tuple[int, float]]) -> None:

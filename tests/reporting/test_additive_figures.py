@@ -9,7 +9,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.reporting.figures import frequency_plot, parameter_plot
+from ctid_cli.reporting.figures import frequency_plot
 from ctid_cli.reporting.figures.parameter_plot import bias_svg, coverage_svg, labelled, mse_svg, symbol
 from ctid_cli.reporting.parameter_errors import parameter_errors, parameter_estimates
 from ctid_cli.signals.held import HeldSignal
@@ -22,23 +22,6 @@ additive = STUDY.module("figures")
 METHODS = {"additive": "the sum", "srivc": "the fraction"}
 ONE = {"additive": "the sum"}
 NAMES = ["g1_a1", "g1_a2", "g1_b0", "g2_a1", "g2_a2", "g2_b0"]
-
-
-@pytest.fixture
-def drawn(monkeypatch):
-    """Matplotlib figures in the order in which they are drawn, in place of SVG files."""
-    from matplotlib.figure import Figure
-
-    figures = []
-
-    def keep(width, height, draw):
-        figures.append(Figure(figsize=(width, height), layout="constrained"))
-        draw(figures[-1])
-        return b""
-
-    for module in (frequency_plot, parameter_plot):
-        monkeypatch.setattr(module, "svg", keep)
-    return figures
 
 
 @pytest.fixture

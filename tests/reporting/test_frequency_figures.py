@@ -28,22 +28,6 @@ def out(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def drawn(monkeypatch):
-    """Matplotlib figures in the order in which they are drawn, in place of SVG files."""
-    from matplotlib.figure import Figure
-
-    figures = []
-
-    def keep(width, height, draw):
-        figures.append(Figure(figsize=(width, height), layout="constrained"))
-        draw(figures[-1])
-        return b""
-
-    monkeypatch.setattr(error_plot, "svg", keep)
-    return figures
-
-
 def lines_of(axes, style):
     """Curves of a look, told by their width."""
     return [line for line in axes.lines if line.get_linewidth() == style["linewidth"]]

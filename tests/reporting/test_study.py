@@ -89,17 +89,18 @@ def test_in_a_fresh_clone_the_committed_tables_stand_in(tmp_path):
 def test_results_of_earlier_code_are_called_so(tmp_path):
     plan = build_plan(load_spec(data_folder("configs") / "useful_redundancy" / "case1_regular.yaml"))
     current = {"code_version": dict(enumerate(current_versions(plan)))}
-    environment = tmp_path / "environment.json"
     assert made_by(tmp_path) == ""
-    environment.write_text(json.dumps({"case1-regular": [current]}), encoding="utf-8")
-    assert made_by(tmp_path) == ""
-    # By the present code of other estimators, and by a specification that is no more.
-    for other in ({"as-printed-case1-regular": [current]}, {"case0": [current]}):
-        environment.write_text(json.dumps(other), encoding="utf-8")
-        assert made_by(tmp_path) == "computed by an earlier version of the code or of its numerical libraries"
-    old = {"case1-regular": [current, {"code_version": "0" * 16}]}
-    environment.write_text(json.dumps({"commit": "abcdef" * 7, "sessions": old}), encoding="utf-8")
-    assert made_by(tmp_path).endswith(" libraries (commit abcdefabcdef)")
+    earlier = "computed by an earlier version of the code or of its numerical libraries (commit abcdefabcdef)"
+    for sessions, said in (
+        ({"case1-regular": [current]}, ""),
+        ({"case1-regular": [current, {"code_version": "0" * 16}]}, earlier),
+        # By the present code of other estimators, and by a specification that is no more.
+        ({"as-printed-case1-regular": [current]}, earlier),
+        ({"case0": [current]}, earlier),
+    ):
+        content = {"commit": "abcdef" * 7, "sessions": sessions}
+        (tmp_path / "environment.json").write_text(json.dumps(content), encoding="utf-8")
+        assert made_by(tmp_path) == said
 
 
 @pytest.mark.parametrize("name", ["5", "useful-redundancy/0", "quickstrat", "other-study/1"])

@@ -11,8 +11,9 @@ from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.synchrophasor import measure_synchrophasors
 from ctid_cli.frequency.synchrophasor_check import CheckedLimit, SynchrophasorCheck
 from ctid_cli.frequency.synchrophasor_limits import limits_of
+from ctid_cli.reporting.layout import csv_text
 from ctid_cli.reporting.result_views import plot, summary, to_frame
-from ctid_cli.reporting.synchrophasor_check_report import check_csv, check_object, check_report
+from ctid_cli.reporting.synchrophasor_check_report import check_object, check_report
 from ctid_cli.reporting.synchrophasor_plot import synchrophasor_drawing
 from ctid_cli.reporting.synchrophasor_report import (
     synchrophasor_bytes,
@@ -118,7 +119,7 @@ def test_the_verdict_comes_first():
 
 
 def test_every_limit_has_its_source_in_the_file():
-    rows = list(csv.DictReader(io.StringIO(check_csv(checked(0.5)).decode())))
+    rows = list(csv.DictReader(io.StringIO(csv_text(check_object(checked(0.5))["limits"]))))
     assert len(rows) == len(limits_of(60, "M", 60))
     assert all(row["source"].startswith("IEEE C37.118.1") for row in rows)
     unlimited = [row for row in rows if not row["limit"]]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, svg
+from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, Drawing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -102,7 +102,7 @@ def errors_svg(rows: Sequence[Row], frequencies: tuple[float, float], errors: tu
         figure.legend(handles=_common_handles(rows), loc="outside lower center", ncols=2, frameon=False)
         figure.suptitle(title)
 
-    return svg(7.8, 2.1 + 2.9 * len(rows), draw)
+    return Drawing(7.8, 2.1 + 2.9 * len(rows), draw).saved()
 
 
 def _draw_frequencies(axes: Any, curves: Sequence[Curve]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.models.additive import AdditiveModel
-from ctid_cli.reporting.figures.style import svg
+from ctid_cli.reporting.figures.style import Drawing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,7 +48,7 @@ def response_svg(curves: Sequence[Response], title: str, unit: str, *, unwrap: b
         figure.legend(loc="outside lower center", ncols=3, frameon=False)
         figure.suptitle(title)
 
-    return svg(7.5, 5.2, draw)
+    return Drawing(7.5, 5.2, draw).saved()
 
 
 def _phase(values: ComplexArray, unwrap: bool) -> Array:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctid_cli.inference.monte_carlo import QUANTILE
-from ctid_cli.reporting.figures.style import BAND, DARK, MARK, MIDDLE, svg
+from ctid_cli.reporting.figures.style import BAND, DARK, MARK, MIDDLE, Drawing
 from ctid_cli.reporting.parameter_errors import ParameterErrors
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def mse_svg(
         _legend(figure, methods, rows, "simulated (marker), theory for long records (line)")
         figure.suptitle(f"{title} ({_data_sets(rows)})")
 
-    return svg(7.5, 1.4 + 2.1 * lines, draw)
+    return Drawing(7.5, 1.4 + 2.1 * lines, draw).saved()
 
 
 def bias_svg(rows: Sequence[ParameterErrors], methods: Methods, parameters: Sequence[str], title: str) -> bytes:
@@ -94,7 +94,7 @@ def bias_svg(rows: Sequence[ParameterErrors], methods: Methods, parameters: Sequ
         _legend(figure, methods, rows, f"grey: within {UNBIASED:g} standard errors of zero", line=False)
         figure.suptitle(f"{title} ({_data_sets(rows)})")
 
-    return svg(7.5, 1.5 + 0.5 * len(parameters), draw)
+    return Drawing(7.5, 1.5 + 0.5 * len(parameters), draw).saved()
 
 
 def coverage_svg(panels: Sequence[tuple[str, Sequence[ParameterErrors], Methods]], title: str) -> bytes:
@@ -124,7 +124,7 @@ def coverage_svg(panels: Sequence[tuple[str, Sequence[ParameterErrors], Methods]
         drawn[0].set_ylabel("intervals that contain the true value [%]")
         figure.suptitle(title)
 
-    return svg(7.5, 3.8, draw)
+    return Drawing(7.5, 3.8, draw).saved()
 
 
 def labelled(method: str, label: str, rows: Sequence[ParameterErrors]) -> str:

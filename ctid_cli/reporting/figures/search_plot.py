@@ -14,7 +14,7 @@ from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.filter_search import FilterSearch
 from ctid_cli.estimation.filtered_costs import FilteredCosts, percents
 from ctid_cli.estimators.useful_redundancy import RedundantFit, UsefulRedundancy
-from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, pointed, ramp, spread, svg
+from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, Drawing, pointed, ramp, spread
 from ctid_cli.simulation.dataset import DataSet
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def costs_svg(result: Landscape, title: str) -> bytes:
         axes.set_ylabel(r"cost $100\,\|y_k - \hat x_k\| \,/\, \|y_k - \mathrm{mean}\,y_k\|$ [%]")
         figure.suptitle(title)
 
-    return svg(7.5, 4.0, draw)
+    return Drawing(7.5, 4.0, draw).saved()
 
 
 def trajectory_svg(result: Landscape, title: str, detail: tuple[float, float]) -> bytes:
@@ -172,7 +172,7 @@ def trajectory_svg(result: Landscape, title: str, detail: tuple[float, float]) -
         handles, labels = (a + b for a, b in zip(above, below, strict=True))
         figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
 
-    return svg(7.5, 5.6, draw)
+    return Drawing(7.5, 5.6, draw).saved()
 
 
 def _draw_true_delay(axes: Any, result: Landscape) -> None:

@@ -161,11 +161,6 @@ def size_for(n: int, columns: int | None = None) -> tuple[float, float]:
     return (7.5, 1.2 + 2.2 * -(-n // (columns or columns_for(n)))) if n > 1 else (5.5, 4.2)
 
 
-def svg(width: float, height: float, draw: Callable[[Figure], None]) -> bytes:
-    """Draw a figure; the same drawing always gives the same bytes."""
-    return Drawing(width, height, draw).saved()
-
-
 def pointed(axes: Any, text: str, point: ArrayLike, place: ArrayLike, arrow: dict[str, Any], **style: Any) -> None:
     """A text beside the axes with a thin line to the point that it speaks of."""
     line: dict[str, Any] = {"arrowstyle": "-", "shrinkA": 0, "shrinkB": 0}
