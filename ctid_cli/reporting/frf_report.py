@@ -1,7 +1,6 @@
 """What ``ctid frf`` answers: a frequency response without a model as text, as an object for JSON, and as a file."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -10,8 +9,9 @@ from ctid_cli.arrays import Array
 from ctid_cli.canonical import plain
 from ctid_cli.inference.frequency_response import FrequencyResponse
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.layout import Report, Table, count, number
-from ctid_cli.signals.measurement import ROLES, Measurement
+from ctid_cli.reporting.identification_report import notes_of, records_line, records_object
+from ctid_cli.reporting.layout import Report, Table, count, number, picked
+from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import wrapped
 
 #: Rows of the printed table, about evenly spaced logarithmically.
@@ -48,33 +48,25 @@ def frf_columns(found: FrequencyResponse, units: Units) -> dict[str, Array]:
 def frf_object(found: FrequencyResponse, measurements: Sequence[Measurement], units: Units) -> dict[str, Any]:
     """A frequency response for ``ctid frf --json``."""
     content = {
-        "files": [measurement.record.name for measurement in measurements],
-        "columns": {role: getattr(measurements[0], role) for role in ROLES},
-        "units": asdict(units),
-        "method": found.method,
-        "hold": found.hold,
-        "frequencies": found.frequencies,
+        **records_object(measurements, units),
+        **picked(found, ("method", "hold", "frequencies")),
         "real": found.response.real,
         "imaginary": found.response.imag,
-        "standard_error": found.standard_error,
-        "freedom": found.freedom,
-        "coherence": found.coherence,
+        **picked(found, ("standard_error", "freedom", "coherence")),
         "distortion": None if found.distortion is None else np.sqrt(found.distortion),
         "hold_bias": found.bias,
-        "notes": [*_in_unit(found, units), *_read(measurements)],
+        "notes": [*_in_unit(found, units), *notes_of(measurements)],
     }
     return dict(plain(content))
 
 
 def frf_text(found: FrequencyResponse, measurements: Sequence[Measurement], units: Units) -> str:
     """A frequency response for people."""
-    names = ", ".join(measurement.record.name for measurement in measurements)
-    samples = sum(measurement.record.n_samples for measurement in measurements)
     low, high = found.frequencies[[0, -1]]
     span = f"{count(found.frequencies.size, 'frequency')} from {low:.4g} to {high:.4g} rad/{units.time}"
     span = span.replace("frequencys", "frequencies")
-    head = f"{names}: {count(samples, 'sample')}; frequency response by {METHODS[found.method]}, {span}"
-    notes = [wrapped(f"- {note}", hanging="  ") for note in (*_in_unit(found, units), *_read(measurements))]
+    head = f"{records_line(measurements)}; frequency response by {METHODS[found.method]}, {span}"
+    notes = [wrapped(f"- {note}", hanging="  ") for note in (*_in_unit(found, units), *notes_of(measurements))]
     return "\n".join([wrapped(head), *notes, "", Report([[_table(found, units)]]).draw()])
 
 
@@ -106,7 +98,3 @@ def _table(found: FrequencyResponse, units: Units) -> Table:
 
 def _in_unit(found: FrequencyResponse, units: Units) -> list[str]:
     return [note.replace("rad/s", f"rad/{units.time}") for note in found.notes]
-
-
-def _read(measurements: Sequence[Measurement]) -> list[str]:
-    return list(dict.fromkeys(note for measurement in measurements for note in measurement.notes))

@@ -20,7 +20,7 @@ from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
 from ctid_cli.reporting.layout import Report, Table, count, number, picked
 from ctid_cli.reporting.loss_report import loss_object, loss_text
 from ctid_cli.signals.band_limited import band_limited_doubt
-from ctid_cli.signals.measurement import Measurement
+from ctid_cli.signals.measurement import ROLES, Measurement
 from ctid_cli.signals.treatment import Hold
 from ctid_cli.text import warning_lines, wrapped
 
@@ -56,6 +56,23 @@ def common_units(measurements: Sequence[Measurement]) -> Units:
                 where = f"{measurement.record.name}: the {role} is in {unit}, that of another file in {found[role]}"
                 raise DataError(f"{where}; files of one command must have the same units")
     return Units(**found)
+
+
+def records_object(measurements: Sequence[Measurement], units: Units) -> dict[str, Any]:
+    """Files, columns and units of records for JSON."""
+    columns = {role: getattr(measurements[0], role) for role in ROLES}
+    return {"files": [each.record.name for each in measurements], "columns": columns, "units": asdict(units)}
+
+
+def records_line(measurements: Sequence[Measurement]) -> str:
+    """Files and their samples."""
+    samples = sum(each.record.n_samples for each in measurements)
+    return f"{', '.join(each.record.name for each in measurements)}: {count(samples, 'sample')}"
+
+
+def notes_of(measurements: Sequence[Measurement]) -> list[str]:
+    """What reading the records has shown, each once."""
+    return list(dict.fromkeys(note for each in measurements for note in each.notes))
 
 
 def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:
@@ -102,14 +119,14 @@ def identification_object(
 ) -> dict[str, Any]:
     """A fit for ``fit.json`` and ``ctid fit --json``."""
     fit, options, criteria = result.fit, result.options, result.criteria
-    interval, profile, judged = result.delay_interval, fit.profile, result.validation
+    interval, profile, judged, additive = result.delay_interval, fit.profile, result.validation, additive_of(fit)
     numerator = [item.estimate for item in result.estimates if item.name.startswith("b")]
     content = {
         "model": {
             "numerator": numerator or fit.model.numerator,
             "denominator": fit.model.denominator,
             "delay": fit.model.delay,
-            **_submodels_object(fit),
+            **({} if additive is None else {"submodels": [asdict(part) for part in additive.submodels]}),
         },
         "parameters": [parameter_object(item) for item in parameters_of(result, units)],
         **picked(fit, ("fit_percent", "r2", "cost")),
@@ -145,11 +162,6 @@ def identification_object(
         "settings": asdict(options) | {"kind": options.kind, "hold": measurements[0].record.input.hold},
     }
     return dict(plain(content))
-
-
-def _submodels_object(fit: MeasuredFit) -> dict[str, Any]:
-    model = additive_of(fit)
-    return {} if model is None else {"submodels": [asdict(part) for part in model.submodels]}
 
 
 def _covariance_object(result: Identification) -> dict[str, Any]:

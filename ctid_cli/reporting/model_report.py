@@ -13,6 +13,7 @@ from ctid_cli.errors import DataError, UsageError
 from ctid_cli.estimators.model_comparison import ModelOnRecord
 from ctid_cli.inference.bands import FrequencyBand, ResponseBand
 from ctid_cli.inference.fitted_model import FittedModel
+from ctid_cli.inference.residuals import ResidualTests
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.layout import Table, number, percent, picked
 from ctid_cli.signals.measurement import MeasuredInput, Measurement, read_measurement, read_table
@@ -180,12 +181,9 @@ def comparison_object(
         {
             "name": model.name,
             "file": str(model.path),
-            "fit_percent": one.fit_percent,
-            "r2": one.r2,
-            "rms": one.rms,
+            **picked(one, ("fit_percent", "r2", "rms")),
             "samples": one.count,
-            "initial_state": one.initial_state,
-            "offset": one.offset,
+            **picked(one, ("initial_state", "offset")),
             **(dict.fromkeys(VERDICTS) if one.tests is None else picked(one.tests, VERDICTS)),
         }
         for model, one in zip(models, found, strict=True)
@@ -235,21 +233,17 @@ def residual_object(model: NamedFit, measurement: Measurement, one: ModelOnRecor
     """Residuals of a model on a record for ``--json``."""
     content = comparison_object([model], measurement, [one])
     test = one.tests
-    correlation = test and {
-        "level": test.level,
-        "autocorrelation": {
-            "lags": np.arange(1, test.lags + 1),
-            "values": test.autocorrelation,
-            "band": test.autocorrelation_band,
-        },
-        "cross_correlation": {
-            "lags": np.arange(-test.lags, test.lags + 1),
-            "values": test.cross_correlation,
-            "band": test.cross_correlation_band,
-        },
-        "sentence": test.sentence,
-    }
+    correlation = test and {"level": test.level, **_correlations(test), "sentence": test.sentence}
     return {**content, **dict(plain({"correlation": correlation}))}
+
+
+def _correlations(test: ResidualTests) -> dict[str, dict[str, Any]]:
+    """Lags, values and bands of the correlations of residuals."""
+    found = {}
+    for name, first in (("autocorrelation", 1), ("cross_correlation", -test.lags)):
+        values, band = getattr(test, name), getattr(test, f"{name}_band")
+        found[name] = {"lags": np.arange(first, test.lags + 1), "values": values, "band": band}
+    return found
 
 
 def residual_text(model: NamedFit, measurement: Measurement, one: ModelOnRecord) -> str:
@@ -259,10 +253,9 @@ def residual_text(model: NamedFit, measurement: Measurement, one: ModelOnRecord)
     lines = [wrapped(f"{head}residuals of {number(one.rms, 4)} {units.output} (rms)")]
     if test is None:
         return "\n".join([*lines, "There are too few samples to test the residuals."])
-    for what, lags, values, band in (
-        ("autocorrelation", np.arange(1, test.lags + 1), test.autocorrelation, test.autocorrelation_band),
-        ("with the input", np.arange(-test.lags, test.lags + 1), test.cross_correlation, test.cross_correlation_band),
-    ):
+    for name, found in _correlations(test).items():
+        what = "with the input" if name == "cross_correlation" else name
+        lags, values, band = found.values()
         if np.isfinite(band) and np.isfinite(values).all():
             outside = np.abs(values) > band
             largest = int(np.argmax(np.abs(values)))

@@ -2,15 +2,15 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from ctid_cli.canonical import plain
 from ctid_cli.estimators.order_search import FittedOrder, OrderSearch
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.layout import Report, Table, count, number
-from ctid_cli.signals.measurement import ROLES, Measurement
+from ctid_cli.reporting.identification_report import notes_of, records_line, records_object
+from ctid_cli.reporting.layout import Report, Table, count, number, picked
+from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import wrapped
 
 #: Rows of the printed table.
@@ -23,9 +23,7 @@ def order_object(
     """An order search for ``order.json``."""
     best = found.recommended
     content = {
-        "files": [measurement.record.name for measurement in measurements],
-        "columns": {role: getattr(measurements[0], role) for role in ROLES},
-        "units": asdict(units),
+        **records_object(measurements, units),
         "recommended": None if best is None else {"poles": best.options.poles, "zeros": best.options.zeros},
         "reason": found.reason,
         "noise_order": found.noise.order,
@@ -40,19 +38,13 @@ def order_object(
 def _of_order(each: FittedOrder, best: FittedOrder) -> dict[str, Any]:
     fit = each.fit
     return {
-        "poles": each.options.poles,
-        "zeros": each.options.zeros,
+        **picked(each.options, ("poles", "zeros")),
         "poles_at_infinity": fit.poles_at_infinity,
         "status": fit.status.name,
-        "numerator": fit.model.numerator,
-        "denominator": fit.model.denominator,
-        "delay": fit.model.delay,
-        "cost": fit.cost,
-        "fit_percent": fit.fit_percent,
-        "cross_validated_percent": each.cross_validated_percent,
-        "validation_percent": each.validation_percent,
-        "aicc": each.criteria.aicc,
-        "bic": each.criteria.bic,
+        **picked(fit.model, ("numerator", "denominator", "delay")),
+        **picked(fit, ("cost", "fit_percent")),
+        **picked(each, ("cross_validated_percent", "validation_percent")),
+        **picked(each.criteria, ("aicc", "bic")),
         "bic_above_least": each.criteria.bic - best.criteria.bic,
         "fpe": each.criteria.fpe,
         "yic": each.yic,
@@ -66,13 +58,11 @@ def _of_order(each: FittedOrder, best: FittedOrder) -> dict[str, Any]:
 
 def order_text(found: OrderSearch, measurements: Sequence[Measurement], units: Units) -> str:
     """An order search for people."""
-    names = ", ".join(measurement.record.name for measurement in measurements)
-    samples = sum(measurement.record.n_samples for measurement in measurements)
     best = found.recommended
     verdict = found.reason
     if best is not None:
         verdict = f"Recommended: {spelled(best)}. {found.reason}"
-    notes = list(dict.fromkeys(note for measurement in measurements for note in measurement.notes))
+    notes = notes_of(measurements)
     if found.noise.order:
         notes.append(
             f"The residuals are not white: the criteria are of the innovations, with one autoregressive noise model of "
@@ -83,7 +73,7 @@ def order_text(found: OrderSearch, measurements: Sequence[Measurement], units: U
         notes.append(f"* A pole runs to infinity, so that the model is one with fewer poles: {', '.join(lost)}.")
     if len(found.orders) > ROWS:
         notes.append(f"The {ROWS} structures of least BIC of {len(found.orders)}; all are in order.json.")
-    head = f"{names}: {count(samples, 'sample')}, {count(len(found.orders), 'structure')}"
+    head = f"{records_line(measurements)}, {count(len(found.orders), 'structure')}"
     lines = [wrapped(head), wrapped(verdict), "", Report([[_table(found, units)]]).draw()]
     return "\n".join([*lines, *([""] if notes else []), *(wrapped(f"- {note}", hanging="  ") for note in notes)])
 
