@@ -1,5 +1,6 @@
 """``ctid check``: a command of its own for a FILE, and a group of further checks beside it."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,7 +13,6 @@ from ctid_cli.cli._common import (
     Config,
     From,
     InputColumn,
-    InputHold,
     Json,
     Out,
     OutputColumn,
@@ -26,6 +26,7 @@ from ctid_cli.cli._common import (
 from ctid_cli.cli._progress import RecordProgress
 from ctid_cli.cli.experiment_commands import load_plans
 from ctid_cli.errors import MismatchError, UsageError
+from ctid_cli.signals.treatment import AskedHold
 
 further = typer.Typer(rich_markup_mode=None, context_settings={"help_option_names": ["-h", "--help"]})
 
@@ -36,7 +37,7 @@ def check(
     time: TimeColumn = None,
     input: InputColumn = None,
     output: OutputColumn = None,
-    hold: InputHold = "zoh",
+    hold: Annotated[AskedHold, typer.Option("--hold", help="The input between its samples.")] = "auto",
     start: From = None,
     stop: To = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 7 if there is a PROBLEM.")] = False,
@@ -53,11 +54,20 @@ def check(
     from ctid_cli.reporting.record_report import record_object, record_text
     from ctid_cli.signals.measurement import read_measurement
 
-    found = read_measurement(file, time=time, input=input, output=output, hold=hold, start=start, stop=stop)
+    read = partial(read_measurement, file, time=time, input=input, output=output, start=start, stop=stop)
+    found = read(hold="zoh" if hold == "auto" else hold)
     units = found.time_unit or "s", found.input_unit or "", found.output_unit or ""
     report = check_record_quality(found.record, *units)
-    proposal = proposed_by_check(found.record, report)
-    answer(as_json, lambda: record_object(found, report, proposal), lambda: record_text(found, report, proposal))
+    searched, why = found, ""
+    if hold == "auto" and report.worst != "problem":
+        from ctid_cli.reporting.hold_choice import hold_for_check
+
+        chosen, why = hold_for_check(found.record, report)
+        searched = found if chosen == "zoh" else read(hold=chosen)
+    proposal = proposed_by_check(searched.record, report)
+    if proposal is not None and searched is not found:
+        proposal = proposal._replace(sentence=f"{why} {proposal.sentence}")
+    answer(as_json, lambda: record_object(found, report, proposal), lambda: record_text(searched, report, proposal))
     if strict and report.worst == "problem":
         raise MismatchError(f"{file}: no model can be identified from this record as it is")
 

@@ -240,7 +240,7 @@ def _warnings(found: Identification, look: SecondLook, hessian: Array, gains: di
     if found.answer.seen:
         yield from warnings.of_status(fit, said=look.integrator > 0)
         yield from warnings.of_conditioning(fit, found.uncertainty.free_covariance, hessian)
-        yield from warnings.of_short_record(found.uncertainty, fit.count)
+        yield from warnings.of_short_record(found.uncertainty, fit.count, "offset" in gains)
         yield from warnings.of_interval(found.delay_interval, options, fit)
     yield from warnings.of_residuals(found.tests, len(fit.residuals), FEWEST_TESTED)
     yield from warnings.of_treatment(gains, options)

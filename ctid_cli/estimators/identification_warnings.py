@@ -78,15 +78,16 @@ def of_conditioning(fit: MeasuredFit, covariance: Array, hessian: Array) -> list
     return [*words, *found[: 1 if fit.status in (Status.AT_BOUND, Status.RIDGE) else None]]
 
 
-def of_short_record(uncertainty: Uncertainty, count: int) -> list[str]:
-    """Whether the noise is so slow that the record hardly shows what it is."""
+def of_short_record(uncertainty: Uncertainty, count: int, offset: bool = False) -> list[str]:
+    """Whether the noise is so slow, or an offset that was left, that the record hardly shows what the noise is."""
     if not uncertainty.short:
         return []
     worth = f"its {count} samples are worth {uncertainty.effective_count:.2g} independent ones"
     size = len(uncertainty.free_covariance)
+    cure = "an offset looks like slow noise: treat it first (--offset)" if offset else "take a longer record"
     return [
         f"The record is too short for its noise: {worth}, and the model has {size} parameters. The intervals are "
-        "rough; take a longer record."
+        f"rough; {cure}."
     ]
 
 

@@ -1,12 +1,13 @@
 """What is odd about records and their fit, in sentences: the worst first, each with its evidence and what to do."""
 
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.hold_comparison import OtherHold
 from ctid_cli.estimators.identification_warnings import of_treatment
 from ctid_cli.estimators.judging import Options
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.estimators.second_look import RecordLook, SecondLook
 from ctid_cli.inference.residuals import ResidualTests
 from ctid_cli.signals.treatment import Hold
@@ -61,7 +62,7 @@ def of_second_look(
     """
     words: list[str] = []
     for k, one in enumerate(look.records):
-        words += [_of_which(k, look) + sentence for sentence in _of_record(one)]
+        words += [_of_which(k, look) + sentence for sentence in _of_record(one, options)]
     if not answered or any(one.growth_time > 0 for one in look.records):
         return words
     causes = list(_causes(look, options, fit, tests, gains))
@@ -85,7 +86,7 @@ def _of_which(k: int, look: SecondLook) -> str:
     return f"Experiment {k + 1}: " if len(look.records) > 1 else ""
 
 
-def _of_record(one: RecordLook) -> Iterator[str]:
+def _of_record(one: RecordLook, options: Options) -> Iterator[str]:
     """What needs no model: an output that diverges, and faults of sensor and recorder."""
     if one.growth_time > 0:
         yield (
@@ -94,7 +95,7 @@ def _of_record(one: RecordLook) -> Iterator[str]:
             "--loop FILE --reference COLUMN."
         )
         return
-    yield from _of_faults(one)
+    yield from _of_faults(one, options)
 
 
 # --- causes ------------------------------------------------------------------------------------------
@@ -121,7 +122,7 @@ def _causes(
     if options.offset == "none" and not look.integrator > 0:
         yield Cause(offset, of_treatment({"offset": offset}, options)[0] if offset else "an offset", mends=True)
     for k, one in enumerate(look.records):
-        for cause in (_drift(one, look, offset), _feedback(one)):
+        for cause in (_drift(one, look, offset), _feedback(one, options)):
             yield cause._replace(words=_of_which(k, look) * (cause.share > 0 or k > 0) + cause.words)
     yield _clock(look, faulty)
 
@@ -139,8 +140,28 @@ def _order(look: SecondLook, options: Options, fit: MeasuredFit, correlated: boo
     zeros = f" --zeros {richer.zeros}" if richer is not None and richer.zeros != options.zeros else ""
     if richer is not None:
         poor, found = richer.fall, f"{100 * richer.fall:.2g} % of the residuals' variance"
-    what = f"the structure is too poor (try --poles {options.poles + 1}{zeros})"
+    # Integrators are asked for beside the poles.
+    more = f"--poles {options.poles - _integrators(options) + 1}{zeros}"
+    if _is_sum(options):
+        more = f"another submodel, --terms {_terms_of(options)},1/0"
+    what = f"the structure is too poor (try {more})"
     return Cause(SIMPLER * poor, f"{found} is what one more pole explains: {what}.", mends=True)
+
+
+def _is_sum(options: Options) -> TypeGuard[MeasuredSubmodels]:
+    """Whether the degrees are given by --terms, not --poles."""
+    if not (isinstance(options, MeasuredSubmodels) and options.factored):
+        return False
+    return len(options.terms) > 1 or not _integrators(options)
+
+
+def _terms_of(options: MeasuredSubmodels) -> str:
+    """The submodels as --terms has them."""
+    return ",".join(f"{term.poles}/{term.zeros}" for term in options.terms)
+
+
+def _integrators(options: Options) -> int:
+    return sum(term.integrators for term in options.terms) if isinstance(options, MeasuredSubmodels) else 0
 
 
 def _delay(look: SecondLook, options: Options, correlated: bool) -> Cause:
@@ -180,10 +201,15 @@ def _drift(one: RecordLook, look: SecondLook, offset: float) -> Cause:
     return Cause(max(power / (1.0 + power), min(1.01 * offset, 1.0)), words)
 
 
-def _feedback(one: RecordLook) -> Cause:
+def _feedback(one: RecordLook, options: Options) -> Cause:
     chance = _chance_of_feedback(one)
     if not chance < FED_BACK or one.dependence is None:
         return Cause(0.0, "feedback")
+    if isinstance(options, MeasuredSubmodels) and options.closed:
+        words = (
+            f"The reference answers the output (p = {chance:.1g}), as in a further loop about this one: look at both."
+        )
+        return Cause(one.dependence.feedback_share, words)
     words = (
         f"The input answers the output (p = {chance:.1g}), as in a closed loop, where noise biases the estimate. "
         "Record the reference, and use --loop FILE --reference COLUMN; without a controller, look at the clock."
@@ -207,15 +233,17 @@ def _clock(look: SecondLook, faulty: bool) -> Cause:
 # --- evidence ----------------------------------------------------------------------------------------
 
 
-def _of_faults(one: RecordLook) -> Iterator[str]:
+def _of_faults(one: RecordLook, options: Options) -> Iterator[str]:
     """What the sensor and the recorder did."""
     report, empty = one.examined.report, "leave those fields of the record empty"
     if len(one.outliers):
         many = len(one.outliers)
         where = ", ".join(f"{t:.6g}" for t, _ in one.outliers[:3]) + (", ..." if many > 3 else "")
         what = f"{many} output samples are outliers" if many > 1 else "1 output sample is an outlier"
+        # Submodels, and models in a loop, are fitted by squares.
+        robust = "" if isinstance(options, MeasuredSubmodels) else ", or use --loss tukey"
         size = f"{'up to ' if many > 1 else ''}{one.outliers[:, 1].max():.3g} away from the neighbours"
-        yield f"{what} (t = {where}), {size}: leave faults of the sensor empty, or use --loss tukey."
+        yield f"{what} (t = {where}), {size}: leave faults of the sensor empty{robust}."
     if report.saturated and report.input_kind not in ("constant", "steps"):
         share = f"{100 * report.saturated:.2g} % of the output samples sit exactly at the least or greatest value"
         yield f"{share}, as at a limit of the sensor: {empty}, or repeat the record with a smaller input."
@@ -275,9 +303,12 @@ def _of_hold(look: SecondLook, other: OtherHold) -> Iterator[str]:
 
 
 def _of_integrator(look: SecondLook, options: Options, fit: MeasuredFit) -> str:
-    poles = fit.model.order - 1
+    integrators = _integrators(options) + 1
+    instead = f"--poles {fit.model.order - integrators} --integrators {integrators} (with a known delay)"
+    if _is_sum(options):
+        instead = f"--integrators {integrators} and one pole fewer in --terms"
     return (
         f"A pole has a time constant of {look.integrator:.4g}, too slow for this record: the system seems to integrate"
-        f", or the output drifts, and the static gain means nothing. Use --poles {poles} --integrators 1 (with a known "
-        "delay), or a longer record."
+        f", or the output drifts, and the static gain means nothing. Use {instead}, or a "
+        "longer record."
     )

@@ -10,6 +10,8 @@ from ctid_cli.inference.quantile import robust_deviation
 
 #: A sample this many robust standard deviations away from its neighbours is an outlier.
 OUTLIER = 10.0
+#: Neighbours on each side that show how large residuals are about one of them.
+ABOUT = 20
 #: So many samples of one value are a recorder that stood still, if neighbours are otherwise alike this seldom.
 STILL, SELDOM_ALIKE = 6, 0.02
 #: A part of the record in which an unstable plant grows by less than this is not told from a polynomial in time.
@@ -37,13 +39,23 @@ def far_off(y: Array) -> tuple[IntArray, Array]:
 
 
 def residual_outliers(e: Array) -> tuple[IntArray, Array]:
-    """Residuals that are far off and that others do not foretell, as they do the peaks of a smooth sequence."""
+    """Residuals that are far off, and that others do not foretell, as they do the peaks of a smooth sequence.
+
+    Where all about are as large, as a nonlinear system leaves them in its large swings, none is a fault of the sensor.
+    """
     found, off = far_off(e)
     usual = e.copy()
     usual[found] -= off
     surprise = fit_noise_model([usual]).innovations(usual)
-    sudden = np.abs(surprise[found] + off) > OUTLIER * robust_deviation(surprise)
+    usual_about = np.array([_level_about(surprise, k) for k in found.tolist()])
+    sudden = np.abs(surprise[found] + off) > OUTLIER * np.fmax(robust_deviation(surprise), usual_about)
     return found[sudden], off[sudden]
+
+
+def _level_about(surprise: Array, k: int) -> float:
+    """Robust deviation before or after a sample, the larger of the two; NaN where there are too few."""
+    sides = (surprise[max(k - ABOUT, 0) : k], surprise[k + 1 : k + 1 + ABOUT])
+    return max((robust_deviation(side) for side in sides if side.size == ABOUT), default=math.nan)
 
 
 def saturated(y: Array) -> float:

@@ -6,6 +6,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.hold_comparison import MOST, best_other_hold
 from ctid_cli.inference.input_moves import input_moves
+from ctid_cli.inference.record_check import RecordReport
 from ctid_cli.reporting.layout import count
 from ctid_cli.reporting.order_proposal import proposed_delay
 from ctid_cli.signals.record import Record, beginning
@@ -49,3 +50,9 @@ def chosen_hold(
     if found.told:
         return "zoh", "Hold: zoh, as --hold is not given: of the three it describes the record best."
     return "zoh", "Hold: zoh, as --hold is not given and the record does not tell how its input was made."
+
+
+def hold_for_check(record: Record, report: RecordReport) -> tuple[Hold, str]:
+    """The hold under which ``ctid check`` looks for a structure, as ``ctid fit`` does, and a sentence."""
+    bounds = report.suggested_delay or (0.0, 0.0)
+    return chosen_hold([record], None, None, bounds, report.suggested_initial_state, report.suggested_offset)

@@ -168,7 +168,7 @@ class _Words:
         if r.input_kind == "continuous" and self.found.record.input.hold == "zoh":
             text = (
                 "The input was not held: if it moves between the samples, straight lines (--hold foh) fit better, and "
-                "behind an anti-alias filter a band-limited input (--hold band-limited); ctid fit takes the best."
+                "behind an anti-alias filter a band-limited input (--hold band-limited); else the best is taken."
             )
             yield Finding("note", "hold", text)
         if not r.output_deviation > 1e-9 * abs(r.output_mean):

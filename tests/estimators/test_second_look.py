@@ -6,7 +6,9 @@ import pytest
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.hold_comparison import best_other_hold
 from ctid_cli.estimators.identification import identify
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.filtering.simulate import simulate
+from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
@@ -68,6 +70,12 @@ FAULTS = {
     "an unstable plant": (record_of(TransferFunction([1.0], [1.0, -0.04])), FIRST_ORDER, "The output diverges"),
     "feedback": (looped(), FIRST_ORDER, "The input answers the output"),
     "one pole too few": (CLEAN, FIRST_ORDER, "try --poles 2"),
+    "a submodel too few": (CLEAN, MeasuredSubmodels((Term(1, 0),)), "try another submodel, --terms 1/0,1/0)"),
+    "one pole too few beside an integrator": (
+        record_of(TransferFunction([2.0], [1.0, 0.8, 2.0, 0.0])),
+        MeasuredSubmodels((Term(1, 0, 1),)),
+        "try --poles 2)",
+    ),
     "a delay that is not searched": (record_of(TransferFunction([2.0], [1.0, 0.8, 2.0], 4.0)), KNOWN, "--delay 0:"),
 }
 

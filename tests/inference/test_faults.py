@@ -49,3 +49,13 @@ def test_only_exponential_growth_diverges(grown, diverges):
     assert growth_time(t, y, u) == (pytest.approx(1.0, rel=0.05) if diverges else pytest.approx(np.nan, nan_ok=True))
     # An input that grows itself explains it.
     assert np.isnan(growth_time(t, y, grown(t)))
+
+
+def test_bursts_that_a_nonlinear_system_leaves_are_no_outliers():
+    rng = np.random.default_rng(3)
+    e = 0.02 * rng.standard_normal(5000)
+    for start in (700, 2100, 4000):
+        e[start : start + 100] += 2.0 * np.hanning(100) * np.sin(0.7 * np.arange(100))
+    assert residual_outliers(e)[0].size == 0
+    e[3000] += 9.0
+    assert residual_outliers(e)[0].tolist() == [3000]
