@@ -30,6 +30,8 @@ GAPS = 0.05
 MOST_NAMED, COMPARABLE = 3, 0.6
 #: Another delay, or one more pole, has to lower the cost by this fraction.
 ANOTHER = 0.05
+#: A state at the beginning that explains so much is named, whatever else there is.
+MOSTLY = 0.5
 #: A simpler cause is named before one more pole that does so little better.
 SIMPLER = 0.9
 
@@ -117,6 +119,12 @@ def _causes(
         0.0 if faulty else look.other_hold,
         next(_of_hold(look, look.held)) if look.held and look.other_hold else "the hold",
     )
+    # Where the record begins somewhere else than at rest, all else may follow from that.
+    if not look.integrator > 0 or gains.get("initial_state", 0.0) > MOSTLY:
+        start = {"initial_state": gains.get("initial_state", 0.0)}
+        yield Cause(
+            start["initial_state"], of_treatment(start, options)[0] if start["initial_state"] else "", mends=True
+        )
     offset = gains.get("offset", 0.0)
     # An integrator, or a pole as slow as the record, makes both.
     if options.offset == "none" and not look.integrator > 0:

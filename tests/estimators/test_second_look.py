@@ -70,6 +70,11 @@ FAULTS = {
     "an unstable plant": (record_of(TransferFunction([1.0], [1.0, -0.04])), FIRST_ORDER, "The output diverges"),
     "feedback": (looped(), FIRST_ORDER, "The input answers the output"),
     "one pole too few": (CLEAN, FIRST_ORDER, "try --poles 2"),
+    "a beginning that is not at rest": (
+        changed(CLEAN, CLEAN.y + 3.0 * np.exp(-0.4 * CLEAN.t) * np.cos(1.36 * CLEAN.t)),
+        KNOWN,
+        "use --initial-state estimate",
+    ),
     "a submodel too few": (CLEAN, MeasuredSubmodels((Term(1, 0),)), "try another submodel, --terms 1/0,1/0)"),
     "one pole too few beside an integrator": (
         record_of(TransferFunction([2.0], [1.0, 0.8, 2.0, 0.0])),
