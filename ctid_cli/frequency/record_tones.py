@@ -26,10 +26,11 @@ USUAL_ROWS = 1000
 FEWEST = 32
 #: Most lines that are fitted in one window.
 MOST_LINES = 16
-#: Records are thinned to no fewer samples than this, or than that if all their tones are wanted: the weakest ones show
-#: only in the longest windows, and may be anywhere.
-FEWEST_KEPT = 2**12
-FEWEST_OF_ALL = 2**15
+#: Records are thinned to no fewer samples than this: the weakest tones show only in the longest windows, and those that
+#: move only in the shortest.
+FEWEST_KEPT = 2**15
+#: Of a record that could be thinned to so many samples the strongest tones are no higher than that would leave them.
+FEWEST_NEEDED = 2**12
 #: Samples of all segments of a length in whose spectra the highest of the strongest tones is looked for.
 LOOKED_AT = 2**18
 #: Of a thinned record this share of the band is kept, and the highest tone lies in this share of it.
@@ -72,7 +73,7 @@ def follow_tones(
     refuse_unusable(samples, FEWEST)
     spikes = find_spikes(samples)
     samples = np.where(spikes, np.nan, samples)
-    decimation, reasons = _thinning(samples, interval, tones)
+    decimation, band, reasons = _thinning(samples, interval, tones)
     scale = float(np.nanmax(np.abs(samples)))
     # Rounding leaves no noise by which errors could be told.
     dither = DITHER * np.random.default_rng(0).standard_normal(samples.size)
@@ -89,6 +90,8 @@ def follow_tones(
             f"no tone stands out of {samples.size * interval:.4g} s, in which a tone must turn several times; use a "
             "longer record, or one with less noise"
         )
+    # The strongest first, but behind the others what is above their band.
+    paths.sort(key=lambda path: float(np.median(found.omega[path])) > band * thin)
     wanted = paths[: MOST_ASKED if tones is None else tones]
     wanted.sort(key=lambda path: float(np.median(found.omega[path])))
     count = len(wanted) if tones is None else tones
@@ -105,24 +108,29 @@ def follow_tones(
     return track, Procedure(METHOD, False, sentences, doubts, used | {"longest_window": longest * thin})
 
 
-def _thinning(samples: Array, interval: float, tones: int | None) -> tuple[Decimation, list[str]]:
-    """A filter, and how many samples are left out after it, where the strongest tones need few of many samples."""
-    fewest = FEWEST_OF_ALL if tones in (None, MOST_ASKED) else FEWEST_KEPT
-    if samples.size < 2 * fewest or tones == 0:
-        return Decimation(np.ones(1)), []
+def _thinning(samples: Array, interval: float, tones: int | None) -> tuple[Decimation, float, list[str]]:
+    """A filter, how many samples are left out after it where the strongest tones need few, and their band [rad/s].
+
+    The strongest tones are those of the median spectrum first, in which what is loud for a moment is not.
+    """
+    unthinned = Decimation(np.ones(1))
+    if samples.size < 2 * FEWEST_NEEDED or tones == 0:
+        return unthinned, np.inf, []
     peaks = find_peaks(samples, interval, tones or MOST_ASKED, LOOKED_AT)
     if not peaks.omega.size:
-        return Decimation(np.ones(1)), []
+        return unthinned, np.inf, []
     top = float(peaks.omega[: tones or MOST_ASKED].max())
-    factor = min(int(np.pi * TONE_BAND / (top * interval)), samples.size // fewest)
+    most = max(1, int(np.pi * TONE_BAND / (top * interval)))
+    band = np.inf if tones is None else KEPT_BAND * np.pi / (min(most, samples.size // FEWEST_NEEDED) * interval)
+    factor = min(most, samples.size // FEWEST_KEPT)
     if factor <= 1:
-        return Decimation(np.ones(1)), []
+        return unthinned, band, []
     nyquist = np.pi / (factor * interval)
     weights = low_pass(KEPT_BAND * nyquist, (2.0 - KEPT_BAND) * nyquist, STOP_BAND, interval)
     bridge = int(BRIDGED * 2.0 * np.pi / (top * interval))
     edge = f"{KEPT_BAND * nyquist / (2.0 * np.pi):.4g} Hz"
     kept = f"One of {factor} samples is kept, every {factor * interval:.4g} s"
-    return Decimation(weights, factor, bridge), [f"{kept}, after a low-pass that keeps what is below {edge}."]
+    return Decimation(weights, factor, bridge), band, [f"{kept}, after a low-pass that keeps what is below {edge}."]
 
 
 def _longest(window: float | None, thin: float, count: int) -> int:

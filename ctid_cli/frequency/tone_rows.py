@@ -16,6 +16,9 @@ SHORTEST = 64
 HOPS = 2
 #: Energy that is left by a change or a line d bins away, in units of the noise, disturbs a tone if it exceeds d^2.
 NEAR = 1.0
+#: A window that takes no more lines and leaves one of more than this share of a tone's energy says nothing of the tone,
+#: which may be one of many that are really one.
+COMPARABLE = 0.1
 #: Lines of one window that are closer than so many bins may be one tone that changes.
 RESOLVED = 1.7
 #: A window shows so many periods of a tone.
@@ -25,6 +28,11 @@ SIGNIFICANT = 5.0
 #: So many lines at equal distances, that differ by no more than this share, may be one tone that is modulated; lines so
 #: many distances beside such a comb belong to it.
 COMB = 3
+SPARSE_COMB = 5
+MOST_APART = 4
+SPARSEST_COMB = 8
+#: A line of a comb that is refuted at more than this share of the instants is none at the others either.
+REFUTED = 0.25
 UNEQUAL = 0.05
 BESIDE = 3.0
 #: Readings closer than so many bins of the shorter window, or so many standard errors, are of one tone.
@@ -74,6 +82,12 @@ class Readings(NamedTuple):
     #: Whether the window tells the tone from its neighbours, and whether the tone is there beyond doubt.
     resolved: BoolArray
     significant: BoolArray
+    #: Distance of the lines of a comb that the tone belongs to, 0 if to none, and the band of that [rad/sample].
+    gap: Array
+    low: Array
+    high: Array
+    #: Which tone of its window it is.
+    tone: IndexArray
 
     def at(self, which: IndexArray | slice) -> "Readings":
         """Some of the readings."""
@@ -110,7 +124,7 @@ def readings_at(
     everything = everything.at(order)
     bounds = np.searchsorted(everything.row, np.arange(places.size + 1))
     kept = np.zeros(everything.row.size, np.bool_)
-    _keep(everything.omega, everything.error, everything.window, everything.middle, bounds, kept)
+    _keep(everything.omega, everything.error, everything.window, bounds, _moving(everything, bounds), kept)
     everything = everything.at(np.flatnonzero(kept))
     return everything.at(np.lexsort((everything.omega, everything.row)))
 
@@ -142,6 +156,8 @@ def _readings(tones: ToneRows, length: int, places: Array) -> Readings:
     near = np.argsort(np.abs(places[row] - tones.middle[window]), kind="stable")
     row, window = row[near], window[near]
     sound = _sound(tones, length)
+    gap, low_end, high_end = np.zeros((3, *tones.omega.shape))
+    _find_combs(tones.omega, tones.omega_error, gap, low_end, high_end)
     pair, tone = np.nonzero(sound[window])
     row, window = row[pair], window[pair]
 
@@ -184,7 +200,23 @@ def _readings(tones: ToneRows, length: int, places: Array) -> Readings:
         tones.middle[window],
         (_distance(tones, length) >= RESOLVED)[window, tone],
         (amplitude > SIGNIFICANT * amplitude_error) & (of(tones.omega) * length > PERIODS * 2.0 * np.pi),
+        of(gap),
+        of(low_end),
+        of(high_end),
+        tone,
     )
+
+
+def _moving(readings: Readings, bounds: IndexArray) -> BoolArray:
+    """Which readings are lines that one moving tone makes, as shorter windows show."""
+    r = readings
+    refuted = np.zeros(r.row.size, np.bool_)
+    if not r.row.size:
+        return refuted
+    _refute(r.omega, r.error, r.window, r.gap, r.low, r.high, bounds, refuted)
+    line = np.unique(np.column_stack((r.window, r.middle, r.tone)), axis=0, return_inverse=True)[1].ravel()
+    share = np.bincount(line, refuted) / np.bincount(line)
+    return np.asarray(refuted | (share[line] > REFUTED))
 
 
 def _sound(tones: ToneRows, length: int) -> BoolArray:
@@ -194,6 +226,8 @@ def _sound(tones: ToneRows, length: int) -> BoolArray:
     sound = np.isfinite(tones.omega_error) & tones.converged[:, None] & ~own
     line = np.where(tones.line_chance < LEVEL, tones.line_energy, 0.0)
     sound &= line[:, None] <= NEAR * ((tones.omega - tones.line[:, None]) * bins) ** 2
+    full = np.isfinite(tones.omega).all(axis=1)
+    sound &= ~(full[:, None] & (line[:, None] > COMPARABLE * 0.5 * (tones.amplitude / tones.amplitude_error) ** 2))
     for j in range(own.shape[1]):
         energy = np.where(own[:, j], tones.change_energy[:, j], 0.0)
         disturbed = energy[:, None] > NEAR * ((tones.omega - tones.omega[:, j, None]) * bins) ** 2
@@ -211,78 +245,85 @@ def _distance(tones: ToneRows, length: int) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _mark_combs(omega: Array, error: Array, window: IndexArray, middle: Array, combs: BoolArray) -> None:
-    """Mark readings of one instant that are lines of a comb, where a shorter window shows one tone that moves.
+def _find_combs(omega: Array, error: Array, gap: Array, low: Array, high: Array) -> None:
+    """Distances and bands of the combs of all windows, shape (R, n); lines that something disturbs are lines too.
 
     Amplitude or frequency that changes periodically makes lines at equal distances, each of them as steady as a tone.
     """
-    seen = np.zeros(omega.size, np.bool_)
-    found, gaps = np.empty(omega.size, np.int64), np.empty(omega.size)
-    for one in range(omega.size):
-        if seen[one]:
-            continue
+    gaps = np.empty(omega.shape[1])
+    for row in range(omega.shape[0]):
+        lines = np.argsort(omega[row])
         count = 0
-        for k in range(one, omega.size):
-            if window[k] == window[one] and middle[k] == middle[one]:
-                seen[k] = True
-                place = count
-                while place and omega[found[place - 1]] > omega[k]:
-                    found[place] = found[place - 1]
-                    place -= 1
-                found[place] = k
-                count += 1
+        while count < lines.size and not math.isnan(error[row, lines[count]]):
+            count += 1
         for k in range(count - 1):
-            gaps[k] = omega[found[k + 1]] - omega[found[k]]
+            gaps[k] = omega[row, lines[k + 1]] - omega[row, lines[k]]
         begin = 0
         while begin < count - COMB + 1:
-            # Lines from `begin` to `end` + 1 are at equal distances.
-            end = begin
-            while end < count - COMB + 1 and _equal(gaps, error, found, end):
-                end += 1
+            # Lines from `begin` to `end` are at equal distances, or at multiples of one: the nearest, or the smallest.
+            base = min(gaps[begin], gaps[begin + 1])
+            end = _end_of_comb(gaps, error[row], lines, begin, count, base)
+            least = gaps[: count - 1].min()
+            other = _end_of_comb(gaps, error[row], lines, begin, count, least)
+            if other > end:
+                base, end = least, other
             if end > begin:
-                _mark_comb(omega, error, window, found[:count], begin, end, combs)
+                first, last = omega[row, lines[begin]] - BESIDE * base, omega[row, lines[end]] + BESIDE * base
+                for k in lines[:count]:
+                    if first < omega[row, k] < last:
+                        gap[row, k], low[row, k], high[row, k] = base, first, last
             begin = max(end, begin + 1)
 
 
 @njit(cache=True, nogil=True)
-def _equal(gaps: Array, error: Array, lines: IndexArray, k: int) -> bool:
-    """Whether two neighbouring distances of lines are equal, as far as is known."""
-    square = error[lines[k]] ** 2 + 2.0 * error[lines[k + 1]] ** 2 + error[lines[k + 2]] ** 2
-    off = abs(gaps[k + 1] - gaps[k])
-    return not math.isnan(square) and off < max(SAME_ERRORS * math.sqrt(square), UNEQUAL * gaps[k + 1])
+def _end_of_comb(gaps: Array, error: Array, lines: IndexArray, begin: int, count: int, base: float) -> int:
+    """Last line of the comb that begins with a line; that line if there is none."""
+    end, largest = begin, 0
+    while end < count - 1:
+        times = round(gaps[end] / base)
+        sure = math.hypot(error[lines[end]], error[lines[end + 1]])
+        if abs(gaps[end] - times * base) > max(SAME_ERRORS * sure, UNEQUAL * base):
+            break
+        largest = max(largest, times)
+        end += 1
+    found = end - begin + 1
+    needed = COMB if largest == 1 else SPARSE_COMB if largest <= MOST_APART else SPARSEST_COMB
+    return end if found >= needed else begin
 
 
 @njit(cache=True, nogil=True)
-def _mark_comb(
-    omega: Array, error: Array, window: IndexArray, lines: IndexArray, begin: int, end: int, combs: BoolArray
+def _refute(
+    omega: Array,
+    error: Array,
+    window: IndexArray,
+    gap: Array,
+    low: Array,
+    high: Array,
+    bounds: IndexArray,
+    refuted: BoolArray,
 ) -> None:
-    """Mark the lines of one comb, and those beside it."""
-    first, last = omega[lines[begin]], omega[lines[end + 1]]
-    gap = (last - first) / (end + 1 - begin)
-    low, high = first - BESIDE * gap, last + BESIDE * gap
-    best = -1
-    for k in range(omega.size):
-        shorter = window[k] < window[lines[0]] and window[k] * gap < 2.0 * math.pi
-        if shorter and low < omega[k] < high and (best < 0 or error[k] < error[best]):
-            best = k
-    for k in lines:
-        if best >= 0 and low < omega[k] < high and abs(omega[k] - omega[best]) > COVERED * error[best]:
-            combs[k] = True
+    """Mark readings that are lines of a comb where a shorter window shows one tone that is elsewhere."""
+    for row in range(bounds.size - 1):
+        for k in range(bounds[row], bounds[row + 1]):
+            best = -1
+            for j in range(bounds[row], bounds[row + 1]):
+                shorter = window[j] < window[k] and window[j] * gap[k] < 2.0 * math.pi
+                if shorter and low[k] < omega[j] < high[k] and (best < 0 or error[j] < error[best]):
+                    best = j
+            refuted[k] = best >= 0 and abs(omega[k] - omega[best]) > COVERED * error[best]
 
 
 @njit(cache=True, nogil=True)
-def _keep(omega: Array, error: Array, window: IndexArray, middle: Array, bounds: IndexArray, kept: BoolArray) -> None:
+def _keep(
+    omega: Array, error: Array, window: IndexArray, bounds: IndexArray, closed: BoolArray, kept: BoolArray
+) -> None:
     """Which readings of each instant are kept: none that is near to one of a longer, or nearer, window."""
     for row in range(bounds.size - 1):
-        here = slice(bounds[row], bounds[row + 1])
-        w, e, of = omega[here], error[here], window[here]
-        closed = np.zeros(w.size, np.bool_)
-        _mark_combs(w, e, of, middle[here], closed)
-        for best in range(w.size):
+        for best in range(bounds[row], bounds[row + 1]):
             if closed[best]:
                 continue
-            kept[bounds[row] + best] = True
-            for k in range(best, w.size):
-                reach = SAME_ERRORS * math.hypot(e[k], e[best])
-                near = abs(w[k] - w[best]) < max(SAME_BINS * 2.0 * math.pi / of[k], reach)
+            kept[best] = True
+            for k in range(best, bounds[row + 1]):
+                reach = SAME_ERRORS * math.hypot(error[k], error[best])
+                near = abs(omega[k] - omega[best]) < max(SAME_BINS * 2.0 * math.pi / window[k], reach)
                 closed[k] |= near and not math.isnan(reach)
