@@ -215,7 +215,7 @@ def _moving(readings: Readings, bounds: IndexArray) -> BoolArray:
         return refuted
     _refute(r.omega, r.error, r.window, r.gap, r.low, r.high, bounds, refuted)
     line = np.unique(np.column_stack((r.window, r.middle, r.tone)), axis=0, return_inverse=True)[1].ravel()
-    share = np.bincount(line, refuted) / np.bincount(line)
+    share: Array = np.bincount(line, refuted) / np.bincount(line)
     return np.asarray(refuted | (share[line] > REFUTED))
 
 
@@ -226,7 +226,7 @@ def _sound(tones: ToneRows, length: int) -> BoolArray:
     sound = np.isfinite(tones.omega_error) & tones.converged[:, None] & ~own
     line = np.where(tones.line_chance < LEVEL, tones.line_energy, 0.0)
     sound &= line[:, None] <= NEAR * ((tones.omega - tones.line[:, None]) * bins) ** 2
-    full = np.isfinite(tones.omega).all(axis=1)
+    full: BoolArray = np.asarray(np.isfinite(tones.omega).all(axis=1))
     sound &= ~(full[:, None] & (line[:, None] > COMPARABLE * 0.5 * (tones.amplitude / tones.amplitude_error) ** 2))
     for j in range(own.shape[1]):
         energy = np.where(own[:, j], tones.change_energy[:, j], 0.0)

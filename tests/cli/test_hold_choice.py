@@ -51,11 +51,11 @@ def test_the_structure_is_searched_with_that_hold(ctid, tmp_path):
 
 
 def test_check_searches_with_that_hold_and_names_it(ctid, tmp_path):
-    text = " ".join(ctid("check", write(tmp_path / "a.csv", "foh")).stdout.split())
+    text = " ".join(ctid("check", moved(tmp_path / "a.csv", "foh")).stdout.split())
     assert "Hold: foh, as --hold is not given: with 2 poles" in text
     assert "Proposed: 2 poles, no zero" in text
     assert "--hold foh" in text.partition("next: ")[2]
-    held = ctid("check", write(tmp_path / "a.csv", "zoh")).stdout
+    held = ctid("check", moved(tmp_path / "a.csv", "zoh")).stdout
     assert "--hold" not in held.partition("next: ")[2]
 
 

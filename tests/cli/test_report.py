@@ -94,7 +94,7 @@ def test_what_is_no_fit_has_no_page(ctid, fitted):
         (fitted / "track.json",): "ctid track writes such a file",
         (fitted / "frf.json",): "is no fit but of kind 'ctid frf'",
         (fitted / "none.json",): "none.json: does not exist",
-        (fitted / "record.csv",): "is no JSON, or damaged",
+        (fitted / "record.csv",): "is neither a fit nor a track",
         (fitted / "fit.json", "--record", fitted / "fit.json"): "is not the file that the fit is of",
         (fitted / "fit.json", "--validate", fitted / "record.csv"): "has no validation record",
         ("quickstart", "--record", fitted / "record.csv"): "--record and --validate go with a file",

@@ -85,6 +85,28 @@ def test_a_tone_that_moves_is_followed(hertz):
     assert track.valid.mean() > 0.9
 
 
+@pytest.mark.parametrize("tones", [1, None])
+@pytest.mark.parametrize(("deviation", "rate"), [(2.5, 0.5), (5.0, 1.0), (2.5, 2.0), (20.0, 0.5)])
+def test_a_tone_whose_frequency_swings_is_not_the_lines_that_it_makes(deviation, rate, tones):
+    """Of 2.5 Hz at .5 Hz there are 13 lines of more than a tenth of the tone; of 20 Hz more than a window takes."""
+    t = INTERVAL * np.arange(10_000)
+    hertz = 100.0 + deviation * np.sin(HERTZ * rate * t)
+    y = np.sin(HERTZ * 100.0 * t - deviation / rate * np.cos(HERTZ * rate * t))
+    y += 0.01 * np.random.default_rng(3).standard_normal(t.size)
+    track = follow_tones(y, INTERVAL, tones, every=0.02)[0].of_accuracy(None)
+    off = np.abs(track.omega / HERTZ - np.interp(track.t, t, hertz)[:, None])
+    bad = track.valid & (off > 3.3 * track.error / HERTZ) & (off > 0.1)
+    assert track.omega.shape[1] == 1
+    assert track.valid.mean() > 0.5
+    assert bad.sum() <= 0.02 * track.valid.sum()
+
+
+def test_three_tones_that_short_windows_tell_apart_are_no_comb():
+    track, _ = follow(tone(60.0) + tone(90.0, 0.8, 1.0) + tone(120.0, 0.5, 2.0))
+    assert [wrong(track, k, 60.0 + 30.0 * k) for k in range(3)] == [0, 0, 0]
+    assert track.valid.mean() > 0.95
+
+
 def test_crossing_tones_keep_their_columns():
     up, down = 60.0 + 10.0 * T, 100.0 - 10.0 * T
     track, _ = follow(tone(up) + tone(down, 0.5, 1.0), 2)
