@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
+from ctid_cli.frequency.tone_combs import COVERED, find_combs, refute
 from ctid_cli.frequency.tone_search import LEVEL, ToneRows, nearest, tones_of_windows
 
 #: Shortest window [samples]; the others are twice as long as one another, up to the whole signal.
@@ -25,16 +26,8 @@ RESOLVED = 1.7
 PERIODS = 4.0
 #: A tone is there if its amplitude at the instant is so many times its standard error.
 SIGNIFICANT = 5.0
-#: So many lines at equal distances, that differ by no more than this share, may be one tone that is modulated; lines so
-#: many distances beside such a comb belong to it.
-COMB = 3
-SPARSE_COMB = 5
-MOST_APART = 4
-SPARSEST_COMB = 8
 #: A line of a comb that is refuted at more than this share of the instants is none at the others either.
 REFUTED = 0.25
-UNEQUAL = 0.05
-BESIDE = 3.0
 #: Readings closer than so many bins of the shorter window, or so many standard errors, are of one tone.
 SAME_BINS = 1.5
 SAME_ERRORS = 5.0
@@ -55,8 +48,6 @@ DOUBT = 2.3
 #: window, pull its frequency by no more than its growth [rad/sample].
 GROWS = 2.0
 BLENDED_GROWTH = 1.0
-#: What should be covered by 3 errors is divided by 3.
-COVERED = 3.0
 #: Standard error of the growth over half a window, in relative errors of the amplitude.
 GROWTH_ERROR = 3.0**0.5
 
@@ -157,7 +148,7 @@ def _readings(tones: ToneRows, length: int, places: Array) -> Readings:
     row, window = row[near], window[near]
     sound = _sound(tones, length)
     gap, low_end, high_end = np.zeros((3, *tones.omega.shape))
-    _find_combs(tones.omega, tones.omega_error, gap, low_end, high_end)
+    find_combs(tones.omega, tones.omega_error, gap, low_end, high_end)
     pair, tone = np.nonzero(sound[window])
     row, window = row[pair], window[pair]
 
@@ -213,7 +204,7 @@ def _moving(readings: Readings, bounds: IndexArray) -> BoolArray:
     refuted = np.zeros(r.row.size, np.bool_)
     if not r.row.size:
         return refuted
-    _refute(r.omega, r.error, r.window, r.gap, r.low, r.high, bounds, refuted)
+    refute(r.omega, r.error, r.window, r.gap, r.low, r.high, bounds, refuted)
     line = np.unique(np.column_stack((r.window, r.middle, r.tone)), axis=0, return_inverse=True)[1].ravel()
     share: Array = np.bincount(line, refuted) / np.bincount(line)
     return np.asarray(refuted | (share[line] > REFUTED))
@@ -242,75 +233,6 @@ def _distance(tones: ToneRows, length: int) -> Array:
     n = apart.shape[1]
     apart[:, np.arange(n), np.arange(n)] = np.inf
     return np.asarray(np.where(np.isnan(apart), np.inf, apart).min(axis=2) * length / (2.0 * np.pi))
-
-
-@njit(cache=True, nogil=True)
-def _find_combs(omega: Array, error: Array, gap: Array, low: Array, high: Array) -> None:
-    """Distances and bands of the combs of all windows, shape (R, n); lines that something disturbs are lines too.
-
-    Amplitude or frequency that changes periodically makes lines at equal distances, each of them as steady as a tone.
-    """
-    gaps = np.empty(omega.shape[1])
-    for row in range(omega.shape[0]):
-        lines = np.argsort(omega[row])
-        count = 0
-        while count < lines.size and not math.isnan(error[row, lines[count]]):
-            count += 1
-        for k in range(count - 1):
-            gaps[k] = omega[row, lines[k + 1]] - omega[row, lines[k]]
-        begin = 0
-        while begin < count - COMB + 1:
-            # Lines from `begin` to `end` are at equal distances, or at multiples of one: the nearest, or the smallest.
-            base = min(gaps[begin], gaps[begin + 1])
-            end = _end_of_comb(gaps, error[row], lines, begin, count, base)
-            least = gaps[: count - 1].min()
-            other = _end_of_comb(gaps, error[row], lines, begin, count, least)
-            if other > end:
-                base, end = least, other
-            if end > begin:
-                first, last = omega[row, lines[begin]] - BESIDE * base, omega[row, lines[end]] + BESIDE * base
-                for k in lines[:count]:
-                    if first < omega[row, k] < last:
-                        gap[row, k], low[row, k], high[row, k] = base, first, last
-            begin = max(end, begin + 1)
-
-
-@njit(cache=True, nogil=True)
-def _end_of_comb(gaps: Array, error: Array, lines: IndexArray, begin: int, count: int, base: float) -> int:
-    """Last line of the comb that begins with a line; that line if there is none."""
-    end, largest = begin, 0
-    while end < count - 1:
-        times = round(gaps[end] / base)
-        sure = math.hypot(error[lines[end]], error[lines[end + 1]])
-        if abs(gaps[end] - times * base) > max(SAME_ERRORS * sure, UNEQUAL * base):
-            break
-        largest = max(largest, times)
-        end += 1
-    found = end - begin + 1
-    needed = COMB if largest == 1 else SPARSE_COMB if largest <= MOST_APART else SPARSEST_COMB
-    return end if found >= needed else begin
-
-
-@njit(cache=True, nogil=True)
-def _refute(
-    omega: Array,
-    error: Array,
-    window: IndexArray,
-    gap: Array,
-    low: Array,
-    high: Array,
-    bounds: IndexArray,
-    refuted: BoolArray,
-) -> None:
-    """Mark readings that are lines of a comb where a shorter window shows one tone that is elsewhere."""
-    for row in range(bounds.size - 1):
-        for k in range(bounds[row], bounds[row + 1]):
-            best = -1
-            for j in range(bounds[row], bounds[row + 1]):
-                shorter = window[j] < window[k] and window[j] * gap[k] < 2.0 * math.pi
-                if shorter and low[k] < omega[j] < high[k] and (best < 0 or error[j] < error[best]):
-                    best = j
-            refuted[k] = best >= 0 and abs(omega[k] - omega[best]) > COVERED * error[best]
 
 
 @njit(cache=True, nogil=True)
