@@ -64,8 +64,7 @@ def follow_tones(
     the residual, whitened, shows no further line. At each instant each tone is read from the longest window in which
     nothing speaks against it: no line left near it, no change within the window, no other tone too close. Missing
     samples are NaN; ``every`` [s] is the time from row to row, or ``at`` [s] holds the instants of the rows, ascending;
-    ``window`` [s] is the longest window. Raises DataError for
-    a signal that is too short, constant, or shows no tone.
+    ``window`` [s] is the longest window. Raises DataError for a signal that is too short, constant, or shows no tone.
     """
     require_positive("interval", interval, "s")
     if tones is not None:
@@ -91,9 +90,9 @@ def follow_tones(
             "longer record, or one with less noise"
         )
     # The strongest first, but behind the others what is above their band.
-    paths.sort(key=lambda path: float(np.median(found.omega[path])) > band * thin)
+    paths.sort(key=lambda path: _middle(found, path) > band * thin)
     wanted = paths[: MOST_ASKED if tones is None else tones]
-    wanted.sort(key=lambda path: float(np.median(found.omega[path])))
+    wanted.sort(key=lambda path: _middle(found, path))
     count = len(wanted) if tones is None else tones
     alone = _alone(thinned, places)
     lost = paths[len(wanted) :][:MOST_MISSING]
@@ -103,9 +102,14 @@ def follow_tones(
     track = RecordTrack.of(places * thin + delay, omega, flags, max(step, 1.0) * thin, **others)
     used = {"interval": thin, "kept_of": decimation.factor, "filter_samples": decimation.weights.size}
     sentences = (*_counted(paths, count, tones), *reasons, *spikes_told(spikes), *_windows_used(found, wanted, thin))
-    highest = max((float(np.median(found.omega[path])) for path in wanted), default=0.0) / (2.0 * np.pi * thin)
+    highest = max((_middle(found, path) for path in wanted), default=0.0) / (2.0 * np.pi * thin)
     doubts = tuple(_doubts(len(paths), tones, highest, 0.5 / interval))
     return track, Procedure(METHOD, False, sentences, doubts, used | {"longest_window": longest * thin})
+
+
+def _middle(found: Readings, path: IndexArray) -> float:
+    """Median frequency of a tone [rad/sample]."""
+    return float(np.median(found.omega[path]))
 
 
 def _thinning(samples: Array, interval: float, tones: int | None) -> tuple[Decimation, float, list[str]]:
@@ -114,7 +118,8 @@ def _thinning(samples: Array, interval: float, tones: int | None) -> tuple[Decim
     The strongest tones are those of the median spectrum first, in which what is loud for a moment is not.
     """
     unthinned = Decimation(np.ones(1))
-    if samples.size < 2 * FEWEST_NEEDED or tones == 0:
+    fewest = FEWEST_KEPT if tones is None else FEWEST_NEEDED
+    if samples.size < 2 * fewest or tones == 0:
         return unthinned, np.inf, []
     peaks = find_peaks(samples, interval, tones or MOST_ASKED, LOOKED_AT)
     if not peaks.omega.size:
@@ -199,9 +204,7 @@ def _others(
 
 
 def _missing(found: Readings, path: IndexArray, rows: int, thin: float, scale: float) -> MissingLine:
-    return MissingLine(
-        float(np.median(found.omega[path])) / thin, path.size / rows, scale * float(np.median(found.amplitude[path]))
-    )
+    return MissingLine(_middle(found, path) / thin, path.size / rows, scale * float(np.median(found.amplitude[path])))
 
 
 def _counted(paths: list[IndexArray], count: int, tones: int | None) -> Iterator[str]:

@@ -10,16 +10,15 @@ from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.frequency.moments import factorise, substitute
 from ctid_cli.frequency.tone_equations import NUMBERS, Work, make_equations, work_for
 
-#: Of them only so many are free in the first steps: what curves is fitted when what turns is nearly right.
+#: Numbers of a tone that do not curve: what curves is fitted when what turns is nearly right.
 STRAIGHT = 4
 #: Largest logarithmic growth over half a window, and phase bent over half a window [rad].
 MOST_GROWTH = 4.0
 MOST_BEND = 1e4
-#: Iterations at most; stop when the step would lower the sum of squares by less than this share of one sample's, or
-#: change no phase by more than this [rad] and no amplitude by more than this share.
-ITERATIONS = 30
-#: What is free, and how many steps are taken at most, one after the other.
-STAGES = ((2, 1), (STRAIGHT, 4), (NUMBERS, ITERATIONS))
+#: How many numbers of each tone are free, and how many steps are taken at most, one stage after the other.
+STAGES = ((2, 1), (STRAIGHT, 4), (NUMBERS, 30))
+#: A stage ends when the step would lower the sum of squares by less than this share of one sample's, or change no phase
+#: by more than this [rad] and no amplitude by more than this share.
 SMALL = 1e-3
 SMALLEST = 1e-9
 #: Longest step of a phase over half a window [rad].
