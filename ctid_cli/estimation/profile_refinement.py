@@ -8,6 +8,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error
+from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.output_error import Layout, sensitivities
@@ -37,8 +38,10 @@ class AppliedModel:
 class Refinement:
     """The output-error cost of measured records, minimised over all parameters."""
 
-    def __init__(self, measured: MeasuredRecords, problem: Problem | None = None) -> None:
-        self.measured = measured
+    def __init__(
+        self, measured: MeasuredRecords, known: KnownCoefficients = NOTHING, problem: Problem | None = None
+    ) -> None:
+        self.measured, self.known = measured, known
         self.structure = measured.structure
         self.problem = problem or measured.problem
 
@@ -49,7 +52,7 @@ class Refinement:
             y = data.y.copy()
             y[data.use] = values
             records.append(data._replace(y=y))
-        return Refinement(self.measured, self.problem._replace(records=tuple(records)))
+        return Refinement(self.measured, self.known, self.problem._replace(records=tuple(records)))
 
     def near(self, errors: Sequence[Array], weighting: Weighting | None) -> "Refinement":
         """The records whose least squares are, near the estimate, what its loss is."""
@@ -67,16 +70,17 @@ class Refinement:
         options = replace(
             self.measured.options,
             starts=starts,
-            nested=nested or not self.measured.plain,
+            nested=nested or not self.measured.plain or self.known is not NOTHING,
             fewer_poles=nested,
             random_starts=RANDOM_STARTS if nested or self.measured.plain else 0,
+            known=self.known,
         )
         return best_output_error(records, poles, zeros, options)
 
     def local(self, near: Optimum) -> Optimum:
         """The least output error in the basin of an optimum of other outputs."""
         starts = [(near.denominator, near.delay)]
-        options = replace(self.measured.options, starts=starts, nested=False, random_starts=0)
+        options = replace(self.measured.options, starts=starts, nested=False, random_starts=0, known=self.known)
         return best_output_error(self.problem.records, near.denominator.size - 1, self.structure.zeros, options)
 
     def parameters(self, found: Optimum) -> tuple[Layout, Array]:

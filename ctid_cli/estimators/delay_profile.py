@@ -1,6 +1,6 @@
 """Global estimation from measured records: a one-dimensional search over the delay, then the least output error."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -11,10 +11,10 @@ from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Estimator, Start, checked_bounds, quality
 from ctid_cli.estimation.fixed import Fixed, places_of
 from ctid_cli.estimation.iteration import Equations
-from ctid_cli.estimation.known_parameters import with_known
 from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
 from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.box import Box
+from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.output_error import Layout, sensitivities
 from ctid_cli.estimation.profile_refinement import Refinement
 from ctid_cli.estimation.profile_search import Profile, search_delay
@@ -226,8 +226,8 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if places_of(self.fixed, Structure(self.poles, self.zeros).names) and self.loss != "squares":
-            raise OptionError("fixed", f"fixed needs the loss squares, not {self.loss}")
+        known = places_of(self.fixed, Structure(self.poles, self.zeros).names)
+        _check_stable(known, self.poles)
         low, high = bounds = checked_bounds(self.delay_bounds, known_allowed=True)
         object.__setattr__(self, "delay_bounds", bounds)
         allowed = self.poles if low == high else self.poles - 1
@@ -245,20 +245,16 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
                 self.delay_bounds, self.initial_state, self.offset, self.hold_output, bridge=self.loss != "squares"
             ),
         )
-        return Refinement(measured)
+        known = places_of(self.fixed, measured.structure.names)
+        return Refinement(measured, KnownCoefficients.of(self.poles, self.zeros, known) if known else NOTHING)
 
     def _estimate(self, refinement: Refinement, start: Start | None) -> MeasuredFit:
         for minima, profile in search_delay(refinement.measured, self.svf_cutoff, self.nested):
             if minima:
                 a = [np.concatenate(([1.0], minimum.theta[: self.poles])) for minimum in minima]
                 starts = [(each, minimum.delay) for each, minimum in zip(a, minima, strict=True)]
-                known = places_of(self.fixed, refinement.structure.names)
                 if self.loss == "squares":
-                    best = refinement.best(starts, self.nested)
-                    if known:
-                        size = refinement.structure.size
-                        best = with_known(refinement, known, [each.theta[:size] for each in minima], best)
-                    fit = fitted(refinement, best, profile, None, known)
+                    fit = fitted(refinement, refinement.best(starts, self.nested), profile, None)
                 else:
                     robust = robust_fit(refinement, self.loss, starts, self.nested)
                     fit = fitted(refinement, robust.found, profile, robust)
@@ -274,7 +270,6 @@ def fitted(
     found: Optimum,
     profile: Profile | None,
     robust: RobustFit | None,
-    known: Collection[int] = (),
 ) -> MeasuredFit:
     """The result of a refinement, but for its covariance."""
     measured = refinement.measured
@@ -310,8 +305,8 @@ def fitted(
         box=found.box,
         weighting=samples.weighting,
         held_poles=tuple(found.held_poles.tolist()),
-        tangent=np.delete(_tangent(layout, found), list(known), axis=1),
-        known=tuple(layout.names[k] for k in known),
+        tangent=_tangent(layout, found, refinement.known),
+        known=tuple(np.array(layout.names[: refinement.known.size])[refinement.known.given].tolist()),
         regular=all(nearly_regular(data.t) for data in refinement.problem.records),
         **values,
     )
@@ -354,13 +349,25 @@ def samples_at(
     return FittedSamples(errors, psi, used, weighted(losses, errors, layout.size))
 
 
-def _tangent(layout: Layout, found: Optimum) -> Array:
-    """Directions of the parameters along which neither a pole nor the delay leaves the set of admissible models."""
+def _tangent(layout: Layout, found: Optimum, known: KnownCoefficients) -> Array:
+    """Directions along which no known parameter changes and neither a pole nor the delay leaves the admissible set."""
     n, delay = layout.structure.poles, layout.structure.size - 1
-    tangent = np.eye(layout.size)
+    fixed = np.zeros(layout.size, dtype=bool)
+    fixed[: known.size] = known.given
     if found.delay_at_bound:
-        tangent = np.delete(tangent, delay, axis=1)
-    if found.held_poles.size:
-        moving = np.pad(found.pole_slopes, ((0, layout.size - n), (0, 0)))
-        tangent = np.column_stack((moving, tangent[:, n:]))
-    return tangent
+        fixed[delay] = True
+    if not found.held_poles.size:
+        return np.eye(layout.size)[:, ~fixed]
+    moving = np.pad(found.pole_slopes, ((0, layout.size - n), (0, 0)))
+    return np.column_stack((moving, np.eye(layout.size)[:, n:][:, ~fixed[n:]]))
+
+
+def _check_stable(known: Mapping[int, float], poles: int) -> None:
+    """Refuse denominators that no stable model has."""
+    for place, value in known.items():
+        if place < poles and not value > 0:
+            raise OptionError("fixed", f"a{place + 1} must be above zero, as in every stable model: got {value:g}")
+    if set(range(poles)) <= set(known):
+        roots = np.roots([1.0, *(known[place] for place in range(poles))])
+        if not (roots.real < 0).all():
+            raise OptionError("fixed", f"the fixed denominator has the poles {roots}, and all must be stable")

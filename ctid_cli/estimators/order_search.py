@@ -305,7 +305,7 @@ class _Search:
         """Laid out records for a structure."""
         structure = Structure(options.poles, options.zeros, delay=self.ladder.box.delay_free)
         problem = laid_out.problem._replace(zeros=options.zeros)
-        return Refinement(laid_out.measured.with_structure(structure), problem)
+        return Refinement(laid_out.measured.with_structure(structure), problem=problem)
 
     def fit(self, poles: int, zeros: int) -> None:
         """Add a structure."""

@@ -7,8 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, ComplexArray
-from ctid_cli.estimation.optimum.box import Box, box_of, point_of
+from ctid_cli.errors import DataError
+from ctid_cli.estimation.optimum.box import Box, box_of, point_of, widened
 from ctid_cli.estimation.optimum.chain import numerators
+from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_space
 from ctid_cli.estimation.optimum.pilot import part_of
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import Ending, Judged
@@ -42,6 +44,8 @@ class SearchOptions:
     #: out: only if the given starts do not agree.
     random_starts: int = 10
     seed: int = 0
+    #: Coefficients that are known.
+    known: KnownCoefficients = NOTHING
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +66,8 @@ class Optimum:
     promise: float
     #: Poles of the structure that have run to infinity, where a smaller model has the least squared error.
     poles_at_infinity: int
-    #: Derivatives of ``a_1 ... a_n`` to the coordinates of the poles that are not held at a bound of the set, and the
-    #: poles that are.
+    #: Derivatives of ``a_1 ... a_n`` to the coordinates of the poles, or with known ones of those to directions that
+    #: keep them, where no bound of the set holds the poles; and the poles that are held.
     pole_slopes: Array
     held_poles: ComplexArray
     #: Whether the delay would leave its bounds.
@@ -87,6 +91,8 @@ def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, opt
     As many zeros as poles need a known delay. Free responses begin at the first used sample of each record.
     """
     problem, box = problem_of(records, zeros, options), box_of(records, options.delays)
+    if options.known is not NOTHING:
+        return _with_known(problem, box, poles, options)
     if options.nested and (part := part_of(problem, options.delays[1])) is not None:
         found = _from_part(problem, part, box, poles, options)
         if found is not None:
@@ -101,6 +107,31 @@ def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, opt
     if options.nested or not in_doubt:
         return found
     nest.refine(poles, zeros, nest.random_points(poles))
+    return _least(nest, poles, zeros, False)
+
+
+def _with_known(problem: Problem, box: Box, poles: int, options: SearchOptions) -> Optimum:
+    """Return the least output error of the models that have known coefficients."""
+    zeros, known = problem.zeros, options.known
+    if known.all_poles:
+        box = widened(box, known.poles)
+    points = [point_of(np.roots(np.asarray(a, dtype=float)).astype(complex), tau, box) for a, tau in options.starts]
+    part = part_of(problem, options.delays[1]) if options.nested else None
+    if options.nested and part is None:
+        free = Nest(problem, box, options.random_starts, options.seed)
+        nest = free.with_known(poles, zeros, known, points)
+    else:
+        if part is not None:
+            there = _with_known(part, box, poles, options)
+            points = [point_of(there.model.poles, there.delay, box)]
+        nest = Nest(problem, box, 0, options.seed, known=known)
+        moved = (known.met(point, box) for point in points)
+        nest.refine(poles, zeros, [point for point in moved if point is not None])
+    if not nest.optima(poles, zeros):
+        raise DataError(
+            "no model with the known coefficients of the denominator has all its poles where they are searched: "
+            f"{box.in_words()}"
+        )
     return _least(nest, poles, zeros, False)
 
 
@@ -155,12 +186,20 @@ def _one_period(data: FilterData, period: float) -> FilterData:
 def optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Optimum:
     """The model in coefficients of polynomials."""
     point, projected = best.local.point, best.local.projected
-    a = point.denominator
+    a, known, n = point.denominator, nest.known, point.poles.size
     over = numerators(point.speed, point.damping)
-    held = best.held[: point.poles.size]
+    held = best.held[:n]
     b = projected.output @ over
     if projected.direct:
         b = np.concatenate(([0.0], b)) + projected.direct * a
+    slopes = point.denominator_slopes()[:, ~held]
+    if known is not NOTHING:
+        # The same up to rounding.
+        a[1:][known.places] = known.denominator[known.places]
+        given = np.isfinite(known.numerator)
+        b = b[b.size - given.size :]
+        b[given] = known.numerator[given]
+        slopes = slopes @ null_space(known.slopes(point, n)[:, ~held])
     return Optimum(
         numerator=np.trim_zeros(b, "f") if b.any() else np.zeros(1),
         denominator=a,
@@ -171,7 +210,7 @@ def optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Opti
         ending=best.ending,
         promise=best.promise,
         poles_at_infinity=lost,
-        pole_slopes=point.denominator_slopes()[:, ~held],
+        pole_slopes=slopes,
         held_poles=point.poles[point.whole_sections(held)],
         delay_at_bound=nest.box.delay_free and bool(best.held[-1]) and not best.pinned,
         pinned=best.pinned,

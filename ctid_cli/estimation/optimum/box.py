@@ -12,7 +12,7 @@ met.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import copysign, exp, sqrt
 
@@ -57,6 +57,25 @@ class Box:
     def delay_free(self) -> bool:
         """Whether the delay is searched."""
         return self.delays[0] < self.delays[1]
+
+    def in_words(self) -> str:
+        """Return the bounds of the poles, for messages."""
+        return (
+            f"magnitudes of {self.slowest:.3g} to {self.fastest:.3g} rad/s, damping of pairs at least "
+            f"{self.least_damping:g}"
+        )
+
+
+def widened(box: Box, poles: ComplexArray) -> Box:
+    """Return a box that holds given stable poles, too."""
+    sizes, pairs = np.abs(poles), poles[poles.imag > 0]
+    return replace(
+        box,
+        slowest=min(box.slowest, float(sizes.min())),
+        fastest=max(box.fastest, float(sizes.max())),
+        imaginary=max(box.imaginary, float(pairs.imag.max(initial=0.0))),
+        least_damping=min(box.least_damping, float((-pairs.real / np.abs(pairs)).min(initial=1.0))),
+    )
 
 
 #: No bounds at all.
@@ -231,7 +250,13 @@ def moved_by(point: Point, step: Array, box: Box) -> Point:
 
 
 def frozen(point: Point, gradient: Array, box: Box) -> BoolArray:
-    """Coordinates at a bound whose gradient points outward; for the delay the bounds of its cell count."""
+    """Return which coordinates are at a bound with the descent pointing outward."""
+    at_low, at_high = at_bounds(point, box)
+    return (at_low & (gradient > 0)) | (at_high & (gradient < 0))
+
+
+def at_bounds(point: Point, box: Box) -> tuple[BoolArray, BoolArray]:
+    """Return which coordinates are at their lower and upper bound; for the delay the bounds of its cell count."""
     at_low: list[bool] = []
     at_high: list[bool] = []
     for w, zeta, edge in zip(point.speed.tolist(), point.damping.tolist(), point.edge.tolist(), strict=True):
@@ -253,4 +278,4 @@ def frozen(point: Point, gradient: Array, box: Box) -> BoolArray:
         slack = TOUCH * (edges[1] - edges[0])
         at_low.append(point.delay.seconds <= edges[0] + slack)
         at_high.append(point.delay.seconds >= edges[1] - slack)
-    return (np.array(at_low) & (gradient > 0)) | (np.array(at_high) & (gradient < 0))
+    return np.array(at_low), np.array(at_high)

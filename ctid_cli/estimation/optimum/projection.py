@@ -4,7 +4,8 @@ r"""Variable projection: the squared output error over the denominator and the d
 
 For given poles and delay B, C and c follow by linear least squares. With Phi their columns and P the projection on
 them, Kaufman's Jacobian of the residual is ``-(I - P) dPhi/dalpha c``; since ``r`` is orthogonal to Phi its gradient is
-exact.
+exact. Known coefficients of B leave Phi, and their part of the response leaves y. The derivatives of ``B/A u`` at a
+fixed B are the same, so that nothing else changes.
 
 References
 ----------
@@ -18,7 +19,7 @@ import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.optimum.chain import chain_dynamics, driven_chain, logarithmic_slopes
+from ctid_cli.estimation.optimum.chain import chain_dynamics, driven_chain, logarithmic_slopes, numerators, polynomial
 from ctid_cli.estimation.optimum.triangle import MOMENTS, ChainState, Delay, rows_of
 from ctid_cli.filtering.filter_data import FilterData
 
@@ -36,6 +37,22 @@ class Problem(NamedTuple):
     offset: bool
     #: Period [s] of each record that repeats for ever, else 0.
     periods: tuple[float, ...]
+    #: Known coefficients ``b_0 ... b_m`` of the numerator, NaN for those that are free; empty where all are.
+    numerator: Array = np.zeros(0)
+
+
+class Weights(NamedTuple):
+    """What the weights of the states, and of u itself, can be: a given part, and the span of a basis.
+
+    The basis has no columns where all are known, and no rows where all are free.
+    """
+
+    basis: Array
+    given: Array
+
+
+#: All weights are free.
+FREE_WEIGHTS = Weights(np.zeros((0, 0)), np.zeros(0))
 
 
 class Projected(NamedTuple):
@@ -59,12 +76,38 @@ class Slopes(NamedTuple):
     curvature: Array
 
 
+def weights_of(problem: Problem, speed: Array, damping: Array) -> Weights:
+    """Weights of the states with which the numerator has its known coefficients.
+
+    With ``b = T'w``, T the numerators of the states (and, last, A for u itself), the known ones ask ``T_k'w = b_k``.
+    """
+    known = np.isfinite(problem.numerator)
+    if not known.any():
+        return FREE_WEIGHTS
+    table = numerators(speed, damping)
+    if problem.zeros == len(table):
+        table = np.vstack((np.pad(table, ((0, 0), (1, 0))), polynomial(speed, damping)))
+    else:
+        table = table[-problem.zeros - 1 :, -problem.zeros - 1 :]
+    asked = table[:, known]
+    lengths = np.linalg.norm(asked, axis=0)
+    whole, triangle = np.linalg.qr(asked / lengths, mode="complete")
+    count = lengths.size
+    given = whole[:, :count] @ np.linalg.solve(triangle[:count].T, problem.numerator[known] / lengths)
+    return Weights(np.ascontiguousarray(whole[:, count:]), given)
+
+
 @njit(cache=True, nogil=True)
-def _columns(rows: Array, n: int, forced: int, zeros: int, free: bool, offset: bool) -> Array:
-    """The columns Phi from rows of all records whose chains, of ``forced`` states, begin with the n states."""
+def _columns(
+    rows: Array, n: int, forced: int, zeros: int, free: bool, offset: bool, weights: Weights
+) -> tuple[Array, Array]:
+    """The columns Phi, and y less what is known of it.
+
+    From rows of all records whose chains, of ``forced`` states, begin with the n states.
+    """
     records, q = rows.shape[0], rows.shape[1]
     proper = min(zeros, n - 1) + 1
-    shared = proper + (1 if zeros == n else 0)
+    shared = zeros + 1
     own = (n if free else 0) + (1 if offset else 0)
     # The numerator is common to all records; a free response and an offset are zero outside their own.
     columns = np.zeros((records * q, shared + records * own))
@@ -79,7 +122,11 @@ def _columns(rows: Array, n: int, forced: int, zeros: int, free: bool, offset: b
             part[:, place : place + n] = rows[k, :, forced + 1 : forced + 1 + n]
         if offset:
             part[:, place + own - 1] = rows[k, :, -2]
-    return columns
+    y = np.ascontiguousarray(rows[:, :, -1]).ravel()
+    if weights.basis.shape[0] == 0:
+        return columns, y
+    both = np.ascontiguousarray(columns[:, :shared])
+    return np.hstack((both @ weights.basis, columns[:, shared:])), y - both @ weights.given
 
 
 @njit(cache=True, nogil=True)
@@ -87,6 +134,8 @@ def _factored(columns: Array) -> tuple[Array, Array, Array, Array]:
     """Lengths of the columns and singular values and vectors of what is left when these are taken out."""
     # Columns of length one: the rank then does not depend on the units of input, output and time.
     lengths = np.sqrt((columns * columns).sum(axis=0))
+    if lengths.size == 0:
+        return lengths, columns, lengths, columns[:0]
     for i in range(lengths.size):
         if not lengths[i] > 0.0:
             lengths[i] = 1.0
@@ -98,10 +147,10 @@ def _factored(columns: Array) -> tuple[Array, Array, Array, Array]:
 
 
 @njit(cache=True, nogil=True)
-def _eliminated(rows: Array, n: int, zeros: int, free_response: bool, offset: bool) -> Projected:
+def _eliminated(rows: Array, n: int, zeros: int, free_response: bool, offset: bool, weights: Weights) -> Projected:
     """Least squares of the last column of the rows on all that is eliminated."""
-    lengths, left, values, right = _factored(_columns(rows, n, n, zeros, free_response, offset))
-    y = np.ascontiguousarray(rows[:, :, -1]).ravel()
+    columns, y = _columns(rows, n, n, zeros, free_response, offset, weights)
+    lengths, left, values, right = _factored(columns)
     along = left.T @ y
     residual = y - left @ along
     # c = V S^-1 U'y; directions of no length are left out, which is the solution of least norm.
@@ -109,12 +158,13 @@ def _eliminated(rows: Array, n: int, zeros: int, free_response: bool, offset: bo
     records = rows.shape[0]
     output, direct, free, offsets = np.zeros(n), 0.0, np.zeros((records, n)), np.zeros(records)
     # Read in the order in which the columns were written.
-    proper = min(zeros, n - 1) + 1
-    output[n - proper :] = solution[:proper]
-    place = proper
+    proper, place, shared = min(zeros, n - 1) + 1, zeros + 1, solution
+    if weights.basis.shape[0] > 0:
+        place = weights.basis.shape[1]
+        shared = weights.given + weights.basis @ solution[:place]
+    output[n - proper :] = shared[:proper]
     if zeros == n:
-        direct = solution[place]
-        place += 1
+        direct = shared[proper]
     for k in range(records):
         if free_response:
             free[k] = solution[place : place + n]
@@ -131,7 +181,8 @@ def project(problem: Problem, speed: Array, damping: Array, delay: Delay) -> Pro
     chain = ChainState(F, g, F, g if problem.free_response else np.zeros(0))
     each = zip(problem.records, problem.periods, strict=True)
     rows = np.stack([rows_of(chain, delay, data, period, MOMENTS) for data, period in each])
-    found: Projected = _eliminated(rows, g.size, problem.zeros, problem.free_response, problem.offset)
+    weights = weights_of(problem, speed, damping)
+    found: Projected = _eliminated(rows, g.size, problem.zeros, problem.free_response, problem.offset, weights)
     return found
 
 
@@ -148,13 +199,19 @@ def twice(F: Array, g: Array, output: Array, direct: float, free: Array | None) 
 
 @njit(cache=True, nogil=True)
 def _kaufman(
-    rows: Array, F: Array, g: Array, projected: Projected, readings: Array, problem: tuple[int, bool, bool, bool]
+    rows: Array,
+    F: Array,
+    g: Array,
+    projected: Projected,
+    readings: Array,
+    problem: tuple[int, bool, bool, bool],
+    weights: Weights,
 ) -> Slopes:
     """Gradient and J'J from the rows of a chain that drives a second one; readings of ``d ln A/d alpha`` from it."""
     n = g.size
     zeros, free_response, offset, delay_free = problem
-    _, left, _, _ = _factored(_columns(rows, n, 2 * n, zeros, free_response, offset))
-    y = np.ascontiguousarray(rows[:, :, -1]).ravel()
+    columns, y = _columns(rows, n, 2 * n, zeros, free_response, offset, weights)
+    _, left, _, _ = _factored(columns)
     residual = y - left @ (left.T @ y)
     psi = np.zeros((y.size, n + 1 if delay_free else n))
     # dx/dtau = -x'(t - tau), x' = output (F z + g u).
@@ -184,5 +241,6 @@ def slopes(
     each = zip(chains, problem.records, problem.periods, strict=True)
     rows = np.stack([rows_of(chain, delay, data, period, MOMENTS) for chain, data, period in each])
     free = problem.zeros, problem.free_response, problem.offset, delay_free
-    found: Slopes = _kaufman(rows, F, g, projected, logarithmic_slopes(speed, damping, F), free)
+    weights = weights_of(problem, speed, damping)
+    found: Slopes = _kaufman(rows, F, g, projected, logarithmic_slopes(speed, damping, F), free, weights)
     return found

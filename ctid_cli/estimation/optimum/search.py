@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
-from ctid_cli.estimation.optimum.box import TOUCH, Box, Point, box_of, frozen, moved_by, point_of
+from ctid_cli.estimation.optimum.box import TOUCH, Box, Point, at_bounds, box_of, frozen, moved_by, point_of
+from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_space
 from ctid_cli.estimation.optimum.projection import Problem, Projected, project, slopes
 
 #: Fall of the squared error that Newton's step may promise, as a fraction of it, at a minimum; what Newton's steps aim
@@ -62,6 +64,27 @@ class Local:
         return self.projected.squared_error
 
 
+class Freedom(NamedTuple):
+    """Where a search can go: coordinates that no bound holds, and directions in them that keep what is known."""
+
+    free: BoolArray
+    #: Lengths of the free coordinates, and an orthonormal basis in these units, shape (f, r).
+    unit: Array
+    basis: Array
+
+    def reduced(self, gradient: Array, curvature: Array) -> tuple[Array, Array]:
+        """Return curvature and gradient in the basis."""
+        scaled = curvature[np.ix_(self.free, self.free)] / np.outer(self.unit, self.unit)
+        return self.basis.T @ scaled @ self.basis, self.basis.T @ (gradient[self.free] / self.unit)
+
+    def whole(self, step: ArrayLike) -> Array:
+        """Return steps in the basis, columns or one, as steps in all coordinates."""
+        inner = self.basis @ np.asarray(step)
+        moved = np.zeros((self.free.size, *inner.shape[1:]))
+        moved[self.free] = (inner.T / self.unit).T
+        return moved
+
+
 @dataclass(frozen=True, eq=False)
 class Judged:
     """A local minimum and its kind."""
@@ -77,10 +100,10 @@ class Judged:
 
 
 class Descent:
-    """Local searches on records."""
+    """Local searches on records, among models with the known coefficients."""
 
-    def __init__(self, problem: Problem, box: Box) -> None:
-        self.problem, self.box = problem, box
+    def __init__(self, problem: Problem, box: Box, known: KnownCoefficients = NOTHING) -> None:
+        self.problem, self.box, self.known = problem._replace(numerator=known.numerator), box, known
         self.evaluations = 0
         used = np.concatenate([data.y_used for data in problem.records])
         self.count = used.size
@@ -105,6 +128,18 @@ class Descent:
         if self.box.delay_free:
             inner[n, n] = self.box.quarter
         return Local(point, projected, inner.T @ found.gradient, inner.T @ found.curvature @ inner)
+
+    def _freedom(self, here: Local, lengths: Array, kinked: bool = False) -> Freedom:
+        """Return where a search can go, coordinates measured in given lengths; not along the delay in a kink."""
+        slopes = self.known.slopes(here.point, lengths.size)
+        free = ~self.known.held(here.gradient / lengths, slopes / lengths, *at_bounds(here.point, self.box))
+        if kinked:
+            free[-1] = False
+        return Freedom(free, lengths[free], null_space(slopes[:, free] / lengths[free]))
+
+    def _moved(self, point: Point, step: Array) -> Point | None:
+        """Return the admissible point a step away that has the known coefficients; None where there is none."""
+        return self.known.met(moved_by(point, step, self.box), self.box)
 
     def _faced(self, here: Local) -> Local:
         """Where the delay is at a sample, the side of it that goes downhill, if any."""
@@ -138,18 +173,15 @@ class Descent:
             there = next((other for other in known if _alike(here, other, self.box)), None)
             if there is not None:
                 return there
-            free = ~frozen(here.point, here.gradient, self.box)
-            gradient, curvature = here.gradient[free], here.curvature[np.ix_(free, free)]
             scale = np.maximum(scale, _lengths(here))
-            unit = scale[free]
-            scaled, slope = curvature / np.outer(unit, unit), gradient / unit
-            promise = _promise(scaled, slope)[0] if free.any() else 0.0
+            ways = self._freedom(here, scale)
+            scaled, slope = ways.reduced(here.gradient, here.curvature)
+            promise = _promise(scaled, slope)[0] if slope.size else 0.0
             arrived = promise <= near * max(here.squared_error, self.floor)
             if arrived or _hopeless(taken, here.squared_error, promise, lowest):
                 break
-            step = np.zeros(free.size)
             for _ in range(MOST_REJECTIONS):
-                step[free] = -np.linalg.solve(scaled + damping * np.eye(unit.size), slope) / unit
+                step = ways.whole(np.linalg.solve(scaled + damping * np.eye(slope.size), -slope))
                 step /= max(1.0, float(np.abs(step).max()))
                 lower = self._lower(here, self._whole_and_to_edge(here.point, step))
                 if lower is not None:
@@ -157,9 +189,9 @@ class Descent:
                 damping, factor = damping * factor, factor * 2.0
             else:
                 break
-            along, trial, found = lower[0][free], *lower[1:]
+            along, trial, found = lower
             fall = here.squared_error - found.squared_error
-            promised = -float(2.0 * along @ gradient + along @ curvature @ along)
+            promised = -float(2.0 * along @ here.gradient + along @ here.curvature @ along)
             damping *= max(1.0 / 3.0, 1.0 - (2.0 * fall / promised - 1.0) ** 3) if promised > 0 else 1.0
             damping, factor = max(damping, 1e-12), 2.0
             slow = slow + 1 if fall < 1e-9 * here.squared_error else 0
@@ -172,12 +204,21 @@ class Descent:
                 break
         return here
 
+    def _forces(self, here: Local) -> Array:
+        """Return the multipliers of the known coefficients of the denominator."""
+        lengths = _lengths(here)
+        free = self._freedom(here, lengths).free
+        slopes = self.known.slopes(here.point, lengths.size) / lengths
+        return np.asarray(np.linalg.lstsq(slopes[:, free].T, -(here.gradient / lengths)[free])[0])
+
     def hessian(self, here: Local) -> Array:
         """Second derivatives of half the squared error, by differences of its exact gradient.
 
-        To one side first: how far that is from symmetric tells its error, and whether the other side is needed.
+        With known coefficients of the denominator those of the Lagrangian, which count along the constraint. To one
+        side first: how far that is from symmetric tells its error, and whether the other side is needed.
         """
         size = here.gradient.size
+        forces = self._forces(here)
         steps = np.full(size, DIFFERENCE)
         if self.box.delay_free and self.box.cell > 0:
             steps[-1] = min(DIFFERENCE, 0.1 * self.box.cell / self.box.quarter)
@@ -187,7 +228,10 @@ class Descent:
                 # Across a sample the delay has other derivatives: stay in its cell.
                 beyond = _unbounded(here.point, side * steps[i] * np.eye(size)[i], self.box)
                 if beyond is not None:
-                    rows[i] += side * (self.local(beyond).gradient - here.gradient)
+                    change = self.local(beyond).gradient - here.gradient
+                    if forces.size:
+                        change += forces @ (self.known.slopes(beyond, size) - self.known.slopes(here.point, size))
+                    rows[i] += side * change
                     widths[i] += steps[i]
             if not (widths > 0).all():
                 continue
@@ -203,24 +247,20 @@ class Descent:
         second: Array | None = None
         for _ in range(MOST_NEWTON):
             here = self._faced(here)
-            free = ~frozen(here.point, here.gradient, self.box)
-            if kinked:
-                free[-1] = False
-            if not free.any():
+            ways = self._freedom(here, _lengths(here), kinked)
+            free = ways.free
+            if not ways.basis.shape[1]:
                 return self._judged(here, free, 0.0, None)
             fresh = second is None
             second = self.hessian(here) if second is None else second
-            curvature = second[np.ix_(free, free)]
-            unit = _lengths(here)[free]
-            scaled, slope = curvature / np.outer(unit, unit), here.gradient[free] / unit
+            scaled, slope = ways.reduced(here.gradient, second)
             promise, values, vectors = _promise(scaled, slope)
             saddle = bool(values[0] < -FLAT * values[-1])
             promise = np.inf if saddle else promise / max(here.squared_error, self.floor)
-            modes = values, vectors / unit[:, None]
+            modes = values, ways.whole(vectors)
             if promise <= AIM:
                 return self._judged(here, free, promise, modes)
-            step = np.zeros(free.size)
-            step[free] = _newton_step(values, vectors, slope) / unit
+            step = ways.whole(_newton_step(values, vectors, slope))
             length = float(np.abs(step).max())
             # At a saddle the gradient says nothing about how far to go.
             step *= (min(max(length, SADDLE), 1.0) if saddle else min(length, 1.0)) / max(length, 1e-300)
@@ -251,7 +291,9 @@ class Descent:
     def _lower(self, here: Local, steps: Sequence[Array]) -> tuple[Array, Point, Projected] | None:
         """The first of several steps that lowers the squared error, with where it leads."""
         for step in steps:
-            trial = moved_by(here.point, step, self.box)
+            trial = self._moved(here.point, step)
+            if trial is None:
+                continue
             found = self.value(trial)
             if found.squared_error < here.squared_error:
                 return step, trial, found
@@ -295,16 +337,17 @@ class Descent:
         The border must be a factor of two away: next to it a direction is short, not flat.
         """
         variance = here.squared_error / max(self.count - free.size - self.problem.zeros - 1, 1)
-        direction = np.zeros(free.size)
-        direction[free] = vectors[:, 0] / np.abs(vectors[:, 0]).max()
+        direction = vectors[:, 0] / np.abs(vectors[:, 0]).max()
         # What the curvature promises over a factor of two.
         expected = values[0] * (RIDGE / np.abs(vectors[:, 0]).max()) ** 2
         if expected > 4.0 * variance or here.squared_error <= self.floor:
             return False
         for sign in (1.0, -1.0):
-            last = moved_by(here.point, 0.9 * sign * RIDGE * direction, self.box)
+            last = self._moved(here.point, 0.9 * sign * RIDGE * direction)
             for length in RIDGE * 2.0 ** np.arange(8):
-                trial = moved_by(here.point, sign * length * direction, self.box)
+                trial = self._moved(here.point, sign * length * direction)
+                if trial is None or last is None:
+                    break
                 if _same(trial, last):
                     # At the border of the set.
                     if length > RIDGE:

@@ -6,6 +6,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.estimation.optimum.box import Box, Point, point_of
+from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import Descent, Local
 
@@ -28,8 +29,18 @@ MOST_DELAYS = 100
 class Nest:
     """The optima of a structure and of all that it contains, each found from those below it."""
 
-    def __init__(self, problem: Problem, box: Box, random_starts: int, seed: int, pilot: "Nest | None" = None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        box: Box,
+        random_starts: int,
+        seed: int,
+        pilot: "Nest | None" = None,
+        known: KnownCoefficients = NOTHING,
+    ) -> None:
         self.problem, self.box, self.random_starts, self.seed = problem, box, random_starts, seed
+        #: Known coefficients; with these only the one structure is searched that has them.
+        self.known = known
         #: The same for a part of the records, from whose optima the searches start.
         self.pilot = pilot
         self.evaluations = 0
@@ -39,7 +50,7 @@ class Nest:
 
     def descent(self, zeros: int) -> Descent:
         """Searches with a numerator of that degree."""
-        return Descent(self.problem._replace(zeros=zeros), self.box)
+        return Descent(self.problem._replace(zeros=zeros), self.box, self.known)
 
     def optima(self, poles: int, zeros: int) -> list[Local]:
         """The lowest minima of a structure that are known, the lowest first."""
@@ -143,6 +154,24 @@ class Nest:
         first.sort(key=lambda point: descent.value(point).squared_error)
         self.evaluations += descent.evaluations
         return self._along_delay(zeros, first + others[:REFINED])
+
+    def with_known(self, poles: int, zeros: int, known: KnownCoefficients, points: Iterable[Point]) -> "Nest":
+        """Return a nest of the models of a structure that have known coefficients.
+
+        Started from all that was found without them, moved to where they hold, from further points and at random.
+        """
+        nest = Nest(self.problem, self.box, self.random_starts, self.seed, known=known)
+        starts = [*points, *(local.point for local in self.optima(poles, zeros)), *self._from_below(poles, zeros)]
+        if known.all_poles:
+            starts = [point_of(known.poles, 0.5 * sum(self.box.delays), self.box)]
+        else:
+            starts += nest.random_points(poles)
+        moved = [point for point in (known.met(start, self.box) for start in starts) if point is not None]
+        descent = nest.descent(zeros)
+        moved.sort(key=lambda point: descent.value(point).squared_error)
+        nest.evaluations += descent.evaluations
+        nest.refine(poles, zeros, nest._along_delay(zeros, moved))
+        return nest
 
     def _grown(self, poles: int, zeros: int, new_zeros: int, added: int) -> list[Point]:
         """The best of a smaller structure with poles added, for another numerator."""

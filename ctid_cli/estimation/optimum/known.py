@@ -1,0 +1,136 @@
+r"""Known coefficients of a model: those of the denominator as constraints on the poles.
+
+With all poles in the left half-plane every coefficient ``a_i`` is positive, and in the logarithms of speeds and
+dampings ``ln a_i`` is convex and nearly linear. So ``ln a_i = ln v_i`` is met by a few Newton steps from almost
+anywhere, and searches move along the surface where it holds. Known coefficients of the numerator do not constrain the
+poles: they are eliminated with the others (:mod:`~ctid_cli.estimation.optimum.projection`).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ctid_cli.arrays import Array, BoolArray, ComplexArray, IntArray
+from ctid_cli.estimation.optimum.box import Box, Point, at_bounds, moved_by
+
+#: Newton steps back to the constraint at most, and the error in ``ln a_i`` at which it holds, up to rounding.
+MOST_STEPS, MET, ROUNDED = 50, 1e-14, 1e-11
+#: Multipliers of bounds and singular values of constraints below this fraction of the largest are zero.
+ZERO = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class KnownCoefficients:
+    """Values of ``a_1 ... a_n`` and ``b_0 ... b_m``, NaN for those that are free."""
+
+    denominator: Array
+    numerator: Array
+
+    @classmethod
+    def of(cls, poles: int, zeros: int, values: Mapping[int, float]) -> "KnownCoefficients":
+        """Return them from values by places in ``a_1 ... a_n, b_0 ... b_m``."""
+        theta = np.full(poles + zeros + 1, np.nan)
+        theta[list(values)] = list(values.values())
+        return cls(theta[:poles], theta[poles:])
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return self.denominator.size + self.numerator.size
+
+    @property
+    def given(self) -> BoolArray:
+        """Which of ``a_1 ... a_n, b_0 ... b_m`` are known."""
+        return np.isfinite(np.concatenate((self.denominator, self.numerator)))
+
+    @cached_property
+    def places(self) -> IntArray:
+        """Places of the known coefficients of the denominator."""
+        return np.flatnonzero(np.isfinite(self.denominator))
+
+    @property
+    def poles(self) -> ComplexArray:
+        """The poles, where all coefficients of the denominator are known."""
+        return np.roots(np.concatenate(([1.0], self.denominator))).astype(complex)
+
+    @property
+    def all_poles(self) -> bool:
+        """Whether there is but one denominator: its poles do not move, however ill-conditioned they are."""
+        return self.places.size == self.denominator.size > 0
+
+    def slopes(self, point: Point, size: int) -> Array:
+        """Return the derivatives of ``ln a_i`` to the coordinates, shape (k, size), size with that of the delay."""
+        n, slopes = point.poles.size, np.zeros((self.places.size, size))
+        if self.all_poles:
+            slopes[:, :n] = np.eye(n)
+        elif self.places.size:
+            a = point.denominator[1:][self.places]
+            slopes[:, :n] = point.denominator_slopes()[self.places] / a[:, None]
+        return slopes
+
+    def met(self, point: Point, box: Box) -> Point | None:
+        """Return the point nearby, in logarithms, where the denominator has its values; None where none is found."""
+        if not self.places.size or self.all_poles:
+            return point
+        values, last = np.log(self.denominator[self.places]), np.inf
+        for _ in range(MOST_STEPS):
+            error = np.log(point.denominator[1:][self.places]) - values
+            size = float(np.abs(error).max())
+            if size <= MET or ROUNDED >= size >= last:
+                return point
+            step = self._least_step(point, error, box)
+            if not step.any():
+                return None
+            step /= max(1.0, float(np.abs(step).max()))
+            moved = moved_by(point, np.append(step, 0.0) if box.delay_free else step, box)
+            point, last = replace(moved, delay=point.delay), size
+        return None
+
+    def _least_step(self, point: Point, error: Array, box: Box) -> Array:
+        """Return the least Newton step to the constraint; what it would push out of the set stays at its bound."""
+        n = point.poles.size
+        slopes, (low, high) = self.slopes(point, n), at_bounds(point, box)
+        free, step = np.ones(n, dtype=bool), np.zeros(n)
+        while free.any():
+            step[:] = 0.0
+            step[free] = -np.linalg.lstsq(slopes[:, free], error)[0]
+            leaving = free & ((low[:n] & (step < 0)) | (high[:n] & (step > 0)))
+            if not leaving.any():
+                break
+            free &= ~leaving
+        return step * free
+
+    def held(self, slope: Array, slopes: Array, low: BoolArray, high: BoolArray) -> BoolArray:
+        """Return which coordinates at a bound are held there: those whose multiplier is positive.
+
+        ``slope + slopes' l = mu_low - mu_high`` with nonnegative ``mu``, by least squares: what is left is the steepest
+        descent that neither the constraint nor a bound forbids.
+        """
+        if not self.places.size:
+            return (low & (slope > 0)) | (high & (slope < 0))
+        from scipy.optimize import lsq_linear
+
+        held, k = np.zeros(slope.size, dtype=bool), len(slopes)
+        places = np.flatnonzero(low | high)
+        bounds = np.zeros((slope.size, places.size))
+        bounds[places, np.arange(places.size)] = np.where(low[places], -1.0, 1.0)
+        if places.size:
+            limits = np.concatenate((np.full(k, -np.inf), np.zeros(places.size)))
+            found = lsq_linear(np.hstack((slopes.T, bounds)), -slope, (limits, np.inf), method="bvls").x
+            held[places] = found[k:] > ZERO * float(np.abs(slope).max())
+        return held
+
+
+def null_space(slopes: Array) -> Array:
+    """Return an orthonormal basis of the directions in which nothing changes, shape (f, r)."""
+    if not slopes.size:
+        return np.eye(slopes.shape[1])
+    _, values, right = np.linalg.svd(slopes)
+    rank = int(np.count_nonzero(values > ZERO * values[0]))
+    return np.asarray(right[rank:].T)
+
+
+#: Nothing is known.
+NOTHING = KnownCoefficients(np.zeros(0), np.zeros(0))
