@@ -6,8 +6,8 @@ Systems of order 1 to 4 (300 to 600 samples, a third of them irregular, with and
 delay) have one or two coefficients fixed, at their true values or off by 20 %. The least output error of
 ``DelayProfile(nested=True, fixed=...)``, and of the same fit with nothing fixed, is compared with the least that
 ``scipy.optimize.minimize(method="SLSQP")`` reaches in the same box of admissible poles and delays: from random starts
-moved onto the constraint (the best of them are refined, all of them for every tenth system), from the free optimum moved
-there, and from the true poles. The peer shares no line with ctid: responses are sums over poles, gradients are exact,
+moved onto the constraint (the best of them are refined, all of them for every tenth system), from the free optimum
+moved there, and from the true poles. The peer shares no line with ctid: responses are sums over poles, gradients are exact,
 numerator, free response and offset are eliminated by dense least squares. A line is printed for each fit above the peer
 by more than a millionth, and a summary at the end.
 """
@@ -117,9 +117,7 @@ class Peer:
         if estimated:
             c = (solution[len(free_b) : len(free_b) + self.n] / middle ** np.arange(self.n))[::-1]
             lag = used - used[0]
-            parts.append(
-                (c, np.polyval(c, poles), np.polyval(np.polyder(c), poles), decay, lag[:, None] * decay)
-            )
+            parts.append((c, np.polyval(c, poles), np.polyval(np.polyder(c), poles), decay, lag[:, None] * decay))
         inverse = 1.0 / gaps
         np.fill_diagonal(inverse, 0.0)
         for _, at, slope, response, changed in parts:
@@ -127,10 +125,8 @@ class Peer:
             along, moving = residual @ response, residual @ changed
             own_slope = slope * weights - residue * inverse.sum(axis=1)
             gradient += residue * moving + own_slope * along + (residue * along) @ inverse
+        # At relative degree one x' holds b0 u, which jumps with u: between the jumps this is its derivative.
         shift = residual @ (rate @ (np.polyval(b, poles) * weights)).real
-        if self.m == self.n - 1:
-            # b0 u jumps where u does: its derivative is no part of x' between the jumps.
-            pass
         return float(residual @ residual), -2.0 * gradient, -2.0 * float(shift)
 
     def roots_of(self, x, pairs):

@@ -181,9 +181,8 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
     bootstrap_draws : int, default 500
         Simulated noise sequences of a bootstrap [-].
     fixed : tuple of Fixed, optional
-        Parameters that are known, by their names ``a1 ... an, b0 ... bm``: their columns leave the normal equations.
-        The search starts from what they would be if they were estimated too. A known delay is given in
-        ``delay_bounds``.
+        Parameters that are known, by their names ``a1 ... an, b0 ... bm``. The estimate is the least output error of
+        the admissible models that have them. A known delay is given in ``delay_bounds``.
 
     Raises
     ------

@@ -75,6 +75,18 @@ def test_knowing_what_is_estimated_changes_nothing_but_the_other_errors():
     assert known.standard_errors["a2"] < free.standard_errors["a2"]
 
 
+def test_outliers_do_not_move_a_fit_with_a_known_coefficient():
+    record = record_of()
+    plain = DelayProfile(2, 1, (0.0, 2.0), fixed=(Fixed("a1", 1.2),)).fit(record)
+    y = record.y.copy()
+    y[::40] += 30.0
+    wild = Record(record.t, y, record.input)
+    fit = DelayProfile(2, 1, (0.0, 2.0), loss="tukey", fixed=(Fixed("a1", 1.2),)).fit(wild)
+    assert fit.parameters["a1"] == 1.2
+    for name in ("a2", "b0", "b1", "delay"):
+        assert abs(fit.parameters[name] - plain.parameters[name]) < plain.standard_errors[name]
+
+
 SUM = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
 
 
@@ -114,6 +126,7 @@ def test_known_parameters_of_submodels(fixed):
         ((Fixed("a1", 1.0), Fixed("a1", 2.0)), "fixed twice"),
         ((Fixed("delay", 1.0),), "a known delay is given as such"),
         ((Fixed("a1", 1.0), Fixed("a2", 1.0), Fixed("b0", 1.0)), "nothing to estimate"),
+        ((Fixed("a2", 0.0),), "a2 must be above zero"),
     ],
 )
 def test_what_cannot_be_fixed_is_refused(fixed, said):

@@ -67,14 +67,14 @@ class Box:
 
 
 def widened(box: Box, poles: ComplexArray) -> Box:
-    """Return a box that holds given stable poles, too."""
-    sizes, pairs = np.abs(poles), poles[poles.imag > 0]
+    """Return a box that holds given stable poles inside its bounds, too."""
+    sizes, pairs, more = np.abs(poles), poles[poles.imag > 0], 1.0 + JUST_BEYOND
     return replace(
         box,
-        slowest=min(box.slowest, float(sizes.min())),
-        fastest=max(box.fastest, float(sizes.max())),
-        imaginary=max(box.imaginary, float(pairs.imag.max(initial=0.0))),
-        least_damping=min(box.least_damping, float((-pairs.real / np.abs(pairs)).min(initial=1.0))),
+        slowest=min(box.slowest, float(sizes.min()) / more),
+        fastest=max(box.fastest, float(sizes.max()) * more),
+        imaginary=max(box.imaginary, float(pairs.imag.max(initial=0.0)) * more),
+        least_damping=min(box.least_damping, float((-pairs.real / np.abs(pairs)).min(initial=1.0)) / more),
     )
 
 
