@@ -7,7 +7,7 @@ delay) have one or two coefficients fixed, at their true values or off by 20 %. 
 ``DelayProfile(nested=True, fixed=...)``, and of the same fit with nothing fixed, is compared with the least that
 ``scipy.optimize.minimize(method="SLSQP")`` reaches in the same box of admissible poles and delays: from random starts
 moved onto the constraint (the best of them are refined, all of them for every tenth system), from the free optimum
-moved there, and from the true poles. The peer shares no line with ctid: responses are sums over poles, gradients are exact,
+moved there, and from the true poles. The peer shares no line with ctid: responses are sums over poles, gradients exact,
 numerator, free response and offset are eliminated by dense least squares. A line is printed for each fit above the peer
 by more than a millionth, and a summary at the end.
 """

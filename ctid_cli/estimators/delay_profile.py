@@ -365,8 +365,11 @@ def _check_stable(known: Mapping[int, float], poles: int) -> None:
     """Refuse denominators that no stable model has."""
     for place, value in known.items():
         if place < poles and not value > 0:
-            raise OptionError("fixed", f"a{place + 1} must be above zero, as in every stable model: got {value:g}")
+            raise OptionError(
+                "fixed", f"fixed a{place + 1} must be above zero, as in every stable model; got {value:g}"
+            )
     if set(range(poles)) <= set(known):
         roots = np.roots([1.0, *(known[place] for place in range(poles))])
-        if not (roots.real < 0).all():
-            raise OptionError("fixed", f"the fixed denominator has the poles {roots}, and all must be stable")
+        unstable = [f"{root:.4g}" for root in roots.tolist() if root.real >= 0]
+        if unstable:
+            raise OptionError("fixed", f"fixed denominator is not stable: it has poles at {', '.join(unstable)} rad/s")

@@ -126,7 +126,7 @@ def test_known_parameters_of_submodels(fixed):
         ((Fixed("a1", 1.0), Fixed("a1", 2.0)), "fixed twice"),
         ((Fixed("delay", 1.0),), "a known delay is given as such"),
         ((Fixed("a1", 1.0), Fixed("a2", 1.0), Fixed("b0", 1.0)), "nothing to estimate"),
-        ((Fixed("a2", 0.0),), "a2 must be above zero"),
+        ((Fixed("a2", 0.0),), "fixed a2 must be above zero"),
     ],
 )
 def test_what_cannot_be_fixed_is_refused(fixed, said):

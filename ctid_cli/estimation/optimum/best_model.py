@@ -128,9 +128,10 @@ def _with_known(problem: Problem, box: Box, poles: int, options: SearchOptions) 
         moved = (known.met(point, box) for point in points)
         nest.refine(poles, zeros, [point for point in moved if point is not None])
     if not nest.optima(poles, zeros):
+        given = ", ".join(f"a{place + 1} = {known.denominator[place]:g}" for place in known.places.tolist())
         raise DataError(
-            "no model with the known coefficients of the denominator has all its poles where they are searched: "
-            f"{box.in_words()}"
+            f"no model with the fixed {given} has all its poles where they are searched: {box.in_words()}; "
+            "change or drop the fixed value"
         )
     return _least(nest, poles, zeros, False)
 

@@ -102,7 +102,7 @@ def test_a_known_denominator_needs_no_box():
 def test_values_that_no_admissible_model_has_are_refused():
     record = record_of(TransferFunction([2.0], [1.0, 1.0, 1.0]), np.random.default_rng(6), noise=0.1)
     known = KnownCoefficients.of(2, 0, {0: 1e5})
-    with pytest.raises(DataError, match="no model with the known coefficients"):
+    with pytest.raises(DataError, match="no model with the fixed a1 = 100000"):
         best_output_error([filter_data(record)], 2, 0, SearchOptions(known=known))
 
 
