@@ -99,7 +99,7 @@ class Refinement:
 
     def squared_error_at(self, model: TransferFunction, delay: float) -> float:
         """Least sum of squared output errors at a given delay, in the basin of a model."""
-        return local_minimum(self.problem, model.poles, delay, (delay, delay)).squared_error
+        return local_minimum(self.problem, model.poles, delay, (delay, delay), known=self.known).squared_error
 
     def squared_error_with(
         self, model: TransferFunction, *, initial_state: bool = False, offset: bool = False
@@ -107,7 +107,8 @@ class Refinement:
         """Least sum of squared output errors if an initial state or an offset were estimated too."""
         problem = self.problem
         more = problem._replace(free_response=problem.free_response or initial_state, offset=problem.offset or offset)
-        return local_minimum(more, model.poles, model.delay, self.measured.treatment.delay_bounds).squared_error
+        bounds = self.measured.treatment.delay_bounds
+        return local_minimum(more, model.poles, model.delay, bounds, known=self.known).squared_error
 
     def errors_of(self, model: TransferFunction) -> AppliedModel:
         """Errors of a given model on these records, each with its own best initial state and offset."""

@@ -73,7 +73,8 @@ def decisive(given: float, other: float, fit: MeasuredFit, records: Sequence[Rec
 def _least(refinement: Refinement, fit: MeasuredFit, records: Sequence[Record]) -> tuple[float, float]:
     """Least sum of squared output errors near a fit, and its delay."""
     measured = MeasuredRecords(records, refinement.structure, refinement.measured.treatment)
-    found = local_minimum(measured.problem, fit.model.poles, fit.model.delay, measured.treatment.delay_bounds)
+    bounds = measured.treatment.delay_bounds
+    found = local_minimum(measured.problem, fit.model.poles, fit.model.delay, bounds, known=refinement.known)
     return found.squared_error, found.point.delay.seconds
 
 

@@ -195,9 +195,7 @@ def identify(
     if not answer.seen:
         unclear |= {name for name in fit.parameter_names if not name.startswith("offset")}
     interval = None
-    # The profile would free what is known.
-    searched = "delay" in fit.parameter_names and not fit.known
-    if isinstance(laid_out, Refinement) and searched and "delay" not in unclear:
+    if isinstance(laid_out, Refinement) and "delay" in fit.parameter_names and "delay" not in unclear:
         interval = _delay_interval(laid_out, linear, uncertainty)
     judged = None
     if checked is not None and validation is not None:
@@ -303,7 +301,7 @@ def _cost_of_delay(
     held = fit.status is Status.DELAY_AT_BOUND
     if held:
         # What the noise does to a delay is seen where it is free.
-        fit = replace(fit, tangent=np.eye(fit.theta.size))
+        fit = replace(fit, tangent=np.column_stack((fit.tangent, np.eye(fit.theta.size)[place])))
         uncertainty = fit.uncertainty("white" if uncertainty.kind == "white" else "robust")
     variance = float(uncertainty.covariance[place, place])
     white = float(fit.uncertainty("white").covariance[place, place])
@@ -312,7 +310,7 @@ def _cost_of_delay(
         float(fit.theta[place]),
         fit.cost * fit.count,
         fit.count,
-        fit.theta.size,
+        fit.theta.size - len(fit.known),
         refinement.measured.treatment.delay_bounds,
         max(variance / white, np.finfo(float).tiny),
     )
@@ -338,7 +336,7 @@ def costs_about_delay(result: Identification) -> DelayCosts | None:
     if "delay" not in fit.parameter_names or not (np.isfinite([item.low, item.high]).all() and fit.cost > 0):
         return None
     laid_out = result.options.prepare(result.records).laid_out
-    if not isinstance(laid_out, Refinement) or fit.known:
+    if not isinstance(laid_out, Refinement):
         return None
     profile, reach, _ = _cost_of_delay(
         laid_out.near(result.fit.residuals, result.fit.weighting), fit, result.uncertainty

@@ -67,7 +67,7 @@ def another_order(laid_out: LaidOut, fit: MeasuredFit, options: Options) -> Rich
 
 def another_delay(laid_out: LaidOut, fit: MeasuredFit, options: Options) -> Richer | None:
     """The best delay outside the range that was searched; None where it cannot be tried."""
-    if not isinstance(laid_out, Refinement) or fit.known or fit.weighting is not None:
+    if not isinstance(laid_out, Refinement) or fit.weighting is not None:
         return None
     low, high = options.delay_bounds
     longest = max(float(np.ptp(data.t)) for data in laid_out.problem.records)
@@ -77,7 +77,8 @@ def another_delay(laid_out: LaidOut, fit: MeasuredFit, options: Options) -> Rich
     trials = [float(delay) for delay in np.linspace(0.0, greatest, DELAYS) if not low <= delay <= high]
     if options.zeros == options.poles or not trials:
         return None
-    costs = [local_minimum(laid_out.problem, fit.model.poles, delay, (0.0, greatest)) for delay in trials]
+    near = laid_out.problem, fit.model.poles
+    costs = [local_minimum(*near, delay, (0.0, greatest), known=laid_out.known) for delay in trials]
     best = min(costs, key=lambda local: local.squared_error)
     return Richer(options.poles, options.zeros, best.point.delay.seconds, _fall(best.squared_error, fit))
 

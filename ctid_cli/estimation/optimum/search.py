@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
-from ctid_cli.estimation.optimum.box import TOUCH, Box, Point, at_bounds, box_of, frozen, moved_by, point_of
+from ctid_cli.estimation.optimum.box import TOUCH, Box, Point, at_bounds, box_of, frozen, moved_by, point_of, widened
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_space
 from ctid_cli.estimation.optimum.projection import Problem, Projected, project, slopes
 
@@ -360,11 +360,18 @@ class Descent:
 
 
 def local_minimum(
-    problem: Problem, poles: ComplexArray, delay: float, delays: tuple[float, float], *effort: Any
+    problem: Problem,
+    poles: ComplexArray,
+    delay: float,
+    delays: tuple[float, float],
+    *effort: Any,
+    known: KnownCoefficients = NOTHING,
 ) -> Local:
-    """Descent from given poles and delay, which stays within its bounds."""
+    """Descent from given poles, which agree with what is known, and delay, which stays within its bounds."""
     box = box_of(problem.records, delays)
-    return Descent(problem, box).descend(point_of(poles, delay, box), (), *effort)
+    if known.all_poles:
+        box = widened(box, poles)
+    return Descent(problem, box, known).descend(point_of(poles, delay, box), (), *effort)
 
 
 def _same(one: Point, other: Point) -> bool:
