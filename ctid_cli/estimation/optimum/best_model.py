@@ -86,7 +86,8 @@ def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, opt
 
     As many zeros as poles need a known delay. Free responses begin at the first used sample of each record.
     """
-    problem, box = problem_of(records, zeros, options), box_of(records, options.delays)
+    problem = problem_of(records, zeros, options)
+    box = box_of(problem, options.delays)
     if options.nested and (part := part_of(problem, options.delays[1])) is not None:
         found = _from_part(problem, part, box, poles, options)
         if found is not None:
@@ -107,7 +108,7 @@ def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, opt
 def _from_part(problem: Problem, part: Problem, box: Box, poles: int, options: SearchOptions) -> Optimum | None:
     """The search of a part, followed on the whole records; None where they say more, or something else, than it."""
     zeros, fewer = problem.zeros, options.fewer_poles
-    pilot = Nest(part, box_of(part.records, options.delays), options.random_starts, options.seed)
+    pilot = Nest(part, box_of(part, options.delays), options.random_starts, options.seed)
     expected = _least(pilot, poles, zeros, fewer)
     found = _least(Nest(problem, box, options.random_starts, options.seed, pilot), poles, zeros, fewer)
     count, part_count = (sum(data.count for data in one.records) for one in (problem, part))

@@ -317,10 +317,18 @@ class Descent:
 
 
 def local_minimum(
-    problem: Problem, poles: ComplexArray, delay: float, delays: tuple[float, float], *effort: Any
+    problem: Problem,
+    poles: ComplexArray,
+    delay: float,
+    delays: tuple[float, float],
+    *effort: Any,
+    box: Box | None = None,
 ) -> Local:
-    """Descent from given poles and delay, which stays within its bounds."""
-    box = box_of(problem.records, delays)
+    """Descent from given poles and delay, which stays within its bounds.
+
+    Costs that are compared need one ``box``: by default that of the problem, which depends on its free response.
+    """
+    box = box or box_of(problem, delays)
     return Descent(problem, box).descend(point_of(poles, delay, box), (), *effort)
 
 
