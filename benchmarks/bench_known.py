@@ -238,6 +238,8 @@ class Peer:
         return self.value(self.roots_of(x, pairs)[0], self.delay(x), False)[0]
 
     def coordinates(self, poles, delay):
+        # Poles that have run to infinity stand at the edge of the box.
+        poles = np.append(poles, np.full(self.n - poles.size, -self.box.fastest))
         pairs, reals = poles[poles.imag > 0], -poles[poles.imag == 0].real
         x = [np.log(np.abs(pairs)), np.log(-pairs.real / np.abs(pairs)), np.log(reals)]
         if self.free_delay:
@@ -330,8 +332,7 @@ def compared(number, asked):
         estimator = DelayProfile(**options, nested=True, fixed=tuple(Fixed(*pair) for pair in known.items()))
         spent, fit = cpu(estimator.fit, record)
         free = free or fit
-        if fit.model.order == options["poles"]:
-            own["the fit itself"] = fit.model.poles, fit.model.delay
+        own["the fit itself"] = fit.model.poles, fit.model.delay
         ours, peer = fit.cost * fit.count, Peer(record, estimator, fit.box, known)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

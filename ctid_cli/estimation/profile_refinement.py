@@ -8,6 +8,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error
+from ctid_cli.estimation.optimum.box import box_of
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import local_minimum
@@ -104,11 +105,14 @@ class Refinement:
     def squared_error_with(
         self, model: TransferFunction, *, initial_state: bool = False, offset: bool = False
     ) -> float:
-        """Least sum of squared output errors if an initial state or an offset were estimated too."""
-        problem = self.problem
+        """Return the least sum of squared output errors if an initial state or an offset were estimated too.
+
+        Among the models that are admissible without them: in a smaller set the cost might be higher.
+        """
+        problem, bounds = self.problem, self.measured.treatment.delay_bounds
         more = problem._replace(free_response=problem.free_response or initial_state, offset=problem.offset or offset)
-        bounds = self.measured.treatment.delay_bounds
-        return local_minimum(more, model.poles, model.delay, bounds, known=self.known).squared_error
+        box = box_of(problem, bounds)
+        return local_minimum(more, model.poles, model.delay, bounds, box=box, known=self.known).squared_error
 
     def errors_of(self, model: TransferFunction) -> AppliedModel:
         """Errors of a given model on these records, each with its own best initial state and offset."""

@@ -294,7 +294,7 @@ class _Search:
         # Of the most poles, so that a record that is too short for them is refused before anything is fitted.
         self.laid_out: Refinement = whole.prepare(records).laid_out
         self.measured, problem = self.laid_out.measured, self.laid_out.problem
-        self.ladder = Ladder(Nest(problem, box_of(problem.records, whole.delay_bounds), 0, 0))
+        self.ladder = Ladder(Nest(problem, box_of(problem, whole.delay_bounds), 0, 0))
         self.found: list[FittedOrder] = []
 
     def options(self, poles: int, zeros: int) -> DelayProfile:

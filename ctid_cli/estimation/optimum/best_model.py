@@ -90,7 +90,8 @@ def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, opt
 
     As many zeros as poles need a known delay. Free responses begin at the first used sample of each record.
     """
-    problem, box = problem_of(records, zeros, options), box_of(records, options.delays)
+    problem = problem_of(records, zeros, options)
+    box = box_of(problem, options.delays)
     if options.known is not NOTHING:
         return _with_known(problem, box, poles, options)
     if options.nested and (part := part_of(problem, options.delays[1])) is not None:
@@ -122,7 +123,7 @@ def _with_known(problem: Problem, box: Box, poles: int, options: SearchOptions) 
         nest = free.with_known(poles, zeros, known, points)
     else:
         if part is not None:
-            there = _with_known(part, box, poles, options)
+            there = _with_known(part, box_of(part, options.delays), poles, options)
             points = [point_of(there.model.poles, there.delay, box)]
         nest = Nest(problem, box, 0, options.seed, known=known)
         moved = (known.met(point, box) for point in points)
@@ -139,7 +140,7 @@ def _with_known(problem: Problem, box: Box, poles: int, options: SearchOptions) 
 def _from_part(problem: Problem, part: Problem, box: Box, poles: int, options: SearchOptions) -> Optimum | None:
     """The search of a part, followed on the whole records; None where they say more, or something else, than it."""
     zeros, fewer = problem.zeros, options.fewer_poles
-    pilot = Nest(part, box_of(part.records, options.delays), options.random_starts, options.seed)
+    pilot = Nest(part, box_of(part, options.delays), options.random_starts, options.seed)
     expected = _least(pilot, poles, zeros, fewer)
     found = _least(Nest(problem, box, options.random_starts, options.seed, pilot), poles, zeros, fewer)
     count, part_count = (sum(data.count for data in one.records) for one in (problem, part))

@@ -365,10 +365,14 @@ def local_minimum(
     delay: float,
     delays: tuple[float, float],
     *effort: Any,
+    box: Box | None = None,
     known: KnownCoefficients = NOTHING,
 ) -> Local:
-    """Descent from given poles, which agree with what is known, and delay, which stays within its bounds."""
-    box = box_of(problem.records, delays)
+    """Descent from given poles, which agree with what is known, and delay, which stays within its bounds.
+
+    Costs that are compared need one ``box``: by default that of the problem, which depends on its free response.
+    """
+    box = box or box_of(problem, delays)
     if known.all_poles:
         box = widened(box, poles)
     return Descent(problem, box, known).descend(point_of(poles, delay, box), (), *effort)

@@ -71,7 +71,7 @@ class Nest:
             points.append(self.optima(poles, zeros - 1)[0].point)
         if poles > 1 and zeros > 0:
             within = self.optima(poles - 1, zeros - 1)[0].point
-            added = [-np.sqrt(self.box.slowest * self.box.fastest)]
+            added = [-np.sqrt(self.box.spread[0] * self.box.fastest)]
             points.append(point_of(np.concatenate((within.poles, added)), within.delay.seconds, self.box))
         return points
 
@@ -194,7 +194,12 @@ class Nest:
         """Poles, or pairs of some dampings, added to given ones, the best first by elimination alone; and where."""
         descent = self.descent(zeros)
         found: list[tuple[float, Array, Point]] = []
-        for w in np.geomspace(self.box.slowest, self.box.fastest, count + 2)[1:-1].tolist():
+        slowest, box = self.box.spread[0], self.box
+        frequencies = np.geomspace(slowest, box.fastest, count + 2)[1:-1]
+        if added == 1 and box.slowest < slowest:
+            # One for all that are next to integrators.
+            frequencies = np.append(frequencies, np.sqrt(box.slowest * slowest))
+        for w in frequencies.tolist():
             for zeta in dampings if added == 2 else (1.0,):
                 pole = w * complex(-zeta, np.sqrt(1 - zeta * zeta))
                 new = [pole, pole.conjugate()] if added == 2 else [complex(-w)]
@@ -222,12 +227,13 @@ class Nest:
         return points + [trials[k] for k in lowest.tolist()]
 
     def random_points(self, poles: int) -> list[Point]:
-        """Starts drawn uniformly from the set: logarithms of frequencies and dampings, delays."""
+        """Return starts drawn uniformly: logarithms of frequencies and dampings in their spread, delays."""
         rng, box, points = np.random.default_rng(self.seed), self.box, []
+        slowest, least_damping = box.spread
         for _ in range(self.random_starts * (1 + poles)):
             pairs = int(rng.integers(0, poles // 2 + 1))
-            w = np.exp(rng.uniform(np.log(box.slowest), np.log(box.fastest), poles - pairs))
-            zeta = np.exp(rng.uniform(np.log(box.least_damping), 0.0, pairs))
+            w = np.exp(rng.uniform(np.log(slowest), np.log(box.fastest), poles - pairs))
+            zeta = np.exp(rng.uniform(np.log(least_damping), 0.0, pairs))
             upper = w[:pairs] * (-zeta + 1j * np.sqrt(1 - zeta**2))
             roots = np.concatenate((upper, upper.conj(), -w[pairs:]))
             points.append(point_of(roots, float(rng.uniform(*box.delays)), box))
