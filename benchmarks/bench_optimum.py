@@ -1,29 +1,60 @@
 """Is the estimate the optimum? Random systems against an optimiser that shares no line with ctid, in the same box.
 
-    python benchmarks/bench_optimum.py [--systems 100] [--seed 1] [--starts 3]
+    python benchmarks/bench_optimum.py [--systems 100] [--seed 1] [--starts 3] [--likes] [--records FOLDER]
 
 For each system the least output error of ``DelayProfile(nested=True)`` is compared with what ``scipy.optimize`` reaches
 from the true poles, from random ones, and from ctid's own estimate: variable projection on columns of modal responses,
 Jacobians by differences. The peer knows the truth and ctid does not. A line is printed for each system where ctid is
 above the peer by more than a millionth, and a summary at the end.
+
+``--likes`` adds two kinds of systems at the border of the admissible models, a lightly damped mode in a periodic record
+and an integrating drive at rest: there the cost is compared with that in a set without such bounds too. ``--records``
+adds measured records, CSV files with columns t, u and y that YAML files beside them name, with four structures each.
 """
 
 import argparse
 import warnings
 from collections import Counter
+from dataclasses import replace
+from pathlib import Path
 
 from _timing import cpu
 
 import numpy as np
+import yaml
 from numba import njit
 from scipy.optimize import least_squares
 
 from ctid_cli import DataError, DelayProfile, HeldSignal, Record, TransferFunction
 
 TOLERANCE = 1e-6
+#: Slowest pole times the record's length, and least damping, of a set that bounds nothing that matters.
+NEARLY_ZERO = 1e-6
+#: Poles and zeros tried on measured records, most of their samples, and the treatment of each: state, offset, delays.
+STRUCTURES, MOST = ((1, 0), (2, 1), (3, 2), (4, 3)), 4000
+OTHERWISE = ("estimate", "estimate", (0.0, 0.0))
+TREATMENTS = {
+    "case1_seed0": ("rest", "none", (7.5, 8.5)),
+    "daisy_dryer": ("estimate", "estimate", (0.0, 0.5)),
+    "daisy_heating": ("rest", "remove", (0.0, 10.0)),
+    "gas_furnace": ("estimate", "estimate", (0.0, 45.0)),
+    "pt326_est": ("estimate", "none", (0.0, 1.0)),
+    "pt326_val": ("estimate", "none", (0.5, 0.5)),
+    "tclab_step_100": ("rest", "estimate", (0.0, 60.0)),
+    "tclab_step_irregular": ("rest", "estimate", (0.0, 0.0)),
+}
 
 
 # --- the peer ----------------------------------------------------------------------------------------
+
+
+@njit(cache=True)
+def grown(p, length):
+    """(exp(p t) - 1)/p, also of poles at the origin."""
+    z = p * length
+    if abs(z) < 1e-3:
+        return length * (1 + z / 2 * (1 + z / 3 * (1 + z / 4 * (1 + z / 5))))
+    return (np.exp(z) - 1.0) / p
 
 
 @njit(cache=True)
@@ -58,7 +89,7 @@ def modal_responses(poles, tu, u, t, delay, period):
                 target = min(target, last)
                 held = u[j] if j >= 0 else 0.0
                 e = np.exp(p * (target - now))
-                v = e * v + (e - 1.0) / p * held
+                v = e * v + grown(p, target - now) * held
                 now = target
                 if i < t.size and now == t[i]:
                     out[i, k] = v
@@ -70,7 +101,7 @@ def modal_responses(poles, tu, u, t, delay, period):
                 if (period > 0 and now >= last) or (period == 0.0 and i == t.size):
                     break
             if period > 0 and lap == 0:
-                v = (v - start * np.exp(p * period)) / (1.0 - np.exp(p * period))
+                v = (v - start * np.exp(p * period)) / (-p * grown(p, period))
     return out
 
 
@@ -198,19 +229,67 @@ def random_poles(rng, n, box):
     return np.concatenate((upper, upper.conj(), -w[pairs:])).astype(complex)
 
 
+def lightly_damped(rng):
+    """A periodic record of a mode with a damping of .0005, one sixth of the samples per radian."""
+    samples, w, zeta = 2000, 0.6, 5e-4
+    t, lines = np.arange(float(samples)), np.arange(1, samples // 3)
+    angles = 2 * np.pi / samples * np.outer(t, lines) + rng.uniform(0, 2 * np.pi, lines.size)
+    poles = w * np.array([complex(-zeta, side * np.sqrt(1 - zeta**2)) for side in (1, -1)])
+    return finished(rng, np.cos(angles).sum(axis=1), poles, 20.0, "periodic")
+
+
+def integrating(rng):
+    """A drive from rest: an integrator behind a lag of eight samples, under random steps."""
+    u = np.repeat(rng.choice([-1.0, 1.0], 50), 20)
+    return finished(rng, u, np.array([-0.125, 0.0], dtype=complex), 40.0, "rest")
+
+
+def finished(rng, u, poles, snr_db, state):
+    t = np.arange(float(u.size))
+    slopes = np.array([np.prod(np.delete(p - poles, k)) for k, p in enumerate(poles)])
+    x = (modal_responses(poles, t, u, t, 0.0, float(u.size) * (state == "periodic")) @ (1 / slopes)).real
+    y = x + x.std() * 10 ** (-snr_db / 20) * rng.standard_normal(u.size)
+    return Record(t, y, HeldSignal(t, u)), TransferFunction([1.0], np.poly(poles).real), state
+
+
+def measured(folder):
+    """Names and records that the YAML files of a folder describe."""
+    for described in sorted(Path(folder).glob("*.yaml")):
+        about = yaml.safe_load(described.read_text())
+        if "file" not in about or "u" not in (about.get("columns") or "tuy"):
+            continue
+        rows = np.genfromtxt(described.parent / about["file"], delimiter=",", names=True)[:MOST]
+        if {"t", "u", "y"} <= set(rows.dtype.names):
+            yield described.stem, Record.from_arrays(rows["t"] - rows["t"][0], rows["u"], rows["y"])
+
+
+# --- comparisons -------------------------------------------------------------------------------------
+
+
+def reached_from(peer, starts, ours):
+    """The peer's least squared errors over ours, less one, by where it started."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return {name: peer.polished(*start) / ours - 1 for name, start in starts.items()}
+
+
+def starts_of(rng, options, fit, count):
+    """Ctid's own estimate, and random starts."""
+    starts = {"ctid's own": (fit.model.poles, fit.model.delay)}
+    for k in range(count):
+        delay = float(rng.uniform(*options.delay_bounds))
+        starts[f"random start {k}"] = (random_poles(rng, options.poles, fit.box), delay)
+    return starts
+
+
 def compared(number, rng, peer_starts):
     """One system: the status of ctid's estimate, its squared error over the peer's, and what to say of it."""
     record, truth, options = random_case(rng)
     spent, fit = cpu(options.fit, record)
     ours, peer = fit.cost * fit.count, Peer(record, options, fit.box)
     here = peer.residual(fit.model.poles, fit.model.delay)
-    starts = {"the truth": (truth.poles, truth.delay), "ctid's own": (fit.model.poles, fit.model.delay)}
-    for k in range(peer_starts):
-        delay = float(rng.uniform(*options.delay_bounds))
-        starts[f"random start {k}"] = (random_poles(rng, options.poles, fit.box), delay)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        reached = {name: peer.polished(*start) / ours - 1 for name, start in starts.items()}
+    starts = {"the truth": (truth.poles, truth.delay)} | starts_of(rng, options, fit, peer_starts)
+    reached = reached_from(peer, starts, ours)
     least = min(reached, key=reached.get)
     clock = "regular" if record.interval else "irregular"
     said = (
@@ -222,6 +301,55 @@ def compared(number, rng, peer_starts):
     return fit.status.name, reached, spent, said
 
 
+def tabulated(name, record, options, rng, count, truth=None):
+    """A line of the table: one structure on one record."""
+    spent, fit = cpu(options.fit, record)
+    ours, peer = fit.cost * fit.count, Peer(record, options, fit.box)
+    reached = reached_from(peer, starts_of(rng, options, fit, count), ours)
+    least = min(reached, key=reached.get)
+    text = f"{name:22}{options.poles}/{options.zeros}  {options.initial_state:9}{options.offset:9}"
+    text += f"{fit.status.name:15}{fit.cost:14.8g}{-reached[least]:+11.1e} {least:15}{spent:8.2f}"
+    if truth is not None:
+        # Bounds that leave the set open where the truth is.
+        wide = replace(fit.box, slowest=NEARLY_ZERO / record.duration, least_damping=NEARLY_ZERO)
+        peer = Peer(record, options, wide)
+        text += f"{1 / (1 + reached_from(peer, {'': (truth.poles, truth.delay)}, ours)['']):12.5g}"
+    print(text, flush=True)
+    return reached[least] < -TOLERANCE
+
+
+def table(asked):
+    """Print the records at the border of the set and the measured ones; return how many are above the peer."""
+    print(
+        f"{'record':22}{'p/z':5}{'state':9}{'offset':9}{'status':15}{'cost':>14}{'above peer':>11} "
+        f"{'peer best from':15}{'CPU s':>8}{'over open':>12}"
+    )
+    above = []
+    if asked.likes:
+        for name, like in (("lightly damped mode", lightly_damped), ("integrating drive", integrating)):
+            for zeros in (0, 1):
+                rng = np.random.default_rng([asked.seed, zeros])
+                record, truth, state = like(rng)
+                options = DelayProfile(2, zeros, (0.0, 0.0), initial_state=state, nested=True)
+                above.append(tabulated(name, record, options, rng, asked.starts, truth))
+    for name, record in measured(asked.records) if asked.records else ():
+        state, offset, delays = TREATMENTS.get(name, OTHERWISE)
+        for n, m in STRUCTURES:
+            options = DelayProfile(n, m, delays, initial_state=state, offset=offset, nested=True)
+            if offset == "remove":
+                # The peer takes records as they are.
+                signal = record.input
+                record = Record(
+                    record.t, record.y - record.y.mean(), HeldSignal(signal.t, signal.values - signal.values.mean())
+                )
+                options = replace(options, offset="none")
+            try:
+                above.append(tabulated(name, record, options, np.random.default_rng([asked.seed, n]), asked.starts))
+            except DataError as error:
+                print(f"{name:22}{n}/{m}  refused: {error}", flush=True)
+    print(f"{len(above)} fits: above the peer in {sum(above)}", flush=True)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--systems", type=int, default=100)
@@ -229,8 +357,14 @@ def main():
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--starts", type=int, default=3, help="random starts of the peer")
     parser.add_argument("--verbose", action="store_true", help="a line for each system")
+    parser.add_argument("--likes", action="store_true", help="systems at the border of the admissible models")
+    parser.add_argument("--records", metavar="FOLDER", help="measured records")
     asked = parser.parse_args()
     warnings.simplefilter("error")
+    if asked.likes or asked.records:
+        table(asked)
+    if not asked.systems:
+        return
     statuses, above, truth_missed, seconds = Counter(), 0, 0, 0.0
     for number in range(asked.first, asked.first + asked.systems):
         try:

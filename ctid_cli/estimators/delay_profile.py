@@ -198,8 +198,10 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
     refined jointly in all parameters on every sample, and the lowest is kept: no start has to be given.
 
     Without bounds the least cost need not exist: with an undamped pole a free initial state fits noise, ever better.
-    Poles have magnitudes between the reciprocal of the record's length and ten over its sampling interval, and pairs a
-    damping of .001 at least; the status says whether the estimate lies at such a bound.
+    Where the state is estimated, poles have magnitudes of at least the reciprocal of the record's length, and pairs a
+    damping of at least .001; at rest these bounds are 1e-4 of that and 1e-5, under a periodic input 1e-2 of that and
+    1e-5. No pole is faster than ten over the sampling interval. The status says whether the estimate lies at such a
+    bound, and ``box`` has them.
 
     Outliers ruin least squares. Both other losses are 95 % efficient where the noise is normal and has none. Huber's
     bounds what an outlier can do, Tukey's forgets the gross ones, on which one-sided ones leave no mark; it starts

@@ -33,7 +33,7 @@ def of_answer(answer: AnswerTest, options: Options) -> list[str]:
 def of_status(fit: MeasuredFit, *, said: bool = False) -> list[str]:
     """How the search ended, where it did not end well, and poles that are not in the table.
 
-    A bound need not be named where it has been said that a pole is too slow.
+    A bound or a ridge need not be named where it has been said that a pole is too slow.
     """
     words = _of_lost_poles(fit.poles_at_infinity, fit.model.order)
     if fit.status is Status.DELAY_AT_BOUND and fit.model.delay == 0.0:
@@ -41,7 +41,7 @@ def of_status(fit: MeasuredFit, *, said: bool = False) -> list[str]:
             *words,
             "The delay stopped at zero: this model needs none; take it as known (--delay 0), or use fewer poles.",
         ]
-    if fit.status is Status.CONVERGED or (said and fit.status is Status.AT_BOUND):
+    if fit.status is Status.CONVERGED or (said and fit.status in (Status.AT_BOUND, Status.RIDGE)):
         return words
     return [*words, fit.status.value]
 
@@ -65,7 +65,7 @@ def of_conditioning(fit: MeasuredFit, covariance: Array, hessian: Array) -> list
     if fit.held_poles:
         held = listed(f"{pole:.4g}" if pole.imag else f"{pole.real:.4g}" for pole in fit.held_poles)
         what = f"Held at the border of the admissible models: {held} (poles, rad per unit of time)"
-        words.append(f"{what}; the other standard errors take this as known.")
+        words.append(f"{what}{_of_limits(fit)}; the other standard errors take this as known.")
     names: list[str] = []
     values: list[float] = []
     for column in fit.tangent.T:
@@ -76,6 +76,12 @@ def of_conditioning(fit: MeasuredFit, covariance: Array, hessian: Array) -> list
     found = describe_conditioning(covariance, np.array(values), names, condition_number(hessian), hessian)
     # At a bound and along a ridge the status has said why, and one sentence is enough.
     return [*words, *found[: 1 if fit.status in (Status.AT_BOUND, Status.RIDGE) else None]]
+
+
+def _of_limits(fit: MeasuredFit) -> str:
+    """Which bounds hold the poles, their values, and what that means."""
+    met = () if fit.box is None else fit.box.limits_met(fit.held_poles)
+    return "".join(f". The {limit.what} is {value:.4g}: {limit.meaning}" for _, limit, value in met)
 
 
 def of_short_record(uncertainty: Uncertainty, count: int, offset: bool = False) -> list[str]:

@@ -15,12 +15,16 @@ from ctid_cli.inference.input_dependence import InputDependence, input_dependenc
 from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.inference.record_check import SIGNIFICANT, Examined, examine
 from ctid_cli.inference.residuals import dependence
+from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.models.factoring import pole_jacobian
 from ctid_cli.signals.record import Record
 
 #: A drift of the residuals counts from this many of their standard deviations on.
 DRIFT = 0.7
 #: A real pole seems to be an integrator where its time constant exceeds this fraction of the record.
 INTEGRATES = 0.6
+#: Standard errors within which a pole is at the origin.
+REACHED = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +53,9 @@ class SecondLook:
     other_hold: float
     #: The hold that lowers the cost most; None where there is none to compare with.
     held: OtherHold | None
-    #: Time constant of a pole too slow to be told from an integrator [s]; nan for none.
+    #: Time constant of a pole that seems to be an integrator [s], nan for none; whether the records tell them apart.
     integrator: float
+    indistinguishable: bool
     #: Errors that go with the speed of the output.
     clock: Clock
     #: The fit with one more pole, and with a delay outside the range; None where that was not tried.
@@ -68,7 +73,8 @@ def look_again(
     """Look at the records, and at what the fit leaves of them."""
     looks = tuple(_look(record, fit, k) for k, record in enumerate(records))
     clock = clock_evidence(fit, records)
-    return SecondLook(looks, held.fall if held else 0.0, held, _integrator(fit, records), clock, richer, elsewhere)
+    slow = _integrator(fit, records)
+    return SecondLook(looks, held.fall if held else 0.0, held, *slow, clock, richer, elsewhere)
 
 
 def _look(record: Record, fit: MeasuredFit, k: int) -> RecordLook:
@@ -102,9 +108,24 @@ def _drift(e: Array, psi: Array, t: Array) -> float:
     return drift if significant and abs(drift) > DRIFT else 0.0
 
 
-def _integrator(fit: MeasuredFit, records: Sequence[Record]) -> float:
+def _integrator(fit: MeasuredFit, records: Sequence[Record]) -> tuple[float, bool]:
+    """Time constant of a pole that is slow for the records, nan for none, and whether it may as well be at the origin.
+
+    It may where it is held at the least that is admissible, or two of its standard errors reach the origin.
+    """
     poles = fit.model.poles
     # Poles at the origin were asked for.
-    slow = np.abs(poles[(poles.imag == 0.0) & (poles.real != 0.0)])
+    slow = np.flatnonzero((poles.imag == 0.0) & (poles.real != 0.0))
     longest = max(record.duration for record in records)
-    return float(1 / slow.min()) if slow.size and slow.min() * longest < 1 / INTEGRATES else float("nan")
+    if not slow.size or np.abs(poles[slow]).min() * longest >= 1 / INTEGRATES:
+        return float("nan"), False
+    k, n = int(slow[np.argmin(np.abs(poles[slow]))]), poles.size
+    size = float(abs(poles[k]))
+    if fit.box is not None and any("slowest" in fit.box.met_by(pole) for pole in fit.held_poles):
+        return 1 / size, True
+    if fit.parameter_names[:n] != Structure(n, 0).names[:n]:
+        # The coefficients of submodels are others.
+        return 1 / size, False
+    slope = pole_jacobian(fit.model.denominator, poles)[k].real
+    variance = float(slope @ fit.uncertainty("white").covariance[:n, :n] @ slope)
+    return 1 / size, not size > REACHED * np.sqrt(variance)

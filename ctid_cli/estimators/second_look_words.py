@@ -311,12 +311,32 @@ def _of_hold(look: SecondLook, other: OtherHold) -> Iterator[str]:
 
 
 def _of_integrator(look: SecondLook, options: Options, fit: MeasuredFit) -> str:
+    """That a pole is slower than the record can show, and the command for a model with an integrator."""
+    slow = f"A pole has a time constant of {look.integrator:.4g}"
+    if look.indistinguishable:
+        what = f"{slow} or more, and is indistinguishable from an integrator over this record: the system integrates"
+    else:
+        what = f"{slow}, too slow for this record: the system seems to integrate"
+    command = _with_integrator(look, options, fit)
+    use = f"Use {command}, or a longer record." if command else "Use a longer record."
+    return f"{what}, or the output drifts, and the static gain means nothing. {use}"
+
+
+def _with_integrator(look: SecondLook, options: Options, fit: MeasuredFit) -> str:
+    """Options of ``ctid fit`` that change the model into one with an integrator; none where it would refuse them."""
+    if len(look.records) > 1 or options.initial_state == "periodic":
+        return ""
     integrators = _integrators(options) + 1
-    instead = f"--poles {fit.model.order - integrators} --integrators {integrators} (with a known delay)"
     if _is_sum(options):
-        instead = f"--integrators {integrators} and one pole fewer in --terms"
-    return (
-        f"A pole has a time constant of {look.integrator:.4g}, too slow for this record: the system seems to integrate"
-        f", or the output drifts, and the static gain means nothing. Use {instead}, or a "
-        "longer record."
-    )
+        return f"--integrators {integrators} and one pole fewer in --terms"
+    words = [f"--poles {fit.model.order - integrators} --integrators {integrators}"]
+    words += [f"--zeros {options.zeros}"] * (options.zeros > 0)
+    # Models with integrators have a known delay, no other loss than squares, and names of their own.
+    low, high = options.delay_bounds
+    words += [f"--delay {fit.model.delay:.6g}"] * (low < high)
+    words += ["--loss squares"] * (options.loss != "squares")
+    # The free response of an integrator is an offset.
+    words += ["--offset none --initial-state estimate"] * (options.offset == "estimate")
+    hold = look.records[0].examined.record.input.hold
+    words += [f"--hold {hold}"] * (hold != "zoh")
+    return " ".join(words) + " without --fix" * bool(options.fixed)

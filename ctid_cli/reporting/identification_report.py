@@ -1,6 +1,6 @@
 """What ``ctid fit`` answers: a fit to measured records as text and as an object for JSON."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -135,7 +135,7 @@ def identification_object(
         "message": fit.status.value,
         "starts": fit.starts and fit.starts._asdict(),
         "poles_at_infinity": fit.poles_at_infinity,
-        "box": fit.box and _box_object(fit.box),
+        "box": fit.box and _box_object(fit.box, fit.held_poles),
         "initial_state": {"treatment": options.initial_state, "values": fit.initial_states},
         "offset": {"treatment": options.offset, "output": fit.offsets, "input": fit.input_offsets},
         "modes": _modes(result, units),
@@ -219,8 +219,11 @@ def quality(result: Identification, units: Units) -> Iterator[tuple[str, str]]:
     yield "condition number", number(fit.condition_number, 3)
     if fit.starts is not None:
         yield "search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}"
-    if fit.box is not None and fit.status is Status.AT_BOUND:
+    if fit.box is not None and (fit.held_poles or fit.status in (Status.AT_BOUND, Status.RIDGE)):
         yield "admissible", _box_text(fit.box, units)
+        for name, limit, value in fit.box.limits_met(fit.held_poles):
+            unit = "" if name == "least_damping" else f" rad/{units.time}"
+            yield "at bound", f"{limit.what}, {value:.4g}{unit}: {limit.meaning}"
     for k, test in enumerate(result.tests, start=1):
         yield "residuals" if len(fit.residuals) == 1 else f"residuals {k}", test.sentence
 
@@ -282,13 +285,17 @@ def _of_iteration(
         yield "start", result.fit.start_method
 
 
-def _box_object(box: Box) -> dict[str, Any]:
-    """The set of models in which the estimate is the best, null for what has no bound."""
+def _box_object(box: Box, held: Iterable[complex]) -> dict[str, Any]:
+    """Return the set of models in which the estimate is the best, null for no bound, and the bounds that poles met."""
     return {
         "poles": (box.slowest, box.fastest),
         "imaginary_part": box.imaginary if np.isfinite(box.imaginary) else None,
         "damping": box.least_damping,
         "delay": box.delays,
+        "met": [
+            {"limit": name, "what": limit.what, "value": value, "meaning": limit.meaning, "reason": limit.reason}
+            for name, limit, value in box.limits_met(held)
+        ],
     }
 
 

@@ -96,6 +96,25 @@ def test_an_integrator_beside_poles_needs_no_other_words(ctid, tmp_path):
     near(content, {"g1_a1": 0.5, "g1_b0": 1.0})
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--poles", 2, "--delay", "0:0.2"),
+        ("--poles", 2, "--offset", "estimate", "--loss", "huber"),
+        ("--poles", 1, "--hold", "foh"),
+    ],
+)
+def test_a_pole_next_to_the_origin_is_answered_with_options_that_are_accepted(ctid, tmp_path, options):
+    file = record(tmp_path / "drive.csv", AdditiveModel([Submodel([1.0], [0.5, 1.0], 1)]))
+    (words,) = (word for word in fitted(ctid, file, *options, "--out", tmp_path)["warnings"] if "--integrators" in word)
+    assert "indistinguishable from an integrator over this record" in words
+    command = words.partition("Use ")[2].partition(", or a longer record")[0].split()
+    given = dict(zip(options[::2], options[1::2], strict=True)) | dict(zip(command[::2], command[1::2], strict=True))
+    content = fitted(ctid, file, *(part for pair in given.items() for part in pair), "--out", tmp_path)
+    assert content["model"]["denominator"][-1] == 0.0
+    assert not any("--integrators" in word for word in content["warnings"])
+
+
 def test_fixed_parameters_have_their_values_and_no_errors(ctid, tmp_path):
     file = record(tmp_path / "one.csv", MODES)
     options = ("--model", "additive", "--terms", "2/0,2/0", "--fix", "g1_a2=0.25", "--fix", "g2_b0=1")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
+from ctid_cli.estimation.optimum.box import LIMITS
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import identify
 from ctid_cli.filtering.simulate import simulate
@@ -201,7 +202,7 @@ def test_a_pole_at_the_border_is_held_and_the_others_have_standard_errors():
     """Those of the model whose parameters are the free pole and the numerator, from central differences."""
     record = record_of(TransferFunction([1.0], [1.0, 2.0]), n=400, seed=3)
     result = identify(DelayProfile(2, 1, (0, 0)), [record], covariance="white")
-    slow, free = 1 / record.t[-1], float(result.fit.model.poles.real.min())
+    slow, free = LIMITS["slowest"].rest / record.t[-1], float(result.fit.model.poles.real.min())
     assert result.fit.status is Status.AT_BOUND
     assert result.fit.held_poles == pytest.approx([-slow])
 

@@ -202,12 +202,12 @@ def test_starts_bounds_and_poles_at_infinity_are_said(fitted):
     assert content["starts"] == {"tried": starts.tried, "agree": starts.agree}
     assert "the best of " in text
     assert ", reached " in text
-    assert content["box"]["poles"] == pytest.approx([1 / 79.9, 10 / 0.1])
+    assert content["box"]["poles"] == pytest.approx([1e-4 / 79.9, 10 / 0.1])
     assert content["box"]["delay"] == [0, 3]
     assert content["poles_at_infinity"] == 0
     # No bound is active, so that the text need not name any.
     assert "admissible" not in text
     lost = replace(result.fit, poles_at_infinity=2, status=Status.AT_BOUND)
     text = identification_text(replace(result, fit=lost), files, UNITS)
-    assert "poles from 0.01252 to 100 rad/ms, imaginary parts up to 31.38 rad/ms" in text
+    assert "poles from 1.252e-06 to 100 rad/ms, imaginary parts up to 31.38 rad/ms" in text
     assert of_status(lost)[0].startswith("2 poles run to infinity")

@@ -102,6 +102,35 @@ def test_a_periodic_record_is_exact_for_a_lightly_damped_model():
     assert found.squared_error == pytest.approx(dense, rel=1e-8)
 
 
+def test_a_resonator_of_little_damping_is_within_the_set_of_a_periodic_record():
+    rng = np.random.default_rng(11)
+    model = TransferFunction([0.64], [1.0, 2 * 5e-4 * 0.8, 0.64])
+    t, periods = 0.5 * np.arange(400), 800
+    u = rng.choice([-1.0, 1.0], t.size)
+    long = 0.5 * np.arange(periods * t.size)
+    x = simulate(model, HeldSignal(long, np.tile(u, periods)), long)[-t.size :]
+    noise = 0.01 * x.std() * rng.standard_normal(t.size)
+    record = Record.from_arrays(t, u, x + noise)
+    found = best_output_error([filter_data(record)], 2, 0, SearchOptions(periods=(200.0,), random_starts=0))
+    assert found.ending is Ending.CONVERGED
+    assert found.squared_error <= noise @ noise
+    np.testing.assert_allclose(found.denominator, model.denominator, rtol=0.1)
+
+
+def test_an_integrating_drive_at_rest_is_next_to_the_set():
+    rng = np.random.default_rng(12)
+    t = np.arange(400.0)
+    u = np.repeat(rng.choice([-1.0, 1.0], 20), 20)
+    x = simulate(TransferFunction([1.0], [8.0, 1.0, 0.0]), HeldSignal(t, u), t)
+    noise = 0.01 * x.std() * rng.standard_normal(t.size)
+    found = best_output_error([filter_data(Record.from_arrays(t, u, x + noise))], 2, 0, SearchOptions(random_starts=0))
+    # Three parameters fit noise too; the slowest pole is not zero.
+    assert found.squared_error <= 1.001 * (noise @ noise)
+    np.testing.assert_allclose(found.denominator[1], 0.125, rtol=0.02)
+    assert found.ending is Ending.AT_BOUND
+    assert [name for name, *_ in found.box.limits_met(found.held_poles)] == ["slowest"]
+
+
 def test_given_starts_alone_are_refined_where_nothing_else_is_wanted():
     rng = np.random.default_rng(8)
     model = random_model(rng, 3, 1)

@@ -5,8 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.estimation.optimum.box import Box, admissible, frozen, moved_by, point_of
-from tests.estimation.optimum.systems import random_poles
+from ctid_cli.estimation.optimum.box import LIMITS, Box, admissible, box_of, frozen, moved_by, point_of
+from ctid_cli.estimation.optimum.projection import Problem
+from ctid_cli.filtering.filter_data import filter_data
+from tests.estimation.optimum.systems import MODEL, random_poles, record_of
 
 BOX = Box(0.01, 20.0, 6.0, (0.0, 2.0), 0.5, 1.0)
 
@@ -72,3 +74,23 @@ def test_a_delay_at_a_sample_keeps_its_side():
     assert moved_by(point, step, BOX).delay == (1.0, 1)
     assert moved_by(point, 2 * step, BOX).delay.cell == 2
     assert frozen(moved_by(point, step, BOX), np.array([0.0, -1.0]), BOX)[-1]
+
+
+@pytest.mark.parametrize(
+    ("free_response", "period", "state"), [(0, 0.0, "rest"), (0, 25.0, "periodic"), (1, 0.0, "estimated")]
+)
+def test_the_set_depends_on_what_is_known_of_the_state(free_response, period, state):
+    data = filter_data(record_of(MODEL, np.random.default_rng(1), samples=50))
+    box = box_of(Problem((data,), 0, bool(free_response), False, (period,)), (0.0, 0.0))
+    limits = {name: getattr(limit, state) for name, limit in LIMITS.items()}
+    assert box.slowest == pytest.approx(limits["slowest"] / 24.5)
+    assert box.fastest == pytest.approx(limits["fastest"] / 0.5)
+    assert box.least_damping == limits["least_damping"]
+    assert box.imaginary == pytest.approx(limits["imaginary"] * np.pi / 0.5)
+    # Starts are spread over the same range whatever the state.
+    assert box.spread == pytest.approx((LIMITS["slowest"].estimated / 24.5, LIMITS["least_damping"].estimated))
+
+
+def test_bounds_that_poles_are_at_are_named():
+    poles = point_of(np.array([-1e-9, -1e-9 + 3j, -1e-9 - 3j, -0.5]), 0.0, BOX).poles
+    assert [(name, value) for name, _, value in BOX.limits_met(poles)] == [("slowest", 0.01), ("least_damping", 1e-3)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from ctid_cli.estimation.optimum.box import box_of, point_of
+from ctid_cli.estimation.optimum.box import LIMITS, box_of, point_of
 from ctid_cli.estimation.optimum.chain import polynomial
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import CONVERGED, Descent, Ending
@@ -97,7 +97,7 @@ def test_a_pole_beyond_the_set_stops_at_its_border():
     slow = Record.from_arrays(t, np.ones(300), 1e-4 * t**2 + 1e-3 * rng.standard_normal(300))
     found = settled(descent_of(slow, 0), [-0.1])
     assert found.ending is Ending.AT_BOUND
-    np.testing.assert_allclose(found.local.point.poles, [-1 / t[-1]])
+    np.testing.assert_allclose(found.local.point.poles, [-LIMITS["slowest"].rest / t[-1]])
 
 
 def test_what_a_record_says_nothing_about_is_a_ridge():
