@@ -53,6 +53,8 @@ def compare_estimators(results: Results, names: str, out: Path) -> Report:
         if name not in known:
             hint = did_you_mean(name, known) or "."
             raise UsageError(f"{results.experiment} has no estimator {name!r}{hint} There are {', '.join(known)}")
+    if pair[0] == pair[1] and sum(part["name"] == pair[0] for part in results.manifest["estimators"]) == 1:
+        raise UsageError(f"--compare {names}: {pair[0]} has no swept option; compare it with another estimator")
     rows = paired_rows(results, pair[0], pair[1])
     if not rows:
         raise UsageError(f"{results.experiment}: {pair[0]} and {pair[1]} have fewer than {FEWEST} data sets in common")
@@ -65,16 +67,16 @@ def compare_estimators(results: Results, names: str, out: Path) -> Report:
 
 
 def paired_rows(results: Results, first: str, second: str) -> list[Row]:
-    """Differences of two estimators of an experiment."""
+    """Return the differences of two estimators of an experiment, or of one with several options, each pair once."""
     members = results.groups()
     simulated = any(map(true_values, results.manifest["data_cells"]))
     estimates = {one.group: one for one in estimates_by_group(results)} if simulated else {}
     labels = {group: row for group, row in labelled_groups(results) if group in members}
     options = results.swept("estimators")
     rows: list[Row] = []
-    for one in labels:
-        for other in labels:
-            if (one.estimator, other.estimator, one.cell) != (first, second, other.cell) or one == other:
+    for k, one in enumerate(labels):
+        for other in list(labels)[k + 1 if first == second else 0 :]:
+            if (one.estimator, other.estimator, one.cell) != (first, second, other.cell):
                 continue
             if one.start != other.start and "none" not in (one.start, other.start):
                 continue
@@ -189,7 +191,8 @@ def _table(rows: Sequence[Row]) -> Table:
 
 def _lost(rows: Sequence[Row], pair: Sequence[str], out: Path) -> Iterator[list[str | Table]]:
     """Data sets on which the first fails and the second does not, with the commands that show them."""
-    ids = [name for row in rows for name in row.get("failed_ids") or ()]
+    # An estimate of the first can be in several rows, beside other options or starts of the second.
+    ids = list(dict.fromkeys(name for row in rows for name in row.get("failed_ids") or ()))
     if ids:
         what = f"{count(len(ids), 'estimate')} of {pair[0]} missed on data sets where {pair[1]} did not:"
         commands = [f"  ctid show {name}{out_option(out)}" for name in ids[:LISTED]]
