@@ -108,10 +108,11 @@ def of_means(statistic: Callable[..., Array], *columns: Array, positive: bool = 
         return Measured()
     sums = [column.sum() for column in columns]
     with np.errstate(all="ignore"):  # what has no value is None
-        value = float(statistic(*(total / n for total in sums)))
+        value = float(statistic(*(total / n for total in sums), n))
         if n == 1:
             return Measured(_finite(value))
-        without = statistic(*((total - column) / (n - 1) for total, column in zip(sums, columns, strict=True)))
+        means = [(total - column) / (n - 1) for total, column in zip(sums, columns, strict=True)]
+        without = statistic(*means, n - 1)
         error = _jackknife(without)
         if positive and value:
             reach = student_quantile(n - 1) * _jackknife(np.log(without))
@@ -153,23 +154,23 @@ def quantile(values: Array, level: float = 0.5) -> Measured:
 
 def bias(sample: Sample) -> Measured:
     """Mean error."""
-    return of_means(lambda mean: mean, sample.errors, positive=False)
+    return of_means(_mean, sample.errors, positive=False)
 
 
 def deviation(sample: Sample) -> Measured:
     """Standard deviation of the estimates."""
-    centred, n = _centred(sample.errors)
-    return of_means(lambda m, s: _scatter(m, s, n), centred, centred**2) if n > 1 else Measured()
+    centred = _centred(sample.errors)
+    return of_means(_scatter, centred, centred**2) if centred.size > 1 else Measured()
 
 
 def mean_square(sample: Sample) -> Measured:
     """Mean square error."""
-    return of_means(lambda mean: mean, sample.errors**2)
+    return of_means(_mean, sample.errors**2)
 
 
 def root_mean_square(sample: Sample) -> Measured:
     """Root of the mean square error."""
-    return of_means(np.sqrt, sample.errors**2)
+    return of_means(_root, sample.errors**2)
 
 
 def robust_deviation(sample: Sample) -> Measured:
@@ -181,16 +182,16 @@ def robust_deviation(sample: Sample) -> Measured:
 
 def standard_error(sample: Sample) -> Measured:
     """Return the root mean square of the standard errors that the estimator gave."""
-    return of_means(np.sqrt, sample.with_widths().widths ** 2)
+    return of_means(_root, sample.with_widths().widths ** 2)
 
 
 def error_ratio(sample: Sample) -> Measured:
     """Return the same over the standard deviation of these estimates: below 1, intervals are too short."""
     known = sample.with_widths()
-    centred, n = _centred(known.errors)
-    if n < 2:
+    centred = _centred(known.errors)
+    if centred.size < 2:
         return Measured()
-    return of_means(lambda m, s, w: np.sqrt(w) / _scatter(m, s, n), centred, centred**2, known.widths**2)
+    return of_means(lambda m, s, w, n: np.sqrt(w) / _scatter(m, s, n), centred, centred**2, known.widths**2)
 
 
 def covered(sample: Sample) -> BoolArray:
@@ -205,16 +206,25 @@ def coverage(sample: Sample) -> Measured:
 
 def efficiency(sample: Sample) -> Measured:
     """Least possible variance over the mean square error [%]."""
-    return of_means(lambda mean: 100.0 * sample.bound / mean, sample.errors**2)
+    return of_means(lambda mean, _: 100.0 * sample.bound / mean, sample.errors**2)
 
 
-def _centred(errors: Array) -> tuple[Array, int]:
-    return (errors - errors.mean() if errors.size else errors), errors.size
+def _mean(mean: Array, _: int) -> Array:
+    return mean
+
+
+def _root(mean: Array, _: int) -> Array:
+    return np.asarray(np.sqrt(mean))
+
+
+def _centred(errors: Array) -> Array:
+    return errors - errors.mean() if errors.size else errors
 
 
 def _scatter(mean: Array, square: Array, n: int) -> Array:
     # Rounding may leave the variance of equal values below zero.
-    return np.sqrt(np.maximum(square - mean**2, 0.0) * n / (n - 1))
+    # One value has no standard deviation.
+    return np.sqrt(np.maximum(square - mean**2, 0.0) * n / (n - 1) if n > 1 else np.full_like(square, np.nan))
 
 
 def _finite(value: float) -> float | None:

@@ -320,7 +320,7 @@ def mse_ratio(one: Sequence[ParameterEstimates], other: Sequence[ParameterEstima
     if len(parts) < 2:
         both = f"{one[0].experiment}: {one[0].estimator} and {other[0].estimator}"
         raise UsageError(f"{both} have {len(parts)} estimates on the same data sets, too few for a ratio")
-    ratio = monte_carlo.of_means(operator.truediv, *parts.T)
+    ratio = monte_carlo.of_means(lambda one, other, _: one / other, *parts.T)
     assert ratio.value is not None
     return PairedRatio(parameter, tuple(group.samples for group in one), ratio.value, ratio.error or 0.0, len(parts))
 
