@@ -26,8 +26,8 @@ QUANTILE = normal_quantile()
 #: Standard deviation of normal values over the median of their sizes.
 NORMAL_MAD = 1.4826
 #: Largest factor from a positive value to an end of its interval. A wider interval holds the truth in 98 to 100 % of
-#: the cases (normal, t5, t3 and exponential errors, 5 to 300 data sets) but spans more than two decades; one outlier
-#: among 60 data sets makes a factor of 3e5 where it is 100 times as large as the others.
+#: the cases (normal, t5, t3 and exponential errors, 5 to 300 data sets) but spans more than two decades: one error that
+#: is 100 times as large as 59 others makes the factor of their mean square 2.5e4.
 LARGEST_FACTOR = 10.0
 
 
@@ -97,11 +97,14 @@ def share(hits: BoolArray) -> Measured:
 
 
 def of_means(statistic: Callable[..., Array], *columns: Array, positive: bool = True) -> Measured:
-    r"""A function of means over the data sets, with the error of the jackknife.
+    r"""Return a function of means over the data sets and of their number, with the error of the jackknife.
 
     With ``r_(i)`` the value of all n data sets but i,
 
     .. math:: s^2 = \frac{n-1}{n} \sum_i \left(r_{(i)} - \frac1n \sum_j r_{(j)}\right)^2.
+
+    The interval of a positive value is that of its logarithm, with the jackknife of the logarithm: ``s`` over the value
+    has no bound where a reciprocal has an outlier. Ends that are farther than ``LARGEST_FACTOR`` are None.
     """
     n = columns[0].size
     if not n:

@@ -20,7 +20,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.inference.paired import Difference, bootstrap_difference, holm, percent_difference
 from ctid_cli.reporting.layout import Report, Table, count, delay_label, number
 from ctid_cli.reporting.measures import parameter_unit
-from ctid_cli.reporting.parameter_errors import ParameterEstimates, estimates_by_group
+from ctid_cli.reporting.parameter_errors import ParameterEstimates, common_places, estimates_by_group
 from ctid_cli.reporting.percentages import Row, labelled_groups, settings_of
 from ctid_cli.reporting.results import Group, Results, out_option
 from ctid_cli.reporting.table_blocks import setting_text, setting_title
@@ -104,8 +104,7 @@ def _named(group: Group, options: Sequence[str]) -> str:
 
 def _common(one: Rows, other: Rows) -> tuple[Rows, Rows]:
     """The estimates of both on the data sets that both have, by replicate."""
-    sides = (one.column("replicate"), other.column("replicate"))
-    _, *places = np.intersect1d(*sides, return_indices=True)
+    places = common_places(one.column("replicate"), other.column("replicate"))
     return one.chosen(places[0]), other.chosen(places[1])
 
 
@@ -125,15 +124,9 @@ def _percentages(one: Rows, other: Rows) -> Iterator[Row]:
 
 def _errors(one: ParameterEstimates, other: ParameterEstimates) -> Iterator[Row]:
     """Root mean square errors of the parameters that both estimate."""
-    places = [{replicate: k for k, replicate in enumerate(side.replicates.tolist())} for side in (one, other)]
-    common = sorted(places[0].keys() & places[1].keys())
+    sides = list(zip((one, other), common_places(one.replicates, other.replicates), strict=True))
     for name in [name for name in one.names if name in other.names]:
-        errors = np.array(
-            [
-                [side.values[place[k], side.names.index(name)] - side.truth[side.names.index(name)] for k in common]
-                for side, place in zip((one, other), places, strict=True)
-            ]
-        )
+        errors = np.array([side.errors[places, side.names.index(name)] for side, places in sides])
         errors = errors[:, np.isfinite(errors).all(axis=0)]
         if errors.shape[1] >= FEWEST:
             difference = bootstrap_difference(_root_of_mean, *(errors**2))
