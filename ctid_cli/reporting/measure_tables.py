@@ -42,7 +42,7 @@ def _table(results: Results, rows: Sequence[Row], names: Sequence[str]) -> Table
     body = []
     for place, found in lines.items():
         # What most measures count; a measure of fewer estimates has its number beside it.
-        some = max(found.values(), key=counted_in)
+        some = max(found.values(), key=lambda row: (counted_in(row), row["without_value"]))
         n = counted_in(some)
         cells = [TEXTS[key](at) if key in TEXTS else setting_text(key, at) for key, at in zip(keys, place, strict=True)]
         cells += [_cell(found.get(name), n) for name in names]
