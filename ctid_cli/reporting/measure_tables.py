@@ -5,7 +5,7 @@ from typing import Any
 
 from ctid_cli.inference.monte_carlo import MEASURES, requested
 from ctid_cli.reporting.layout import Report, Table, delay_label, number, with_error
-from ctid_cli.reporting.measures import measure_rows
+from ctid_cli.reporting.measures import counted_in, measure_rows
 from ctid_cli.reporting.percentages import Row, settings_of
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.table_blocks import NOT_RUN, setting_text, setting_title
@@ -27,7 +27,7 @@ def measure_report(results: Results, names: Sequence[str], notes: Sequence[str] 
     meanings = "; ".join(f"{name}: {MEASURES[name].meaning}" for name in bases)
     foot = f"{meanings}. ± is one Monte Carlo standard error, [ ] a 95 % interval; --format csv and json have both."
     if any(row["without_value"] for row in rows):
-        foot += " no value: estimates that could not be counted, failed ones among them."
+        foot += " n: estimates that count; no value: those without what is measured, failed ones among them."
     return Report([[f"### {results.experiment}"], *blocks, [foot]], rows, notes)
 
 
@@ -41,10 +41,12 @@ def _table(results: Results, rows: Sequence[Row], names: Sequence[str]) -> Table
         lines.setdefault(tuple(row[key] for key in keys), {})[row["measure"]] = row
     body = []
     for place, found in lines.items():
-        some = next(iter(found.values()))
+        # What most measures count; a measure of fewer estimates has its number beside it.
+        some = max(found.values(), key=lambda row: (counted_in(row), row["without_value"]))
+        n = counted_in(some)
         cells = [TEXTS[key](at) if key in TEXTS else setting_text(key, at) for key, at in zip(keys, place, strict=True)]
-        cells += [_cell(found.get(name)) for name in names]
-        cells += [str(some["n"]), str(some["failed"])] if some["n"] else [NOT_RUN, ""]
+        cells += [_cell(found.get(name), n) for name in names]
+        cells += [str(n), str(some["failed"])] if some["n"] else [NOT_RUN, ""]
         body.append(cells + ([str(some["without_value"])] if lacking else []))
     titles = {"initial_delay": "initial delay", "parameter": "status" if "failures" in names else "parameter"}
     header = [titles.get(key) or setting_title(key) for key in keys]
@@ -58,9 +60,11 @@ def _title(name: str) -> str:
     return f"{name} [{unit}]" if unit in ("%", "s") else name
 
 
-def _cell(row: Row | None) -> str:
+def _cell(row: Row | None, n: int) -> str:
+    """Value with its Monte Carlo error or interval; its number of estimates where that is not the n of the line."""
     if row is None or row["value"] is None:
         return "-"
+    own = "" if counted_in(row) == n else f" (n {counted_in(row)})"
     if row["unit"] == "%" and row["low"] is not None and row["high"] is not None:
-        return f"{row['value']:.1f} [{row['low']:.1f}, {row['high']:.1f}]"
-    return number(row["value"], 4) if row["error"] is None else with_error(row["value"], row["error"])
+        return f"{row['value']:.1f} [{row['low']:.1f}, {row['high']:.1f}]{own}"
+    return (number(row["value"], 4) if row["error"] is None else with_error(row["value"], row["error"])) + own

@@ -7,8 +7,8 @@ Keys of a row
   failures are counted; ``unit``.
 - ``value`` with its Monte Carlo standard error ``error`` and 95 % interval from ``low`` to ``high``; None where the
   data sets do not tell.
-- ``n``: data sets; ``failed``: those without a result; ``without_value``: those that ``value`` could not count, with
-  those that failed.
+- ``n``: data sets; ``failed``: those without a result; ``without_value``: those without what is measured, with those
+  that failed. Distances and fits count them as infinitely bad, other measures leave them out (``counted_in``).
 """
 
 import math
@@ -85,6 +85,12 @@ def measure_rows(results: Results, names: Sequence[str], first: int | None = Non
     return rows
 
 
+def counted_in(row: Row) -> int:
+    """Return the number of data sets that the value of a row is computed from."""
+    left_out = 0 if requested(row["measure"]).source in ("distance", "fresh_fit_percent") else row["without_value"]
+    return int(row["n"] - left_out)
+
+
 def default_measures(results: Results) -> Sequence[str]:
     """What the specification asks for; bias and root mean square error where it has no success rule; else nothing."""
     asked: Sequence[str] = results.settings.get("measures") or ()
@@ -122,6 +128,7 @@ def _of_errors(
     for k, name in enumerate(estimates.names):
         if argument in ("", "poles", name):
             sample = estimates.sample(k, bounds.get(name, math.nan))
+            sample = sample.with_widths() if measure.of_widths else sample
             own = parameter_unit(name, estimates.names)
             unit = {"": own, "^2": f"({own})^2"}.get(measure.unit, measure.unit)
             yield name, measure.compute(sample), unit, estimates.runs - sample.errors.size

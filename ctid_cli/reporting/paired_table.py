@@ -20,7 +20,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.inference.paired import Difference, bootstrap_difference, holm, percent_difference
 from ctid_cli.reporting.layout import Report, Table, count, delay_label, number
 from ctid_cli.reporting.measures import parameter_unit
-from ctid_cli.reporting.parameter_errors import ParameterEstimates, estimates_by_group
+from ctid_cli.reporting.parameter_errors import ParameterEstimates, common_places, estimates_by_group
 from ctid_cli.reporting.percentages import Row, labelled_groups, settings_of
 from ctid_cli.reporting.results import Group, Results, out_option
 from ctid_cli.reporting.table_blocks import setting_text, setting_title
@@ -53,6 +53,8 @@ def compare_estimators(results: Results, names: str, out: Path) -> Report:
         if name not in known:
             hint = did_you_mean(name, known) or "."
             raise UsageError(f"{results.experiment} has no estimator {name!r}{hint} There are {', '.join(known)}")
+    if pair[0] == pair[1] and sum(part["name"] == pair[0] for part in results.manifest["estimators"]) == 1:
+        raise UsageError(f"--compare {names}: {pair[0]} has no swept option; compare it with another estimator")
     rows = paired_rows(results, pair[0], pair[1])
     if not rows:
         raise UsageError(f"{results.experiment}: {pair[0]} and {pair[1]} have fewer than {FEWEST} data sets in common")
@@ -65,16 +67,16 @@ def compare_estimators(results: Results, names: str, out: Path) -> Report:
 
 
 def paired_rows(results: Results, first: str, second: str) -> list[Row]:
-    """Differences of two estimators of an experiment."""
+    """Return the differences of two estimators of an experiment, or of one with several options, each pair once."""
     members = results.groups()
     simulated = any(map(true_values, results.manifest["data_cells"]))
     estimates = {one.group: one for one in estimates_by_group(results)} if simulated else {}
     labels = {group: row for group, row in labelled_groups(results) if group in members}
     options = results.swept("estimators")
     rows: list[Row] = []
-    for one in labels:
-        for other in labels:
-            if (one.estimator, other.estimator, one.cell) != (first, second, other.cell) or one == other:
+    for k, one in enumerate(labels):
+        for other in list(labels)[k + 1 if first == second else 0 :]:
+            if (one.estimator, other.estimator, one.cell) != (first, second, other.cell):
                 continue
             if one.start != other.start and "none" not in (one.start, other.start):
                 continue
@@ -102,8 +104,7 @@ def _named(group: Group, options: Sequence[str]) -> str:
 
 def _common(one: Rows, other: Rows) -> tuple[Rows, Rows]:
     """The estimates of both on the data sets that both have, by replicate."""
-    sides = (one.column("replicate"), other.column("replicate"))
-    _, *places = np.intersect1d(*sides, return_indices=True)
+    places = common_places(one.column("replicate"), other.column("replicate"))
     return one.chosen(places[0]), other.chosen(places[1])
 
 
@@ -123,15 +124,9 @@ def _percentages(one: Rows, other: Rows) -> Iterator[Row]:
 
 def _errors(one: ParameterEstimates, other: ParameterEstimates) -> Iterator[Row]:
     """Root mean square errors of the parameters that both estimate."""
-    places = [{replicate: k for k, replicate in enumerate(side.replicates.tolist())} for side in (one, other)]
-    common = sorted(places[0].keys() & places[1].keys())
+    sides = list(zip((one, other), common_places(one.replicates, other.replicates), strict=True))
     for name in [name for name in one.names if name in other.names]:
-        errors = np.array(
-            [
-                [side.values[place[k], side.names.index(name)] - side.truth[side.names.index(name)] for k in common]
-                for side, place in zip((one, other), places, strict=True)
-            ]
-        )
+        errors = np.array([side.errors[places, side.names.index(name)] for side, places in sides])
         errors = errors[:, np.isfinite(errors).all(axis=0)]
         if errors.shape[1] >= FEWEST:
             difference = bootstrap_difference(_root_of_mean, *(errors**2))
@@ -189,7 +184,8 @@ def _table(rows: Sequence[Row]) -> Table:
 
 def _lost(rows: Sequence[Row], pair: Sequence[str], out: Path) -> Iterator[list[str | Table]]:
     """Data sets on which the first fails and the second does not, with the commands that show them."""
-    ids = [name for row in rows for name in row.get("failed_ids") or ()]
+    # An estimate of the first can be in several rows, beside other options or starts of the second.
+    ids = list(dict.fromkeys(name for row in rows for name in row.get("failed_ids") or ()))
     if ids:
         what = f"{count(len(ids), 'estimate')} of {pair[0]} missed on data sets where {pair[1]} did not:"
         commands = [f"  ctid show {name}{out_option(out)}" for name in ids[:LISTED]]

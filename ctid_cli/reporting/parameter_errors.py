@@ -17,7 +17,6 @@ Attributes of ``ParameterErrors``
   square of the standard errors over the standard deviation of the estimates.
 """
 
-import operator
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -78,9 +77,14 @@ class ParameterEstimates:
 
     def sample(self, k: int, bound: float = np.nan) -> Sample:
         """Errors of one of the parameters, where it has a value."""
-        errors = self.values[:, k] - self.truth[k]
+        errors = self.errors[:, k]
         counted = np.isfinite(errors)
         return Sample(errors[counted], self.standard_errors[counted, k], bound)
+
+    @property
+    def errors(self) -> Array:
+        """Estimates minus true values, shape (R, p)."""
+        return self.values - self.truth
 
     @property
     def runs(self) -> int:
@@ -303,26 +307,30 @@ def mse_ratio(one: Sequence[ParameterEstimates], other: Sequence[ParameterEstima
     Longer records begin with the shorter ones of the same data set, so that their errors go together too: a data set,
     at all its lengths, is what the jackknife leaves out.
     """
-    import pandas as pd
-
     if not one or [(g.experiment, g.samples) for g in one] != [(g.experiment, g.samples) for g in other]:
         raise ValueError("a ratio needs estimates of one experiment at the same numbers of samples")
-
-    def squares(group: ParameterEstimates) -> "pd.Series[float]":
+    groups = [*one, *other]
+    for group in groups:
         if parameter not in group.names:
             raise UsageError(f"the system has no parameter {parameter!r}; it has {', '.join(group.names)}")
-        k = group.names.index(parameter)
-        return pd.Series(group.samples * (group.values[:, k] - group.truth[k]) ** 2, list(group.replicates))
-
+    places = common_places(*(group.replicates for group in groups))
+    squares = np.array(
+        [g.samples * g.errors[at, g.names.index(parameter)] ** 2 for g, at in zip(groups, places, strict=True)]
+    )
     # N times the squared error by data set, summed over its lengths, where all of them have one.
-    sides = [reduce(operator.add, map(squares, side)) for side in (one, other)]
-    parts = pd.concat(sides, axis=1).dropna().sort_index().to_numpy()
+    parts = squares[:, np.isfinite(squares).all(axis=0)].reshape(2, len(one), -1).sum(axis=1).T
     if len(parts) < 2:
         both = f"{one[0].experiment}: {one[0].estimator} and {other[0].estimator}"
         raise UsageError(f"{both} have {len(parts)} estimates on the same data sets, too few for a ratio")
-    ratio = monte_carlo.of_means(operator.truediv, *parts.T)
+    ratio = monte_carlo.of_means(lambda one, other, _: one / other, *parts.T)
     assert ratio.value is not None
     return PairedRatio(parameter, tuple(group.samples for group in one), ratio.value, ratio.error or 0.0, len(parts))
+
+
+def common_places(*replicates: IndexArray) -> list[IndexArray]:
+    """Return the places of the data sets that all sides have, by ascending number, in each of them."""
+    common = reduce(np.intersect1d, replicates)
+    return [np.flatnonzero(np.isin(own, common)) for own in replicates]
 
 
 def _quotient(one: float | None, other: float | None) -> float | None:

@@ -15,7 +15,7 @@ from ctid_cli.inference.monte_carlo import QUANTILE
 from ctid_cli.inference.paired import holm
 from ctid_cli.reporting.expected_accuracy import why_biased
 from ctid_cli.reporting.layout import delay_label
-from ctid_cli.reporting.measures import measure_rows
+from ctid_cli.reporting.measures import counted_in, measure_rows
 from ctid_cli.reporting.parameter_errors import place_of, readable_plan
 from ctid_cli.reporting.percentages import Row, labelled_groups, settings_of
 from ctid_cli.reporting.results import Group, Results, lookup
@@ -86,17 +86,18 @@ def _tested(results: Results, rows: Iterable[Row]) -> Iterator[Finding]:
 def _tests(measured: Mapping[str, Row]) -> Iterator[tuple[str, float, float]]:
     """Kind, size and p-value of what can be tested of a parameter."""
     some = measured["bias"]
-    n = some["n"] - some["without_value"]
+    n = counted_in(some)
     if n < FEWEST or not some["error"]:
         return
     value = {name: row["value"] for name, row in measured.items()}
     scale = value["standard_error"] or value["deviation"]
     yield "bias", value["bias"] / scale, _p_value(value["bias"], BIAS * value["deviation"], some["error"], n)
-    if ratio := value["error_ratio"]:
+    known = counted_in(measured["error_ratio"])
+    if (ratio := value["error_ratio"]) and known >= FEWEST:
         # Where errors with heavy tails happened to be small, the jackknife believes too much in their deviation.
-        error = max(measured["error_ratio"]["error"] / ratio, 1.0 / math.sqrt(2.0 * n))
+        error = max(measured["error_ratio"]["error"] / ratio, 1.0 / math.sqrt(2.0 * known))
         margin = math.log(SMALL if ratio < 1.0 else LARGE)
-        yield "width", ratio, _p_value(math.log(ratio), margin, error, n)
+        yield "width", ratio, _p_value(math.log(ratio), margin, error, known)
     if value["coverage"] is not None:
         from scipy.special import bdtr
 
@@ -170,7 +171,7 @@ def _sentence(name: str, why: Sequence[str], found: Sequence[Finding], cells: se
     phrases = []
     for kind in ("bias", "width", "coverage", "rmse"):
         for members in _sides([finding for finding in found if finding.kind == kind]):
-            worst = max(members, key=lambda finding: abs(math.log(abs(finding.size) or math.ulp(0.0))))
+            worst = max(members, key=_badness)
             place = [worst.parameter, *(_place(key, worst.labels[key]) for key in swept)]
             phrases.append(f"{_phrase(worst, 'up to ' * (len(members) > 1))} ({', '.join(place)})")
     own = {group for group in cells if group.estimator == name}
@@ -184,6 +185,14 @@ def _sides(found: Sequence[Finding]) -> Iterator[list[Finding]]:
     for large in (False, True):
         if members := [f for f in found if (f.kind == "width" and f.size > 1.0) == large]:
             yield members
+
+
+def _badness(finding: Finding) -> float:
+    """Return how far the size of a finding lies from what theory expects, on the scale of its kind."""
+    if finding.kind == "coverage":
+        return -finding.size
+    # A ratio of standard errors is as bad as its reciprocal.
+    return abs(math.log(finding.size)) if finding.kind == "width" else abs(finding.size)
 
 
 def _phrase(finding: Finding, up_to: str) -> str:

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import UsageError
+from ctid_cli.reporting.measure_tables import measure_report
 from ctid_cli.reporting.measures import default_measures, measure_rows
-from ctid_cli.reporting.parameter_errors import estimates_by_group, least_variances
 from ctid_cli.reporting.percentages import experiment_rows
-from tests.reporting.ideal_results import TWO_MODES, ideal_results, plan_of
 
 DELAYS = (8.1, 7.9, 8.4)
 
@@ -46,6 +45,18 @@ def test_a_row_says_of_what_and_of_how_many(results):
     assert units == {"a1": "(1/s)^2", "a2": "(1/s^2)^2", "b0": "(out/in/s^2)^2", "delay": "(s)^2"}
 
 
+def test_n_is_the_number_of_estimates_that_a_value_is_computed_from(make_results, estimate):
+    found = [estimate(8.0 + 0.1 * k, standard_errors={"delay": 0.1} if k < 4 else {}) for k in range(6)]
+    results = make_results({(5.0, "0.0"): [*found, estimate(None, status="FAILED")]})
+    for cell in results.manifest["data_cells"]:
+        cell["replicates"] = 7
+    text = measure_report(results, ["standard_error:delay"]).draw()
+    assert ["4", "1", "3"] in [line.split()[-3:] for line in text.splitlines()]
+    text = measure_report(results, ["bias:delay", "standard_error:delay"]).draw()
+    (line,) = (line for line in text.splitlines() if "(n 4)" in line)
+    assert line.split()[-3:] == ["6", "1", "1"]
+
+
 def test_measures_come_for_every_planned_cell_in_the_order_asked_for(results):
     rows = measure_rows(results, ["rmse", "percent"])
     places = [tuple(row[key] for key in ("snr_db", "initial_delay")) for row in experiment_rows(results)]
@@ -53,11 +64,6 @@ def test_measures_come_for_every_planned_cell_in_the_order_asked_for(results):
     assert [row["measure"] for row in rows_of(results, "rmse", "percent")] == ["rmse"] * 4 + ["percent"]
     empty = [row for row in rows if row["initial_delay"] == "random"]
     assert {(row["n"], row["value"], row["parameter"]) for row in empty} == {(0, None, None)}
-
-
-def test_percentages_are_those_of_the_table(results):
-    (row,), (cell, *_) = rows_of(results, "percent"), experiment_rows(results)
-    assert [row[key] for key in ("value", "low", "high", "n")] == [cell[key] for key in ("percent", "low", "high", "n")]
 
 
 def test_coefficients_go_together_by_their_power(make_results, estimate):
@@ -99,38 +105,6 @@ def test_real_poles_are_matched_whatever_their_order(make_results, estimate):
         cell["content"]["system"] = system
     values = {row["parameter"]: row["value"] for row in rows_of(results, "bias:poles")}
     assert values == pytest.approx({"pole_1": -0.2, "pole_2": -0.1})
-
-
-def test_distances_count_what_has_no_model_as_infinitely_far(make_results, estimate):
-    near, far, none = estimate(8.0, numerator=(8.8,)), estimate(8.0, numerator=(16.0,)), estimate(None, status="FAILED")
-    for name in ("h2", "hinf", "response:2"):
-        (row,) = rows_of(make_results({(5.0, "0.0"): [near, far, none]}), name)
-        assert (row["value"], row["without_value"], row["unit"]) == (pytest.approx(100.0), 1, "%")
-        (row,) = rows_of(make_results({(5.0, "0.0"): [near, none, none]}), name)
-        assert row["value"] is None
-
-
-def test_efficiency_is_the_bound_over_the_mean_square(tmp_path):
-    plan = plan_of(TWO_MODES, tmp_path)
-    results = ideal_results(plan, tmp_path)
-    rows = [row for row in measure_rows(results, ["efficiency"]) if row["method"] == "additive"]
-    assert len(rows) == 2 * 6
-    for row, group in zip(rows, np.repeat(estimates_by_group(results)[:2], 6), strict=True):
-        bound = least_variances(results)[group.group][row["parameter"]]
-        k = group.names.index(row["parameter"])
-        assert row["value"] == pytest.approx(100 * bound / np.mean((group.values[:, k] - group.truth[k]) ** 2))
-        # The estimates were drawn with the variance of long records.
-        assert 40 < row["value"] < 250
-
-
-def test_failures_are_counted_by_kind(make_results, estimate):
-    found = [estimate(8.0), estimate(None, status="FAILED"), estimate(8.1, status="MAX_ITERATIONS"), estimate(8.0)]
-    results = make_results({(5.0, "0.0"): found, (15.0, "0.0"): found[:1]})
-    rows = [row for row in measure_rows(results, ["failures"]) if row["n"]]
-    assert [(row["snr_db"], row["parameter"], row["value"]) for row in rows] == [
-        *((5.0, "FAILED", 25.0), (5.0, "MAX_ITERATIONS", 25.0)),
-        *((15.0, "FAILED", 0.0), (15.0, "MAX_ITERATIONS", 0.0)),
-    ]
 
 
 def test_what_cannot_be_measured_is_refused_in_a_sentence(results, make_results, estimate):

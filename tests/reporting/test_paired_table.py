@@ -45,6 +45,19 @@ def test_the_text_lists_what_only_the_second_solves(results, tmp_path):
     assert "adjusted by Holm over the 1 difference in percent; 4 differences in rmse" in " ".join(text.split())
 
 
+def test_each_pair_and_each_estimate_counts_once(results, add_estimator, estimate, tmp_path):
+    # The second has two sets of options: what the first missed is listed once.
+    add_estimator(results, "third", {(5.0, None): [estimate(delay) for delay in SECOND]})
+    _, other, third = results.manifest["estimators"]
+    other["swept"], third["swept"], third["name"] = {"zeros": 0}, {"zeros": 1}, "other"
+    assert "3 estimates of existing missed" in compare_estimators(results, "existing,other", tmp_path).draw()
+    # Options of one estimator: one difference each, not two of opposite sign.
+    rows = paired_rows(results, "other", "other")
+    assert [(row["first"], row["second"]) for row in rows] == [("other, zeros 0", "other, zeros 1")] * 5
+    with pytest.raises(UsageError, match="existing has no swept option; compare it with another estimator"):
+        compare_estimators(results, "existing,existing", tmp_path)
+
+
 def test_estimators_that_are_not_there_are_refused(results, tmp_path):
     with pytest.raises(UsageError, match=r"takes two estimators, A,B, not 'existing'; there are existing, other"):
         compare_estimators(results, "existing", tmp_path)

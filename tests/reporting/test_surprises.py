@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from ctid_cli.reporting.expected_accuracy import expected_accuracy
-from ctid_cli.reporting.surprises import surprises
+from ctid_cli.reporting.results import Group
+from ctid_cli.reporting.surprises import Finding, _sentence, surprises
 from ctid_cli.reporting.tables import build_tables
 from tests.reporting.ideal_results import estimate, plan_of, results_of
 
@@ -109,3 +110,19 @@ def test_the_table_says_it(results, monkeypatch):
     assert report.notes[-1] == surprises(made)[0]
     few = results(SPEC.replace("runs: 60", "runs: 40"), change=biased)
     assert surprises(few) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "sizes", "worst"),
+    [
+        ("bias", [0.02, -1.4, 1.0], "biased by up to 1.4 standard errors (p1)"),
+        ("width", [0.9, 0.5, 0.8], "standard errors up to 2 times too small (p1)"),
+        ("width", [1.3, 1.9, 1.5], "standard errors up to 1.9 times too large (p1)"),
+        ("coverage", [91.0, 60.0, 85.0], "coverage down to 60 % of 95 % (p1)"),
+        ("rmse", [1.3, 4.0, 2.0], "RMSE up to 4 times theory (p1)"),
+    ],
+)
+def test_the_worst_cell_is_that_of_its_kind(kind, sizes, worst):
+    group = Group("cell", "one", (), "none")
+    found = [Finding(group, {}, f"p{k}", kind, size, 0.0) for k, size in enumerate(sizes)]
+    assert _sentence("one", [], found, {group}, []) == f"one: {worst}"

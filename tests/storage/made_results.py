@@ -11,7 +11,7 @@ ORIGINS = (Origin("c", "p", ()),)
 
 
 class MadeResults(Stored):
-    """Results by key, all of which took the same time but those that have their own [s]."""
+    """Results by key, all of which took the same time but those that have their own [s]; some hold a CPU time."""
 
     def __init__(self, manifest, results, origins=ORIGINS, seconds=0.02):
         vars(self).update(manifest=manifest, origins=origins, results=results, usual=seconds, seconds={})
@@ -19,5 +19,6 @@ class MadeResults(Stored):
     @cached_property
     def table(self):
         planned = [slot for slot in slots(self.manifest) if slot.key in self.results]
-        rows = [Packed(slot, self.results[slot.key], self.seconds.get(slot.key, self.usual)) for slot in planned]
+        found = [(slot, self.results[slot.key], self.seconds.get(slot.key, self.usual)) for slot in planned]
+        rows = [Packed(*row, row[1].get("cpu_seconds")) for row in found]
         return PackedTable(self.manifest, rows)
