@@ -66,9 +66,6 @@ def lowered(options: Options, laid_out: LaidOut, fit: MeasuredFit) -> dict[str, 
         own, submodels = _of_submodels(options, fit)
         return own._lowered(submodels, laid_out)
     found: dict[str, float] = {}
-    if fit.known:
-        # It would free what is known too.
-        return found
     if options.initial_state == "rest":
         found["initial_state"] = laid_out.squared_error_with(fit.model, initial_state=True)
     if options.offset == "none":
@@ -79,8 +76,7 @@ def lowered(options: Options, laid_out: LaidOut, fit: MeasuredFit) -> dict[str, 
 def other_hold(options: Options, laid_out: LaidOut, fit: MeasuredFit, records: Sequence[Record]) -> OtherHold | None:
     """The best other hold of the input; None where the holds cannot be compared."""
     if isinstance(laid_out, Refinement):
-        comparable = options.loss == "squares" and not fit.known
-        return best_other_hold(laid_out, fit, records) if comparable else None
+        return best_other_hold(laid_out, fit, records) if options.loss == "squares" else None
     own, submodels = _of_submodels(options, fit)
     if own.closed:
         # A discrete controller holds its input.
