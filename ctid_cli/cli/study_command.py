@@ -91,7 +91,7 @@ def check_study(
 
 
 def _compute_first(studies: list[StudyFolder], update: bool, jobs: int | None) -> None:
-    from ctid_cli.studies.first_estimates import compute_first, differences, read_first, write_first
+    from ctid_cli.studies.first_estimates import Comparison, compare, compute_first, read_first, write_first
 
     wrong = []
     for item in studies:
@@ -100,12 +100,17 @@ def _compute_first(studies: list[StudyFolder], update: bool, jobs: int | None) -
             found = compute_first(item, Path(folder), jobs)
         if update:
             write_first(item, found)
-        different = [] if update else differences(found, read_first(item))
-        wrong += different
-        verdict = f"{len(different)} differ" if different else "written" if update else "as committed"
-        typer.echo(f"{item.name}: {len(found)} estimates, {verdict} ({time.monotonic() - begun:.0f} s)")
-        for line in different:
+        compared = Comparison([], []) if update else compare(found, read_first(item))
+        wrong += compared.wrong
+        if compared.wrong:
+            verdict = f"{len(compared.wrong)} of {len(found)} estimates differ from the committed ones"
+        else:
+            verdict = f"{len(found)} estimates {'written' if update else 'agree with the committed ones'}"
+        typer.echo(f"{item.name}: {verdict} ({time.monotonic() - begun:.0f} s)")
+        for line in compared.wrong:
             typer.echo(f"  {line}")
+        for line in compared.largest:
+            typer.echo(f"  largest difference: {line}")
     if wrong:
         raise MismatchError(f"{len(wrong)} of the first estimates are not as they were committed")
 

@@ -207,7 +207,8 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
                 raise DataError(f"the start has the submodels {model.terms} and the estimator {self.terms}")
         else:
             model, method = laid_out.start
-        return _fit(laid_out.problem, self._iterate(laid_out.problem, model), model, method)
+        problem, model = in_one_order(laid_out.problem, model)
+        return _fit(problem, self._iterate(problem, model), model, method)
 
     def _iterate(self, problem: AdditiveProblem, start: AdditiveModel) -> SubmodelEstimate:
         """Estimate from a start."""
@@ -244,6 +245,16 @@ def check_terms(terms: tuple[Term, ...]) -> None:
     order = sum(term.order for term in terms)
     if order > 40:
         raise OptionError("terms", f"terms have {order} poles together; at most 40 are supported")
+
+
+def in_one_order(problem: AdditiveProblem, start: AdditiveModel) -> tuple[AdditiveProblem, AdditiveModel]:
+    """A problem and its start with submodels by rising natural frequency: sums of submodels then round the same in
+    whatever order they were given. Where parameters are known by name, submodels stay.
+    """
+    if problem.fixed:
+        return problem, start
+    ordered = start.sorted()
+    return problem if ordered.terms == problem.terms else replace(problem, terms=ordered.terms), ordered
 
 
 def _nearest(theta: Array, terms: tuple[Term, ...], fixed: Mapping[int, float]) -> Array:

@@ -16,7 +16,7 @@ from ctid_cli.estimation.common import Estimator, Start
 from ctid_cli.estimation.fixed import Fixed
 from ctid_cli.estimation.measured_records import without_means
 from ctid_cli.estimation.profile_refinement import AppliedModel
-from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
+from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels, in_one_order
 from ctid_cli.estimators.delay_profile import FittedSamples, MeasuredFit
 from ctid_cli.filtering.filter_data import used_samples
 from ctid_cli.filtering.free_response import free_response
@@ -185,10 +185,10 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         return LaidOutSubmodels(record, self.estimator._lay_out(record).problem, u0, y0)
 
     def _estimate(self, laid_out: LaidOutSubmodels, start: Start | None) -> SubmodelsFit:
-        problem = laid_out.problem
         model, method = laid_out.start
         if start is not None and start.model is not None:
             model, method = start.model, "The start was given."
+        problem, model = in_one_order(laid_out.problem, model)
         found = self.estimator._iterate(problem, model)
         rows = problem.filter.rows(found.whole)
         if rows is None or not np.isfinite(rows[2]).all():

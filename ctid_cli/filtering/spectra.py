@@ -49,14 +49,16 @@ class RecordSpectra:
         self.window = window
         self.greatest_delay = greatest_delay
         self._first = 0 if keep_mean else 1
+        frequencies = 2 * np.pi / (end - start) * np.arange(count + 1, dtype=np.float64)
+        damping = _damping(record, window, frequencies)
         #: Frequencies [rad/s], shape (K,).
-        self.frequencies: Array = 2 * np.pi / (end - start) * np.arange(self._first, count + 1, dtype=np.float64)
+        self.frequencies: Array = frequencies[self._first :]
         output = HeldSignal(record.t, record.bridged_y, "foh")
         #: Mean factor by which straight lines between the samples damp each frequency [-], shape (K,).
-        self.damping: Array = _damping(record, window, self.frequencies)
+        self.damping: Array = damping[self._first :]
         joined = _held_spectrum(output, start, end - start, 0.0, count)
         #: Spectrum of the output [output unit], shape (K,).
-        self.outputs: ComplexArray = window_spectrum(joined, 0.0, 1.0 / self.damping[-count:])[self._first :]
+        self.outputs: ComplexArray = window_spectrum(joined, 0.0, 1.0 / damping[1:])[self._first :]
         #: The input, laid out for its spectrum at any delay.
         self.input = _held_spectrum(record.input, start, end - start, greatest_delay, count)
 

@@ -82,7 +82,9 @@ def orthonormal(columns: Rows, least: float | None = None) -> Array:
     triangle = columns[:0]
     for rows in row_blocks(len(columns)):
         triangle = np.asarray(np.linalg.qr(np.vstack((triangle, columns[rows])), mode="r"))
-    lengths = np.maximum(np.linalg.norm(triangle, axis=0), np.finfo(float).tiny)
+    lengths = np.linalg.norm(triangle, axis=0)
+    # A column of zeros has no length to divide by: the rounding of its weights would grow beyond bounds.
+    lengths[lengths == 0] = 1.0
     _, values, vectors = np.linalg.svd(triangle / lengths, full_matrices=False)
     kept = values > (len(columns) * np.finfo(float).eps if least is None else least) * values[0]
     return np.asarray(vectors[kept].T / values[kept] / lengths[:, None])

@@ -106,20 +106,49 @@ def test_first_estimates_are_those_that_are_stored_and_a_difference_is_seen(smal
     found = first_estimates.compute_first(small, tmp_path, jobs=1)
     assert len(found) == 10
     committed = json.loads(json.dumps(found))
-    assert first_estimates.differences(found, committed) == []
+    assert first_estimates.compare(found, committed) == ([], [])
     name = "two-tones finite_time None 0"
-    values = committed[name]["values"]
-    assert values["measures.omega_1"] == pytest.approx(2.0)
-    values["measures.omega_1"] *= 1 + 5e-7
-    assert first_estimates.differences(found, committed) == []
-    values["measures.omega_1"] *= 1 + 2e-6
-    (line,) = first_estimates.differences(found, committed)
-    assert line.startswith(f"{name}: measures.omega_1")
     committed[name]["status"] = "INVALID"
-    assert first_estimates.differences(found, committed) == [f"{name}: status VALID (not INVALID)"]
+    assert first_estimates.compare(found, committed).wrong == [f"{name}: status VALID (not INVALID)"]
     del committed[name]
-    assert first_estimates.differences(found, committed) == [f"{name}: not among those that were committed"]
-    assert first_estimates.differences(committed, found) == [f"{name}: missing"]
+    assert first_estimates.compare(found, committed).wrong == [f"{name}: not among those that were committed"]
+    assert first_estimates.compare(committed, found).wrong == [f"{name}: missing"]
+
+
+FIRST = {"parameters.g1_a1": 2.0, "standard_errors.g1_a1": 0.1, "delay": 8.0, "standard_errors.delay": 0.01}
+FIRST |= {"denominator.1": -3.0, "numerator.0": 5.0, "standard_errors.a1": 0.1, "cost": 0.5}
+FIRST |= {"measures.omega_1": 2.0, "measures.valid_share": 97.0}
+
+
+@pytest.mark.parametrize(
+    ("quantity", "allowed", "unit"),
+    [
+        ("parameters.g1_a1", 2e-4 * 0.1, "standard errors"),
+        ("denominator.1", 2e-4 * 0.1, "standard errors"),
+        ("delay", 2e-4 * 0.01, "standard errors"),
+        ("numerator.0", 2e-5 * 5.0, "of its value"),  # known: it has no standard error
+        ("standard_errors.a1", 2e-5 * 0.1, "of its value"),
+        ("cost", 2e-5 * 0.5, "of its value"),
+        ("measures.omega_1", 1e-9, "rad/s or s"),
+        ("measures.valid_share", 0.1, "% of the samples"),
+    ],
+)
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_first_estimates_may_differ_by_a_stated_tolerance(quantity, allowed, unit, sign):
+    committed = {"e 0": {"status": "CONVERGED", "values": FIRST}}
+
+    def moved(by):
+        return {"e 0": {"status": "CONVERGED", "values": {**FIRST, quantity: FIRST[quantity] + sign * by}}}
+
+    inside = first_estimates.compare(moved(0.9 * allowed), committed)
+    assert inside.wrong == []
+    (line,) = inside.largest
+    assert f" {unit} (allowed: " in line
+    assert line.endswith(f"{quantity} of e 0")
+    (line,) = first_estimates.compare(moved(1.1 * allowed), committed).wrong
+    assert line.startswith(f"e 0: {quantity} {FIRST[quantity] + sign * 1.1 * allowed!r} (not {FIRST[quantity]!r}, ")
+    (line,) = first_estimates.compare(moved(float("nan")), committed).wrong
+    assert line.startswith(f"e 0: {quantity} nan")
 
 
 def test_a_chaotic_iteration_is_compared_over_one_step():
