@@ -14,7 +14,7 @@ from ctid_cli.estimators import identification_warnings as warnings
 from ctid_cli.estimators import judging
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.judging import Options
-from ctid_cli.estimators.measured_submodels import SubmodelsFit
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, SubmodelsFit
 from ctid_cli.estimators.residual_causes import another_delay, another_order
 from ctid_cli.estimators.second_look import SecondLook, look_again
 from ctid_cli.estimators.second_look_words import of_second_look
@@ -27,6 +27,8 @@ from ctid_cli.inference.delay_interval import CostOfDelay, DelayInterval
 from ctid_cli.inference.diagnostics import fit_percent, r_squared
 from ctid_cli.inference.fitted_model import FittedModel, responses
 from ctid_cli.inference.later import FilledLater
+from ctid_cli.inference.nonlinearity import UNSAFE, shifts_of_ends
+from ctid_cli.inference.parametric import Parametric
 from ctid_cli.inference.residuals import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertain_value import UncertainValue
@@ -236,10 +238,13 @@ def identify(
         another_delay(*tried) if failed else None,
     )
     gains = _gains(linear, judging.lowered(options, laid_out, linear))
-    return replace(found, warnings=tuple(dict.fromkeys(_warnings(found, look, hessian, gains))))
+    unsafe = _unsafe(found, prepared.laid_out)
+    return replace(found, warnings=tuple(dict.fromkeys(_warnings(found, look, hessian, gains, unsafe))))
 
 
-def _warnings(found: Identification, look: SecondLook, hessian: Array, gains: dict[str, float]) -> Iterator[str]:
+def _warnings(
+    found: Identification, look: SecondLook, hessian: Array, gains: dict[str, float], unsafe: Sequence[str]
+) -> Iterator[str]:
     """What the user should know, the worst first; of a model without an answer to the input only that it is none."""
     options, fit = found.options, found.fit
     yield from warnings.of_answer(found.answer, options)
@@ -249,6 +254,7 @@ def _warnings(found: Identification, look: SecondLook, hessian: Array, gains: di
         known = fit.uncertainty("white") if found.uncertainty.kind == "biased" else found.uncertainty
         yield from warnings.of_conditioning(fit, known.free_covariance, hessian)
         yield from warnings.of_short_record(found.uncertainty, fit.count, "offset" in gains)
+        yield from warnings.of_nonlinearity(unsafe)
         yield from warnings.of_interval(found.delay_interval, options, fit)
     yield from warnings.of_residuals(found.tests, len(fit.residuals), FEWEST_TESTED)
     yield from warnings.of_treatment(gains, options)
@@ -286,6 +292,18 @@ def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
         correlation = np.abs(covariance / np.outer(errors, errors))
     moving = (correlation[unclear] > CLOSE_TO_ONE).any(axis=0)
     return set(np.flatnonzero(unclear | moving).tolist())
+
+
+def _unsafe(found: Identification, laid_out: judging.LaidOut) -> list[str]:
+    """Parameters whose intervals reach as far as the output is not linear in them."""
+    fit, options = found.fit, found.options
+    shown = [item.name for item in found.estimates if np.isfinite(item.standard_error)]
+    if not shown or (isinstance(options, MeasuredSubmodels) and options.closed):
+        return []
+    records, linear = judging.answering(options, laid_out), fit.linear
+    model = Parametric(fit.parametrised, fit.parameter_names)
+    shifts = shifts_of_ends(model, found.uncertainty, records, linear.used, linear.sensitivities)
+    return [name for name, shift in zip(fit.parameter_names, shifts, strict=True) if name in shown and shift > UNSAFE]
 
 
 def _free(fit: MeasuredFit) -> tuple[IndexArray, Array]:
