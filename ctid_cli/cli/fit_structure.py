@@ -178,5 +178,5 @@ def with_loop(loop: Path, measured: "Measurement", ignored: bool) -> "Measuremen
     options = load_loop(loop)
     if ignored:
         note = "The loop is ignored (--ignore-loop): noise that comes back through it biases the estimate."
-        return replace(measured, notes=(*measured.notes, note))
+        return replace(measured, record=replace(measured.record, feedback=True), notes=(*measured.notes, note))
     return in_loop(measured, options)

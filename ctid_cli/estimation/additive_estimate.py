@@ -15,7 +15,7 @@ from ctid_cli.filtering.loop import loop_radius
 from ctid_cli.inference.covariance import white_noise_covariance
 from ctid_cli.inference.fit import IterationRecord
 from ctid_cli.inference.status import Status
-from ctid_cli.inference.uncertainty import Covariance, estimate_uncertainty
+from ctid_cli.inference.uncertainty import Covariance, Uncertainty, estimate_uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.controller import DiscreteController
 
@@ -60,6 +60,14 @@ class SubmodelEstimate(NamedTuple):
     #: Covariance, status and all else that a `Fit` says of them, by its names.
     values: dict[str, Any]
 
+    def values_in(self, jacobian: Array) -> dict[str, Any]:
+        """The same of parameters with these derivatives by the present ones."""
+        law: Uncertainty | None = self.values.get("law")
+        if law is None:
+            return {**self.values, "covariance": np.full((len(jacobian),) * 2, np.nan)}
+        law = law.transformed(jacobian)
+        return {**self.values, "law": law, "covariance": law.covariance}
+
 
 def estimate_submodels(
     problem: AdditiveProblem, theta: Array, steps: Steps, covariance: Covariance, draws: int
@@ -95,12 +103,16 @@ def estimate_submodels(
     if result is None:
         return SubmodelEstimate(whole[:p], whole, {**values, **diverged(p, y.size)})
     equations, status = result.equations, result.status
-    matrix = np.full((p, p), np.nan)
+    law, matrix = None, np.full((p, p), np.nan)
     if status is not Status.DIVERGED:
-        matrix = _covariance(problem, result.theta, equations, covariance, draws)[:p, :p]
+        law = _law(problem, result.theta, equations, covariance, draws)
+        # Those of a free response are nobody's.
+        law = law and law.transformed(np.eye(p, whole.size))
+        matrix = matrix if law is None else law.covariance
         if status is Status.CONVERGED and np.isnan(np.delete(np.diag(matrix), list(problem.fixed))).any():
             status = Status.SINGULAR
-    values |= {"covariance": matrix, "status": status, **quality(equations, float(np.sum((y - y.mean()) ** 2)), y.size)}
+    values |= {"covariance": matrix, "law": law, "status": status}
+    values |= quality(equations, float(np.sum((y - y.mean()) ** 2)), y.size)
     return SubmodelEstimate(result.theta[:p], result.theta, values)
 
 
@@ -113,17 +125,20 @@ def _better(one: Iterated | None, other: Iterated | None) -> Iterated | None:
     return one if one.equations.squared_error <= other.equations.squared_error else other
 
 
-def _covariance(problem: AdditiveProblem, theta: Array, equations: Equations, kind: Covariance, draws: int) -> Array:
-    """Covariance of all parameters, those of a free response included."""
+def _law(
+    problem: AdditiveProblem, theta: Array, equations: Equations, kind: Covariance, draws: int
+) -> Uncertainty | None:
+    """Uncertainty of all parameters, those of a free response included; None where the response is not finite."""
     if kind == "white" and not problem.fixed:
-        return white_noise_covariance(equations.hessian, equations.squared_error, problem.data.count)
+        count = problem.data.count
+        found = white_noise_covariance(equations.hessian, equations.squared_error, count)
+        return Uncertainty("white", np.eye(theta.size), found, count)
     rows = problem.filter.rows(theta)
     if rows is None:
-        return np.full((theta.size, theta.size), np.nan)
+        return None
     psi, _, error, _ = rows
     tangent = problem.tangent if problem.fixed else None
-    found = estimate_uncertainty([psi], [error], kind, draws, regular=problem.data.interval > 0.0, tangent=tangent)
-    return found.widened()
+    return estimate_uncertainty([psi], [error], kind, draws, regular=problem.data.interval > 0.0, tangent=tangent)
 
 
 def radius_in_loop(problem: AdditiveProblem, model: AdditiveModel) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, ClassVar, Generic, Literal, TypeVar, get_args, get_origin, get_type_hints
 
@@ -20,7 +20,7 @@ from ctid_cli.inference.covariance import condition_number, white_noise_covarian
 from ctid_cli.inference.diagnostics import percent_from_r_squared
 from ctid_cli.inference.fit import Fit, IterationRecord
 from ctid_cli.inference.status import Status
-from ctid_cli.inference.uncertainty import DRAWS, Covariance, estimate_uncertainty
+from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty, estimate_uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_choice, require_integer, require_not_negative, require_positive
@@ -72,7 +72,9 @@ class Estimator(Generic[LaidOut, AnyFit]):
 
         A DataError says why nothing can be estimated.
         """
-        return Prepared(self, self._lay_out(record))
+        records = [record] if isinstance(record, Record) else list(record)
+        in_loop = any(one.in_loop for one in records) and getattr(self, "instruments", "open_loop") == "open_loop"
+        return Prepared(self, self._lay_out(record), in_loop)
 
     def fit(self, record: Any, start: Start | None = None) -> AnyFit:
         """Estimate from a record, or several where they may be, and from a start where the estimator takes one.
@@ -88,10 +90,20 @@ class Prepared(Generic[LaidOut, AnyFit]):
 
     estimator: Estimator[LaidOut, AnyFit]
     laid_out: LaidOut
+    #: Whether the record is from a loop of which the estimator knows nothing.
+    in_ignored_loop: bool = False
 
     def fit(self, start: Start | None = None) -> AnyFit:
         """Estimate from one start."""
-        return self.estimator._estimate(self.laid_out, start)
+        fit = self.estimator._estimate(self.laid_out, start)
+        if not self.in_ignored_loop:
+            return fit
+        if fit.law is not None and getattr(self.estimator, "covariance", "") == "auto":
+            # One fit and its parts in other forms: what is not defined in one is not in any.
+            law = fit.law.in_ignored_loop
+            covariance = fit.covariance if law is fit.law else np.full_like(fit.covariance, np.nan)
+            fit = replace(fit, law=law, covariance=covariance)
+        return replace(fit, in_ignored_loop=True)
 
 
 # --- options ---------------------------------------------------------------------------------------
@@ -240,20 +252,20 @@ def finish(
         found = found._replace(hessian=found.hessian[:size, :size])
         # A delay at its bound is no minimum: it has no standard error, and the others hold for that delay.
         accurate = 0 if status is Status.LEAST_SQUARES else size - int(status is Status.DELAY_AT_BOUND)
-        covariance = np.full((size, size), np.nan)
-        known = covariance[:accurate, :accurate]
+        law, tangent = None, np.eye(size)[:, :accurate]
         if accurate:
-            known[:] = white_noise_covariance(found.hessian[:accurate, :accurate], found.squared_error, y.size)
-            if status is Status.CONVERGED and np.isnan(known).any():
+            white = white_noise_covariance(found.hessian[:accurate, :accurate], found.squared_error, y.size)
+            law = Uncertainty("white", tangent, white, y.size)
+            if status is Status.CONVERGED and np.isnan(white).any():
                 status = Status.SINGULAR
         if kind != "white" and accurate:
             rows = standard_rows(problem.data, a, b, delay)
-            psi = (rows[:, problem.structure.sensitivity_rows] * problem.structure.signs)[:, :accurate]
+            psi = (rows[:, problem.structure.sensitivity_rows] * problem.structure.signs)[:, :size]
             errors, regular = rows[:, problem.structure.error_row], problem.data.interval > 0.0
-            uncertainty = estimate_uncertainty([psi], [errors], kind, draws, regular=regular)
-            known[:] = uncertainty.widened()
+            law = estimate_uncertainty([psi], [errors], kind, draws, regular=regular, tangent=tangent)
+        covariance = np.full((size, size), np.nan) if law is None else law.covariance
         spread = float(np.sum((y - y.mean()) ** 2))
-        values = {"covariance": covariance, "status": status, **quality(found, spread, y.size)}
+        values = {"covariance": covariance, "law": law, "status": status, **quality(found, spread, y.size)}
     else:
         values = diverged(size, y.size)
     return Fit(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice, permutations
 from typing import ClassVar
 
@@ -83,7 +83,8 @@ class AdditiveFit(Fit):
             With standard errors by the delta method, see
             :func:`~ctid_cli.inference.derived.additive_derived`.
         """
-        return additive_derived(self.additive, self.covariance, lambda _: normal_quantile(level))
+        quantile = (lambda _: normal_quantile(level)) if self.law is None else partial(self.law.quantile, level=level)
+        return additive_derived(self.additive, self.covariance, quantile)
 
 
 @dataclass(frozen=True)
@@ -101,10 +102,11 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         reference: needed for unbiased estimates where feedback brings coloured noise into the input.
     initial_state : {"rest", "periodic", "estimated"}, default "rest"
         State at the first sample: at rest, that of one period of a steady state, or free responses to be estimated.
-    covariance : {"auto", "white", "robust", "bootstrap"}, default "white"
+    covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
         Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
-        residuals; ``auto`` is white unless the residuals are not. ``bootstrap`` scales those for coloured noise so that
-        1.96 of them make the interval of a bootstrap-t. ``sandwich`` is an earlier name of ``robust``.
+        residuals (``robust``), whose intervals ``bootstrap`` takes from a bootstrap-t. ``auto`` is white where the
+        residuals pass Ljung and Box's test at the level of 5 %, else robust; and gives none where they do not in a
+        loop that the estimator ignores. ``sandwich`` is an earlier name of ``robust``.
     max_iterations : int, default 100
         Largest number of iterations.
     tolerance : float, default 1e-8
@@ -167,7 +169,7 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
     delay: float = 0.0
     instruments: Instruments = "open_loop"
     initial_state: InitialState = "rest"
-    covariance: Covariance = "white"
+    covariance: Covariance = "auto"
     max_iterations: int = 100
     tolerance: float = 1e-8
     variant: StepRule = "relaxed"
@@ -292,5 +294,5 @@ def _fit(problem: AdditiveProblem, estimate: SubmodelEstimate, start: AdditiveMo
         start=start,
         start_method=method,
         loop_radius=radius_in_loop(problem, model),
-        **{**estimate.values, "covariance": estimate.values["covariance"][np.ix_(order, order)]},
+        **estimate.values_in(np.eye(problem.size)[order]),
     )

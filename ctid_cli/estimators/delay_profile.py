@@ -128,8 +128,9 @@ class MeasuredFit(FilledLater, Fit):
             Covariance, and how many standard errors intervals reach.
         """
         noise: Any = {"regular": self.regular, "tangent": self.tangent, "progress": progress}
-        law = self.linear
-        return estimate_uncertainty(law.sensitivities, law.residuals, kind, draws, **noise)
+        linear = self.linear
+        found = estimate_uncertainty(linear.sensitivities, linear.residuals, kind, draws, **noise)
+        return found.in_ignored_loop if self.in_ignored_loop and kind == "auto" else found
 
     @property
     def linear(self) -> "MeasuredFit":
@@ -174,10 +175,11 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
         cost then never rises with the number of poles or zeros. Else only the minima of the profile are refined.
     hold_output : {"foh", "zoh"}, default "foh"
         Interpolation of the measured output between samples; does not change the estimate.
-    covariance : {"auto", "white", "robust", "bootstrap"}, default "white"
+    covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
         Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
-        residuals; ``auto`` is white unless the residuals are not. ``bootstrap`` scales those for coloured noise so that
-        1.96 of them make the interval of a bootstrap-t. ``sandwich`` is an earlier name of ``robust``.
+        residuals (``robust``), whose intervals ``bootstrap`` takes from a bootstrap-t. ``auto`` is white where the
+        residuals pass Ljung and Box's test at the level of 5 %, else robust; and gives none where they do not in a
+        loop that the estimator ignores. ``sandwich`` is an earlier name of ``robust``.
     bootstrap_draws : int, default 500
         Simulated noise sequences of a bootstrap [-].
     fixed : tuple of Fixed, optional
@@ -221,7 +223,7 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
     svf_cutoff: float | None = None
     nested: bool = False
     hold_output: OutputHold = "foh"
-    covariance: Covariance = field(default="white", metadata={"added_later": True})
+    covariance: Covariance = "auto"
     bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
     fixed: tuple[Fixed, ...] | None = field(default=None, metadata={"added_later": True})
 
@@ -262,7 +264,7 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
                 uncertainty = fit.uncertainty(self.covariance, self.bootstrap_draws)
                 singular = fit.status is Status.CONVERGED and not np.isfinite(uncertainty.free_covariance).all()
                 status = Status.SINGULAR if singular else fit.status
-                return replace(fit, covariance=uncertainty.widened(), status=status)
+                return replace(fit, covariance=uncertainty.covariance, law=uncertainty, status=status)
         raise DataError(Status.SINGULAR.value)
 
 

@@ -14,7 +14,7 @@ from ctid_cli.estimators import identification_warnings as warnings
 from ctid_cli.estimators import judging
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.judging import Options
-from ctid_cli.estimators.measured_submodels import SubmodelsFit
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, SubmodelsFit
 from ctid_cli.estimators.residual_causes import another_delay, another_order
 from ctid_cli.estimators.second_look import SecondLook, look_again
 from ctid_cli.estimators.second_look_words import of_second_look
@@ -27,10 +27,12 @@ from ctid_cli.inference.delay_interval import CostOfDelay, DelayInterval
 from ctid_cli.inference.diagnostics import fit_percent, r_squared
 from ctid_cli.inference.fitted_model import FittedModel, responses
 from ctid_cli.inference.later import FilledLater
+from ctid_cli.inference.nonlinearity import UNSAFE, shifts_of_ends
+from ctid_cli.inference.parametric import Parametric
 from ctid_cli.inference.residuals import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertain_value import UncertainValue
-from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty
+from ctid_cli.inference.uncertainty import BIASED, DRAWS, Covariance, Uncertainty
 from ctid_cli.signals.record import Record
 from ctid_cli.text import ShownAsTable
 
@@ -74,8 +76,6 @@ class Identification(FilledLater, FittedModel, ShownAsTable):
         The estimate.
     answer : AnswerTest
         Whether the outputs are seen to answer to the inputs at all; without it no parameter has a standard error.
-    uncertainty : Uncertainty
-        Covariance that the standard errors are from, for white or coloured noise, and how many of them intervals reach.
     estimates : tuple of UncertainValue
         The parameters with their uncertainty.
     delay_interval : DelayInterval or None
@@ -101,7 +101,6 @@ class Identification(FilledLater, FittedModel, ShownAsTable):
     options: Options
     fit: MeasuredFit | SubmodelsFit
     answer: AnswerTest
-    uncertainty: Uncertainty
     estimates: tuple[UncertainValue, ...]
     delay_interval: DelayInterval | None
     derived: tuple[UncertainValue, ...]
@@ -115,6 +114,12 @@ class Identification(FilledLater, FittedModel, ShownAsTable):
 
     def __repr__(self) -> str:
         return f"Identification: {self.uncertainty.kind} covariance, {len(self.warnings)} warnings\n{self.fit!r}"
+
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """Covariance that the standard errors are from, and how many of them intervals reach."""
+        assert self.fit.law is not None
+        return self.fit.law
 
     def _estimated(self) -> "Estimated":
         """The model with what its reported errors and intervals are from."""
@@ -175,8 +180,11 @@ def identify(
     """
     # Before the fit takes its time.
     checked = None if validation is None else judging.laid_out_validation(options, validation)
-    prepared = options.prepare(records)
+    # Errors for coloured noise are computed once, below, where a bootstrap can tell how far it is.
+    prepared = replace(options, covariance="white").prepare(records)
     fit: MeasuredFit | SubmodelsFit = prepared.fit()
+    uncertainty = fit.uncertainty(covariance, bootstrap_draws, progress)
+    fit = replace(fit, covariance=uncertainty.covariance, law=uncertainty)
     # What the estimate is by least squares near it: pseudo-errors where the loss is another.
     linear, laid_out = fit.linear, prepared.laid_out
     if isinstance(laid_out, Refinement):
@@ -187,8 +195,10 @@ def identify(
     answer = answer_test(answering, fit.used, options.delay_bounds, options.initial_state)
     squared_error = float(residuals @ residuals) if fit.weighting is None else fit.cost * fit.count
     tests = tests_of(options, linear, records, answer)
-    uncertainty = fit.uncertainty(covariance, bootstrap_draws, progress)
-    matrix = uncertainty.covariance
+    # What the data determine can be told even where no standard error can be given.
+    biased = uncertainty.kind == "biased"
+    known = fit.uncertainty("white") if biased else uncertainty
+    matrix = known.covariance
     free, hessian = _free(linear)
     singular = not condition_number(hessian) <= NEARLY_SINGULAR
     unclear = {fit.parameter_names[k] for k in (free if singular else _undetermined(fit, matrix))}
@@ -196,7 +206,7 @@ def identify(
         unclear |= {name for name in fit.parameter_names if not name.startswith("offset")}
     interval = None
     if isinstance(laid_out, Refinement) and "delay" in fit.parameter_names and "delay" not in unclear:
-        interval = _delay_interval(laid_out, linear, uncertainty)
+        interval = None if biased else _delay_interval(laid_out, linear, uncertainty)
     judged = None
     if checked is not None and validation is not None:
         judged = validated(judging.applied(fit, options, checked), validation)
@@ -204,7 +214,6 @@ def identify(
         options=replace(options, covariance=covariance, bootstrap_draws=bootstrap_draws),
         fit=fit,
         answer=answer,
-        uncertainty=uncertainty,
         estimates=_estimates(fit, uncertainty, unclear, interval),
         delay_interval=interval,
         derived=judging.derived(fit, uncertainty, answer.seen and not singular),
@@ -227,18 +236,23 @@ def identify(
         another_delay(*tried) if failed else None,
     )
     gains = _gains(linear, judging.lowered(options, laid_out, linear))
-    return replace(found, warnings=tuple(dict.fromkeys(_warnings(found, look, hessian, gains))))
+    unsafe = _unsafe(found, prepared.laid_out)
+    return replace(found, warnings=tuple(dict.fromkeys(_warnings(found, look, hessian, gains, unsafe))))
 
 
-def _warnings(found: Identification, look: SecondLook, hessian: Array, gains: dict[str, float]) -> Iterator[str]:
+def _warnings(
+    found: Identification, look: SecondLook, hessian: Array, gains: dict[str, float], unsafe: Sequence[str]
+) -> Iterator[str]:
     """What the user should know, the worst first; of a model without an answer to the input only that it is none."""
     options, fit = found.options, found.fit
     yield from warnings.of_answer(found.answer, options)
     yield from of_second_look(look, options, fit, found.tests, gains, answered=found.answer.seen)
     if found.answer.seen:
         yield from warnings.of_status(fit, said=look.integrator > 0)
-        yield from warnings.of_conditioning(fit, found.uncertainty.free_covariance, hessian)
+        known = fit.uncertainty("white") if found.uncertainty.kind == "biased" else found.uncertainty
+        yield from warnings.of_conditioning(fit, known.free_covariance, hessian)
         yield from warnings.of_short_record(found.uncertainty, fit.count, "offset" in gains)
+        yield from warnings.of_nonlinearity(unsafe)
         yield from warnings.of_interval(found.delay_interval, options, fit)
     yield from warnings.of_residuals(found.tests, len(fit.residuals), FEWEST_TESTED)
     yield from warnings.of_treatment(gains, options)
@@ -276,6 +290,18 @@ def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
         correlation = np.abs(covariance / np.outer(errors, errors))
     moving = (correlation[unclear] > CLOSE_TO_ONE).any(axis=0)
     return set(np.flatnonzero(unclear | moving).tolist())
+
+
+def _unsafe(found: Identification, laid_out: judging.LaidOut) -> list[str]:
+    """Parameters whose intervals reach as far as the output is not linear in them."""
+    fit, options = found.fit, found.options
+    shown = [item.name for item in found.estimates if np.isfinite(item.standard_error)]
+    if not shown or (isinstance(options, MeasuredSubmodels) and options.closed):
+        return []
+    records, linear = judging.answering(options, laid_out), fit.linear
+    model = Parametric(fit.parametrised, fit.parameter_names)
+    shifts = shifts_of_ends(model, found.uncertainty, records, linear.used, linear.sensitivities)
+    return [name for name, shift in zip(fit.parameter_names, shifts, strict=True) if name in shown and shift > UNSAFE]
 
 
 def _free(fit: MeasuredFit) -> tuple[IndexArray, Array]:
@@ -376,7 +402,8 @@ def _estimates(
             found[name] = UncertainValue(name, value, status="undetermined")
         elif k in free:
             reach = uncertainty.quantile(np.eye(errors.size)[k], LEVEL)
-            found[name] = UncertainValue.symmetric(name, value, float(errors[k]), quantile=reach)
+            reason = BIASED if uncertainty.kind == "biased" else ""
+            found[name] = UncertainValue.symmetric(name, value, float(errors[k]), quantile=reach, reason=reason)
         else:
             found[name] = UncertainValue(name, value, status="fixed" if name in fit.known else "at bound")
         if name == "delay" and interval is not None:

@@ -97,6 +97,17 @@ def of_short_record(uncertainty: Uncertainty, count: int, offset: bool = False) 
     ]
 
 
+def of_nonlinearity(names: Sequence[str]) -> list[str]:
+    """Which intervals a linearisation cannot be trusted with."""
+    if not names:
+        return []
+    what = f"intervals of {listed(names)} are" if len(names) > 1 else f"interval of {names[0]} is"
+    return [
+        f"The {what} unsafe: so far from the estimate the output is not linear in the parameters, and the truth lies "
+        "outside more often than in 5 %. Take a longer record, or an input that tells more."
+    ]
+
+
 def of_interval(interval: DelayInterval | None, options: Options, fit: MeasuredFit) -> list[str]:
     """Whether the interval of the delay ends where its search ended."""
     if interval is None:

@@ -114,7 +114,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         Whether parameters are those of the submodels; else those of the monic transfer function of the only term.
     fixed : tuple of Fixed, optional
         Known parameters of the submodels.
-    covariance : {"auto", "white", "robust", "bootstrap"}, default "white"
+    covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
         As in :class:`AdditiveSrivc`.
     bootstrap_draws : int, default 500
         Simulated noise sequences of a bootstrap [-].
@@ -135,7 +135,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
     offset: Offset = "none"
     factored: bool = True
     fixed: tuple[Fixed, ...] | None = None
-    covariance: Covariance = "white"
+    covariance: Covariance = "auto"
     bootstrap_draws: int = DRAWS
 
     def __post_init__(self) -> None:
@@ -227,7 +227,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         samples = self._samples_of(fit, laid_out)
         fit = replace(fit, residuals=samples.residuals, sensitivities=samples.sensitivities, used=samples.used)
         uncertainty = fit.uncertainty(self.covariance, self.bootstrap_draws)
-        return replace(fit, covariance=uncertainty.widened())
+        return replace(fit, covariance=uncertainty.covariance, law=uncertainty)
 
     # --- what a fit is judged by -----------------------------------------------------------------------
 

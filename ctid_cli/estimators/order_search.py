@@ -337,7 +337,8 @@ class _Search:
     def judged(self, each: FittedOrder, checked: Refinement | None, validation: Record | None) -> FittedOrder:
         """A structure with everything that is printed of it."""
         fit = each.fit
-        fit = replace(fit, covariance=fit.uncertainty("white").widened())
+        white = fit.uncertainty("white")
+        fit = replace(fit, covariance=white.covariance, law=white)
         free = np.flatnonzero(fit.tangent.any(axis=1))
         residuals = np.concatenate(fit.residuals)
         output = [record.y[use] for record, use in zip(self.records, fit.used, strict=True)]

@@ -62,10 +62,11 @@ class Srivc(Estimator[Iteration, Fit]):
     instruments : {"open_loop", "closed_loop"}, default "open_loop"
         ``closed_loop`` (CLSRIVC) simulates the instruments in the noise-free loop of the model with the record's
         controller and reference: needed where feedback brings coloured noise into the input.
-    covariance : {"auto", "white", "robust", "bootstrap"}, default "white"
+    covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
         Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
-        residuals; ``auto`` is white unless the residuals are not. ``bootstrap`` scales those for coloured noise so that
-        1.96 of them make the interval of a bootstrap-t. ``sandwich`` is an earlier name of ``robust``.
+        residuals (``robust``), whose intervals ``bootstrap`` takes from a bootstrap-t. ``auto`` is white where the
+        residuals pass Ljung and Box's test at the level of 5 %, else robust; and gives none where they do not in a
+        loop that the estimator ignores. ``sandwich`` is an earlier name of ``robust``.
     bootstrap_draws : int, default 500
         Simulated noise sequences of a bootstrap [-].
 
@@ -110,7 +111,7 @@ class Srivc(Estimator[Iteration, Fit]):
     variant: SrivcVariant = "auto"
     hold_output: OutputHold = "foh"
     instruments: Instruments = field(default="open_loop", metadata={"added_later": True})
-    covariance: Covariance = field(default="white", metadata={"added_later": True})
+    covariance: Covariance = "auto"
     bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
 
     def __post_init__(self) -> None:
@@ -170,9 +171,7 @@ class Srivc(Estimator[Iteration, Fit]):
         )
         additive = problem.model(estimate.theta)
         jacobian = unfactored_jacobian(additive, self.zeros)
-        covariance = jacobian @ estimate.values["covariance"] @ jacobian.T
-        values = {**estimate.values, "covariance": covariance}
-        return Fit(model=unfactored(additive), parameter_names=structure.names, **values)
+        return Fit(model=unfactored(additive), parameter_names=structure.names, **estimate.values_in(jacobian))
 
 
 def given_coefficients(model: AdditiveModel, structure: Structure, delay: float) -> Array:

@@ -78,10 +78,11 @@ class TdSrivc(Estimator["Searches", Fit]):
         iterations on coefficients and delay.
     hold_output : {"foh", "zoh"}, default "foh"
         Interpolation of the measured output between samples; changes the path, not the converged estimate.
-    covariance : {"auto", "white", "robust", "bootstrap"}, default "white"
+    covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
         Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
-        residuals; ``auto`` is white unless the residuals are not. ``bootstrap`` scales those for coloured noise so that
-        1.96 of them make the interval of a bootstrap-t. ``sandwich`` is an earlier name of ``robust``.
+        residuals (``robust``), whose intervals ``bootstrap`` takes from a bootstrap-t. ``auto`` is white where the
+        residuals pass Ljung and Box's test at the level of 5 %, else robust; and gives none where they do not in a
+        loop that the estimator ignores. ``sandwich`` is an earlier name of ``robust``.
     bootstrap_draws : int, default 500
         Simulated noise sequences of a bootstrap [-].
 
@@ -119,7 +120,7 @@ class TdSrivc(Estimator["Searches", Fit]):
     tolerance: float = 1e-6
     variant: Variant = "guarded"
     hold_output: OutputHold = "foh"
-    covariance: Covariance = field(default="white", metadata={"added_later": True})
+    covariance: Covariance = "auto"
     bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
 
     def __post_init__(self) -> None:

@@ -23,6 +23,7 @@ from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.inference.status import Status
+from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import OutputHold
 
@@ -91,6 +92,13 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
         Interpolation of the measured output between samples; changes the path, not the converged estimate.
     variant : {"guarded", "plain"}, default "guarded"
         ``plain`` is the published algorithm, slower and less certain to converge.
+    covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
+        Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
+        residuals (``robust``), whose intervals ``bootstrap`` takes from a bootstrap-t. ``auto`` is white where the
+        residuals pass Ljung and Box's test at the level of 5 %, else robust; and gives none where they do not in a
+        loop that the estimator ignores. ``sandwich`` is an earlier name of ``robust``.
+    bootstrap_draws : int, default 500
+        Simulated noise sequences of a bootstrap [-].
     max_delay_step : float, optional
         Longest Gauss-Newton step of the delay [s]. By default a third of the range of the delay, in ``plain`` half the
         shortest period: the publication has such a limit, but does not print it.
@@ -159,6 +167,8 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
     tolerance: float = 1e-3
     max_rounds: int = 20
     hold_output: OutputHold = "foh"
+    covariance: Covariance = "auto"
+    bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
     variant: Variant = field(default="guarded", metadata={"added_later": True})
     max_delay_step: float | None = field(default=None, metadata={"added_later": True})
 
@@ -171,7 +181,14 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
     @property
     def refinement(self) -> TdSrivc:
         """The estimator that ends the estimation on unfiltered data."""
-        return TdSrivc(self.poles, self.zeros, self.delay_bounds, hold_output=self.hold_output)
+        return TdSrivc(
+            self.poles,
+            self.zeros,
+            self.delay_bounds,
+            hold_output=self.hold_output,
+            covariance=self.covariance,
+            bootstrap_draws=self.bootstrap_draws,
+        )
 
     def _lay_out(self, record: Record) -> RedundantSearch | PrintedSearch:
         unfiltered = self.refinement._lay_out(record).last

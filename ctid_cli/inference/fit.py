@@ -8,7 +8,9 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.fitted_model import FittedModel, responses
+from ctid_cli.inference.quantile import normal_quantile
 from ctid_cli.inference.status import Status
+from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.text import ShownAsTable, wrapped
 
@@ -42,7 +44,7 @@ class Fit(FittedModel, ShownAsTable):
     parameter_names : tuple of str
         Names of the free parameters, in the order of ``covariance``.
     covariance : ndarray, shape (p, p)
-        Asymptotic covariance for white residuals; NaN where it is not defined.
+        Asymptotic covariance by the formula that ``law`` names; NaN where it is not defined.
     status : Status
         How the iterations ended.
     cost : float
@@ -59,6 +61,11 @@ class Fit(FittedModel, ShownAsTable):
         Of the scaled ``sum psi psi'`` [-].
     history : sequence of IterationRecord
         The accepted iterations.
+    law : Uncertainty, optional
+        What the covariance is from, and how many standard errors intervals reach; None where that is not known, and
+        intervals are then those of the normal distribution.
+    in_ignored_loop : bool, default False
+        Whether the input answers to the output through a loop of which the estimator knows nothing.
     """
 
     model: TransferFunction
@@ -72,6 +79,8 @@ class Fit(FittedModel, ShownAsTable):
     iterations: int
     condition_number: float
     history: Sequence[IterationRecord] = ()
+    law: Uncertainty | None = None
+    in_ignored_loop: bool = False
 
     def __repr__(self) -> str:
         errors = self.standard_errors
@@ -99,10 +108,19 @@ class Fit(FittedModel, ShownAsTable):
         return dict(zip(self.parameter_names, errors.tolist(), strict=True))
 
     @property
+    def quantiles(self) -> dict[str, float]:
+        """Standard errors to each side of the 95 % intervals of the parameters, by name [-]."""
+        if self.law is None:
+            return dict.fromkeys(self.standard_errors, normal_quantile())
+        return dict(zip(self.parameter_names, self.law.quantiles().tolist(), strict=True))
+
+    @property
     def parametrised(self) -> "TransferFunction | AdditiveModel":
         """The model in the form that has the parameters."""
         return self.model
 
     def _estimated(self) -> "Estimated":
-        """The model with its covariance, whose normal intervals are those of the parameters."""
+        """The model with the joint law of its parameters."""
+        if self.law is not None:
+            return responses.with_uncertainty(self.parametrised, self.parameter_names, self.law, defined=True)
         return responses.with_covariance(self.parametrised, self.parameter_names, self.covariance)

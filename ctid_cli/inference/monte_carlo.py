@@ -21,7 +21,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.inference.quantile import normal_quantile, student_quantile
 from ctid_cli.text import did_you_mean
 
-#: Standard errors on either side of an estimate that make a 95 % interval.
+#: Standard errors on either side of a normal estimate that make a 95 % interval.
 QUANTILE = normal_quantile()
 #: Standard deviation of normal values over the median of their sizes.
 NORMAL_MAD = 1.4826
@@ -49,6 +49,8 @@ class Sample(NamedTuple):
     widths: Array
     #: Least variance that an unbiased estimator can have; NaN where it is not known.
     bound: float = math.nan
+    #: Standard errors on either side of each estimate that make its 95 % interval, shape (n,).
+    quantiles: Array | float = QUANTILE
 
     def with_widths(self) -> "Sample":
         """Return the part of the data sets that have a standard error."""
@@ -199,7 +201,8 @@ def error_ratio(sample: Sample) -> Measured:
 
 def covered(sample: Sample) -> BoolArray:
     """Which 95 % intervals hold the true value; a standard error that could not be computed covers nothing."""
-    return np.abs(sample.errors) <= QUANTILE * sample.widths
+    hits: BoolArray = np.abs(sample.errors) <= sample.quantiles * sample.widths
+    return hits
 
 
 def coverage(sample: Sample) -> Measured:

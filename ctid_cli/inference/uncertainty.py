@@ -1,7 +1,7 @@
 """Standard errors and intervals of an estimate, by what its noise is taken for."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -9,13 +9,20 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.inference.bootstrap import BootstrapT, Progress, bootstrap_t
 from ctid_cli.inference.covariance import white_noise_covariance
-from ctid_cli.inference.quantile import normal_quantile, student_quantile
+from ctid_cli.inference.quantile import student_quantile
 from ctid_cli.inference.residuals import all_white
 from ctid_cli.inference.robust import robust_covariance
 
 #: What standard errors take the noise for; ``auto`` is ``white`` unless the residuals are not, ``sandwich`` an earlier
 #: name of ``robust``.
 Covariance = Literal["auto", "white", "robust", "bootstrap", "sandwich"]
+#: The formula that was used; by ``biased`` there is no standard error.
+Formula = Literal["white", "robust", "bootstrap", "biased"]
+#: Why there is none.
+BIASED = (
+    "There are no standard errors: the input answers to the output through a loop that this fit ignores, and the "
+    "residuals are coloured, so that the estimate is biased."
+)
 #: Draws of a bootstrap that is asked for.
 DRAWS = 500
 #: Student's t of fewer degrees of freedom has no variance.
@@ -28,7 +35,7 @@ ENOUGH_FREEDOM = 5.0
 class Uncertainty:
     """Covariance of the parameters, and how many standard errors their intervals reach."""
 
-    kind: Literal["white", "robust", "bootstrap"]
+    kind: Formula
     #: Directions in which the parameters are free, shape (p, f), and the covariance along them, shape (f, f).
     tangent: Array
     free_covariance: Array
@@ -57,7 +64,7 @@ class Uncertainty:
     @property
     def short(self) -> bool:
         """Whether the record is too short for the colour of its noise."""
-        return self.kind != "white" and self.spare < ENOUGH_FREEDOM
+        return self.kind in ("robust", "bootstrap") and self.spare < ENOUGH_FREEDOM
 
     def quantile(self, gradient: Array, level: float = 0.95) -> float:
         """Standard errors to each side of a quantity with this gradient by the leading parameters."""
@@ -65,13 +72,23 @@ class Uncertainty:
             return student_quantile(self.degrees_of_freedom, level)
         return self.bootstrap.quantile(gradient @ self.tangent[: gradient.size], level)
 
-    def widened(self) -> Array:
-        """Covariance whose normal intervals of the parameters are those of the bootstrap."""
-        covariance = self.covariance
+    def quantiles(self, level: float = 0.95) -> Array:
+        """Standard errors to each side of every parameter, shape (p,)."""
+        size = len(self.tangent)
         if self.bootstrap is None:
-            return covariance
-        factors = np.array([self.quantile(row) for row in np.eye(len(covariance))]) / normal_quantile()
-        return covariance * np.outer(factors, factors)
+            return np.full(size, self.quantile(np.zeros(size), level))
+        return np.array([self.quantile(row, level) for row in np.eye(size)])
+
+    def transformed(self, jacobian: Array) -> "Uncertainty":
+        """Uncertainty of parameters with these derivatives by the present ones, shape (q, p)."""
+        return replace(self, tangent=jacobian @ self.tangent)
+
+    @property
+    def in_ignored_loop(self) -> "Uncertainty":
+        """What is left where the fit ignores the loop of its record: nothing, unless the residuals are white."""
+        if self.kind == "white" or not np.isfinite(self.free_covariance).all():
+            return self
+        return replace(self, kind="biased", free_covariance=np.full_like(self.free_covariance, np.nan), bootstrap=None)
 
 
 def estimate_uncertainty(

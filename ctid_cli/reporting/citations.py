@@ -115,6 +115,6 @@ def bibtex(result: Identification) -> str:
     entries = [_CTID.format(version=ctid_cli.__version__), method]
     if result.fit.weighting is not None:
         entries.append(_ROBUST)
-    if result.uncertainty.kind != "white":
+    if result.uncertainty.kind in ("robust", "bootstrap"):
         entries.append(_LIKELIHOOD)
     return "\n\n".join([*entries, _FREQUENCY])

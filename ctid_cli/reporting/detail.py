@@ -8,7 +8,8 @@ from typing import Any
 
 from ctid_cli.canonical import plain
 from ctid_cli.errors import MismatchError
-from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.inference.uncertain_value import NORMAL, UncertainValue
+from ctid_cli.inference.uncertainty import BIASED
 from ctid_cli.kinds import KINDS
 from ctid_cli.reporting.estimate import as_object, parameter_object, parameter_table, parameters
 from ctid_cli.reporting.layout import Table, delay_label, number, seconds
@@ -74,7 +75,7 @@ def _parameters(found: FoundEstimate) -> list[UncertainValue]:
 def _fitted(found: FoundEstimate) -> list[list[str]]:
     """Parameters of a model, and how well it fits."""
     row, shown = found.row, _parameters(found)
-    table = [parameter_table(shown).draw(), *_conventions(shown)] if shown else []
+    table = [parameter_table(shown).draw(), *_conventions(shown, _interval(row))] if shown else []
     if row.get("true_delay") is not None:
         table.append(f"True delay: {number(row['true_delay'])} s.")
     facts = [("fit", f"{number(row['fit_percent'])} % of the data it was estimated from")]
@@ -178,16 +179,29 @@ def _settings(content: Mapping[str, Any]) -> list[str]:
     return [f"  {key}: {json.dumps(value, ensure_ascii=False)}" for key, value in content.items()]
 
 
-def _conventions(shown: list[UncertainValue]) -> list[str]:
+def _interval(row: Mapping[str, Any]) -> str:
+    """How intervals follow from errors."""
+    formula, freedom = row.get("covariance"), row.get("degrees_of_freedom")
+    if formula == "biased":
+        return BIASED
+    reach = {f"{value:.3g}" for value in (row.get("quantiles") or {}).values()} or {f"{NORMAL:.3g}"}
+    text = f"low and high are estimate -+ {reach.pop() if len(reach) == 1 else 'their own number of'} errors"
+    if formula is None:
+        return f"{text}."
+    noise = "white" if formula == "white" else "coloured"
+    how = "bootstrap-t" if formula == "bootstrap" else f"t, {number(freedom, 4)} degrees of freedom"
+    return f"{text} ({how}); errors are those for {noise} noise."
+
+
+def _conventions(shown: list[UncertainValue], interval: str) -> list[str]:
     """What the names and columns of a table of parameters mean."""
-    interval = "low and high are estimate -+ 1.96 errors."
     names = [item.name for item in shown]
     if not any(name.startswith("g") for name in names):
         return [f"Monic denominator, descending powers; {interval}"]
     lines = ["g1: submodel of the least natural frequency; g1_a2: coefficient of p^2 in its denominator (ends in 1)."]
     if "a1" in names:
         lines.append("a1, b0: all submodels as one fraction with a monic denominator, descending powers.")
-    return [*lines, interval.capitalize()]
+    return [*lines, interval[0].upper() + interval[1:]]
 
 
 def _start(row: Mapping[str, Any]) -> str:

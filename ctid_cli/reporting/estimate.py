@@ -7,7 +7,7 @@ from math import nan
 from typing import Any
 
 from ctid_cli.canonical import plain
-from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.inference.uncertain_value import NORMAL, UncertainValue
 from ctid_cli.reporting.layout import Table, number
 from ctid_cli.signals.sampled_signal import SECONDS
 
@@ -65,7 +65,10 @@ class Units:
 def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None = None) -> list[UncertainValue]:
     """Parameters of an estimate with their uncertainty."""
     numerator, denominator = estimate.get("numerator"), estimate.get("denominator")
-    errors, given, units = estimate.get("standard_errors") or {}, estimate.get("parameters") or {}, Units()
+    given, units = estimate.get("parameters") or {}, Units()
+    # What was stored before quantiles were has intervals of the normal distribution.
+    reach = estimate.get("quantiles") or {}
+    errors = {name: (error, reach.get(name)) for name, error in (estimate.get("standard_errors") or {}).items()}
     if not numerator or not denominator:
         return [_found(name, value, errors, "") for name, value in given.items()]
     submodels = {name: value for name, value in given.items() if re.match(r"g\d+_", name)}
@@ -85,8 +88,11 @@ def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None
     return [*found[:-1], replace(found[-1], status="free" if "delay" in given else _delay_status(delay, delay_bounds))]
 
 
-def _found(name: str, value: float | None, errors: Mapping[str, float | None], unit: str) -> UncertainValue:
-    return UncertainValue.symmetric(name, _or_nan(value), _or_nan(errors.get(name)), unit)
+def _found(
+    name: str, value: float | None, errors: Mapping[str, tuple[float | None, float | None]], unit: str
+) -> UncertainValue:
+    error, reach = errors.get(name, (None, None))
+    return UncertainValue.symmetric(name, _or_nan(value), _or_nan(error), unit, reach or NORMAL)
 
 
 def _or_nan(value: float | None) -> float:

@@ -15,6 +15,7 @@ from ctid_cli.estimators.judging import Options
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, SubmodelsFit
 from ctid_cli.inference.status import Status
 from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.inference.uncertainty import BIASED
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
 from ctid_cli.reporting.layout import Report, Table, count, number, picked
@@ -171,7 +172,8 @@ def _covariance_object(result: Identification) -> dict[str, Any]:
         "names": result.fit.parameter_names,
         "values": uncertainty.covariance,
         "effective_samples": uncertainty.effective_count,
-        "degrees_of_freedom": uncertainty.degrees_of_freedom if draws is None else None,
+        "degrees_of_freedom": uncertainty.degrees_of_freedom if uncertainty.kind in ("white", "robust") else None,
+        "reason": BIASED if uncertainty.kind == "biased" else None,
         "bootstrap_draws": 0 if draws is None else len(draws.errors),
     }
 
@@ -332,6 +334,8 @@ def covariance_line(result: Identification) -> str:
     text = "Standard errors are those for white residuals"
     if not result.answer.seen:
         return f"There are no standard errors, as no answer to the input is seen. {_form(result.fit)}"
+    if found.kind == "biased":
+        return f"{BIASED} {_form(result.fit)}"
     if found.kind != "white":
         text = "Standard errors are those for coloured noise" + ", because the residuals are not white" * (not asked)
     elif result.tests:

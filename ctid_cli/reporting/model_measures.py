@@ -63,12 +63,14 @@ def pole_estimates(estimates: ParameterEstimates, system: TransferFunction, rows
     for number, k in enumerate(upper, start=1):
         names += [f"pole_{number}_real", f"pole_{number}_imag"] if true[k].imag else [f"pole_{number}"]
     values = np.array([_numbers(_matched(true, a), true, upper) for a in rows.values("denominator")])
+    nothing = np.full((len(rows), len(names)), np.nan)
     return replace(
         estimates,
         names=tuple(names),
         truth=np.array(_numbers(true, true, upper)),
         values=values.reshape(len(rows), len(names)),
-        standard_errors=np.full((len(rows), len(names)), np.nan),
+        standard_errors=nothing,
+        quantiles=nothing,
     )
 
 

@@ -58,6 +58,8 @@ class ParameterEstimates:
     values: Array
     #: Standard errors; NaN where there is none, shape (R, p).
     standard_errors: Array
+    #: Standard errors to each side of the 95 % intervals [-], shape (R, p).
+    quantiles: Array
     #: Whether each estimate failed, and whether one that did not fail did not converge either, shape (R,).
     failures: BoolArray
     unconverged: BoolArray
@@ -79,7 +81,7 @@ class ParameterEstimates:
         """Errors of one of the parameters, where it has a value."""
         errors = self.errors[:, k]
         counted = np.isfinite(errors)
-        return Sample(errors[counted], self.standard_errors[counted, k], bound)
+        return Sample(errors[counted], self.standard_errors[counted, k], bound, self.quantiles[counted, k])
 
     @property
     def errors(self) -> Array:
@@ -104,7 +106,7 @@ class ParameterEstimates:
     def first(self, n: int) -> "ParameterEstimates":
         """Those of the first data sets only."""
         kept = self.replicates < n
-        arrays = ("values", "standard_errors", "failures", "unconverged", "replicates")
+        arrays = ("values", "standard_errors", "quantiles", "failures", "unconverged", "replicates")
         return replace(self, **{name: getattr(self, name)[kept] for name in arrays})
 
 
@@ -212,7 +214,7 @@ def estimates_by_group(results: Results) -> list[ParameterEstimates]:
     truths = {name: true_values(cell) for name, cell in cells.items()}
     found = {group: rows.found(tuple(truths[group.cell])) for group, rows in groups.items()}
     delays: dict[tuple[Any, ...], list[Array]] = {}
-    for group, (values, errors) in found.items():
+    for group, (values, errors, _) in found.items():
         names = list(truths[group.cell])
         if "delay" in names:
             k = names.index("delay")
@@ -223,8 +225,8 @@ def estimates_by_group(results: Results) -> list[ParameterEstimates]:
         true = truths[group.cell]
         kept = [name != "delay" or (group.estimator, group.options) not in given for name in true]
         known = {name: value for (name, value), keep in zip(true.items(), kept, strict=True) if keep}
-        values, errors = (side[:, kept] for side in found.pop(group))
-        estimates.append(_estimates(results, cells[group.cell], group, rows, known, values, errors))
+        numbers = (side[:, kept] for side in found.pop(group))
+        estimates.append(_estimates(results, cells[group.cell], group, rows, known, *numbers))
     return estimates
 
 
@@ -243,6 +245,7 @@ def _estimates(
     true: Mapping[str, float],
     values: Array,
     errors: Array,
+    quantiles: Array,
 ) -> ParameterEstimates:
     """What an estimator found in a data cell."""
     values[~monte_carlo.complete(values)] = np.nan
@@ -258,6 +261,8 @@ def _estimates(
         truth=np.array([*true.values()]),
         values=values,
         standard_errors=errors,
+        # Results of before quantiles were stored, and estimators that give none.
+        quantiles=np.where(np.isnan(quantiles), monte_carlo.QUANTILE, quantiles),
         failures=failures,
         unconverged=(rows.column("status") != b"CONVERGED") & ~failures,
         replicates=rows.column("replicate"),

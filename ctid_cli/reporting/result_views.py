@@ -209,6 +209,8 @@ def _parameters(result: Fit | Identification) -> list[UncertainValue]:
     """Parameters with their units."""
     if isinstance(result, Identification):
         return parameters_of(result, Units())
-    values, errors = result.parameters, result.standard_errors
+    values, errors, reach = result.parameters, result.standard_errors, result.quantiles
     units = {name: parameter_unit(name, list(values)) for name in values}
-    return [UncertainValue.symmetric(name, value, errors[name], units[name]) for name, value in values.items()]
+    return [
+        UncertainValue.symmetric(name, value, errors[name], units[name], reach[name]) for name, value in values.items()
+    ]

@@ -11,6 +11,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from statistics import NormalDist
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ctid_cli.inference.monte_carlo import QUANTILE
 from ctid_cli.inference.paired import holm
 from ctid_cli.reporting.expected_accuracy import why_biased
@@ -140,7 +142,8 @@ class _Reasons:
         if self.plan is None or not isinstance(source, SimulatedSource):
             return []
         late = self.input_is_late and lookup(cell, "sampling.input_record") == "sampled"
-        white = part["content"].get("covariance", "white") == "white"
+        rows = self.results.groups()[finding.group]
+        white = rows.has("covariance") and float(np.mean(rows.column("covariance") == b"white")) > 0.5
         coloured = source.noise is not None and getattr(source.noise, "coloured", True)
         treated = next((key for key in ("initial_state", "offset") if part["content"].get(key) == "estimate"), "")
         noise, option = lookup(cell, "noise.kind"), f"estimators.{part['name']}.{treated}: estimate"

@@ -82,6 +82,8 @@ class Record:
         Where the record comes from; appears in messages.
     loop : Loop, optional
         What closed the loop; None for a record taken in open loop, or in a loop that is not known.
+    feedback : bool, default False
+        Whether the input answers to the output in a way of which ``loop`` says nothing.
 
     Raises
     ------
@@ -100,6 +102,7 @@ class Record:
     noise_free: Array | None = None
     name: str = ""
     loop: Loop | None = None
+    feedback: bool = False
 
     def __post_init__(self) -> None:
         t = np.array(self.t, dtype=float)
@@ -172,6 +175,11 @@ class Record:
     def inputs(self) -> tuple[HeldSignal, ...]:
         """The inputs; today there is one."""
         return (self.input,)
+
+    @property
+    def in_loop(self) -> bool:
+        """Whether the input is known to answer to the output."""
+        return self.loop is not None or self.feedback
 
     @property
     def n_samples(self) -> int:

@@ -65,7 +65,9 @@ class DataSet:
 
     def result_of(self, fit: Any, start: Any, terms: Sequence[Term] | None) -> dict[str, Any]:
         """What is stored of a fit to the record."""
-        parameters, errors = additive_parameters(fit, terms)
+        parameters, errors, quantiles = additive_parameters(fit, terms)
+        errors, quantiles = {**fit.standard_errors, **errors}, {**fit.quantiles, **quantiles}
+        law = fit.law
         # Of estimators of one's own, which may give parameters of any name, and no model.
         named, model = getattr(fit, "named", {}), fit.model
         # Of useful redundancy alone.
@@ -78,7 +80,10 @@ class DataSet:
             "numerator": None if model is None else model.numerator,
             "denominator": None if model is None else model.denominator,
             "parameters": {**named, **(parameters or {})} or None,
-            "standard_errors": fit.standard_errors | errors,
+            "standard_errors": errors,
+            "covariance": None if law is None else law.kind,
+            "degrees_of_freedom": law.degrees_of_freedom if law and law.kind in ("white", "robust") else None,
+            "quantiles": {name: value for name, value in quantiles.items() if np.isfinite(errors[name])},
             "cost": fit.cost,
             "fit_percent": fit.fit_percent,
             "validation_fit_percent": _fit_percent(model, self.validation, "y"),
@@ -154,7 +159,7 @@ class SimulatedSource:
             u, x = simulate_loop(self.system, controller, *signals)
             closed = Loop(reference, controller, loop.enters)
         y = self._with_losses(self.recorder.rounded(x + noise), replicate)
-        return Record(times, y, HeldSignal(times, u), noise_free=x, loop=closed)
+        return Record(times, y, HeldSignal(times, u), noise_free=x, loop=closed, feedback=True)
 
     def _drawn(self, times: Array, output: Array, replicate: int) -> Array:
         if self.noise is None:
@@ -241,7 +246,8 @@ class MeasuredSource:
             y = y - np.nanmean(y[:count])
         # Without its folder: what an estimator says about the record is part of the results.
         name = Path(self.file).name
-        record = Record(t[:count], y[:count], HeldSignal(t[:count], u[:count], self.hold), name=name, loop=loop)
+        signal = HeldSignal(t[:count], u[:count], self.hold)
+        record = Record(t[:count], y[:count], signal, name=name, loop=loop, feedback=self.loop is not None)
         rest = np.where(np.arange(t.size) < count, np.nan, y)
         if not np.isfinite(rest).any():
             return DataSet(record)

@@ -88,6 +88,18 @@ COLUMNS = (
         of="systems",
     ),
     Column("standard_errors", "by name", "of `b0` ..., `a1` ..., `delay` and `parameters`", of="systems", prefix="se_"),
+    Column(
+        *("covariance", "str"),
+        "formula of the standard errors: `white`, `robust`, `bootstrap`; `biased`: none, as a loop is ignored and the "
+        "residuals are coloured",
+        of="systems",
+    ),
+    Column("degrees_of_freedom", "float64", "of Student's t, whose quantile intervals reach", "-", of="systems"),
+    Column(
+        *("quantiles", "by name", "standard errors to each side of the 95 % interval, of the same parameters", "-"),
+        of="systems",
+        prefix="quantile_",
+    ),
     Column("cost", "float64", "mean squared output error", "output unit^2", of="systems"),
     Column("fit_percent", "float64", "fit on the record that was estimated from", "%", of="systems"),
     Column("validation_fit_percent", "float64", "fit on the rest of a measured record", "%", of="systems"),

@@ -181,15 +181,23 @@ def _coefficients(names: tuple[str, ...]) -> tuple[int, int]:
     return poles, zeros
 
 
-def found_values(
-    row: Mapping[str, Any], names: Iterable[str]
-) -> tuple[dict[str, float | None], dict[str, float | None]]:
-    """Estimated values and standard errors under the names of the true ones.
+class Found(NamedTuple):
+    """Numbers of an estimate under the names of the true parameters; None where there is none."""
+
+    values: dict[str, float | None]
+    standard_errors: dict[str, float | None]
+    #: Standard errors to each side of 95 % intervals [-].
+    quantiles: dict[str, float | None]
+
+
+def found_values(row: Mapping[str, Any], names: Iterable[str]) -> Found:
+    """Estimated values, standard errors and quantiles of intervals under the names of the true ones.
 
     Coefficients go together by their power of s: of a model with more zeros than the system, ``b1`` may be what is
     ``b0`` in truth. Those of a model with another number of poles have nothing to be compared with.
     """
-    wanted, errors = tuple(names), dict(row.get("standard_errors") or {})
+    wanted = tuple(names)
+    errors, quantiles = (dict(row.get(name) or {}) for name in ("standard_errors", "quantiles"))
     values = dict(row.get("parameters") or {}) | {"delay": row.get("delay")}
     b, a = row.get("numerator"), row.get("denominator")
     poles, zeros = _coefficients(wanted)
@@ -200,5 +208,6 @@ def found_values(
         padded = dict(enumerate(b, start=own - len(b)))
         shift = own - zeros
         values |= {f"b{k}": padded.get(k + shift, 0.0) for k in range(zeros)}
-        errors |= {f"b{k}": errors.get(f"b{k + shift}") for k in range(zeros)} if shift else {}
-    return {name: values.get(name) for name in wanted}, {name: errors.get(name) for name in wanted}
+        for each in (errors, quantiles):
+            each |= {f"b{k}": each.get(f"b{k + shift}") for k in range(zeros)} if shift else {}
+    return Found(*({name: each.get(name) for name in wanted} for each in (values, errors, quantiles)))

@@ -30,6 +30,7 @@ _OF_PARAMETERS = {
     "delay": "",
     "parameters": "present",
     "standard_errors": "present",
+    "quantiles": "present",
 }
 
 
@@ -145,8 +146,8 @@ class Stored:
         fit = self.at("fit_percent", where)
         return judged(success, truth, self.failures(where), dict(zip(truth, values.T, strict=True)), fit, measures)
 
-    def found(self, where: AnyArray, names: Sequence[str]) -> tuple[Array, Array]:
-        """Estimated values and standard errors under the names of the true ones, NaN where there is none, shape (n, p).
+    def found(self, where: AnyArray, names: Sequence[str]) -> tuple[Array, Array, Array]:
+        """Values, standard errors and quantiles under the names of the true ones, NaN where none is, shape (n, p).
 
         Rows that have the same form take their numbers from the same places: what `found_values` says of places.
         """
@@ -155,13 +156,13 @@ class Stored:
         held |= {name: self.at(name, where) for name in names_of_forms}
         forms = [held[name].reshape(len(where), -1) for name in names_of_forms]
         form: AnyArray = np.hstack(forms) if forms else np.zeros((len(where), 1), dtype=int)
-        values, errors = np.full((2, len(where), len(names)), np.nan)
+        values, errors, quantiles = np.full((3, len(where), len(names)), np.nan)
         left = np.ones(len(where), dtype=bool)
         while left.any():
             some = int(left.argmax())
             alike = left & (form == form[some]).all(axis=1)
             row = self._places(some, held)
-            for target, places in zip((values, errors), found_values(row, names), strict=True):
+            for target, places in zip((values, errors, quantiles), found_values(row, names), strict=True):
                 for k, name in enumerate(names):
                     place = places[name]
                     if isinstance(place, tuple):
@@ -169,7 +170,7 @@ class Stored:
                     elif place is not None:
                         target[alike, k] = place
             left &= ~alike
-        return values, errors
+        return values, errors, quantiles
 
     def _places(self, number: int, held: Mapping[str, AnyArray]) -> dict[str, Any]:
         """One of some rows with the places of its numbers in their place."""
@@ -248,8 +249,8 @@ class Rows(Sequence[dict[str, Any]]):
         known = [part for part in found if part is not None]
         return np.concatenate(known) if known and len(known) == len(found) else None
 
-    def found(self, names: Sequence[str]) -> tuple[Array, Array]:
-        """Estimated values and standard errors under the names of the true ones."""
+    def found(self, names: Sequence[str]) -> tuple[Array, Array, Array]:
+        """Estimated values, standard errors and quantiles of intervals under the names of the true ones."""
         return self.stored.found(self.places, names)
 
     def _by_block(self, places: IndexArray) -> Iterator[tuple[Block, IndexArray]]:

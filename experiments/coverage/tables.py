@@ -8,7 +8,6 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.inference import monte_carlo
 from ctid_cli.inference.monte_carlo import Sample
-from ctid_cli.inference.quantile import normal_quantile, student_quantile
 from ctid_cli.reporting.layout import Table
 from ctid_cli.reporting.parameter_errors import estimates_by_group
 from ctid_cli.reporting.results import Results
@@ -34,18 +33,17 @@ def coverage(results: Results) -> list[dict[str, Any]]:
     plan = build_plan(spec_from_canonical(dict(results.settings)))
     (found,) = estimates_by_group(results)
     with_value = np.flatnonzero(np.isfinite(found.values).all(axis=1))
-    # Standard errors by formula, and how many of them the interval reaches, over the normal quantile.
-    formulas = {"white": (found.standard_errors[with_value], np.ones(with_value.size))}
+    # Standard errors by formula, and how many of them intervals reach.
+    formulas = {"white": (found.standard_errors[with_value], found.quantiles[with_value])}
     if plan.data_cells[0].source.noise.coloured:
         # Coloured noise is what the sandwich is meant for; the estimator stores the white formula, misused here.
         formulas = {"sandwich, t": _robust(plan, [found.replicates[k] for k in with_value]), **formulas}
     letter, _ = ROWS[last_part(results.experiment)]
     lines = []
-    for formula, (widths, reach) in formulas.items():
-        for name, true, values, width in zip(
-            found.names, found.truth, found.values[with_value].T, widths.T, strict=True
-        ):
-            sample, mean_error = Sample(values - true, reach * width), float(np.nanmean(width))
+    for formula, (widths, reaches) in formulas.items():
+        columns = (found.values[with_value].T, widths.T, reaches.T)
+        for name, true, values, width, reach in zip(found.names, found.truth, *columns, strict=True):
+            sample, mean_error = Sample(values - true, width, quantiles=reach), float(np.nanmean(width))
             percent, bias, deviation = (
                 measure(sample) for measure in (monte_carlo.coverage, monte_carlo.bias, monte_carlo.deviation)
             )
@@ -73,16 +71,13 @@ def coverage(results: Results) -> list[dict[str, Any]]:
 
 
 def _robust(plan: Any, replicates: list[int]) -> tuple[Array, Array]:
-    """Standard errors for coloured noise, which are not stored, from the same fits, made again.
-
-    And Student's quantiles over the normal one.
-    """
+    """Standard errors for coloured noise, which are not stored, and their quantiles, from the same fits, made again."""
     (cell,), (estimator,) = plan.data_cells, plan.estimators
     errors, reach = [], []
     for replicate in replicates:
         uncertainty = estimator.estimator.prepare(cell.dataset(replicate).record).fit(None).uncertainty("robust")
         errors.append(np.sqrt(np.diag(uncertainty.covariance)))
-        reach.append(student_quantile(uncertainty.degrees_of_freedom) / normal_quantile())
+        reach.append(uncertainty.quantiles())
     return np.array(errors), np.array(reach)
 
 

@@ -1,21 +1,27 @@
 """What standard errors take the noise for, in every estimator that asks."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from ctid_cli.canonical import plain
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc
 from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.estimators.identification import identify
 from ctid_cli.estimators.srivc import Srivc
 from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.quantile import normal_quantile
-from ctid_cli.inference.uncertainty import estimate_uncertainty
+from ctid_cli.inference.quantile import student_quantile
+from ctid_cli.inference.status import Status
 from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.reporting.estimate import parameters
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
+from ctid_cli.simulation.dataset import DataSet
 
 DELAY = 0.25
 ESTIMATORS = {
@@ -34,10 +40,14 @@ def record(colour):
     return Record(t, simulate(TransferFunction([2.0], [1.0, 2.0], DELAY), u, t) + noise, u)
 
 
-def errors(name, colour, covariance, **options):
+def fitted(name, colour, covariance, feedback=False, **options):
     start = Start(delay=0.3) if name == "td_srivc" else None
-    fit = ESTIMATORS[name](covariance=covariance, **options).fit(record(colour), start)
-    return np.array([*fit.standard_errors.values()])
+    given = replace(record(colour), feedback=feedback)
+    return ESTIMATORS[name](covariance=covariance, **options).fit(given, start)
+
+
+def errors(name, colour, covariance):
+    return np.array([*fitted(name, colour, covariance).standard_errors.values()])
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
@@ -49,18 +59,44 @@ def test_auto_is_white_unless_the_residuals_are_not(name):
     assert (coloured[:2] > 1.5 * errors(name, 0.9, "white")[:2]).all()
 
 
-@pytest.mark.parametrize("name", ["srivc", "delay_profile"])
-def test_both_routes_to_a_bootstrap_differ_from_robust_errors_by_its_quantiles(name):
-    scaled = errors(name, 0.9, "bootstrap", bootstrap_draws=50) / errors(name, 0.9, "robust")
-    assert ((scaled > 0.6) & (scaled < 1.7)).all()
-    assert (scaled != 1.0).all()
-
-
-def test_normal_intervals_of_the_widened_covariance_are_those_of_the_bootstrap():
-    fit = DelayProfile(1, 0, (0.0, 1.0)).fit(record(0.9))
-    found = estimate_uncertainty(fit.sensitivities, fit.residuals, "bootstrap", 50, regular=True)
-    unit = np.eye(fit.theta.size)
-    reach = [found.quantile(row) for row in unit] * np.sqrt(np.diag(found.covariance))
-    np.testing.assert_allclose(normal_quantile() * np.sqrt(np.diag(found.widened())), reach, rtol=1e-12)
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_bootstrap_has_the_robust_errors_and_quantiles_of_its_own(name):
+    robust, found = (fitted(name, 0.9, kind, bootstrap_draws=50) for kind in ("robust", "bootstrap"))
+    assert found.standard_errors == robust.standard_errors
+    assert len(set(robust.quantiles.values())) == 1 < len(set(found.quantiles.values()))
+    assert all(0.6 < found.quantiles[key] / value < 1.7 for key, value in robust.quantiles.items())
     # A quantity and a multiple of it have the same interval in standard errors.
-    assert found.quantile(unit[0]) == pytest.approx(found.quantile(-3.0 * unit[0]))
+    row = np.eye(len(found.parameters))[0]
+    assert found.law.quantile(row) == pytest.approx(found.law.quantile(-3.0 * row))
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_intervals_are_those_of_student(name):
+    white, coloured = fitted(name, 0.0, "auto"), fitted(name, 0.9, "auto")
+    size = len(white.parameters)
+    assert white.quantiles == dict.fromkeys(white.parameters, student_quantile(white.count - size))
+    count = coloured.law.effective_count
+    assert count < 100
+    assert coloured.quantiles == dict.fromkeys(coloured.parameters, student_quantile(count - size))
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_fit_that_ignores_a_loop_has_no_errors_where_residuals_are_coloured(name):
+    found = fitted(name, 0.9, "auto", feedback=True)
+    assert (found.law.kind, found.status) == ("biased", Status.CONVERGED)
+    assert np.isnan([*found.standard_errors.values()]).all()
+    assert fitted(name, 0.9, "robust", feedback=True).standard_errors == fitted(name, 0.9, "robust").standard_errors
+    assert fitted(name, 0.0, "auto", feedback=True).standard_errors == fitted(name, 0.0, "auto").standard_errors
+
+
+@pytest.mark.parametrize("kind", ["auto", "bootstrap"])
+@pytest.mark.parametrize("colour", [0.0, 0.9])
+def test_what_is_stored_of_an_estimate_is_what_a_fit_prints(kind, colour):
+    options = ESTIMATORS["delay_profile"](covariance=kind, bootstrap_draws=50)
+    stored = DataSet(record(colour)).result_of(options.fit(record(colour)), None, None)
+    printed = identify(ESTIMATORS["delay_profile"](), [record(colour)], None, kind, 50)
+    assert stored["covariance"] == printed.uncertainty.kind
+    assert printed.delay_interval is None
+    assert {item.name: (item.estimate, item.low, item.high) for item in printed.estimates} == {
+        item.name: (item.estimate, item.low, item.high) for item in parameters(plain(stored), (0.0, 1.0))
+    }

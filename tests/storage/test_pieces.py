@@ -149,11 +149,11 @@ def test_found_values_are_those_of_single_rows() -> None:
     manifest, table = filled(11)
     stored = Stored(manifest, (ORIGIN,), table)
     names = ("a1", "b0", "b1", "delay")
-    values, errors = stored.every().found(names)
+    found = stored.every().found(names)
     from ctid_cli.storage.manifest import found_values
 
     for k, row in enumerate(stored.rows()):
-        for array, expected in zip((values, errors), found_values(row, names), strict=True):
+        for array, expected in zip(found, found_values(row, names), strict=True):
             wanted = np.array([expected[name] for name in names], dtype=float)
             np.testing.assert_array_equal(array[k], wanted)
 
