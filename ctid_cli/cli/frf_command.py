@@ -64,21 +64,22 @@ def frf(
     for name, value, wanted in (("--period", period, "periodic"), ("--segment", segment, "welch")):
         if value is not None and method not in ("auto", wanted):
             raise UsageError(f"{name} belongs to --method {wanted}, not to {method}")
+    for name, value, least in (("--period", period, 2), ("--width", width, 4)):
+        if value is not None and value < least:
+            raise UsageError(f"{name} must be {least} or more, not {value}")
     if width is not None and method not in ("auto", "local-polynomial"):
         raise UsageError(f"--width belongs to --method local-polynomial, not to {method}")
     columns = {"time": time, "input": input, "output": output}
     measurements = [read_measurement(file, **columns, hold=hold, start=start, stop=stop) for file in files]
     units = common_units(measurements)
-    try:
-        found = estimate_frequency_response(
-            [item.record for item in measurements],
-            method=_method(method, period, width, segment),
-            period=period,
-            half_width=width,
-            segment=segment,
-        )
-    except ValueError as error:
-        raise UsageError(str(error).replace("half_width", "--width").replace("period must", "--period must")) from None
+    found = estimate_frequency_response(
+        [item.record for item in measurements],
+        method=_method(method, period, width, segment),
+        period=period,
+        half_width=width,
+        segment=segment,
+        time_unit=units.time,
+    )
     title = ", ".join(file.name for file in files)
     content = columns_bytes(frf_columns(found, units), "csv", {})
     write_files({data: content, figure: frf_drawing(found, units, title).saved()})

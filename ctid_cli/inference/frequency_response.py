@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.spectra import record_spectra
 from ctid_cli.inference.answer import analyse_answer
@@ -29,6 +29,9 @@ ON_GRID = 1e-5
 IMAGES_MATTER = 0.05
 #: Places at which a response is estimated, unless another number is asked for.
 POINTS = 400
+#: Frequencies on each side of one whose phases must mostly be known for its own, and unknown ones that a phase is
+#: followed across.
+BESIDE, BRIDGED = 2, 2
 #: Fewer frequencies than these are no response over frequency.
 FEWEST = 3
 
@@ -61,7 +64,9 @@ class FrequencyResponse:
     hold : {"zoh", "foh", "band-limited"}
         What the input was taken to do between its samples.
     notes : tuple of str
-        What was chosen, and what to know before believing the numbers.
+        What was chosen, and what to know before believing the numbers; where there is no interval, why.
+    told : ndarray of bool, shape (K,)
+        Whether an interval is given.
     """
 
     frequencies: Array
@@ -74,6 +79,7 @@ class FrequencyResponse:
     method: Literal["periodic", "local-polynomial", "welch"]
     hold: Hold
     notes: tuple[str, ...]
+    told: BoolArray
 
     def __repr__(self) -> str:
         low, high = self.frequencies[[0, -1]]
@@ -96,12 +102,12 @@ class FrequencyResponse:
         -------
         ndarray, shape (K,)
             Radii [output unit/input unit]: with d degrees of freedom ``|error|^2`` over its variance has the
-            F-distribution of 2 and 2 d degrees of freedom.
+            F-distribution of 2 and 2 d degrees of freedom. NaN where no interval is given.
         """
-        return np.asarray(np.sqrt(self.variance * self.freedom * ((1.0 - level) ** (-1.0 / self.freedom) - 1.0)))
+        return np.where(self.told, self._radius(level), np.nan)
 
     def gain_band(self, level: float = 0.95) -> tuple[Array, Array]:
-        """Pointwise interval of the gain; its lower end is zero where the noise exceeds the response.
+        """Pointwise interval of the gain; its lower end is zero where the response may be.
 
         Parameters
         ----------
@@ -111,10 +117,53 @@ class FrequencyResponse:
         Returns
         -------
         low, high : ndarray, shape (K,)
-            Ends [output unit/input unit].
+            Ends [output unit/input unit]; NaN where no interval is given.
         """
-        half = self._half_width(level)
-        return np.maximum(np.abs(self.response) - half, 0.0), np.abs(self.response) + half
+        gain, half = np.abs(self.response), np.where(self.told, self._half_width(level), np.nan)
+        low = np.where(gain > self._radius(level), gain - half, 0.0)
+        return np.where(self.told, low, np.nan), gain + half
+
+    def phase_known(self, level: float = 0.95) -> BoolArray:
+        """Whether the phase is known to better than a quarter of a turn to each side.
+
+        Parameters
+        ----------
+        level : float, default 0.95
+            Probability [-].
+
+        Returns
+        -------
+        ndarray of bool, shape (K,)
+            True where an interval is given and the circle of that probability leaves out zero, there and at most of the
+            five frequencies around: among many frequencies of noise alone some exceed their circles by chance.
+        """
+        clear = self.told & (np.abs(self.response) > self._radius(level))
+        around = np.ones(2 * BESIDE + 1)
+        share = np.convolve(clear, around, "same") / np.convolve(np.ones(clear.size), around, "same")
+        return np.asarray(clear & (share > 0.5))
+
+    def phase(self, level: float = 0.95) -> Array:
+        """Phase, followed over the frequencies at which it is known.
+
+        Parameters
+        ----------
+        level : float, default 0.95
+            Probability of the intervals that decide where it is known [-].
+
+        Returns
+        -------
+        ndarray, shape (K,)
+            Phases [rad]; NaN where unknown. After more than two unknown frequencies, and where the turn to the next
+            known one may be more than half a turn, it begins anew between -pi and pi.
+        """
+        phase = np.full(self.response.size, np.nan)
+        places = np.flatnonzero(self.phase_known(level))
+        angle, half = np.angle(self.response[places]), self.phase_band(level)[places]
+        turn = np.angle(self.response[places][1:] * self.response[places][:-1].conj())
+        followed = (np.diff(places) <= BRIDGED + 1) & (np.abs(turn) + np.hypot(half[1:], half[:-1]) < np.pi)
+        for run in np.split(np.arange(places.size), np.flatnonzero(~followed) + 1):
+            phase[places[run]] = np.unwrap(angle[run])
+        return phase
 
     def phase_band(self, level: float = 0.95) -> Array:
         """Half the width of the pointwise interval of the phase.
@@ -127,17 +176,20 @@ class FrequencyResponse:
         Returns
         -------
         ndarray, shape (K,)
-            Half-widths [rad]; pi where the noise exceeds the response.
+            Half-widths [rad], below pi/2; NaN where the phase is not known.
         """
-        gain, half = np.abs(self.response), self._half_width(level)
-        return np.where(half < gain, np.arcsin(np.minimum(half / np.maximum(gain, 1e-300), 1.0)), np.pi)
+        share = self._half_width(level) / np.maximum(np.abs(self.response), 1e-300)
+        return np.where(self.phase_known(level), np.arcsin(np.minimum(share, 1.0)), np.nan)
+
+    def _radius(self, level: float) -> Array:
+        """Radius of the circle around each estimate, whether or not it can be given."""
+        return np.asarray(np.sqrt(self.variance * self.freedom * ((1.0 - level) ** (-1.0 / self.freedom) - 1.0)))
 
     def _half_width(self, level: float) -> Array:
         """Half the width of an interval of one part of the response."""
         from scipy.special import stdtrit
 
-        quantile = stdtrit(2 * self.freedom, 0.5 + level / 2)
-        return np.asarray(quantile * np.sqrt(0.5 * self.variance))
+        return np.asarray(stdtrit(2 * self.freedom, 0.5 + level / 2) * np.sqrt(0.5 * self.variance))
 
 
 def estimate_frequency_response(
@@ -148,6 +200,7 @@ def estimate_frequency_response(
     half_width: int | None = None,
     segment: int | None = None,
     points: int = POINTS,
+    time_unit: str = "s",
 ) -> FrequencyResponse:
     r"""Frequency response of what lies between input and output, without a model.
 
@@ -168,6 +221,8 @@ def estimate_frequency_response(
         Length of Welch's segments [samples]; by default an eighth of the record.
     points : int, default 400
         Frequencies at which a local polynomial estimates the response, at most [-].
+    time_unit : str, default "s"
+        Unit of time that the notes name.
 
     Returns
     -------
@@ -223,7 +278,7 @@ def estimate_frequency_response(
     first, hold = every[0], every[0].input.hold
     odd = next((sentence for record in every if (sentence := _not_on_one_clock(record))), None)
     if odd is not None:
-        return _on_any_clock(every, odd, method, points, half_width)
+        return _on_any_clock(every, odd, method, points, half_width, time_unit)
     signals = [(record.input.at(record.t), record.bridged_y) for record in every]
     interval = float(first.interval or 0.0)
     if method in ("auto", "periodic"):
@@ -233,27 +288,23 @@ def estimate_frequency_response(
     if len(every) > 1:
         _require_alike(every, period)
     if period is not None and method in ("auto", "periodic"):
-        return _finished(from_periods(signals, period, interval), "periodic", hold, interval, first)
+        return _finished(from_periods(signals, period, interval), "periodic", hold, interval, first, time_unit)
+    # A long delay turns the phase fast: the output is advanced to where it begins to answer.
     u, y = signals[0]
-    if method != "welch":
-        lines = _by_polynomials(first, u, y, points, half_width)
-        if lines.frequencies.size >= FEWEST or method == "local-polynomial":
-            return _finished(lines, "local-polynomial", hold, interval, first)
-    return _finished(welch(u, y, interval, segment), "welch", hold, interval, first)
-
-
-def _by_polynomials(record: Record, u: Array, y: Array, points: int, half_width: int | None) -> ResponseLines:
-    """Local polynomials, with the output advanced to where it begins to answer: a long delay turns the phase fast."""
-    interval = float(record.interval or 0.0)
-    shift = min(int(_begins(record) / interval), u.size // 2)
+    shift = min(int(_begins(first) / interval), u.size // 2)
     u, y = u[: u.size - shift], y[shift:]
-    inputs, outputs = (np.fft.rfft(x - x.mean())[1 : (x.size + 1) // 2] / x.size for x in (u, y))
-    found = local_polynomial(inputs, outputs, 2 * np.pi / (u.size * interval), points, half_width)
-    return _later(found, shift * interval)
+    if method != "welch":
+        inputs, outputs = (np.fft.rfft(x - x.mean())[1 : (x.size + 1) // 2] / x.size for x in (u, y))
+        lines = local_polynomial(inputs, outputs, 2 * np.pi / (u.size * interval), points, half_width, time_unit)
+        if lines.frequencies.size >= FEWEST or method == "local-polynomial":
+            return _finished(_later(lines, shift * interval), "local-polynomial", hold, interval, first, time_unit)
+    return _finished(
+        _later(welch(u, y, interval, segment, time_unit), shift * interval), "welch", hold, interval, first, time_unit
+    )
 
 
 def _on_any_clock(
-    records: list[Record], reason: str, method: ResponseMethod, points: int, half_width: int | None
+    records: list[Record], reason: str, method: ResponseMethod, points: int, half_width: int | None, time_unit: str
 ) -> FrequencyResponse:
     """The same from the exact spectrum of the held input and from straight lines between the samples of the output."""
     (record, *more) = records
@@ -266,15 +317,15 @@ def _on_any_clock(
     late = min(_begins(record), 0.5 * record.duration)
     spectra = record_spectra(record, late, np.inf, late, keep_mean=False)
     base = 2 * np.pi / spectra.duration
-    found = _later(local_polynomial(spectra.inputs(late), spectra.outputs, base, points, half_width), late)
+    found = _later(local_polynomial(spectra.inputs(late), spectra.outputs, base, points, half_width, time_unit), late)
     note = (
         f"Since {reason}, the spectrum of the output is that of straight lines between its samples, corrected for what "
-        f"they damp; towards {np.pi / float(np.median(np.diff(record.t))):.3g} rad/s that is rough."
+        f"they damp; towards {np.pi / float(np.median(np.diff(record.t))):.3g} rad/{time_unit} that is rough."
     )
     notes = (*found.notes, note, *_of_record(record))
     bias = np.zeros(found.frequencies.size)
     _require_some(found, record)
-    return FrequencyResponse(*found[:6], bias, "local-polynomial", record.input.hold, notes)
+    return FrequencyResponse(*found[:6], bias, "local-polynomial", record.input.hold, notes, found.told)
 
 
 def _begins(record: Record) -> float:
@@ -301,6 +352,7 @@ def _finished(
     hold: Hold,
     interval: float,
     record: Record,
+    time_unit: str,
 ) -> FrequencyResponse:
     """The response to the input as it was between its samples."""
     _require_some(lines, record)
@@ -309,11 +361,11 @@ def _finished(
     distortion = None if lines.distortion is None else lines.distortion / power
     held = lines._replace(response=lines.response / factor, variance=lines.variance / power, distortion=distortion)
     bias = images(hold, held.frequencies, held.response, held.variance, interval)
-    notes = (*held.notes, _of_hold(hold, held.frequencies, bias, np.abs(held.response)), *_of_record(record))
-    return FrequencyResponse(*held[:6], bias, method, hold, notes)
+    notes = (*held.notes, _of_hold(hold, held.frequencies, bias, np.abs(held.response), time_unit), *_of_record(record))
+    return FrequencyResponse(*held[:6], bias, method, hold, notes, held.told)
 
 
-def _of_hold(hold: Hold, frequencies: Array, bias: Array, gain: Array) -> str:
+def _of_hold(hold: Hold, frequencies: Array, bias: Array, gain: Array, time_unit: str) -> str:
     """What the hold means for the estimate."""
     if hold == "band-limited":
         return (
@@ -326,7 +378,7 @@ def _of_hold(hold: Hold, frequencies: Array, bias: Array, gain: Array) -> str:
     large = bias > IMAGES_MATTER * gain
     onward = np.cumsum(large[::-1])[::-1] >= 0.8 * np.arange(large.size, 0, -1)
     if (large & onward).any():
-        where = f"from {frequencies[np.argmax(large & onward)]:.3g} rad/s on"
+        where = f"from {frequencies[np.argmax(large & onward)]:.3g} rad/{time_unit} on"
         text += f" Its images may bias the estimate by more than {100 * IMAGES_MATTER:g} % {where}."
     return text + " With another hold the phase differs by up to half a sampling interval of delay." * (hold == "zoh")
 

@@ -1,9 +1,11 @@
-r"""A frequency response from periods of a steady state: what differs between them is noise.
+r"""A frequency response from periods of an input: what lies between the lines of the period is transient and noise.
 
-With M periods and the DFT of each, the response on an excited line is the ratio of the mean spectra. Sample variances
-and covariance of input and output over the periods give its variance, noise on the input included:
+The DFT of M whole periods has the input on every M-th line only. On the lines between, input and output hold noise and
+the transient of a start that has not settled, which is smooth over frequency. A polynomial of degree 2 through the
+nearest of these lines gives the transient on the line of the input, which is taken out, and its residuals the variances
+and the covariance of the noise, noise on the input included. With the lines U and Y the response is Y/U, of variance
 
-.. math:: \sigma_G^2 = \frac{|G|^2}{M} \Big(\frac{\sigma_Y^2}{|Y|^2} + \frac{\sigma_U^2}{|U|^2}
+.. math:: \sigma_G^2 = |G|^2 \Big(\frac{\sigma_Y^2}{|Y|^2} + \frac{\sigma_U^2}{|U|^2}
           - 2 \mathrm{Re} \frac{\sigma_{YU}^2}{Y U^*}\Big).
 
 Nonlinear distortions repeat with the input, so that periods do not show them. They show on lines that the input does
@@ -26,10 +28,8 @@ REPEATED = 1e-3
 #: Lines on which the input has less than this share of its greatest power do not excite, nor those that stand out of
 #: the input's noise by less than so many times its variance.
 EXCITED, ABOVE_NOISE = 1e-6, 10.0
-#: Variances are averaged over neighbouring lines until they have at least this many degrees of freedom.
-FREEDOM = 8
-#: The first periods differ from the last ones where the mean square of that is so many times what noise explains.
-SETTLED = 2.0
+#: Lines on each side of one of the input from which transient and noise are read, and the degree of the polynomial.
+BETWEEN, DEGREE = 4, 2
 #: Unexcited lines on each side of an excited one from which the distortion on it is read.
 DETECTION = 3
 #: A kind of unexcited lines tells the distortions from this number on.
@@ -39,16 +39,14 @@ FEWEST = 4
 class _Periods(NamedTuple):
     """What the periods of one realisation tell on every line above zero."""
 
-    #: Mean spectra, shape (K,).
+    #: Spectra without the transient, shape (K,).
     inputs: ComplexArray
     outputs: ComplexArray
-    #: Sample variances and covariance over the periods, averaged over neighbouring lines, shape (K,).
+    #: Variances and covariance of these, shape (K,).
     input_noise: Array
     output_noise: Array
     both: ComplexArray
     number: int
-    freedom: int
-    dropped: int
 
 
 def find_period(u: Array) -> int | None:
@@ -87,7 +85,7 @@ def from_periods(signals: Sequence[tuple[Array, Array]], period: int, interval: 
     responses = np.array([response for response, _ in each])
     noise = np.array([variance for _, variance in each])
     response = responses.mean(axis=0)
-    freedom = np.full(excited.size, float(found[0].freedom))
+    freedom = np.full(excited.size, 2.0 * BETWEEN - DEGREE - 1.0)
     variance, distortion = noise.mean(axis=0) / len(found), None
     if len(found) > 1:
         scatter = np.var(responses, axis=0, ddof=1)
@@ -100,69 +98,41 @@ def from_periods(signals: Sequence[tuple[Array, Array]], period: int, interval: 
     else:
         distortion, notes = _distortion(found[0], excited)
     followed = np.mean([np.abs(response * one.inputs[excited]) ** 2 for one in found], axis=0)
-    rest = np.mean([one.output_noise[excited] for one in found], axis=0)
+    rest = np.mean([one.number * one.output_noise[excited] for one in found], axis=0)
     coherence = np.asarray(followed / np.maximum(followed + rest, np.finfo(float).tiny), dtype=np.float64)
     frequencies = np.asarray(2 * np.pi / (period * interval) * (excited + 1), dtype=np.float64)
-    head = _head(found, period, excited.size)
-    return ResponseLines(frequencies, response, variance, freedom, coherence, distortion, (*head, *notes))
-
-
-def _head(found: list[_Periods], period: int, lines: int) -> list[str]:
-    one = found[0]
-    text = f"{one.number} periods of {period} samples, {lines} excited lines."
-    if one.dropped:
-        text += f" {one.dropped} more at the beginning, in which the output had not settled, are left out."
-    elif one.number == 2:
-        text += " With two periods a transient in the first one is not told from noise."
-    wide = one.freedom // (one.number - 1)
-    if wide > 1:
-        text += f" The variance on each line is averaged over {wide} lines."
-    return [text]
+    head = (
+        f"{found[0].number} periods of {period} samples, {excited.size} excited lines. Transient and noise are "
+        f"read from the {2 * BETWEEN} lines around each one on which the input has nothing.",
+    )
+    told = np.ones(excited.size, dtype=bool)
+    return ResponseLines(frequencies, response, variance, freedom, coherence, distortion, (*head, *notes), told)
 
 
 def _periods(u: Array, y: Array, period: int) -> _Periods:
     count = u.size // period
     if count < 2:
         raise DataError(f"{u.size} samples hold no two periods of {period}; give the period of the input, in samples")
-    inputs, outputs = (np.fft.rfft(x[x.size - count * period :].reshape(count, period), axis=1) for x in (u, y))
-    kept = slice(1, (period + 1) // 2)
-    inputs, outputs = inputs[:, kept] / period, outputs[:, kept] / period
-    dropped = _unsettled(outputs)
-    inputs, outputs = inputs[dropped:], outputs[dropped:]
-    count -= dropped
-    reach = min(outputs.shape[1] - 1, max(0, -(-(-(-FREEDOM // (count - 1)) - 1) // 2)))
-    width = 2 * reach + 1
-    off_u, off_y = inputs - inputs.mean(axis=0), outputs - outputs.mean(axis=0)
-    products = [np.sum(a * b.conj(), axis=0) / (count - 1) for a, b in ((off_u, off_u), (off_y, off_y), (off_y, off_u))]
-    smooth_u, smooth_y, both = (_averaged(part, width) for part in products)
-    means = inputs.mean(axis=0), outputs.mean(axis=0)
-    return _Periods(*means, smooth_u.real, smooth_y.real, both, count, (count - 1) * width, dropped)
-
-
-def _unsettled(outputs: ComplexArray) -> int:
-    """Number of periods at the beginning that differ from those after them by more than noise; two are always left."""
-    for first in range(len(outputs) - 2):
-        after = outputs[first + 1 :]
-        rest = len(after) - 1
-        scatter = float(np.sum(np.abs(after - after.mean(axis=0)) ** 2)) / rest
-        off = float(np.sum(np.abs(outputs[first] - after.mean(axis=0)) ** 2))
-        rounding = 1e-24 * float(np.sum(np.abs(after.mean(axis=0)) ** 2))
-        if off <= SETTLED * scatter * (1 + 1 / len(after)) + rounding:
-            return first
-    return max(len(outputs) - 2, 0)
-
-
-def _averaged(values: ComplexArray, width: int) -> ComplexArray:
-    """Moving average over so many lines, fewer at the ends."""
-    ones = np.ones(width)
-    half = width // 2
-    total = np.convolve(values, ones, "full")[half : half + values.size]
-    return np.asarray(total / np.convolve(np.ones(values.size), ones, "full")[half : half + values.size])
+    size = count * period
+    spectra = [np.fft.fft(x[x.size - size :]) / size for x in (u, y)]
+    lines = count * np.arange(1, (period + 1) // 2)
+    apart = np.arange(1, 2 * BETWEEN + 1)
+    apart = apart[apart % count > 0][:BETWEEN].astype(np.int64)
+    places = np.concatenate((-apart[::-1], apart))
+    powers = (places / places[-1])[:, None] ** np.arange(DEGREE + 1)
+    inverse = np.linalg.pinv(powers)
+    # Beyond both ends the spectra of samples go on by themselves.
+    between = [x[(lines[:, None] + places) % size] for x in spectra]
+    inputs, outputs = (x[lines] - near @ inverse[0] for x, near in zip(spectra, between, strict=True))
+    off_u, off_y = (near - near @ (powers @ inverse).T for near in between)
+    scale = (1.0 + float(inverse[0] @ inverse[0])) / (places.size - DEGREE - 1)
+    noise = [scale * np.sum(a * b.conj(), axis=1) for a, b in ((off_u, off_u), (off_y, off_y), (off_y, off_u))]
+    return _Periods(inputs, outputs, noise[0].real, noise[1].real, noise[2], count)
 
 
 def _excited(one: _Periods) -> BoolArray:
     power = np.abs(one.inputs) ** 2
-    return np.asarray((power > EXCITED * power.max()) & (power > ABOVE_NOISE * one.input_noise / one.number))
+    return np.asarray((power > EXCITED * power.max()) & (power > ABOVE_NOISE * one.input_noise))
 
 
 def _response(one: _Periods, lines: IntArray) -> tuple[ComplexArray, Array]:
@@ -171,7 +141,7 @@ def _response(one: _Periods, lines: IntArray) -> tuple[ComplexArray, Array]:
     g = y / u
     noise_y, noise_u, both = one.output_noise[lines], one.input_noise[lines], one.both[lines]
     error = noise_y + np.abs(g) ** 2 * noise_u - 2 * np.real(both * g.conj())
-    return g, np.maximum(error, 0.0) / (np.abs(u) ** 2 * one.number)
+    return g, np.maximum(error, 0.0) / np.abs(u) ** 2
 
 
 def _distortion(one: _Periods, excited: IntArray) -> tuple[Array | None, list[str]]:
@@ -188,11 +158,11 @@ def _distortion(one: _Periods, excited: IntArray) -> tuple[Array | None, list[st
     cure = "leave some lines without input, at random, or record several realisations of it"
     if not told:
         return None, [f"Nonlinear distortions are not told from the response; to see them, {cure}."]
-    power = np.abs(one.outputs) ** 2 - one.output_noise / one.number
+    power = np.abs(one.outputs) ** 2 - one.output_noise
     signal = float(np.mean(np.abs(one.outputs[excited]) ** 2))
     sizes = []
     for kind, lines in told.items():
-        level, chance = float(np.mean(power[lines])), float(np.mean(one.output_noise[lines])) / one.number
+        level, chance = float(np.mean(power[lines])), float(np.mean(one.output_noise[lines]))
         seen = level > 4 * chance / np.sqrt(lines.size) and level > 1e-24 * signal
         size = f"{10 * np.log10(level / signal):.3g} dB of the excited ones" if seen else "no more than noise"
         sizes.append(f"{kind}: {size}" if kind != "all" else size)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.signals.treatment import Hold
 
 #: Images on each side that are summed; those beyond add less than a hundredth of the first.
@@ -38,6 +38,8 @@ class ResponseLines(NamedTuple):
     #: Variance that nonlinear distortions give the response of one realisation, where they are told, shape (K,).
     distortion: Array | None
     notes: tuple[str, ...]
+    #: Whether an interval can be given, shape (K,).
+    told: BoolArray
 
 
 def hold_factor(hold: Hold, frequencies: Array, interval: float) -> ComplexArray:

@@ -16,7 +16,7 @@ SHORTEST = 16
 EXCITED = 1e-12
 
 
-def welch(u: Array, y: Array, interval: float, length: int | None) -> ResponseLines:
+def welch(u: Array, y: Array, interval: float, length: int | None, time_unit: str) -> ResponseLines:
     """Response, coherence and variance from segments of a given or a chosen number of samples."""
     size = length or max(SHORTEST, u.size // PARTS)
     half = size // 2
@@ -39,9 +39,10 @@ def welch(u: Array, y: Array, interval: float, length: int | None) -> ResponseLi
     variance = (1.0 - coherence) * yy / uu / (count - 1.0)
     note = (
         f"Averages over {begins.size} segments of {size} samples under Hann windows, each overlapping the next by one "
-        f"half: peaks narrower than {8 * np.pi / (size * interval):.3g} rad/s are flattened, which the variance does "
-        "not show."
+        f"half. No intervals: peaks narrower than {8 * np.pi / (size * interval):.3g} rad/{time_unit} are flattened and "
+        "leakage stays, which the scatter of the segments does not show; --method local-polynomial gives intervals."
     )
     frequencies: Array = 2 * np.pi / (size * interval) * np.flatnonzero(kept).astype(np.float64)
     freedom = np.full(frequencies.size, count - 1.0)
-    return ResponseLines(frequencies, yu / uu, variance, freedom, coherence, None, (note,))
+    told = np.zeros(frequencies.size, dtype=bool)
+    return ResponseLines(frequencies, yu / uu, variance, freedom, coherence, None, (note,), told)

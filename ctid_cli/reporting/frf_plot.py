@@ -14,9 +14,6 @@ from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, Dr
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: A point whose standard error exceeds this share of its gain has no phase to draw.
-NO_PHASE = 0.7
-
 
 def frf_drawing(found: FrequencyResponse, units: Units, title: str) -> Drawing:
     """Gain, phase and coherence over frequency."""
@@ -60,8 +57,9 @@ def draw_points(
 ) -> None:
     """Points of gain [dB] and phase [degrees] with their pointwise 95 % intervals in grey, on logarithmic frequency.
 
-    A lower end of zero goes down to the standard error; points that are all noise have no phase. Of all angles that a
-    phase may be, those next to the phases ``around`` [rad] are drawn, if they are given.
+    A lower end of zero goes down to the standard error; a point without an interval stands alone, and one whose phase
+    is not known has none. Of all angles that a phase may be, those next to the phases ``around`` [rad] are drawn, if
+    they are given.
     """
     low, high = found.gain_band()
     size = np.abs(found.response)
@@ -69,17 +67,15 @@ def draw_points(
     gain.set_xscale("log")
     phase.set_xscale("log")
     seen = size > 0
-    w = found.frequencies[seen]
-    gain.vlines(w, decibels(floor[seen]), decibels(high[seen]), color=BAND, linewidth=1.6, zorder=0)
-    gain.plot(w, decibels(size[seen]), ".", color=MIDDLE, markersize=3, label=label, zorder=1)
-    known = found.standard_error < NO_PHASE * size
-    if around is None:
-        angle = np.rad2deg(np.unwrap(np.angle(found.response[known])))
-    else:
+    w, drawn = found.frequencies, seen & found.told
+    gain.vlines(w[drawn], decibels(floor[drawn]), decibels(high[drawn]), color=BAND, linewidth=1.6, zorder=0)
+    gain.plot(w[seen], decibels(size[seen]), ".", color=MIDDLE, markersize=3, label=label, zorder=1)
+    known = found.phase_known()
+    angle, half = np.rad2deg(found.phase()[known]), np.rad2deg(found.phase_band()[known])
+    if around is not None:
         angle = np.rad2deg(around[known] + np.angle(found.response[known] * np.exp(-1j * around[known])))
-    half = np.rad2deg(found.phase_band()[known])
-    phase.vlines(found.frequencies[known], angle - half, angle + half, color=BAND, linewidth=1.6, zorder=0)
-    phase.plot(found.frequencies[known], angle, ".", color=MIDDLE, markersize=3, label=label, zorder=1)
+    phase.vlines(w[known], angle - half, angle + half, color=BAND, linewidth=1.6, zorder=0)
+    phase.plot(w[known], angle, ".", color=MIDDLE, markersize=3, label=label, zorder=1)
 
 
 def decibels(values: Any) -> Any:

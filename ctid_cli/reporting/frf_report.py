@@ -10,7 +10,7 @@ from ctid_cli.canonical import plain
 from ctid_cli.inference.frequency_response import FrequencyResponse
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.identification_report import notes_of, records_line, records_object
-from ctid_cli.reporting.layout import Report, Table, count, number, picked
+from ctid_cli.reporting.layout import Report, Table, number, picked
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import wrapped
 
@@ -35,7 +35,7 @@ def frf_columns(found: FrequencyResponse, units: Units) -> dict[str, Array]:
         f"gain [{units.gain}]": np.abs(found.response),
         f"gain_low [{units.gain}]": low,
         f"gain_high [{units.gain}]": high,
-        "phase [deg]": np.rad2deg(np.angle(found.response)),
+        "phase [deg]": np.rad2deg(found.phase()),
         "phase_half_width [deg]": np.rad2deg(found.phase_band()),
         "coherence [-]": found.coherence,
         f"hold_bias [{units.gain}]": found.bias,
@@ -47,15 +47,20 @@ def frf_columns(found: FrequencyResponse, units: Units) -> dict[str, Array]:
 
 def frf_object(found: FrequencyResponse, measurements: Sequence[Measurement], units: Units) -> dict[str, Any]:
     """A frequency response for ``ctid frf --json``."""
+    low, high = found.gain_band()
     content = {
         **records_object(measurements, units),
         **picked(found, ("method", "hold", "frequencies")),
         "real": found.response.real,
         "imaginary": found.response.imag,
         **picked(found, ("standard_error", "freedom", "coherence")),
+        "gain_low": low,
+        "gain_high": high,
+        "phase": np.rad2deg(found.phase()),
+        "phase_half_width": np.rad2deg(found.phase_band()),
         "distortion": None if found.distortion is None else np.sqrt(found.distortion),
         "hold_bias": found.bias,
-        "notes": [*_in_unit(found, units), *notes_of(measurements)],
+        "notes": [*found.notes, *notes_of(measurements)],
     }
     return dict(plain(content))
 
@@ -63,10 +68,9 @@ def frf_object(found: FrequencyResponse, measurements: Sequence[Measurement], un
 def frf_text(found: FrequencyResponse, measurements: Sequence[Measurement], units: Units) -> str:
     """A frequency response for people."""
     low, high = found.frequencies[[0, -1]]
-    span = f"{count(found.frequencies.size, 'frequency')} from {low:.4g} to {high:.4g} rad/{units.time}"
-    span = span.replace("frequencys", "frequencies")
+    span = f"{found.frequencies.size} frequencies from {low:.4g} to {high:.4g} rad/{units.time}"
     head = f"{records_line(measurements)}; frequency response by {METHODS[found.method]}, {span}"
-    notes = [wrapped(f"- {note}", hanging="  ") for note in (*_in_unit(found, units), *notes_of(measurements))]
+    notes = [wrapped(f"- {note}", hanging="  ") for note in (*found.notes, *notes_of(measurements))]
     return "\n".join([wrapped(head), *notes, "", Report([[_table(found, units)]]).draw()])
 
 
@@ -74,17 +78,13 @@ def _table(found: FrequencyResponse, units: Units) -> Table:
     """Some of the frequencies."""
     places = np.geomspace(found.frequencies[0], found.frequencies[-1], ROWS)
     rows = np.unique(np.searchsorted(found.frequencies, places).clip(max=found.frequencies.size - 1))
-    gain, half = np.abs(found.response), np.rad2deg(found.phase_band())
-    known = half < 180
-    # Through points that are all noise no phase can be followed.
-    phase = np.full(gain.size, np.nan)
-    phase[known] = np.rad2deg(np.unwrap(np.angle(found.response[known])))
+    gain, phase, half = np.abs(found.response), np.rad2deg(found.phase()), np.rad2deg(found.phase_band())
     low, high = found.gain_band()
     header = [f"[rad/{units.time}]", f"gain [{units.gain}]", "95 % low", "95 % high", "phase [°]", "±", "coherence"]
     cells = [
         [
             *(number(float(values[k]), 4) for values in (found.frequencies, gain, low, high)),
-            *((f"{phase[k]:.1f}", f"{half[k]:.1f}") if known[k] else ("any", "")),
+            *((f"{phase[k]:.1f}", f"{half[k]:.1f}") if np.isfinite(phase[k]) else ("unknown", "")),
             f"{found.coherence[k]:.3f}",
         ]
         for k in rows
@@ -94,7 +94,3 @@ def _table(found: FrequencyResponse, units: Units) -> Table:
         for row, k in zip(cells, rows, strict=True):
             row.append(number(float(np.sqrt(found.distortion[k])), 2))
     return Table(header, cells, "r" * len(header))
-
-
-def _in_unit(found: FrequencyResponse, units: Units) -> list[str]:
-    return [note.replace("rad/s", f"rad/{units.time}") for note in found.notes]

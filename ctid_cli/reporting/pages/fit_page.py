@@ -164,7 +164,7 @@ def _responses(result: Identification, measurements: Sequence[Measurement], unit
     notes: list[str] = []
     found = None
     try:
-        found = estimate_frequency_response(measurements[0].record)
+        found = estimate_frequency_response(measurements[0].record, time_unit=units.time)
         notes += found.notes
     except DataError as error:
         notes.append(f"The record gives no frequency response without a model: {error}.")
