@@ -94,7 +94,7 @@ def assert_same_iterations(problem, gauss_newton, **effort):
     for digits in (1e-12, -1e-12):
         moved = starts * (1 + digits * np.cos(np.arange(starts.size).reshape(starts.shape)))
         other = in_python(data, structure, delay, moved, gauss_newton, **effort)
-        assume(distance(other.theta, other.equations.squared_error, expected, data) < 1e-9)
+        assume(distance(other.theta, other.equations.squared_error, expected, data) < 1e-10)
     theta, squared_error, _ = best_coefficients(data, structure, delay, starts, gauss_newton=gauss_newton, **effort)
     assert distance(theta, squared_error, expected, data) < 1e-9
 
