@@ -41,7 +41,7 @@ TREATMENTS = {
     "gas_furnace": ("estimate", "estimate", (0.0, 45.0)),
     "pt326_est": ("estimate", "none", (0.0, 1.0)),
     "pt326_val": ("rest", "none", (0.5, 0.5)),
-    "tclab_step_100": ("rest", "estimate", (0.0, 0.0)),
+    "tclab_step_100": ("estimate", "none", (0.0, 0.0)),
     "tclab_step_irregular": ("rest", "estimate", (0.0, 0.0)),
 }
 
