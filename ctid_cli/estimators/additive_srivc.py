@@ -43,6 +43,8 @@ class AdditiveFit(Fit):
     ----------
     model, parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number, history
         As in :class:`~ctid_cli.inference.fit.Fit`.
+    law, in_ignored_loop
+        As in :class:`~ctid_cli.inference.fit.Fit`.
     additive : AdditiveModel
         The estimate, its submodels by rising natural frequency. ``model`` is the same as one transfer function, and
         ``covariance`` that of the parameters of this sum.

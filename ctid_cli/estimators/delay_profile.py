@@ -45,7 +45,7 @@ class MeasuredFit(FilledLater, Fit):
 
     Parameters
     ----------
-    model, parameter_names, covariance, status, r2, count, condition_number
+    model, parameter_names, covariance, status, r2, count, condition_number, law, in_ignored_loop
         As in :class:`~ctid_cli.inference.fit.Fit`.
     cost : float
         Mean squared output error over the used samples, or twice the mean of another loss [output unit^2].

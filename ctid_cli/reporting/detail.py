@@ -186,7 +186,7 @@ def _interval(row: Mapping[str, Any]) -> str:
         return BIASED
     reach = {f"{value:.3g}" for value in (row.get("quantiles") or {}).values()} or {f"{NORMAL:.3g}"}
     text = f"low and high are estimate -+ {reach.pop() if len(reach) == 1 else 'their own number of'} errors"
-    if formula is None:
+    if not formula:
         return f"{text}."
     noise = "white" if formula == "white" else "coloured"
     how = "bootstrap-t" if formula == "bootstrap" else f"t, {number(freedom, 4)} degrees of freedom"

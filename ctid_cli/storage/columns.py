@@ -142,5 +142,5 @@ def failed(message: str, status: str) -> dict[str, Any]:
 
 
 def no_result() -> dict[str, Any]:
-    """A result in which everything is missing."""
-    return {column.name: None for column in COLUMNS if column.source == "result"}
+    """A result in which everything is missing; texts are empty, as they are read again."""
+    return {column.name: "" if column.type == "str" else None for column in COLUMNS if column.source == "result"}

@@ -45,6 +45,7 @@ def estimate(parameters, standard_errors=None, status="CONVERGED", **more):
         "denominator": None if failed else [1.0, 1.0],
         "parameters": parameters,
         "standard_errors": standard_errors,
+        "covariance": "white",
         "cost": 0.1,
         "fit_percent": None if failed else 90.0,
         "validation_fit_percent": None,

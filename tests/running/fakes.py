@@ -46,6 +46,11 @@ class FakeFit:
     fit_percent: float = 97.5
     iterations: int = 4
     condition_number: float = float("nan")
+    law: None = None
+
+    @property
+    def quantiles(self) -> dict[str, float]:
+        return dict.fromkeys(self.standard_errors, 2.5)
 
 
 @dataclass(frozen=True)

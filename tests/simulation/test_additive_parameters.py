@@ -5,8 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from ctid_cli.inference.bootstrap import BootstrapT
+from ctid_cli.inference.quantile import normal_quantile
+from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
-from ctid_cli.models.factoring import factored, unfactored
+from ctid_cli.models.factoring import factored, factored_jacobian, unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.simulation.additive_parameters import additive_parameters
 
@@ -19,6 +22,7 @@ class FractionFit:
     model: TransferFunction
     parameter_names: tuple[str, ...]
     covariance: np.ndarray
+    law: Uncertainty | None = None
 
 
 def fraction_fit(model=MODES, names=None):
@@ -31,14 +35,15 @@ def fraction_fit(model=MODES, names=None):
 
 
 def test_values_are_those_of_the_partial_fractions():
-    parameters, errors = additive_parameters(fraction_fit(), TERMS)
+    parameters, errors, quantiles = additive_parameters(fraction_fit(), TERMS)
     assert parameters == pytest.approx(MODES.parameters, rel=1e-10)
     assert parameters.keys() == errors.keys()
+    assert quantiles == dict.fromkeys(parameters, normal_quantile())
 
 
 def test_errors_are_those_of_perturbed_coefficients():
     fit = fraction_fit()
-    _, errors = additive_parameters(fit, TERMS)
+    _, errors, _ = additive_parameters(fit, TERMS)
     coefficients = np.concatenate((fit.model.denominator[1:], fit.model.numerator))
     columns = []
     for k, value in enumerate(coefficients):
@@ -62,6 +67,20 @@ def test_the_order_of_the_covariance_and_an_estimated_delay_do_not_matter():
     assert additive_parameters(shuffled, TERMS)[1] == pytest.approx(additive_parameters(fit, TERMS)[1], rel=1e-9)
 
 
+def test_quantiles_are_those_of_each_parameter():
+    fit = fraction_fit()
+    rng, size = np.random.default_rng(4), len(fit.parameter_names)
+    # The delay is a parameter of the fraction, not of the submodels.
+    draws = BootstrapT(rng.standard_normal((60, size + 1)), np.broadcast_to(np.eye(size + 1), (60, size + 1, size + 1)))
+    law = Uncertainty("bootstrap", np.eye(size + 1), np.eye(size + 1), 100.0, draws)
+    covariance = np.pad(fit.covariance, ((1, 0), (1, 0)))
+    found = additive_parameters(FractionFit(fit.model, ("delay", *fit.parameter_names), covariance, law), TERMS)
+    model = factored(fit.model, TERMS)
+    jacobian = factored_jacobian(fit.model, model)
+    expected = [law.quantile(np.concatenate(([0.0], row))) for row in jacobian]
+    np.testing.assert_allclose([*found.quantiles.values()], expected, rtol=1e-12)
+
+
 def test_undefined_errors_are_not_finite():
     fit = fraction_fit()
     fit.covariance[:] = np.nan
@@ -77,7 +96,7 @@ def test_a_sum_of_submodels_is_what_it_is():
     class AdditiveFit:
         additive: AdditiveModel
 
-    assert additive_parameters(AdditiveFit(MODES), TERMS) == (MODES.parameters, {})
+    assert additive_parameters(AdditiveFit(MODES), TERMS) == (MODES.parameters, {}, {})
 
 
 @pytest.mark.parametrize(
@@ -93,12 +112,12 @@ def test_a_sum_of_submodels_is_what_it_is():
 )
 def test_fractions_that_have_no_such_submodels(denominator, terms):
     fit = FractionFit(TransferFunction([1.0], denominator), ("a1", "a2", "b0"), np.eye(3))
-    assert additive_parameters(fit, terms) == (None, {})
+    assert additive_parameters(fit, terms) == (None, {}, {})
 
 
 def test_real_poles_are_neighbours_in_a_submodel_of_the_second_order():
     poles = TransferFunction([1.0], np.poly([-1.0, -2.0, -30.0, -40.0]))
     fit = FractionFit(poles, ("a1", "a2", "a3", "a4", "b0"), np.eye(5))
-    parameters, _ = additive_parameters(fit, TERMS)
+    parameters, *_ = additive_parameters(fit, TERMS)
     assert parameters["g1_a2"] == pytest.approx(1 / 2)
     assert parameters["g2_a2"] == pytest.approx(1 / 1200)

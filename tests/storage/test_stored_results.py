@@ -109,7 +109,7 @@ def test_a_column_that_is_added_is_sealed_and_read(tmp_path: Path) -> None:
     values = {"peak": 1.5, "visits": 3, "remark": "well", "poles": [1.0, None], "shares": {"b": None, "a": 0.5}}
     first = next(iter(stored.results))
     # A text that is missing reads as an empty one.
-    results = {key: result | {"remark": ""} for key, result in stored.results.items()}
+    results = {key: result | {"remark": "", "covariance": ""} for key, result in stored.results.items()}
     results[first] |= values
     (tmp_path / "runs.h5").write_bytes(seal_image(stored.manifest, stored.origins, results)[0])
     assert read_sealed(tmp_path / "runs.h5").results == results
