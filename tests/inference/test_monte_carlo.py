@@ -89,6 +89,8 @@ def test_standard_errors_of_the_model():
     assert monte_carlo.covered(sample).tolist() == [True, False, False, False, True]
     assert monte_carlo.coverage(sample) == share(np.array([True, False, False, False, True]))
     assert monte_carlo.coverage(Sample(ERRORS, np.full(5, np.nan))) == Measured()
+    wider = sample._replace(quantiles=np.array([1.0, 1.0, 1.0, 1e9, 1e9]) * 1.96)
+    assert monte_carlo.covered(wider).tolist()[-2:] == [True, True]
 
 
 def test_nothing_is_said_of_nothing():
