@@ -79,8 +79,6 @@ def test_a_loop_that_is_ignored_leaves_no_errors_and_the_reason():
     named = identify(OPTIONS, [replace(record_of(colour=0.9), feedback=True)], covariance="robust")
     errors = [by_name(one)["b0"].standard_error for one in (named, identify(OPTIONS, [record_of(colour=0.9)]))]
     assert errors[0] == errors[1]
-        by_name(named)["b0"].standard_error == by_name(identify(OPTIONS, [record_of(colour=0.9)]))["b0"].standard_error
-    )
 
 
 def test_intervals_that_reach_beyond_the_linear_are_called_unsafe():
