@@ -74,7 +74,7 @@ class NoiseModel:
             with np.errstate(over="ignore", invalid="ignore"):
                 while (more := step.T @ energy @ step).max() > ROUNDING * energy.max():
                     energy, step = energy + more, step @ step
-            total += before.T @ energy @ before
+                total += before.T @ energy @ before
         return np.asarray(self.innovation_variance * total)
 
 
