@@ -31,8 +31,8 @@ from ctid_cli.inference.nonlinearity import UNSAFE, shifts_of_ends
 from ctid_cli.inference.parametric import Parametric
 from ctid_cli.inference.residuals import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.status import Status
-from ctid_cli.inference.uncertain_value import UncertainValue
-from ctid_cli.inference.uncertainty import BIASED, DRAWS, Covariance, Uncertainty
+from ctid_cli.inference.uncertain_value import BIASED, UncertainValue
+from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty
 from ctid_cli.signals.record import Record
 from ctid_cli.text import ShownAsTable
 

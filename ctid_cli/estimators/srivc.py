@@ -141,34 +141,37 @@ class Srivc(Estimator[Iteration, Fit]):
         problem, record = iteration
         structure = Structure(self.poles, self.zeros)
         if start is not None and start.model is not None:
-            return self._from(problem, given_coefficients(start.model, structure, self.delay))
+            return self._from(problem, given_coefficients(start.model, structure, self.delay), self.covariance)
         refit = self.step_rule != "plain" or isinstance(problem, AdditiveProblem)
         cutoffs = cutoffs_of(record, self.svf_cutoff)
         starts = least_squares_starts(problem.data, structure, self.delay, cutoffs, refit)
-        fits = [self._from(problem, theta) for theta in starts]
+        fits = [self._from(problem, theta, "white") for theta in starts]
         if not fits:
             raise DataError(Status.SINGULAR.value)
-        return min(fits, key=lambda fit: (not fit.status.succeeded, np.nan_to_num(fit.cost, nan=np.inf)))
+        ranks = [(not fit.status.succeeded, np.nan_to_num(fit.cost, nan=np.inf)) for fit in fits]
+        best = ranks.index(min(ranks))
+        # Errors for coloured noise take as long as a fit, and only those of the best are wanted.
+        return fits[best] if self.covariance == "white" else self._from(problem, starts[best], self.covariance)
 
-    def _from(self, problem: SampledProblem | AdditiveProblem, theta: Array) -> Fit:
+    def _from(self, problem: SampledProblem | AdditiveProblem, theta: Array, covariance: Covariance) -> Fit:
         """Iterate from one start."""
         structure = Structure(self.poles, self.zeros)
         steps = Steps(self.max_iterations, self.tolerance, RULES[self.step_rule])
         if isinstance(problem, AdditiveProblem):
-            return self._as_submodel(problem, theta, structure, steps)
+            return self._as_submodel(problem, theta, structure, steps, covariance)
         result = iterate(problem, theta, steps)
         if result is None:
             return finish(problem, theta, Status.DIVERGED, 0, [])
         history = history_of("refine", problem, result)
-        noise = self.covariance, self.bootstrap_draws
+        noise = covariance, self.bootstrap_draws
         return finish(problem, result.theta, result.status, result.iterations, history, *noise)
 
-    def _as_submodel(self, problem: AdditiveProblem, theta: Array, structure: Structure, steps: Steps) -> Fit:
+    def _as_submodel(
+        self, problem: AdditiveProblem, theta: Array, structure: Structure, steps: Steps, covariance: Covariance
+    ) -> Fit:
         """Estimate a sum of one submodel; coefficients and covariance are converted to the monic form."""
         single = Submodel(theta[self.poles : -1], np.concatenate(([1.0], theta[: self.poles])))
-        estimate = estimate_submodels(
-            problem, AdditiveModel([single]).theta, steps, self.covariance, self.bootstrap_draws
-        )
+        estimate = estimate_submodels(problem, AdditiveModel([single]).theta, steps, covariance, self.bootstrap_draws)
         additive = problem.model(estimate.theta)
         jacobian = unfactored_jacobian(additive, self.zeros)
         return Fit(model=unfactored(additive), parameter_names=structure.names, **estimate.values_in(jacobian))

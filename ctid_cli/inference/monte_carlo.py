@@ -55,7 +55,8 @@ class Sample(NamedTuple):
     def with_widths(self) -> "Sample":
         """Return the part of the data sets that have a standard error."""
         known = np.isfinite(self.widths)
-        return self._replace(errors=self.errors[known], widths=self.widths[known])
+        reach = np.broadcast_to(self.quantiles, known.shape)
+        return self._replace(errors=self.errors[known], widths=self.widths[known], quantiles=reach[known])
 
 
 def complete(values: Array) -> BoolArray:

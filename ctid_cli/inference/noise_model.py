@@ -70,9 +70,11 @@ class NoiseModel:
             step = np.eye(r, k=1)
             step[-1] = -self.coefficients[:0:-1]
             energy = np.outer(step[-1], step[-1])
-            while (more := step.T @ energy @ step).max() > ROUNDING * energy.max():
-                energy, step = energy + more, step @ step
-            total += before.T @ energy @ before
+            # Rounding may leave poles of a very slow noise outside the unit circle: then nothing is finite.
+            with np.errstate(over="ignore", invalid="ignore"):
+                while (more := step.T @ energy @ step).max() > ROUNDING * energy.max():
+                    energy, step = energy + more, step @ step
+                total += before.T @ energy @ before
         return np.asarray(self.innovation_variance * total)
 
 

@@ -137,7 +137,12 @@ def fit_residual_noise(psi: Sequence[Array], residuals: Sequence[Array]) -> Nois
     (count, size), number = columns.shape, len(blocks)
 
     def at(partial: Array) -> _Likelihood:
-        likelihood: _Likelihood = restricted_likelihood(products, count, number, partial)
+        try:
+            likelihood: _Likelihood = restricted_likelihood(products, count, number, partial)
+        except np.linalg.LinAlgError:
+            # Residuals without noise, which so slow a model would explain altogether.
+            r = partial.size
+            return _Likelihood(np.inf, np.zeros(r), np.eye(r), np.nan)
         return likelihood
 
     def penalised(partial: Array) -> float:

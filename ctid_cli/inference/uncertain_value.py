@@ -9,6 +9,11 @@ from ctid_cli.inference.quantile import normal_quantile
 
 #: Standard errors to each side of a normal estimate.
 NORMAL = normal_quantile()
+#: Why a fit that ignores the loop of its record has no standard errors.
+BIASED = (
+    "There are no standard errors: the input answers to the output through a loop that this fit ignores, and the "
+    "residuals are coloured, so that the estimate is biased."
+)
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,8 @@ from ctid_cli.inference.robust import robust_covariance
 #: What standard errors take the noise for; ``auto`` is ``white`` unless the residuals are not, ``sandwich`` an earlier
 #: name of ``robust``.
 Covariance = Literal["auto", "white", "robust", "bootstrap", "sandwich"]
-#: The formula that was used; by ``biased`` there is no standard error.
+#: The formula that was used; by ``biased`` there is no standard error (`BIASED`).
 Formula = Literal["white", "robust", "bootstrap", "biased"]
-#: Why there is none.
-BIASED = (
-    "There are no standard errors: the input answers to the output through a loop that this fit ignores, and the "
-    "residuals are coloured, so that the estimate is biased."
-)
 #: Draws of a bootstrap that is asked for.
 DRAWS = 500
 #: Student's t of fewer degrees of freedom has no variance.

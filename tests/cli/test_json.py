@@ -108,7 +108,7 @@ def test_show(ctid, done, estimates):
     for name, item in by_name.items():
         error = shown["standard_errors"][name]
         assert item["standard_error"] == error
-        assert item["high"] - item["low"] == pytest.approx(2 * 1.96 * error, rel=1e-3)
+        assert item["high"] - item["low"] == pytest.approx(2 * shown["quantiles"][name] * error, rel=1e-12)
         assert item["relative_percent"] == pytest.approx(100 * error / abs(item["estimate"]))
     assert (by_name["b0"]["unit"], by_name["a1"]["unit"], by_name["delay"]["unit"]) == ("out/in/s", "1/s", "s")
     assert shown["seed"] == 1

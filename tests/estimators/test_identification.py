@@ -1,5 +1,7 @@
 """A fit with its uncertainty and diagnostics, from measured records."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.quantile import student_quantile
 from ctid_cli.inference.robust import robust_covariance
 from ctid_cli.inference.status import Status
+from ctid_cli.inference.uncertain_value import BIASED
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
@@ -62,10 +65,32 @@ def test_coloured_residuals_take_the_sandwich():
     expected, noise = robust_covariance(result.fit.sensitivities, result.fit.residuals, regular=True)
     np.testing.assert_allclose(result.uncertainty.covariance, expected, rtol=1e-9)
     b0 = by_name(result)["b0"]
-    assert b0.standard_error > 1.5 * result.fit.standard_errors["b0"]
+    assert b0.standard_error > 1.5 * np.sqrt(np.diag(result.fit.uncertainty("white").covariance))[1]
     reach = student_quantile(noise.effective_count(1000) - 3)
     assert b0.high - b0.estimate == pytest.approx(reach * b0.standard_error)
     assert any("not white" in warning for warning in result.warnings)
+
+
+def test_a_loop_that_is_ignored_leaves_no_errors_and_the_reason():
+    result = identify(OPTIONS, [replace(record_of(colour=0.9), feedback=True)])
+    assert result.uncertainty.kind == "biased"
+    for item in result.estimates:
+        assert (item.status, item.reason) == ("free", BIASED)
+        assert np.isnan([item.standard_error, item.low, item.high]).all()
+    named = identify(OPTIONS, [replace(record_of(colour=0.9), feedback=True)], covariance="robust")
+    errors = [by_name(one)["b0"].standard_error for one in (named, identify(OPTIONS, [record_of(colour=0.9)]))]
+    assert errors[0] == errors[1]
+
+
+def test_intervals_that_reach_beyond_the_linear_are_called_unsafe():
+    t = 0.05 * np.arange(600)
+    step = HeldSignal(t, (t >= 3.0).astype(float))
+    x = simulate(TransferFunction([2.0], [0.4, 1.4, 1.0], 0.63), step, t)
+    drawn = np.random.default_rng(5).standard_normal(600)
+    options = DelayProfile(2, 0, (0, 2))
+    quiet, loud = (identify(options, [Record(t, x + level * drawn, step)]) for level in (0.01, 0.2))
+    assert not any("unsafe" in warning for warning in quiet.warnings)
+    assert any("unsafe" in warning and "a1" in warning for warning in loud.warnings)
 
 
 @pytest.mark.parametrize(("jitter", "regular"), [(0.002, True), (0.04, False)])

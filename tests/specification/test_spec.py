@@ -460,6 +460,15 @@ def test_an_input_file(tmp_path):
     assert build_plan(load(tmp_path, text)).data_cells[0].hash != cell.hash
 
 
+def test_the_formula_of_standard_errors_is_part_of_the_identity(tmp_path):
+    estimators = {
+        formula: build_plan(load(tmp_path, changed(SIMULATED, ("zeros: 0", f"zeros: 0{formula}")))).estimators[0]
+        for formula in ("", *(f"\n    covariance: {name}" for name in ("auto", "white", "robust")))
+    }
+    assert estimators[""].content["covariance"] == "auto"
+    assert len({one.hash for one in estimators.values()}) == 3
+
+
 # -- what is shipped --------------------------------------------------------------------------------------------------
 
 
