@@ -102,6 +102,7 @@ def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, opt
     points = [point_of(np.roots(np.asarray(a, dtype=float)).astype(complex), tau, box) for a, tau in options.starts]
     if options.nested or not points:
         nest.optima(poles, zeros)
+        points += nest.resonances(poles, zeros)
     nest.refine(poles, zeros, points)
     found = _least(nest, poles, zeros, options.nested and options.fewer_poles)
     in_doubt = (found.tried > 1 and found.agree == 1) or not found.ending.optimal

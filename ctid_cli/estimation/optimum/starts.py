@@ -14,6 +14,9 @@ from ctid_cli.estimation.optimum.search import Descent, Local
 FREQUENCIES, DAMPINGS, REFINED = 24, (0.02, 0.1, 0.5), 3
 #: A pair alone has minima at every peak of the noise: so much more is tried, and refined.
 DENSER, MORE = 4, 2
+#: Evaluations times samples that are spent on pairs of the least damping: up to 1,000 samples all frequencies that
+#: these resolve. The best of them, and delays, that are looked at together.
+RESOLVED, LOOKED_AT = 1_000_000, 16
 #: Optima kept of each structure, and how far the best of what is not yet one may lie above and still be refined.
 KEPT = 3
 #: Squared errors that differ by less than this fraction are those of one minimum.
@@ -162,6 +165,7 @@ class Nest:
         """
         nest = Nest(self.problem, self.box, self.random_starts, self.seed, known=known)
         starts = [*points, *(local.point for local in self.optima(poles, zeros)), *self._from_below(poles, zeros)]
+        starts += self.resonances(poles, zeros)
         if known.all_poles:
             starts = [point_of(known.poles, 0.5 * sum(self.box.delays), self.box)]
         else:
@@ -172,6 +176,44 @@ class Nest:
         nest.evaluations += descent.evaluations
         nest.refine(poles, zeros, nest._along_delay(zeros, moved))
         return nest
+
+    def resonances(self, poles: int, zeros: int) -> list[Point]:
+        """Return starts with a pair of the least damping, beside the poles of a smaller model.
+
+        Such a pair follows one frequency of the noise, and the cost has a minimum at every frequency that the record
+        resolves: all are tried by elimination alone, the best of them at delays of the whole range.
+        """
+        samples = sum(data.count for data in self.problem.records)
+        # Half of what separates two frequencies.
+        resolution, highest = 0.5 * np.pi * self.box.spread[0], min(self.box.imaginary, self.box.fastest)
+        count = min(int(highest / resolution), RESOLVED // samples)
+        if poles < 2 or count < FREQUENCIES:
+            return []
+        roots, delay = np.zeros(0, dtype=complex), 0.5 * sum(self.box.delays)
+        if poles > 2:
+            smaller = self.optima(poles - 2, min(zeros, poles - 3))[0].point
+            roots, delay = smaller.poles, smaller.delay.seconds
+        descent, zeta = self.descent(zeros), self.box.least_damping
+
+        def tried(places: Iterable[tuple[float, float]]) -> list[tuple[float, float, Point]]:
+            """Costs, frequencies and points, the lowest cost first."""
+            found = []
+            for w, tau in places:
+                pair = w * complex(-zeta, 1.0)
+                point = point_of(np.concatenate((roots, [pair, pair.conjugate()])), tau, self.box)
+                found.append((descent.value(point).squared_error, w, point))
+            return found
+
+        alone = tried((w, delay) for w in np.linspace(resolution, highest, count).tolist())
+        minima = _lowest_minima(np.array([cost for cost, _, _ in alone]), LOOKED_AT)
+        best = [alone[k] for k in minima]
+        if self.box.delay_free:
+            best += tried((alone[k][1], tau) for k in minima for tau in self._delays(LOOKED_AT))
+        self.evaluations += descent.evaluations
+        lowest: dict[float, Point] = {}
+        for _, w, point in sorted(best, key=lambda entry: entry[0]):
+            lowest.setdefault(w, point)
+        return list(lowest.values())[: LOOKED_AT // 2]
 
     def _grown(self, poles: int, zeros: int, new_zeros: int, added: int) -> list[Point]:
         """The best of a smaller structure with poles added, for another numerator."""
@@ -210,21 +252,22 @@ class Nest:
 
     def _along_delay(self, zeros: int, points: list[Point]) -> list[Point]:
         """Further starts at the minima of the profile over the delay, for the poles of the best start."""
-        low, high = self.box.delays
-        if low == high or not points:
+        if not self.box.delay_free or not points:
             return points
-        spacing = max(self.box.cell or 0.25 * self.box.quarter, (high - low) / MOST_DELAYS)
-        count = int(np.ceil((high - low) / spacing))
-        delays = low + (high - low) * (np.arange(count) + 0.5) / count
         descent = self.descent(zeros)
         best = points[0]
-        trials = [point_of(best.poles, delay, self.box) for delay in delays.tolist()]
+        trials = [point_of(best.poles, delay, self.box) for delay in self._delays(MOST_DELAYS)]
         errors = np.array([descent.value(trial).squared_error for trial in trials])
         self.evaluations += descent.evaluations
-        padded = np.concatenate(([np.inf], errors, [np.inf]))
-        minima = np.flatnonzero((errors <= padded[:-2]) & (errors < padded[2:]))
-        lowest = minima[np.argsort(errors[minima])[:KEPT]]
-        return points + [trials[k] for k in lowest.tolist()]
+        return points + [trials[k] for k in _lowest_minima(errors, KEPT)]
+
+    def _delays(self, most: int) -> list[float]:
+        """Delays that are spread over the whole range, at most one for each of its cells."""
+        low, high = self.box.delays
+        spacing = max(self.box.cell or 0.25 * self.box.quarter, (high - low) / most)
+        count = int(np.ceil((high - low) / spacing))
+        delays: list[float] = (low + (high - low) * (np.arange(count) + 0.5) / count).tolist()
+        return delays
 
     def random_points(self, poles: int) -> list[Point]:
         """Return starts drawn uniformly: logarithms of frequencies and dampings in their spread, delays."""
@@ -238,3 +281,10 @@ class Nest:
             roots = np.concatenate((upper, upper.conj(), -w[pairs:]))
             points.append(point_of(roots, float(rng.uniform(*box.delays)), box))
         return points
+
+
+def _lowest_minima(values: Array, most: int) -> list[int]:
+    """Return the places of the lowest local minima, the lowest first."""
+    padded = np.concatenate(([np.inf], values, [np.inf]))
+    minima = np.flatnonzero((values <= padded[:-2]) & (values < padded[2:]))
+    return [int(k) for k in minima[np.argsort(values[minima])[:most]]]
