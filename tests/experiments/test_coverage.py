@@ -6,6 +6,7 @@ from scipy import stats
 
 from ctid_cli.studies.catalogue import find_study, read_study
 from ctid_cli.studies.publishing import published_texts
+from experiments.coverage import defaults
 from tests.reporting.frequency_results import run_here
 
 STUDY = find_study("coverage")
@@ -84,3 +85,23 @@ def test_rows_b_and_e_see_the_same_data_sets():
     exact, sampled = (STUDY.plan(f"case1-irregular-{kind}").data_cells[0].dataset(3) for kind in ("exact", "sampled"))
     assert (exact.record.y == sampled.record.y).all()
     assert exact.record.input.values.size != sampled.record.input.values.size
+
+
+def test_published_intervals_of_default_settings_cover():
+    lines = pd.read_csv(defaults.PUBLISHED / "defaults.csv")
+    assert (lines["runs"] % 400 == 0).all()
+    together = lines[(lines["system"] == "all") & lines["noise"].isin(defaults.BOUNDED)]
+    bounded = together[(together["input"] == "prbs") | (together["snr_db"] == 30.0)]
+    assert len(bounded) == 8
+    assert bounded["percent"].between(92.0, 98.0).all()
+    # Where an interval covers less than nine in ten, the fit says so of most records.
+    short = lines[(lines["system"] != "all") & (lines["percent"] < 90.0)]
+    assert (short["called_unsafe"] > 0.5 * short["runs"]).all()
+
+
+def test_a_small_study_of_default_settings_covers():
+    lines = pd.DataFrame(defaults.study(10, 3, [("prbs", 20.0, "AR(1) .9")]))
+    assert lines["system"].tolist() == [*defaults.SYSTEMS, "all"]
+    assert (lines["robust"] == lines["converged"]).all()
+    # Ten records, of whose intervals those of one estimate go together.
+    assert lines["percent"].iloc[-1] > 80.0
