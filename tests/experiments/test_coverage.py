@@ -94,9 +94,10 @@ def test_published_intervals_of_default_settings_cover():
     bounded = together[(together["input"] == "prbs") | (together["snr_db"] == 30.0)]
     assert len(bounded) == 8
     assert bounded["percent"].between(92.0, 98.0).all()
-    # Where an interval covers less than nine in ten, the fit says so of most records.
-    short = lines[(lines["system"] != "all") & (lines["percent"] < 90.0)]
-    assert (short["called_unsafe"] > 0.5 * short["runs"]).all()
+    # Where intervals of such records cover less than nine in ten, the fit says so.
+    short = lines[(lines["system"] != "all") & (lines["percent"] < 90.0) & (lines["snr_db"] == 30.0)]
+    assert len(short) == 2
+    assert (short["called_unsafe"] > 0.9 * short["runs"]).all()
 
 
 def test_a_small_study_of_default_settings_covers():
