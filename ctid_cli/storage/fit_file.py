@@ -34,7 +34,8 @@ from ctid_cli.storage.result_file import (
     texts,
 )
 
-FIT = ResultKind("ctid fit", 1, "fit", "ctid fit", "fit again")
+#: Format 2 has the formula of the standard errors and the bounds of the admissible models.
+FIT = ResultKind("ctid fit", 2, "fit", "ctid fit", "fit again", oldest=2)
 #: A path, as the caller gives it.
 AnyPath = str | os.PathLike[str]
 

@@ -22,13 +22,15 @@ class ResultKind(NamedTuple):
     """A kind of file."""
 
     kind: str
-    #: The newest that is read and the one that is written.
+    #: The format that is written, and the newest that is read.
     format: int
     #: What it is, as in "this is no fit", and the command that makes it.
     noun: str
     command: str
     #: What to do instead of using another record, as in "or fit again".
     again: str
+    #: The oldest format that is read.
+    oldest: int = 1
 
 
 def result_text(kind: ResultKind, content: Mapping[str, Any], command: str | None) -> str:
@@ -81,6 +83,8 @@ def content_of(file: str, kind: ResultKind) -> dict[str, Any]:
     if not isinstance(content.get("format"), int) or content["format"] > kind.format:
         written = f"was written by a newer ctid ({str(content.get('ctid'))[:20]}): its format is "
         refuse(file, kind, f"{written}{str(content.get('format'))[:20]}, and this one reads up to {kind.format}")
+    if content["format"] < kind.oldest:
+        refuse(file, kind, f"was written by an older ctid and cannot be read back; {kind.again}")
     if content.get("checksum") != content_hash({key: item for key, item in content.items() if key != "checksum"}):
         refuse(file, kind, "is damaged, or was changed after it was written: its checksum is that of other content")
     return content
