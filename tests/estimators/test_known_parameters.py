@@ -100,7 +100,7 @@ def test_known_parameters_of_submodels(fixed):
     u = HeldSignal(t, rng.standard_normal(600))
     record = Record(t, simulate_additive(SUM, u, t) + 0.1 * rng.standard_normal(600), u)
     terms = (Term(2, 0), Term(2, 0))
-    fit = AdditiveSrivc(terms, fixed=tuple(Fixed(*pair) for pair in fixed.items())).fit(record)
+    fit = AdditiveSrivc(terms, covariance="white", fixed=tuple(Fixed(*pair) for pair in fixed.items())).fit(record)
     names, theta = list(fit.additive.names), fit.additive.theta
     free = [k for k, name in enumerate(names) if name not in fixed]
 
