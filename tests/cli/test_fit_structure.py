@@ -140,7 +140,7 @@ def test_a_loop_removes_the_bias_that_coloured_noise_makes(ctid, closed, tmp_pat
     assert estimates == plain
     # What is known to be biased has no standard error; without the loop nobody knows.
     assert all(one["standard_error"] is None for one in ignored["parameters"])
-    assert any("estimate is biased" in warning for warning in ignored["warnings"])
+    assert "estimate is biased" in ignored["covariance"]["reason"]
     again = load_fit(tmp_path / "fit.json")
     assert again.records[0].n_samples == 1500
 
