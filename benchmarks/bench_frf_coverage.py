@@ -1,10 +1,12 @@
 """How often the 95 % intervals of a frequency response without a model hold the truth, on short records.
 
 Each record is of a random system of one family (overdamped of second order; resonant with damping .1; both with and
-without a delay), sampled every 0.1 s, with one input, record length, signal-to-noise ratio, and colour of the noise.
-Half of the records begin at rest, the others in the middle of an experiment. Two truths are told apart: what samples
-of a held input show, images included ("sampled", which is what the estimates tend to), and the response of the system
-in continuous time ("system"). Counted are the frequencies at which an interval is given.
+without a delay; two modes with damping .05, the slower with five to ten periods in 500 samples), sampled every 0.1 s,
+with one input, record length, signal-to-noise ratio, and colour of the noise. Half of the records begin at rest, the
+others in the middle of an experiment. Two truths are told apart: what samples of a held input show, images included
+(which is what the estimates tend to), and the response of the system in continuous time ("system"). Counted are the
+frequencies at which an interval is given, first those with a gain above a tenth of the greatest, then all, then that
+of the greatest gain alone ("top").
 
     python benchmarks/bench_frf_coverage.py --records 24 --seed 1
 """
@@ -24,7 +26,7 @@ from ctid_cli.signals.record import Record
 
 INTERVAL = 0.1
 INPUTS = ("prbs", "prbs periods", "multisine", "multisine periods", "gaussian", "binary")
-SYSTEMS = ("overdamped", "overdamped, delay", "resonant", "resonant, delay")
+SYSTEMS = ("overdamped", "overdamped, delay", "resonant", "resonant, delay", "slow modes")
 LENGTHS, RATIOS, COLOURS = (400, 500, 1000), (10.0, 15.0, 20.0), (0.0, 0.8)
 #: The band of a response: where its gain is more than this share of its greatest.
 IN_BAND = 0.1
@@ -38,7 +40,8 @@ class Counts(NamedTuple):
     """What is counted of one record."""
 
     #: Hits and trials inside the band of the response, then over all frequencies: intervals and phases drawn, gain,
-    #: phase and complex value covered, complex value of the system covered, shape (12, 2).
+    #: phase and complex value covered, complex value of the system covered; then interval drawn and complex value
+    #: covered at the greatest gain, shape (14, 2).
     counts: np.ndarray
     #: Radii over the gain, and over the error, of the intervals drawn inside the band.
     widths: np.ndarray
@@ -48,6 +51,10 @@ class Counts(NamedTuple):
 
 def random_system(family, rng):
     delay = rng.uniform(0.2, 2.0) if "delay" in family else 0.0
+    if family == "slow modes":
+        slow, fast = rng.uniform(0.7, 1.3), rng.uniform(2.5, 4.0)
+        modes = [1.0, 0.1 * slow, slow**2], [1.0, 0.1 * fast, fast**2]
+        return TransferFunction(np.polyadd(slow**2 * np.array(modes[1]), modes[0]), np.polymul(*modes))
     if family.startswith("overdamped"):
         slow, fast = np.exp(rng.uniform(np.log(0.5), np.log(5.0))), np.exp(rng.uniform(np.log(0.15), np.log(0.5)))
         return TransferFunction([1.0], np.polymul([slow, 1.0], [fast, 1.0]), delay)
@@ -118,9 +125,9 @@ def exact_response(model, w):
     return np.polyval(model.numerator, s) / np.polyval(model.denominator, s) * np.exp(-s * model.delay)
 
 
-def count_record(model, record):
+def count_record(model, record, method="auto"):
     try:
-        found = estimate_frequency_response(record)
+        found = estimate_frequency_response(record, method=method)
     except DataError:
         return None
     w, g = found.frequencies, found.response
@@ -146,6 +153,8 @@ def count_record(model, record):
         d, p = where & drawn, where & phased
         pairs = [(d, where), (p, where), (gain_in[0], d), (phase_in[0], p), (joint_in[0], d), (joint_in[1], d)]
         counts += [((a & b).sum(), b.sum()) for a, b in pairs]
+    top = np.arange(w.size) == np.argmax(np.abs(system))
+    counts += [((top & drawn).sum(), 1), ((joint_in[0] & drawn & top).sum(), (drawn & top).sum())]
     error = np.abs(g - sampled)
     return Counts(
         np.array(counts),
@@ -156,7 +165,9 @@ def count_record(model, record):
 
 
 HEAD = (
-    f"{'':34}" + f"{'drawn':>6}{'phase':>6} |{'gain':>5}{'phase':>6}{'joint':>6}{'system':>7} |" * 2 + " width /error"
+    f"{'':34}"
+    + f"{'drawn':>6}{'phase':>6} |{'gain':>5}{'phase':>6}{'joint':>6}{'system':>7} |" * 2
+    + f"{'top':>6}{'joint':>6} | width /error"
 )
 
 
@@ -169,7 +180,7 @@ def row(name, counts):
         shares = 100 * sums[:, 0] / sums[:, 1]
     widths, ratios = (np.concatenate([c[k] for c in counts]) for k in (1, 2))
     methods = " ".join(f"{m} {sum(c.method == m for c in counts)}" for m in sorted({c.method for c in counts}))
-    line = "{:6.1f}{:6.1f} |{:5.1f}{:6.1f}{:6.1f}{:7.1f} |" * 2
+    line = "{:6.1f}{:6.1f} |{:5.1f}{:6.1f}{:6.1f}{:7.1f} |" * 2 + "{:6.1f}{:6.1f} |"
     medians = [np.median(x) if x.size else np.nan for x in (widths, ratios)]
     print(f"{name:34}" + line.format(*shares) + "{:6.2f}{:7.2f}  ".format(*medians) + methods, flush=True)
 
@@ -179,6 +190,7 @@ def main():
     options.add_argument("--records", type=int, default=24, help="records of each input, system and length")
     options.add_argument("--seed", type=int, default=1)
     options.add_argument("--lengths", type=int, nargs="+", default=LENGTHS)
+    options.add_argument("--method", default="auto")
     chosen = options.parse_args()
     results = {}
     for kind, family, n in itertools.product(INPUTS, SYSTEMS, chosen.lengths):
@@ -186,7 +198,9 @@ def main():
             ratio, colour = RATIOS[k % 3], COLOURS[k % 2]
             rng = np.random.default_rng([chosen.seed, INPUTS.index(kind), SYSTEMS.index(family), n, k])
             key = (kind, family, n, ratio, colour)
-            results.setdefault(key, []).append(count_record(*make_record(kind, family, n, ratio, colour, rng)))
+            results.setdefault(key, []).append(
+                count_record(*make_record(kind, family, n, ratio, colour, rng), chosen.method)
+            )
     print(HEAD)
     for place, values in enumerate((INPUTS, SYSTEMS, chosen.lengths, RATIOS, COLOURS)):
         for value in values:

@@ -1,7 +1,7 @@
 """The frequency response that a record shows without any model, and how far it can be trusted."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -134,8 +134,9 @@ class FrequencyResponse:
         Returns
         -------
         ndarray of bool, shape (K,)
-            True where an interval is given and the circle of that probability leaves out zero, there and at most of the
-            five frequencies around: among many frequencies of noise alone some exceed their circles by chance.
+            True where an interval is given, the circle of that probability around the response leaves out zero, and
+            the same holds for most of the five frequencies around: of many frequencies with noise alone some leave out
+            zero by chance.
         """
         clear = self.told & (np.abs(self.response) > self._radius(level))
         around = np.ones(2 * BESIDE + 1)
@@ -244,9 +245,11 @@ def estimate_frequency_response(
     ``bias``. Without a hold (band-limited signals) there are none.
 
     The estimate by local polynomials has a variance from their residuals, which also hold what the polynomials cannot
-    follow. Neighbouring estimates share lines. On an irregular clock, with an input that moves between the samples, or
-    with many samples missing, it takes the exact spectrum of the held input and that of straight lines through the
-    output; what these miss is noise-like and in the variance.
+    follow; no interval is given on peaks that are narrower than its lines. Neighbouring estimates share lines. Welch's
+    method gives no intervals: leakage and flattened peaks are not in the scatter of its segments. On an irregular
+    clock, with an input that moves between the samples, or with many samples missing, local polynomials take the exact
+    spectrum of the held input and that of straight lines through the output; what these miss is noise-like and in the
+    variance.
 
     References
     ----------
@@ -325,7 +328,9 @@ def _on_any_clock(
     notes = (*found.notes, note, *_of_record(record))
     bias = np.zeros(found.frequencies.size)
     _require_some(found, record)
-    return FrequencyResponse(*found[:6], bias, "local-polynomial", record.input.hold, notes, found.told)
+    return _with_phase_note(
+        FrequencyResponse(*found[:6], bias, "local-polynomial", record.input.hold, notes, found.told)
+    )
 
 
 def _begins(record: Record) -> float:
@@ -362,7 +367,19 @@ def _finished(
     held = lines._replace(response=lines.response / factor, variance=lines.variance / power, distortion=distortion)
     bias = images(hold, held.frequencies, held.response, held.variance, interval)
     notes = (*held.notes, _of_hold(hold, held.frequencies, bias, np.abs(held.response), time_unit), *_of_record(record))
-    return FrequencyResponse(*held[:6], bias, method, hold, notes, held.told)
+    return _with_phase_note(FrequencyResponse(*held[:6], bias, method, hold, notes, held.told))
+
+
+def _with_phase_note(found: FrequencyResponse) -> FrequencyResponse:
+    """The response with a sentence on where its phase is unknown, and why."""
+    unknown = int(np.count_nonzero(found.told & ~found.phase_known()))
+    if not unknown:
+        return found
+    text = (
+        f"No phase at {unknown} of the {found.response.size} frequencies, where the interval of the response holds "
+        "zero, or that of most frequencies around does."
+    )
+    return replace(found, notes=(*found.notes, text))
 
 
 def _of_hold(hold: Hold, frequencies: Array, bias: Array, gain: Array, time_unit: str) -> str:

@@ -95,8 +95,8 @@ def _words(used: list[int], base: float, chosen: bool, untold: Array, time_unit:
     span = f"{2 * used[0] + 1}" if len(used) == 1 else f"{2 * used[0] + 1} to {2 * used[-1] + 1}"
     how = "half of the most that fit as well as the fewest do" if chosen else "as given"
     text = (
-        f"Each estimate is from {span} lines, {base:.4g} rad/{time_unit} apart, {how}; estimates closer than that share "
-        "data."
+        f"Each estimate is from {span} lines, {base:.4g} rad/{time_unit} apart, {how}; estimates closer than that "
+        "share data."
     )
     if not untold.size:
         return (text,)

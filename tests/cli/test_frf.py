@@ -37,6 +37,9 @@ def test_table_file_and_figure(ctid, record, tmp_path):
     inside = (frame["gain_low [mm/V]"] - bias <= true) & (true <= frame["gain_high [mm/V]"] + bias)
     assert inside[near].mean() > 0.8
     assert (out / "frf.svg").read_bytes().startswith(b"<?xml")
+    content = json.loads(ctid("frf", record, "--method", "welch", "--json", "--out", tmp_path / "welch").stdout)
+    for name in ("gain_low", "gain_high", "phase", "phase_half_width"):
+        assert set(content[name]) == {None}
 
 
 def test_periods_and_realisations(ctid, tmp_path):

@@ -73,9 +73,9 @@ def test_variance_of_periods_covers():
     assert 0.93 < np.mean(shares) < 0.97
 
 
-def test_a_start_that_has_not_settled_is_left_out():
-    found = estimate_frequency_response(periodic_record(multisine(0), 6, settling=0, noise=0.001))
-    assert "in which the output had not settled" in found.notes[0]
+def test_a_start_that_has_not_settled_is_taken_out():
+    once = np.random.default_rng(0).standard_normal(PERIOD)
+    found = estimate_frequency_response(periodic_record(once, 3, settling=0))
     true = sampled_response(MODEL, found.frequencies)
     assert np.abs(found.response - true).max() < 0.01 * np.abs(true).max()
 
@@ -104,13 +104,53 @@ def test_realisations_tell_distortions_from_noise():
     assert 0.3 < np.median(off / distorted.distortion.mean()) < 3
 
 
-def test_local_polynomials_cover():
-    shares = []
-    for seed in range(8):
-        found = estimate_frequency_response(random_record(seed, n=1200))
-        assert found.method == "local-polynomial"
-        shares.append(covered(found, sampled_response(MODEL, found.frequencies)))
-    assert 0.91 < np.mean(shares) < 0.985
+@pytest.mark.parametrize("periods", [1, 3])
+def test_intervals_of_short_records_cover(periods):
+    # A resonance with damping .1 of which the record has 8 to 16 periods, 15 dB. Lines share windows: some 7 of 9 in
+    # the band of the gain are independent at most, and of 30 records at least 400 are. 90 % is then 3.3 deviations
+    # below 95 %.
+    hits = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        w = rng.uniform(1.0, 2.0)
+        model = TransferFunction([w**2], [1.0, 0.2 * w, w**2])
+        t = INTERVAL * np.arange(500)
+        u = np.resize(rng.choice([-1.0, 1.0], 500 // periods), 500)
+        x = simulate(model, HeldSignal(t, u), t)
+        record = Record(t, x + 0.18 * x.std() * rng.standard_normal(t.size), HeldSignal(t, u))
+        found = estimate_frequency_response(record)
+        assert found.method == ("periodic" if periods > 1 else "local-polynomial")
+        true = sampled_response(model, found.frequencies)
+        band = found.told & (np.abs(true) > 0.1 * np.abs(true).max())
+        hits.extend((np.abs(found.response - true) <= found.radius())[band])
+    assert np.mean(hits) > 0.9
+
+
+def test_no_interval_on_a_peak_between_the_lines():
+    model = TransferFunction([1.0], [1.0, 0.06, 1.0])
+    found = estimate_frequency_response(random_record(0, n=500, noise=0.1, model=model))
+    top = np.argmin(np.abs(found.frequencies - 1.0))
+    low, high = found.gain_band()
+    assert np.isnan([low[top], high[top], found.radius()[top], found.phase_band()[top]]).all()
+    assert any("narrow peak" in note for note in found.notes)
+    assert found.told.mean() > 0.9
+
+
+def test_the_phase_is_followed_where_it_is_known():
+    # After 2 rad/s the response is below the noise.
+    model = TransferFunction([1.0], np.polymul([1.0, 1.0], [0.7, 1.0]), delay=3.0)
+    found = estimate_frequency_response(random_record(0, n=800, noise=0.5, model=model))
+    phase, half = found.phase(), found.phase_band()
+    known = np.isfinite(phase)
+    assert (np.isfinite(half) == known).all()
+    assert (half[known] < np.pi / 2).all()
+    first = np.flatnonzero(~known)[0]
+    true = np.unwrap(np.angle(exact(model, found.frequencies[:first])))
+    assert first >= 8
+    assert np.abs(phase[:first] - true).max() < 0.6
+    assert known[found.frequencies > 10.0].mean() < 0.1
+    assert np.abs(phase[known]).max() < 5 * np.pi
+    assert any("No phase at" in note for note in found.notes)
 
 
 def test_local_polynomials_follow_a_long_delay():
@@ -141,12 +181,12 @@ def test_any_clock_covers():
 def test_bands_of_gain_and_phase():
     found = estimate_frequency_response(random_record(1))
     low, high = found.gain_band()
-    assert (low <= np.abs(found.response)).all()
-    assert (np.abs(found.response) <= high).all()
-    half = found.phase_band()
-    clear = low > 0
-    assert np.sin(half[clear]) == pytest.approx((high - low)[clear] / 2 / np.abs(found.response)[clear])
-    assert (half[~clear] == np.pi).all()
+    gain, half = np.abs(found.response), found.phase_band()
+    assert (low <= gain).all()
+    assert (gain <= high).all()
+    assert ((low > 0) == (gain > found.radius())).all()
+    known = found.phase_known()
+    assert np.sin(half[known]) == pytest.approx((high - low)[known] / 2 / gain[known])
     assert (found.radius(0.99) > found.radius(0.9)).all()
 
 
@@ -157,7 +197,8 @@ def test_welch_averages():
     low = found.frequencies < 5
     assert np.median((np.abs(found.response - true) / np.abs(true))[low]) < 0.05
     assert found.coherence[found.frequencies < 3].min() > 0.95
-    assert covered(found, true) > 0.8
+    assert not found.told.any()
+    assert any("No intervals" in note for note in found.notes)
 
 
 def test_the_period_of_an_input():
