@@ -2,7 +2,7 @@
 
 The data sets of rows a, c, d and f of the study, fitted as there, and of each fit the linearised bands of gain and
 phase, of the step response, and of the output for an input that is not the experiment's. Writes ``bands.csv`` and
-``bands.md`` to ``results/published/coverage``.
+``bands.md`` to ``results/published/intervals``.
 """
 
 import sys
@@ -23,7 +23,7 @@ from ctid_cli.signals.held import HeldSignal
 from ctid_cli.specification.load import load_spec
 
 ROOT = Path(__file__).resolve().parents[2]
-PUBLISHED = ROOT / "results" / "published" / "coverage"
+PUBLISHED = ROOT / "results" / "published" / "intervals"
 #: Row of the study, specification, what the noise is taken for, and a time constant of the system [s].
 ROWS = (
     ("a", "case1_regular", "white", 0.5),

@@ -1,7 +1,7 @@
 """Coverage of 95 % intervals with default settings: ``python -m experiments.coverage.defaults [RUNS [SEED]]``.
 
 Three systems with a delay, after a PRBS and after a step, in white and in coloured noise. ``delay_profile`` is told
-nothing of the noise. Writes ``defaults.csv`` and ``defaults.md`` to ``results/published/coverage``.
+nothing of the noise. Writes ``defaults.csv`` and ``defaults.md`` to ``results/published/intervals``.
 """
 
 import itertools
