@@ -27,12 +27,13 @@ demo: $(VENV)/.installed
 	$(BIN)/ctid run configs/quickstart.yaml
 	$(BIN)/ctid table quickstart
 
+# One thread each: the threads of two workers wait for each other, and tests of frequencies took 3 to 5 times as long.
 test: $(VENV)/.test-installed
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -q -n logical --dist loadfile
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n logical --dist loadfile
 
 faults: $(VENV)/.test-installed
 	$(BIN)/python -m tests.faults --share $(or $(SHARE),1) $(if $(MINUTES),--minutes $(MINUTES)) \
