@@ -164,12 +164,11 @@ class Nest:
         Started from all that was found without them, moved to where they hold, from further points and at random.
         """
         nest = Nest(self.problem, self.box, self.random_starts, self.seed, known=known)
-        starts = [*points, *(local.point for local in self.optima(poles, zeros)), *self._from_below(poles, zeros)]
-        starts += self.resonances(poles, zeros)
         if known.all_poles:
             starts = [point_of(known.poles, 0.5 * sum(self.box.delays), self.box)]
         else:
-            starts += nest.random_points(poles)
+            starts = [*points, *(local.point for local in self.optima(poles, zeros)), *self._from_below(poles, zeros)]
+            starts += self.resonances(poles, zeros) + nest.random_points(poles)
         moved = [point for point in (known.met(start, self.box) for start in starts) if point is not None]
         descent = nest.descent(zeros)
         moved.sort(key=lambda point: descent.value(point).squared_error)
@@ -193,27 +192,27 @@ class Nest:
         if poles > 2:
             smaller = self.optima(poles - 2, min(zeros, poles - 3))[0].point
             roots, delay = smaller.poles, smaller.delay.seconds
-        descent, zeta = self.descent(zeros), self.box.least_damping
-
-        def tried(places: Iterable[tuple[float, float]]) -> list[tuple[float, float, Point]]:
-            """Costs, frequencies and points, the lowest cost first."""
-            found = []
-            for w, tau in places:
-                pair = w * complex(-zeta, 1.0)
-                point = point_of(np.concatenate((roots, [pair, pair.conjugate()])), tau, self.box)
-                found.append((descent.value(point).squared_error, w, point))
-            return found
-
-        alone = tried((w, delay) for w in np.linspace(resolution, highest, count).tolist())
-        minima = _lowest_minima(np.array([cost for cost, _, _ in alone]), LOOKED_AT)
-        best = [alone[k] for k in minima]
+        alone = self._with_pairs(zeros, roots, [(w, delay) for w in np.linspace(resolution, highest, count).tolist()])
+        best = [alone[k] for k in _lowest_minima(np.array([cost for cost, _, _ in alone]), LOOKED_AT)]
         if self.box.delay_free:
-            best += tried((alone[k][1], tau) for k in minima for tau in self._delays(LOOKED_AT))
-        self.evaluations += descent.evaluations
+            places = [(w, tau) for _, w, _ in best for tau in self._delays(LOOKED_AT)]
+            best += self._with_pairs(zeros, roots, places)
         lowest: dict[float, Point] = {}
         for _, w, point in sorted(best, key=lambda entry: entry[0]):
             lowest.setdefault(w, point)
         return list(lowest.values())[: LOOKED_AT // 2]
+
+    def _with_pairs(
+        self, zeros: int, roots: ComplexArray, places: Iterable[tuple[float, float]]
+    ) -> list[tuple[float, float, Point]]:
+        """Squared errors, frequencies and points with a pair of the least damping at frequencies and delays."""
+        descent, found = self.descent(zeros), []
+        for w, tau in places:
+            pair = w * complex(-self.box.least_damping, 1.0)
+            point = point_of(np.concatenate((roots, [pair, pair.conjugate()])), tau, self.box)
+            found.append((descent.value(point).squared_error, w, point))
+        self.evaluations += descent.evaluations
+        return found
 
     def _grown(self, poles: int, zeros: int, new_zeros: int, added: int) -> list[Point]:
         """The best of a smaller structure with poles added, for another numerator."""
