@@ -192,23 +192,31 @@ class Nest:
         if poles > 2:
             smaller = self.optima(poles - 2, min(zeros, poles - 3))[0].point
             roots, delay = smaller.poles, smaller.delay.seconds
-        alone = self._with_pairs(zeros, roots, [(w, delay) for w in np.linspace(resolution, highest, count).tolist()])
+        zeta = self.box.least_damping
+        frequencies = np.linspace(resolution, highest, count).tolist()
+        alone = self._with_pairs(zeros, roots, [(w, zeta, delay) for w in frequencies])
         best = [alone[k] for k in _lowest_minima(np.array([cost for cost, _, _ in alone]), LOOKED_AT)]
+        delays = self._delays(LOOKED_AT) or [delay]
         if self.box.delay_free:
-            places = [(w, tau) for _, w, _ in best for tau in self._delays(LOOKED_AT)]
-            best += self._with_pairs(zeros, roots, places)
+            best += self._with_pairs(zeros, roots, [(w, zeta, tau) for _, w, _ in best for tau in delays])
         lowest: dict[float, Point] = {}
         for _, w, point in sorted(best, key=lambda entry: entry[0]):
             lowest.setdefault(w, point)
-        return list(lowest.values())[: LOOKED_AT // 2]
+        found = list(lowest.values())[: LOOKED_AT // 2]
+        if self.box.imaginary < self.box.fastest:
+            # A pair that alternates with the samples is another one at every delay.
+            places = [(self.box.imaginary, damping, tau) for damping in (zeta, *DAMPINGS) for tau in delays]
+            edge = sorted(self._with_pairs(zeros, roots, places), key=lambda entry: entry[0])
+            found += [point for _, _, point in edge[:REFINED]]
+        return found
 
     def _with_pairs(
-        self, zeros: int, roots: ComplexArray, places: Iterable[tuple[float, float]]
+        self, zeros: int, roots: ComplexArray, places: Iterable[tuple[float, float, float]]
     ) -> list[tuple[float, float, Point]]:
-        """Squared errors, frequencies and points with a pair of the least damping at frequencies and delays."""
+        """Squared errors, frequencies and points with a pair of each imaginary part and damping, at each delay."""
         descent, found = self.descent(zeros), []
-        for w, tau in places:
-            pair = w * complex(-self.box.least_damping, 1.0)
+        for w, zeta, tau in places:
+            pair = w * complex(-zeta, 1.0)
             point = point_of(np.concatenate((roots, [pair, pair.conjugate()])), tau, self.box)
             found.append((descent.value(point).squared_error, w, point))
         self.evaluations += descent.evaluations
@@ -261,7 +269,7 @@ class Nest:
         return points + [trials[k] for k in _lowest_minima(errors, KEPT)]
 
     def _delays(self, most: int) -> list[float]:
-        """Delays that are spread over the whole range, at most one for each of its cells."""
+        """Delays that are spread over the whole range, at most one for each of its cells; none of a known delay."""
         low, high = self.box.delays
         spacing = max(self.box.cell or 0.25 * self.box.quarter, (high - low) / most)
         count = int(np.ceil((high - low) / spacing))
