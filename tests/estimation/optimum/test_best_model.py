@@ -8,6 +8,8 @@ from ctid_cli.estimation.optimum.best_model import SearchOptions, best_output_er
 from ctid_cli.estimation.optimum.search import Ending
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
+from ctid_cli.models.additive import AdditiveModel, Submodel
+from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
@@ -45,6 +47,16 @@ def test_no_structure_is_worse_than_one_that_it_contains(seed):
         for smaller in ((n - 1, m - 1), (n, m - 1), (n - 1, m)):
             if smaller in least:
                 assert error <= least[smaller] * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_mode_that_hardly_decays_is_found_between_the_others_of_the_noise(seed):
+    modes = AdditiveModel([Submodel([1.0], [1.0, 1.2, 1.0]), Submodel([0.004], [5.05**-2, 2e-4 / 5.05, 1.0])])
+    model = unfactored(modes)
+    data = filter_data(record_of(model, np.random.default_rng(seed), samples=240, noise=0.1))
+    true_poles = SearchOptions(starts=[(model.denominator, 0.0)], nested=False)
+    expected = best_output_error([data], 4, 2, true_poles).squared_error
+    assert best_output_error([data], 4, 2, SearchOptions(random_starts=2)).squared_error <= expected * (1 + 1e-9)
 
 
 def test_a_superfluous_pole_runs_to_infinity():
