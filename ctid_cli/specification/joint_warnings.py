@@ -52,6 +52,10 @@ def _of_open_loop(at: KeyPath, options: Any) -> Iterator[Complaint]:
 def _simulation_warnings(spec: Spec) -> list[Complaint]:
     """What is unwise where the truth is known."""
     warnings: list[Complaint] = []
+    if spec.noise is not None and not getattr(spec.noise, "own", False):
+        for name, section in spec.estimators.items():
+            at = ("estimators", name)
+            warnings += over({("noise",): variants(spec.noise), at: variants(section)}, partial(_of_white_formula, at))
     # What is one's own is asked in a worker process only.
     samplings = [] if getattr(spec.sampling, "own", False) else variants(spec.sampling)
     if spec.excitation is not None and not getattr(spec.excitation, "own", False):
@@ -136,6 +140,12 @@ def _of_delay(at: KeyPath, system: Any, options: Any, *, in_loop: bool) -> Itera
         other = "" if in_loop else " or, to estimate it, use kind: delay_profile"
         wrong = f"is taken as {known:g} s and the system has {true:g} s, which biases the parameters"
         yield (*at, "delay"), f"{wrong}; write delay: {true:g}{other}"
+
+
+def _of_white_formula(at: KeyPath, noise: Any, options: Any) -> Iterator[Complaint]:
+    if getattr(noise, "coloured", False) and getattr(options, "covariance", "") == "white":
+        short = "is for white noise and the noise is coloured, so that the intervals are too short or too long"
+        yield (*at, "covariance"), f"{short}; write covariance: auto, unless that is the point"
 
 
 def _of_structure(at: KeyPath, system: Any, options: Any) -> Iterator[Complaint]:

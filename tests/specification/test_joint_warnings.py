@@ -34,6 +34,14 @@ def warnings(tmp_path):
     return load
 
 
+def test_standard_errors_for_white_noise_in_coloured_noise(warnings):
+    coloured = "noise={kind: arma, numerator: [1.0], denominator: [1.0, -0.9], snr_db: 15}"
+    assert warnings(coloured) == []
+    (said,) = warnings(coloured, "estimators.searched.covariance=white")
+    assert "estimators.searched.covariance: is for white noise" in said
+    assert warnings("estimators.searched.covariance=white") == []
+
+
 def test_nothing_is_said_of_what_is_right(warnings):
     assert warnings() == []
     assert warnings(IRREGULAR % (400, "exact")) == []
