@@ -104,6 +104,8 @@ def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, opt
         nest.optima(poles, zeros)
         points += nest.resonances(poles, zeros)
     nest.refine(poles, zeros, points)
+    if options.nested:
+        nest.refine(poles, zeros, nest.close_delays(poles, zeros))
     found = _least(nest, poles, zeros, options.nested and options.fewer_poles)
     in_doubt = (found.tried > 1 and found.agree == 1) or not found.ending.optimal
     if options.nested or not in_doubt:
@@ -122,6 +124,8 @@ def _with_known(problem: Problem, box: Box, poles: int, options: SearchOptions) 
     if options.nested and part is None:
         free = Nest(problem, box, options.random_starts, options.seed)
         nest = free.with_known(poles, zeros, known, points)
+        if nest.optima(poles, zeros):
+            nest.refine(poles, zeros, nest.close_delays(poles, zeros))
     else:
         if part is not None:
             there = _with_known(part, box_of(part, options.delays), poles, options)

@@ -1,11 +1,12 @@
 """Where searches start: from the optima of the smaller models, from given estimates, and at random."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray
-from ctid_cli.estimation.optimum.box import Box, Point, point_of
+from ctid_cli.estimation.optimum.box import LIMITS, Box, Point, point_of
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import Descent, Local
@@ -17,6 +18,8 @@ DENSER, MORE = 4, 2
 #: Evaluations times samples that are spent on pairs of the least damping: up to 1,000 samples all frequencies that
 #: these resolve. The best of them, and delays, that are looked at together.
 RESOLVED, LOOKED_AT = 1_000_000, 16
+#: Delays tried beside the best one, in sampling intervals: minima between kinks lie a twentieth of an interval apart.
+CLOSE_DELAYS = np.array([1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2])
 #: Optima kept of each structure, and how far the best of what is not yet one may lie above and still be refined.
 KEPT = 3
 #: Squared errors that differ by less than this fraction are those of one minimum.
@@ -221,6 +224,19 @@ class Nest:
             found.append((descent.value(point).squared_error, w, point))
         self.evaluations += descent.evaluations
         return found
+
+    def close_delays(self, poles: int, zeros: int) -> list[Point]:
+        """Return starts with the best poles at delays within half a sampling interval of the best one.
+
+        On an irregular clock the cost has a kink wherever a sample meets an edge of the input, and minima between them.
+        """
+        if self.box.cell > 0 or not self.box.delay_free:
+            return []
+        best = self.optima(poles, zeros)[0].point
+        interval = LIMITS["fastest"].rest / self.box.fastest
+        delays = best.delay.seconds + interval * np.concatenate((-CLOSE_DELAYS, CLOSE_DELAYS))
+        inside = np.unique(np.clip(delays, *self.box.delays))
+        return [replace(best, delay=best.delay._replace(seconds=tau)) for tau in inside.tolist()]
 
     def _grown(self, poles: int, zeros: int, new_zeros: int, added: int) -> list[Point]:
         """The best of a smaller structure with poles added, for another numerator."""
