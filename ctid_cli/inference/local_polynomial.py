@@ -26,7 +26,7 @@ HALF_WIDTHS = (4, 6, 8, 11, 16, 22, 32, 45, 64, 90, 128)
 #: the standard error is not seen in residuals, and falls with the third power of the width or faster.
 NARROWER = 2.0
 #: A peak narrower than a window leaves large residuals and is flattened by more than its interval. There is none where
-#: the residuals of the least width have so many times the power that is usual within so many lines, and the gain is
+#: the residuals of the least width exceed their usual power within a number of lines by this factor, and the gain is
 #: above this share of the greatest one in the window. At 500 samples, of the tops of resonances with a damping ratio
 #: of .03 to .1 at two to eight periods of the record, one in ten is drawn then; unguarded, 30 to 50 % were covered.
 PEAK_RESIDUALS, USUAL, PEAK_GAIN = 8.0, 32, 0.5
@@ -167,7 +167,7 @@ def _told(least: _LocalFit, centres: IntArray) -> BoolArray:
 
 
 def _around(values: Array, centres: IntArray, reach: int, measure: Callable[[Array], float]) -> Array:
-    """A measure of the values at all centres within so many lines."""
+    """Return a measure of the values at all centres within a given number of lines."""
     first, last = np.searchsorted(centres, centres - reach), np.searchsorted(centres, centres + reach, side="right")
     return np.array([measure(values[a:b]) for a, b in zip(first, last, strict=True)])
 

@@ -206,6 +206,8 @@ class Descent:
 
     def _forces(self, here: Local) -> Array:
         """Return the multipliers of the known coefficients of the denominator."""
+        if not self.known.places.size:
+            return np.zeros(0)
         lengths = _lengths(here)
         free = self._freedom(here, lengths).free
         slopes = self.known.slopes(here.point, lengths.size) / lengths
