@@ -1,17 +1,16 @@
 """The estimation problem of a single transfer function on the samples of one record."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from ctid_cli.arrays import Array
-from ctid_cli.estimation.iteration import Equations, compiled_as, inadmissible, solve_scaled, with_best
+from ctid_cli.arrays import Array, IntArray
+from ctid_cli.estimation.iteration import Equations, inadmissible, solve_scaled, with_best
 from ctid_cli.estimation.stability import reflect_unstable, with_stable_denominator
-from ctid_cli.filtering.bank import second_moments, standard_moments
+from ctid_cli.filtering.bank import second_moments
 from ctid_cli.filtering.filter_data import FilterData
-from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT
 from ctid_cli.inference.answer import output_bandwidth
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.signals.record import Record
@@ -51,60 +50,44 @@ class SampledProblem(NamedTuple):
 
     def equations(self, theta: Array) -> Equations:
         """Second moments of the iteration."""
-        moments: Equations = sampled_equations(self, theta)
-        return moments
+        n, m = self.poles, self.zeros
+        delay = float(theta[-1])
+        if not (self.low <= delay <= self.high and np.isfinite(theta).all()):
+            return inadmissible(theta.size)
+        b = theta[n:-1]
+        # What overflows is found by the moments not being finite.
+        with np.errstate(all="ignore"):
+            moments = second_moments(self.data, np.concatenate(([1.0], theta[:n])), b, delay)
+        if not np.isfinite(moments).all():
+            return inadmissible(theta.size)
+        psi, phi, signs, error = _rows_of(n, m)
+        mixed, hessian = moments[psi[:, None], phi] * signs, moments[psi[:, None], psi] * signs
+        # x = sum b_j p^(m-j)/A u.
+        rising = b[::-1]
+        power = float(rising @ moments[: m + 1, : m + 1] @ rising)
+        return Equations(mixed, moments[psi, error] * signs[-2], hessian, float(moments[error, error]), power)
 
     def admissible(self, theta: Array) -> Array:
         """Reflect unstable denominators."""
         return with_stable_denominator(theta, self.poles)
 
 
+@lru_cache
+def _rows_of(poles: int, zeros: int) -> tuple[IntArray, IntArray, Array, int]:
+    """Return the standard rows of the sensitivities and of the regressors, signs of their products, and of the error.
+
+    ``dx/da_i = -p^(n-i)/A x`` (of y in the regressor), ``dx/db_j = p^(m-j)/A u`` and ``dx/dtau = -p x``.
+    """
+    n, m = poles, zeros
+    of_b, tau = np.arange(m, -1, -1), 3 * n + 2
+    psi, phi = (np.concatenate((np.arange(last, last - n, -1), of_b, [tau])) for last in (2 * n, 3 * n))
+    sign = np.concatenate((-np.ones(n), np.ones(m + 1), [-1.0]))
+    return psi, phi, np.outer(sign, sign), 3 * n + 1
+
+
 def at_known_delay(data: FilterData, structure: Structure) -> SampledProblem:
     """The coefficients at a delay that is held."""
     return SampledProblem(data, structure.poles, structure.zeros, False, 0.0, np.inf)
-
-
-@njit(cache=True, nogil=True)
-def sampled_equations(problem: SampledProblem, theta: Array) -> Equations:
-    """Second moments of the iteration, the delay included."""
-    n, m = problem.poles, problem.zeros
-    p = n + m + 2
-    delay = theta[p - 1]
-    if not (problem.low <= delay <= problem.high and np.isfinite(theta).all()):
-        return inadmissible(p)
-    a = np.ones(n + 1)
-    a[1:] = theta[:n]
-    b = theta[n : p - 1].copy()
-    # Not the literal False, for which numba would compile all that lies below a second time.
-    moments = standard_moments(a, b, delay, problem.data, bool(0), MODAL_CONDITION_LIMIT)
-    if not np.isfinite(moments).all():
-        return inadmissible(p)
-    # Standard rows of the sensitivities and of the regressors: dx/da_i = -p^(n-i)/A x with the measured output in the
-    # regressor, dx/db_j = p^(m-j)/A u, dx/dtau = -p x.
-    psi, phi = np.empty(p, np.int64), np.empty(p, np.int64)
-    sign = np.ones(p)
-    for i in range(n):
-        psi[i], phi[i], sign[i] = 2 * n - i, 3 * n - i, -1.0
-    for j in range(m + 1):
-        psi[n + j] = phi[n + j] = m - j
-    psi[p - 1] = phi[p - 1] = 3 * n + 2
-    sign[p - 1] = -1.0
-    error_row = 3 * n + 1
-    mixed, hessian, gradient = np.empty((p, p)), np.empty((p, p)), np.empty(p)
-    for i in range(p):
-        gradient[i] = moments[psi[i], error_row] * sign[i]
-        for j in range(p):
-            mixed[i, j] = moments[psi[i], phi[j]] * (sign[i] * sign[j])
-            hessian[i, j] = moments[psi[i], psi[j]] * (sign[i] * sign[j])
-    # x = sum b_j p^(m-j)/A u.
-    power = 0.0
-    for i in range(m + 1):
-        for j in range(m + 1):
-            power += b[m - i] * moments[i, j] * b[m - j]
-    return Equations(mixed, gradient, hessian, moments[error_row, error_row], power)
-
-
-compiled_as(SampledProblem, sampled_equations)
 
 
 def cutoffs_of(record: Record, given: float | None) -> tuple[float, ...]:
@@ -152,5 +135,4 @@ def least_squares_start(
     theta = np.concatenate((stable[1:], coefficients[n:], [delay]))
     if not refit:
         return theta
-    fitted: Array = with_best(at_known_delay(data, structure), theta, n, n + m + 1)
-    return fitted
+    return with_best(at_known_delay(data, structure), theta, n, n + m + 1)

@@ -1,196 +1,256 @@
 r"""Filtered signals of a record and their second moments, exactly, for any clock, hold and delay.
 
-For a monic A of degree n, a numerator B, and a delay tau, the *standard rows* at each used sample are
+For a monic A of degree n, l integrators, a numerator B of lower degree than ``p^l A``, and a delay tau, the *standard
+rows* at each used sample are
 
-====================  =====================================================
-rows                  signal
-====================  =====================================================
-``0 … n-1``           ``p^k/A u(t - tau)``, k = 0 … n-1
-``n``                 ``u(t - tau)``
-``n+1 … 2n``          ``p^k/A x(t)``, ``x = B/A u(t - tau)``
-``2n+1 … 3n``         ``p^k/A y``
-``3n+1``              ``y - x``, the output error
-``3n+2``              ``p x``, the derivative of the output error with respect to tau
-====================  =====================================================
+==========================  ===============================================================================
+rows                        signal
+==========================  ===============================================================================
+``0 … n+l-1``               ``p^k/(p^l A) u(t - tau)``, k = 0 … n+l-1
+``n+l``                     ``u(t - tau)``
+``n+l+1 … 2n+l``            ``p^k/A x(t)``, k = 0 … n-1, ``x = B/(p^l A) u(t - tau)``
+``2n+l+1 … 3n+l``           ``p^k/A y``, k = 0 … n-1
+``3n+l+1``                  ``y - x``, the output error
+``3n+l+2``                  ``p x``, the derivative of the output error with respect to tau
+==========================  ===============================================================================
 
 Every refined instrumental variable step, cost, gradient and Hessian is a function of their second moments.
 """
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
-from numba import njit
 
-from ctid_cli.arrays import Array, ComplexArray
-from ctid_cli.filtering.chain_pass import irregular_chain_pass, regular_chain_pass
-from ctid_cli.filtering.exponential import held_readout, held_step, place
-from ctid_cli.filtering.filter_data import FilterData, in_unit, plain_array, split_delay
-from ctid_cli.filtering.modal_pass import irregular_modal_pass, regular_modal_pass
-from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT, add_mode, modal_condition, pole_slopes
-from ctid_cli.filtering.realisation import chain, horner, scaled_roots
-from ctid_cli.filtering.row_sink import RowSink, row_sink
+from ctid_cli.arrays import Array, ComplexArray, IntArray
+from ctid_cli.filtering import kernels
+from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
+from ctid_cli.filtering.realisation import chain, held_step, scaled_roots, transitions
+
+#: Partial fractions are used while they amplify rounding by less than this; beyond, poles count as repeated.
+MODAL_CONDITION_LIMIT = 1e4
+#: Integrators that the modal form has.
+MOST_MODAL_INTEGRATORS = 2
 
 Form = Literal["auto", "modal", "chain"]
+#: No input besides the first, nothing that is not wanted.
+NOTHING, NO_ROWS = np.zeros(0), np.zeros((0, 0))
 
 
-@njit(cache=True, nogil=True)
-def _double_chain(a: Array, b: Array) -> tuple[float, Array, Array, Array, Array]:
-    """Realise 1/A driven by the input and a second 1/A driven by the output of B/A."""
-    n = a.size - 1
-    m = b.size - 1
+class Modes(NamedTuple):
+    """Partial fractions of one model, or of several submodels with their modes pooled."""
+
+    #: One pole of each pair [rad/s], shape (m,).
+    poles: ComplexArray
+    #: Submodel of each mode, shape (m,).
+    owner: IntArray
+    #: Weights of z and w of each mode in the output, shape (m, 2).
+    residues: ComplexArray
+    #: Direct feed-through of each submodel.
+    direct: Array
+
+    @property
+    def width(self) -> int:
+        """Number of rows of z: one for a real pole, two for a pair."""
+        return self.poles.size + int(np.count_nonzero(self.poles.imag))
+
+
+class ModalForm(NamedTuple):
+    """Partial fractions of the standard rows."""
+
+    #: Amplification of rounding [-], infinite where poles coincide.
+    condition: float
+    poles: ComplexArray
+    residues: ComplexArray
+    #: The standard rows of the rows ``z, w, v, y - x, e`` of a pass.
+    mapping: Array
+
+    @property
+    def modes(self) -> Modes:
+        """The modes of a model by itself."""
+        return Modes(self.poles, np.zeros(self.poles.size, np.int64), self.residues, np.zeros(1))
+
+
+def modal_form(a: Array, b: Array, integrators: int = 0) -> ModalForm:
+    """Return the partial fractions of ``B/(p^l A)``; their condition says whether they can be used."""
     w0, roots = scaled_roots(a)
-    single, entry, powers = chain(roots)
-    # p^k/A in seconds, from the chain in the time unit 1/w0.
-    for k in range(n):
-        for i in range(n):
-            powers[k, i] *= w0 ** (k - n)
-    # x = B/A u on the states of the first chain, which drives the second: z2' = F z2 + g (output z1).
-    output = np.zeros(n)
-    for i in range(m + 1):
-        for j in range(n):
-            output[j] += b[i] * powers[m - i, j]
-    dynamics = np.zeros((2 * n, 2 * n))
-    gain = np.zeros(2 * n)
-    place(dynamics, 0, 0, single)
-    place(dynamics, n, n, single)
-    for i in range(n):
-        gain[i] = entry[i]
-        for j in range(n):
-            dynamics[n + i, j] = entry[i] * output[j]
-    return w0, dynamics, gain, powers, output
+    try:
+        return ModalForm(*kernels.modal_form(a, b, integrators, roots * w0))
+    except ZeroDivisionError:
+        # A pole on the imaginary axis, or products that underflow.
+        nothing = np.zeros(0, np.complex128)
+        return ModalForm(np.inf, nothing, nothing.reshape(0, 2), NO_ROWS)
 
 
-@njit(cache=True, nogil=True)
-def _fill_derivative(a: Array, b: Array, mapping: Array) -> None:
-    """Write the row ``p x`` of a map to standard rows from the rows above it."""
-    n = a.size - 1
-    m = b.size - 1
-    last = 3 * n + 2
-    for column in range(mapping.shape[1]):
-        total = 0.0
-        for i in range(m + 1):
-            power = m - i + 1
-            # p^n/A u = u - sum of a_k p^(n-k)/A u, in terms of the rows below it.
-            if power < n:
-                total += b[i] * mapping[power, column]
-            else:
-                total += b[i] * mapping[n, column]
-                for k in range(1, n + 1):
-                    total -= b[i] * a[k] * mapping[n - k, column]
-        mapping[last, column] = total
+def modal_pass(
+    data: FilterData,
+    modes: Modes,
+    delay: float,
+    *,
+    rows: bool = False,
+    double: bool = True,
+    filter_output: bool = True,
+    leading: int | None = None,
+    states: ComplexArray | None = None,
+    instruments: Array | None = None,
+) -> Array:
+    """Return the moments of the rows of a pass, or the rows themselves, shape (count, q).
 
-
-@njit(cache=True, nogil=True)
-def _to_standard(mapping: Array, sink: RowSink, want_rows: bool) -> Array:
-    """Apply the map from internal to standard rows to what a pass has left: rows, or their moments."""
-    if want_rows:
-        return sink.rows @ np.ascontiguousarray(mapping.T)
-    return mapping @ sink.gram @ np.ascontiguousarray(mapping.T)
-
-
-@njit(cache=True, nogil=True)
-def _chain_rows(a: Array, b: Array, delay: float, data: FilterData, want_rows: bool) -> Array:
-    """Standard rows for any poles, from [z (both chains), u and on a regular clock its change, filtered y, y - x]."""
-    n = a.size - 1
-    w0, dynamics, gain, powers, output = _double_chain(a, b)
-    regular = data.interval > 0.0
-    shift, fraction = split_delay(delay, data.interval) if regular else (0, 0.0)
-    # On a regular clock the states stand at the break before the instant that arrives now: this reads them out there.
-    readout = held_readout(dynamics, gain, data.interval * w0, fraction)
-    filtered = 2 * n + (2 if regular else 1)
-    mapping = np.zeros((3 * n + 3, filtered + n + 1))
-    place(mapping, 0, 0, powers @ readout[:n])
-    place(mapping, n + 1, 0, powers @ readout[n:])
-    mapping[n, 2 * n] = 1.0
-    place(mapping, 2 * n + 1, filtered, powers)
-    mapping[3 * n + 1, filtered + n] = 1.0
-    sink = row_sink(mapping.shape[1], data.use, want_rows)
-    # y - x needs x at the instant read.
-    output_map = output @ readout[:n]
-    if regular:
-        mapping[n, 2 * n + 1] = fraction
-        # The states step by whole intervals whatever the delay.
-        step = held_step(dynamics, gain, data.interval * w0)
-        regular_chain_pass(step, output_map, shift, data, sink)
-    else:
-        irregular_chain_pass(dynamics, gain, output_map, delay * w0, in_unit(data, w0), sink)
-    _fill_derivative(a, b, mapping)
-    return _to_standard(mapping, sink, want_rows)
-
-
-@njit(cache=True, nogil=True)
-def modal_map(a: Array, b: Array) -> tuple[float, ComplexArray, ComplexArray, Array]:
-    """Partial fractions of the standard rows: their condition, poles, residues of x, and the map from internal rows."""
-    n = a.size - 1
-    w0, scaled = scaled_roots(a)
-    roots = scaled * w0
-    modes = 0
-    for i in range(n):
-        if roots[i].imag >= 0.0:
-            modes += 1
-    poles, residues = np.zeros(modes, np.complex128), np.zeros(modes, np.complex128)
-    mapping = np.zeros((3 * n + 3, 3 * n + 2))
-    simple, slopes, curvatures = pole_slopes(roots)
-    if not simple:
-        return np.inf, poles, residues, mapping
-    row, mode = 0, 0  # of the internal rows
-    for i in range(n):
-        pole, slope = roots[i], slopes[i]
-        if pole.imag < 0.0:
-            continue
-        paired = pole.imag > 0.0
-        poles[mode] = pole
-        value, first = horner(b, pole)
-        residues[mode] = (2.0 if paired else 1.0) * value / slope
-        # p^k/A at its pole, and p^k B/A^2, a double pole: with f = p^k B it is f/A'^2 of w and
-        # (f' - f A''/A')/A'^2 of z.
-        power, power_slope = 1.0 + 0.0j, 0.0j
-        for k in range(n):
-            numerator = power * value
-            numerator_slope = power_slope * value + power * first
-            squared = slope * slope
-            add_mode(mapping, k, row, paired, power / slope)
-            add_mode(mapping, 2 * n + 1 + k, 2 * n + 1 + row, paired, power / slope)
-            add_mode(mapping, n + 1 + k, row, paired, (numerator_slope - numerator * curvatures[i]) / squared)
-            add_mode(mapping, n + 1 + k, n + row, paired, numerator / squared)
-            power_slope = power_slope * pole + power
-            power *= pole
-        row += 2 if paired else 1
-        mode += 1
-    mapping[n, 2 * n] = 1.0
-    mapping[3 * n + 1, 3 * n + 1] = 1.0
-    _fill_derivative(a, b, mapping)
-    return modal_condition(roots, slopes, curvatures), poles, residues, mapping
-
-
-@njit(cache=True, nogil=True)
-def standard_moments(a: Array, b: Array, delay: float, data: FilterData, want_rows: bool, limit: float) -> Array:
-    """Second moments of the standard rows, or the rows: one compiled entry, so that a call costs one crossing.
-
-    Partial fractions where they amplify rounding by less than the limit, else chains.
+    The rows are z of all modes; w, if ``double``; v; ``y - sum x``; and, if ``filter_output``, e. Where ``instruments``
+    are given they are v, held between the samples of a regular clock, and the rows go on with z, w and u of the input
+    itself. ``leading`` rows are multiplied with all (default: all); ``states`` are those at the first sample, and
+    become those after the last one, shape (m, 5).
     """
-    condition, poles, residues, mapping = modal_map(a, b)
-    if condition < limit:
-        sink = row_sink(mapping.shape[1], data.use, want_rows)
-        if data.interval > 0.0:
-            regular_modal_pass(poles, residues, delay, data, sink)
-        else:
-            irregular_modal_pass(poles, residues, delay, data, sink)
-        return _to_standard(mapping, sink, want_rows)
-    return _chain_rows(a, b, delay, data, want_rows)
+    n = modes.width
+    layout = (n if double else 0, 2 * n if double else n, (2 * n + 2 if double else n + 2) if filter_output else 0)
+    width = layout[1] + 2 + (n if filter_output else 0) + (0 if instruments is None else 2 * n + 1)
+    gram = NO_ROWS if rows else np.zeros((width if leading is None else leading, width))
+    found = np.zeros((data.count, width)) if rows else NO_ROWS
+    _run(data, modes, delay, layout, states, instruments, gram, found, NOTHING)
+    return found if rows else gram
 
 
-def _run(data: FilterData, a: Array, b: Array, delay: float, want_rows: bool, form: Form) -> Array:
+def modal_output(data: FilterData, modes: Modes, delay: float) -> Array:
+    """Return the output of a model at all samples of a clock, shape (N,)."""
+    n, x = modes.width, np.zeros(data.t.size)
+    _run(data, modes, delay, (n, 2 * n, 0), None, None, NO_ROWS, NO_ROWS, x)
+    return x
+
+
+def _run(
+    data: FilterData,
+    modes: Modes,
+    delay: float,
+    layout: tuple[int, int, int],
+    states: ComplexArray | None,
+    instruments: Array | None,
+    gram: Array,
+    rows: Array,
+    simulated: Array,
+) -> None:
+    """Run the pass for the clock of a record."""
+    if states is None:
+        states = np.zeros((modes.poles.size, 5), np.complex128)
+    output = data.y, data.y_foh
+    if data.interval > 0.0:
+        clock = (data.interval, *split_delay(delay, data.interval))
+        own = instruments is None
+        driving = (data.u if own else instruments, bool(data.input_foh and own))
+        measured = NOTHING if own else data.u
+        kernels.regular_pass(*modes, states, clock, driving, measured, output, data.use, layout, gram, rows, simulated)
+    else:
+        breaks = data.tu, data.u, data.input_foh
+        kernels.irregular_pass(
+            *modes, states, (data.t, delay, data.slack), breaks, output, data.use, layout, gram, rows, simulated
+        )
+
+
+def chain_states(
+    dynamics: Array, gain: Array, w0: float, data: FilterData, delay: float, initial: Array | None = None
+) -> Array:
+    """Return ``[z, u]`` at all samples for the chain ``z' = w0 (F z + g u)``, shape (N, n + 1)."""
+    initial = np.zeros(gain.size) if initial is None else initial
+    if data.interval == 0.0:
+        longest = max(
+            float(np.diff(data.t).max(initial=0.0)),
+            float(np.diff(data.tu).max(initial=0.0)),
+            float(data.t[-1] - delay - data.tu[-1]),
+        )
+        table = transitions(dynamics, gain, longest * w0)
+        instants = (data.t - delay) * w0
+        breaks = data.tu * w0, data.u, data.input_foh
+        return np.asarray(kernels.irregular_states(*table, *breaks, instants, data.slack * w0, initial)[:, :-1])
+    shift, fraction = split_delay(delay, data.interval)
+    count, late = data.t.size, min(shift, data.t.size)
+    values, changes = np.zeros(count), np.zeros(count)
+    values[late:] = data.u[: count - late]
+    if data.input_foh:
+        changes[late:] = np.diff(data.u, append=data.u[-1])[: count - late]
+    step = held_step(dynamics, gain, data.interval * w0)
+    states = kernels.regular_states(*step, values, changes, initial)
+    if fraction > 0.0:
+        # The states stand at the break before the instant that arrives now: this reads them out there.
+        part = held_step(dynamics, gain, fraction * data.interval * w0)
+        states = states @ part.transition.T + np.outer(values, part.from_value)
+        states += np.outer(fraction * changes, part.from_change)
+    return np.column_stack((states, values + fraction * changes))
+
+
+class DoubleChain(NamedTuple):
+    """A chain ``z1' = w0 (F z1 + g u)`` and a second one behind it, driven by ``x = B/(p^l A) u``."""
+
+    w0: float
+    dynamics: Array
+    gain: Array
+    #: Maps from the states of one chain to ``p^k/(p^l A)`` of what drives it, in s, and to x.
+    powers: Array
+    output: Array
+
+    @property
+    def order(self) -> int:
+        """Number of states of one chain."""
+        return self.output.size
+
+    def signals(self, states: Array, integrators: int) -> tuple[Array, Array]:
+        """Return ``p^k/(p^l A) u`` and ``p^k/A x`` from the states of both chains, columns."""
+        driven = states[:, : self.order] @ self.powers.T
+        return driven, (states[:, self.order : 2 * self.order] @ self.powers.T)[:, integrators:]
+
+    def after_impulse(self, elapsed: Array) -> Array:
+        """Return the states of both chains after an impulse of u [s]."""
+        table = transitions(self.dynamics, self.gain, float(elapsed.max()) * self.w0)
+        breaks = np.zeros(1), np.zeros(1), False
+        initial = self.gain * self.w0
+        return np.asarray(kernels.irregular_states(*table, *breaks, elapsed * self.w0, 0.0, initial))
+
+
+def double_chain(a: Array, b: Array, integrators: int) -> DoubleChain:
+    """Realise ``1/(p^l A)`` twice in a row."""
+    order = a.size - 1 + integrators
+    w0, roots = scaled_roots(np.concatenate((a, np.zeros(integrators))))
+    single, entry, powers = chain(roots)
+    powers = powers * (w0 ** np.arange(-order, 0.0))[:, None]
+    output = b[::-1] @ powers[: b.size]
+    dynamics = np.kron(np.eye(2), single)
+    dynamics[order:, :order] = np.outer(entry, output)
+    return DoubleChain(w0, dynamics, np.concatenate((entry, np.zeros(order))), powers, output)
+
+
+def _chain_rows(a: Array, b: Array, integrators: int, delay: float, data: FilterData) -> Array:
+    """Return the standard rows for any poles."""
+    both = double_chain(a, b, integrators)
+    n, order = a.size - 1, both.order
+    states = chain_states(both.dynamics, both.gain, both.w0, data, delay)[data.use]
+    of_output = data._replace(u=data.y, tu=data.t, input_foh=data.y_foh)
+    filtered = chain_states(both.dynamics[:order, :order], both.gain[:order], both.w0, of_output, 0.0)[data.use, :order]
+    u, error = states[:, -1:], data.y_used - states[:, :order] @ both.output
+    driven, behind = both.signals(states, integrators)
+    highest = u[:, 0] - driven[:, order - np.arange(1, n + 1)] @ a[1:]
+    slope = np.column_stack((driven[:, 1:], highest))[:, : b.size] @ b[::-1]
+    return np.column_stack((driven, u, behind, (filtered @ both.powers.T)[:, integrators:], error, slope))
+
+
+def standard_rows(
+    data: FilterData, a: Array, b: Array, delay: float = 0.0, form: Form = "auto", integrators: int = 0
+) -> Array:
+    """Return the standard rows at the used samples, shape (count, 3 n + l + 3)."""
+    return _standard(data, a, b, delay, form, integrators, True)
+
+
+def second_moments(
+    data: FilterData, a: Array, b: Array, delay: float = 0.0, form: Form = "auto", integrators: int = 0
+) -> Array:
+    """Return the sums of products of the standard rows over the used samples."""
+    return _standard(data, a, b, delay, form, integrators, False)
+
+
+def _standard(data: FilterData, a: Array, b: Array, delay: float, form: Form, integrators: int, rows: bool) -> Array:
     limit = {"chain": 0.0, "modal": np.inf, "auto": MODAL_CONDITION_LIMIT}[form]
-    moments: Array = standard_moments(plain_array(a), plain_array(b), float(delay), data, want_rows, limit)
-    return moments
-
-
-def second_moments(data: FilterData, a: Array, b: Array, delay: float = 0.0, form: Form = "auto") -> Array:
-    """Sums of products of the standard rows over the used samples."""
-    return _run(data, a, b, delay, False, form)
-
-
-def standard_rows(data: FilterData, a: Array, b: Array, delay: float = 0.0, form: Form = "auto") -> Array:
-    """The standard rows themselves."""
-    return _run(data, a, b, delay, True, form)
+    a, b = plain_array(a), plain_array(b)
+    if integrators <= MOST_MODAL_INTEGRATORS and limit > 0.0:
+        modal = modal_form(a, b, integrators)
+        if modal.condition < limit:
+            found = modal_pass(data, modal.modes, delay, rows=rows)
+            mapping = modal.mapping
+            return found @ mapping.T if rows else mapping @ found @ mapping.T
+    found = _chain_rows(a, b, integrators, delay, data)
+    return found if rows else found.T @ found

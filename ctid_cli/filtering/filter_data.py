@@ -1,9 +1,9 @@
-"""A record as the compiled passes take it: one named tuple of plain arrays."""
+"""A record as the passes take it: one named tuple of plain arrays."""
 
+from math import ceil
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, BoolArray
@@ -18,9 +18,9 @@ ROUNDING_GAP = 1e-9
 
 
 class FilterData(NamedTuple):
-    """A record laid out for the compiled passes, which take it whole.
+    """A record laid out for the passes.
 
-    Arrays are contiguous and writeable: for any other layout every pass would be compiled again.
+    Arrays are contiguous and writeable: for any other layout a pass would be compiled again.
     """
 
     #: Sampling instants [s] and outputs, masked samples bridged by straight lines, shape (N,).
@@ -37,6 +37,8 @@ class FilterData(NamedTuple):
     interval: float
     #: Whether input and output have the same instants.
     common_clock: bool
+    #: Time [s] by which a break may be late and still count as reached: what rounding makes of one instant.
+    slack: float = 0.0
 
     @property
     def count(self) -> int:  # type: ignore[override]  # what a tuple counts is of no use here
@@ -81,7 +83,14 @@ def filter_data(
         y_foh=hold_output == "foh",
         interval=interval,
         common_clock=same,
+        slack=clock_slack(t, signal.t),
     )
+
+
+def clock_slack(*clocks: Array) -> float:
+    """Return a small fraction of the shortest interval of some clocks [s]."""
+    shortest = min((float(np.diff(clock).min()) for clock in clocks if clock.size > 1), default=0.0)
+    return ROUNDING_GAP * shortest
 
 
 def used_samples(data: FilterData, record: Record) -> BoolArray:
@@ -89,32 +98,11 @@ def used_samples(data: FilterData, record: Record) -> BoolArray:
     return data.use if data.use.size == record.n_samples else data.use[::FINER]
 
 
-@njit(cache=True, nogil=True)
 def split_delay(delay: float, interval: float) -> tuple[int, float]:
-    """Whole intervals by which the read-out lags, and the fraction of an interval read beyond that break."""
+    """Return whole intervals by which the read-out lags, and the fraction of an interval read beyond that break."""
     ratio = delay / interval
-    shift = int(np.ceil(ratio))
+    shift = ceil(ratio)
     fraction = shift - ratio
     if fraction > 1.0 - WHOLE_INTERVAL:
         return shift - 1, 0.0
-    if fraction < WHOLE_INTERVAL:
-        return shift, 0.0
-    return shift, fraction
-
-
-@njit(cache=True, nogil=True)
-def clock_slack(data: FilterData) -> float:
-    """Distance [s] below which a break and a delayed sample are one instant: a fraction of the shortest interval."""
-    gap = np.inf
-    for k in range(data.t.size - 1):
-        gap = min(gap, data.t[k + 1] - data.t[k])
-    for k in range(data.tu.size - 1):
-        gap = min(gap, data.tu[k + 1] - data.tu[k])
-    return ROUNDING_GAP * gap if gap < np.inf else 0.0
-
-
-@njit(cache=True, nogil=True)
-def in_unit(data: FilterData, w0: float) -> FilterData:
-    """The record with its clocks in the time unit 1/w0."""
-    t, y, use, tu, u, input_foh, y_foh, interval, common_clock = data
-    return FilterData(t * w0, y, use, tu * w0, u, input_foh, y_foh, interval * w0, common_clock)
+    return shift, fraction if fraction >= WHOLE_INTERVAL else 0.0

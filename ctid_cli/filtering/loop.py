@@ -8,11 +8,11 @@ instants.
 from typing import NamedTuple, get_args
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
+from ctid_cli.filtering import kernels
 from ctid_cli.filtering.filter_data import plain_array
 from ctid_cli.filtering.sampled import SampledModel, sampled_model
 from ctid_cli.models.additive import AdditiveModel
@@ -91,58 +91,14 @@ def simulate_loop(
     discrete = _realised(controller)
     _require_solvable(plant, discrete)
     A, B, C, D = discrete.state_space()
-    law = SampledModel(A, B[:, 0].copy(), C[0].copy(), float(D[0, 0]), 0)
-    u, x = _closed_loop(plant, law, r, v, float(enters == "controller"))
+    law = plain_array(A), plain_array(B[:, 0]), plain_array(C[0]), float(D[0, 0])
+    u, x = kernels.loop_signals(tuple(plant), law, r, v, float(enters == "controller"))
     if not (np.isfinite(u).all() and np.isfinite(x).all()):
         raise DataError(
             "the signals of the closed loop are not finite; check reference, noise and stability: its largest pole has "
             f"the magnitude {loop_radius(model, controller, interval):.6g}"
         )
     return LoopSignals(u, x)
-
-
-@njit(cache=True, nogil=True)
-def _closed_loop(plant: SampledModel, law: SampledModel, r: Array, v: Array, before: float) -> tuple[Array, Array]:
-    """Compiled body of :func:`simulate_loop`; ``before`` is the share of r that the controller sees, 1 or 0."""
-    F, g, c, direct, shift = plant
-    A, B, C, D, _ = law
-    n, m = g.size, B.size
-    u, x = np.empty(r.size), np.empty(r.size)
-    z, z_next = np.zeros(n), np.zeros(n)
-    s, s_next = np.zeros(m), np.zeros(m)
-    for k in range(r.size):
-        # x without the input that arrives now, and what the controller's state and the reference put out.
-        free = 0.0
-        for i in range(n):
-            free += c[i] * z[i]
-        error = before * r[k] - v[k]
-        held = (1.0 - before) * r[k]
-        for i in range(m):
-            held += C[i] * s[i]
-        if shift == 0:
-            # The input acts on the output that it is made from: solve for it.
-            arriving = (held + D * (error - free)) / (1.0 + D * direct)
-            x[k] = free + direct * arriving
-            u[k] = arriving
-        else:
-            arriving = u[k - shift] if k >= shift else 0.0
-            x[k] = free + direct * arriving
-            u[k] = held + D * (error - x[k])
-        # Both step on with what they have seen at this sample.
-        error -= x[k]
-        for i in range(n):
-            total = g[i] * arriving
-            for j in range(n):
-                total += F[i, j] * z[j]
-            z_next[i] = total
-        for i in range(m):
-            total = B[i] * error
-            for j in range(m):
-                total += A[i, j] * s[j]
-            s_next[i] = total
-        z, z_next = z_next, z
-        s, s_next = s_next, s
-    return u, x
 
 
 def loop_radius(model: AdditiveModel | TransferFunction, controller: Controller, interval: float) -> float:

@@ -3,9 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
-from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.transfer_function import TransferFunction
@@ -73,6 +71,8 @@ class Lowpass:
         other clock the held signals pass through the analogue filter exactly, and the smooth results are taken as
         linear between the samples.
         """
+        from scipy.signal import butter, sosfilt
+
         y = record.bridged_y
         if record.interval is not None and record.input_on_grid:
             if self.cutoff * record.interval >= np.pi:
@@ -80,42 +80,12 @@ class Lowpass:
                     f"the low-pass cut-off {self.cutoff:g} rad/s is not below half the sampling frequency, "
                     f"{np.pi / record.interval:g} rad/s"
                 )
-            sections = self._sections(record.interval)
-            filtered_u = HeldSignal(record.input.t, _behind(sections, record.input.values.copy()), record.input.hold)
-            filtered_y = _behind(sections, y.copy())
+            # The filter by bilinear transform with the cut-off in its place.
+            sections = butter(self.order, self.cutoff * record.interval / np.pi, output="sos")
+            filtered_u = HeldSignal(record.input.t, sosfilt(sections, record.input.values), record.input.hold)
+            filtered_y = sosfilt(sections, y)
         else:
             instants = np.union1d(record.t, record.input.t[record.input.t <= record.t[-1]])
             filtered_u = HeldSignal(instants, simulate(self.model, record.input, instants), "foh")
             filtered_y = simulate(self.model, HeldSignal(record.t, y, "foh"), record.t)
         return Record(record.t, np.where(record.valid, filtered_y, np.nan), filtered_u, name=record.name)
-
-    def _sections(self, interval: float) -> Array:
-        """The filter by bilinear transform with the cut-off in its place, in sections of second order, shape (k, 5).
-
-        Each is ``(b0 + b1/q + b2/q^2)/(1 + a1/q + a2/q^2)`` with unit gain at zero frequency.
-        """
-        warped = np.tan(0.5 * self.cutoff * interval)
-        # Pairs of poles at the angles from the imaginary axis, the most damped first; of odd orders a real one too.
-        angles = np.pi * np.arange(2 * (self.order // 2) - 1, 0, -2) / (2 * self.order)
-        sections = [np.array([warped, warped, 0.0, warped - 1.0, 0.0]) / (1.0 + warped)] * (self.order % 2)
-        square = warped**2
-        for damping in (2.0 * np.sin(angles) * warped).tolist():
-            section = np.array([square, 2.0 * square, square, 2.0 * (square - 1.0), 1.0 - damping + square])
-            sections.append(section / (1.0 + damping + square))
-        return np.array(sections)
-
-
-@njit(cache=True, nogil=True)
-def _behind(sections: Array, x: Array) -> Array:
-    """Samples behind sections of second order in a row, from rest, in their place."""
-    states = np.zeros((sections.shape[0], 2))
-    for k in range(x.size):
-        value = x[k]
-        for i in range(sections.shape[0]):
-            # Transposed direct form: two numbers remember all that went before.
-            out = sections[i, 0] * value + states[i, 0]
-            states[i, 0] = sections[i, 1] * value - sections[i, 3] * out + states[i, 1]
-            states[i, 1] = sections[i, 2] * value - sections[i, 4] * out
-            value = out
-        x[k] = value
-    return x

@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
-from ctid_cli.filtering.exponential import held_step
 from ctid_cli.filtering.filter_data import plain_array, split_delay
-from ctid_cli.filtering.realisation import chain, scaled_roots
+from ctid_cli.filtering.realisation import chain, held_step, scaled_roots
 from ctid_cli.filtering.simulate import feedthrough, simulate
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction

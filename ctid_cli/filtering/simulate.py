@@ -1,16 +1,13 @@
 """Exact response of a transfer function to a held input, at any instants."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.chain_pass import irregular_chain_pass, regular_chain_pass
-from ctid_cli.filtering.exponential import held_readout, held_step
-from ctid_cli.filtering.filter_data import FilterData, in_unit, plain_array, split_delay
+from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, chain_states, modal_form, modal_output
+from ctid_cli.filtering.filter_data import FilterData, clock_slack, plain_array
 from ctid_cli.filtering.realisation import chain, scaled_roots
-from ctid_cli.filtering.row_sink import RowSink
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.band_limited import FINER
 from ctid_cli.signals.held import HeldSignal
@@ -70,7 +67,7 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
     )
     data = FilterData(
         t=t,
-        y=t,
+        y=np.zeros(t.size),
         use=np.zeros(0, dtype=bool),
         tu=plain_array(signal.t),
         u=plain_array(signal.values),
@@ -78,6 +75,7 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
         y_foh=False,
         interval=(interval or 0.0) if on_grid else 0.0,
         common_clock=False,
+        slack=clock_slack(t, signal.t),
     )
     x: Array = _response(plain_array(model.denominator), plain_array(strictly_proper), model.delay, data)
     if direct:
@@ -94,28 +92,13 @@ def feedthrough(model: TransferFunction) -> tuple[float, Array]:
     return direct, (numerator - direct * model.denominator)[1:]
 
 
-@njit(cache=True, nogil=True)
 def _response(a: Array, b: Array, delay: float, data: FilterData) -> Array:
-    """Compiled body of :func:`simulate`: no output is filtered and no row kept; ``b`` has n entries."""
-    n = a.size - 1
+    """Return the output of a strictly proper model at all samples of a clock; ``b`` has n entries."""
+    modal = modal_form(a, b)
+    if modal.condition < MODAL_CONDITION_LIMIT:
+        return modal_output(data, modal.modes, delay)
     w0, roots = scaled_roots(a)
     dynamics, gain, powers = chain(roots)
-    output_map = np.zeros(n)
-    for i in range(n):
-        for j in range(n):
-            output_map[j] += b[i] / w0 ** (i + 1) * powers[n - 1 - i, j]
-    # Only the output is asked for: no rows, no moments.
-    nothing = np.zeros((0, 0))
-    sink = RowSink(nothing, nothing, nothing, np.zeros(data.t.size))
-    if data.interval == 0.0:
-        irregular_chain_pass(dynamics, gain, output_map, delay * w0, in_unit(data, w0), sink)
-        return sink.output
-    shift, fraction = split_delay(delay, data.interval)
-    # x at the instant that arrives now, from the states and the held input at the break before it.
-    arrived = held_readout(dynamics, gain, data.interval * w0, fraction)
-    readout = np.zeros(n + 2)
-    for i in range(n):
-        for j in range(n + 2):
-            readout[j] += output_map[i] * arrived[i, j]
-    regular_chain_pass(held_step(dynamics, gain, data.interval * w0), readout, shift, data, sink)
-    return sink.output
+    n = gain.size
+    reading = (b / w0 ** np.arange(1.0, n + 1))[::-1] @ powers
+    return np.asarray(chain_states(dynamics, gain, w0, data, delay)[:, :n] @ reading)

@@ -14,24 +14,46 @@ open and closed loop*, equations (10), (20), (29) and (31)).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.bank import standard_rows
+from ctid_cli.filtering import kernels
+from ctid_cli.filtering.bank import (
+    MODAL_CONDITION_LIMIT,
+    MOST_MODAL_INTEGRATORS,
+    ModalForm,
+    Modes,
+    double_chain,
+    modal_form,
+    modal_pass,
+    standard_rows,
+)
 from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
-from ctid_cli.filtering.free_response import free_response, free_response_size
 from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT
-from ctid_cli.filtering.submodel_blocks import LoopData
-from ctid_cli.filtering.submodel_pass import filtered_submodels
-from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController
 
 #: State of the filters at the first sample.
 InitialState = Literal["rest", "periodic", "estimated"]
+
+
+class LoopData(NamedTuple):
+    """The feedback around a record."""
+
+    #: Reference at the sampling instants; empty in open loop, shape (N,).
+    reference: Array
+    #: Controller in descending powers of q, monic, both of one length, shape (nc + 1,).
+    numerator: Array
+    denominator: Array
+    at_controller: bool
+
+    @property
+    def closed(self) -> bool:
+        """Whether there is feedback."""
+        return self.reference.size > 0
 
 
 #: No feedback.
@@ -54,12 +76,71 @@ class SubmodelMoments:
     output_power: float
 
 
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One submodel with a monic denominator, and what of the input it passes on at once."""
+
+    term: Term
+    #: Coefficient of the highest power of A; theta has A with a constant term of 1.
+    highest: float
+    #: A, monic, without the integrators, and B less the direct part, descending powers.
+    a: Array
+    b: Array
+    direct: float
+
+    @classmethod
+    def of(cls, theta: Array, term: Term) -> "Part":
+        """Return the submodel with parameters ``a_1 … a_n, b_0 … b_m``."""
+        rising = np.concatenate(([1.0], theta[: term.poles]))
+        highest = float(rising[-1])
+        a, b = rising[::-1] / highest, theta[term.poles :][::-1] / highest
+        if term.zeros < term.order:
+            return cls(term, highest, a, b, 0.0)
+        direct = float(b[0])
+        rest = b[1:] - direct * np.concatenate((a, np.zeros(term.integrators)))[1:]
+        return cls(term, highest, a, rest if rest.size else np.zeros(1), direct)
+
+    def modal(self) -> ModalForm | None:
+        """Return the partial fractions; None where they amplify rounding, or a pole is lost."""
+        if not self.term.order:
+            # A pure gain has no modes; of the standard rows it has the input and the output error.
+            mapping = np.zeros((3, 2))
+            mapping[0, 0] = mapping[1, 1] = 1.0
+            return ModalForm(1.0, np.zeros(0, complex), np.zeros((0, 2), complex), mapping)
+        if self.term.integrators > MOST_MODAL_INTEGRATORS:
+            return None
+        form = modal_form(plain_array(self.a), plain_array(self.b), self.term.integrators)
+        return form if form.condition < MODAL_CONDITION_LIMIT else None
+
+    def output(self, driven: Array, u: Array) -> Array:
+        """Return the output from ``p^k/(p^l A) u``, columns, and u."""
+        return np.asarray(driven[:, : self.b.size] @ self.b[::-1][: driven.shape[1]] + self.direct * u)
+
+    def instruments(self, driven: Array, u: Array, strictly: Array) -> Array:
+        """Return psi from ``p^k/(p^l A) z`` and z, and from ``p^k/A x`` of the strictly proper part of the output."""
+        of_input = self._with_highest(driven, u)
+        of_output = self._with_highest(strictly, self.output(driven, 0.0 * u), 0)
+        of_output = of_output + self.direct * of_input[:, self.term.integrators :]
+        return np.column_stack((-of_output[:, 1:], of_input[:, : self.term.zeros + 1])) / self.highest
+
+    def regressors(self, driven: Array, u: Array, filtered: Array, left: Array) -> Array:
+        """Return phi from ``p^k/(p^l A) u`` and u, and from ``p^k/A`` of what the others leave of the output."""
+        of_output = self._with_highest(filtered, left, 0)
+        of_input = self._with_highest(driven, u)
+        return np.column_stack((-of_output[:, 1:], of_input[:, : self.term.zeros + 1])) / self.highest
+
+    def _with_highest(self, lower: Array, signal: Array, integrators: int | None = None) -> Array:
+        """Return the columns ``p^k/(p^l A) s``, k = 0 … n + l, from those below the last and s itself."""
+        first = self.term.integrators if integrators is None else integrators
+        return np.column_stack((lower, signal - lower[:, first:] @ self.a[:0:-1]))
+
+
 class SubmodelFilter:
     """The filters of a record for sums of submodels of one structure.
 
-    On a regular clock all submodels are filtered in one compiled pass of their pooled modes. Any other clock, and
-    submodels with (nearly) repeated poles, go through :func:`ctid_cli.filtering.bank.standard_rows` submodel by
-    submodel, several times slower.
+    All submodels are filtered in one compiled pass of their pooled modes. Submodels with (nearly) repeated poles, and
+    closed loops on irregular clocks, go through :func:`ctid_cli.filtering.bank.standard_rows` submodel by submodel,
+    several times slower.
     """
 
     def __init__(
@@ -76,19 +157,13 @@ class SubmodelFilter:
         self.loop = loop
         self.periodic = initial_state == "periodic"
         self.free = free_response_size(terms) if initial_state == "estimated" else 0
-        self.degrees = np.array([(term.poles, term.zeros, term.integrators) for term in terms], dtype=np.int64)
         self.size = sum(term.size for term in terms)
-        self._u = data.u
-        if self.periodic:
-            if data.interval == 0.0:
-                raise ValueError("initial_state periodic needs input and output on one regular clock")
-            shift, _ = split_delay(delay, data.interval)
-            # Two samples more: the last interval leads back to the first sample, where the next slope begins.
-            rolled = np.roll(data.u, shift)
-            self._u = np.concatenate((rolled, rolled[:2]))
+        self._everywhere = np.ones(data.y.size, dtype=bool)
+        if self.periodic and data.interval == 0.0:
+            raise ValueError("initial_state periodic needs input and output on one regular clock")
 
     def moments(self, theta: Array) -> SubmodelMoments | None:
-        """Second moments at one parameter vector."""
+        """Return the second moments at one parameter vector; None where they are not finite."""
         # What overflows is found by the sums not being finite.
         with np.errstate(all="ignore"):
             moments = self._moments(theta)
@@ -98,10 +173,8 @@ class SubmodelFilter:
         return moments if finite else None
 
     def _moments(self, theta: Array) -> SubmodelMoments | None:
-        """Second moments that need not be finite: of the pass, or of the rows where these are made in parts."""
-        p = self.size
-        fast = None if self.free else self._run(self.data, theta, False)
-        if fast is None:
+        pooled = None if self.free else self._pooled(theta)
+        if pooled is None:
             rows = self.rows(theta)
             if rows is None:
                 return None
@@ -109,20 +182,18 @@ class SubmodelFilter:
             return SubmodelMoments(
                 psi.T @ phi, psi.T @ error, psi.T @ psi, float(error @ error), float(output @ output)
             )
-        row, maps, gram = fast
-        # psi and the model output are made of the rows before that of the error.
-        leading = row + 1
-        products = maps[:p, :leading] @ gram
-        return SubmodelMoments(
-            products @ maps[p : 2 * p].T,
-            products[:, row].copy(),
-            products @ maps[:p].T,
-            float(gram[row, row]),
-            float(maps[2 * p, :leading] @ gram @ maps[2 * p]),
-        )
+        psi, phi, output = pooled.psi, pooled.phi, pooled.output
+        # psi and the model output are made of the rows up to that of the error.
+        leading = 2 * pooled.modes.width + 2
+        gram = self._pass(self.data, pooled, rows=False, leading=leading)
+        products = psi[:leading].T @ gram
+        power = output[:leading] @ gram @ output
+        squared = float(gram[leading - 1, leading - 1])
+        error = products[:, leading - 1].copy()
+        return SubmodelMoments(products @ phi, error, products @ psi, squared, float(power))
 
     def rows(self, theta: Array) -> tuple[Array, Array, Array, Array] | None:
-        """Instruments, regressors, output error and model output at the used samples."""
+        """Return instruments, regressors, output error and model output at the used samples."""
         if not self.free:
             return self._rows(self.data, theta)
         data = self.data
@@ -144,120 +215,214 @@ class SubmodelFilter:
         )
 
     def _rows(self, data: FilterData, theta: Array) -> tuple[Array, Array, Array, Array] | None:
-        """The rows without a free response."""
-        p = self.size
-        fast = self._run(data, theta, True)
-        if fast is None:
+        """Return the rows without a free response."""
+        pooled = self._pooled(theta)
+        if pooled is None:
             return self._general_rows(data, theta)
-        row, maps, rows = fast
-        return rows @ maps[:p].T, rows @ maps[p : 2 * p].T, rows[:, row].copy(), rows @ maps[2 * p]
+        rows = self._pass(data, pooled, rows=True, leading=None)
+        return rows @ pooled.psi, rows @ pooled.phi, rows[:, 2 * pooled.modes.width + 1].copy(), rows @ pooled.output
 
-    def _run(self, data: FilterData, theta: Array, want_rows: bool) -> tuple[int, Array, Array] | None:
-        """The compiled pass: row of the error, maps, and rows or moments; None where it does not apply."""
-        if data.interval == 0.0:
+    def _pooled(self, theta: Array) -> "Pooled | None":
+        """Return the partial fractions of all submodels; None where one has none."""
+        if self.loop.closed and self.data.interval == 0.0:
             return None
+        parts, forms = [], []
+        for part in _parts(theta, self.terms):
+            form = part.modal() if part is not None else None
+            if part is None or form is None:
+                return None
+            parts.append(part)
+            forms.append(form)
+        return pooled_modes(parts, forms, self.loop.closed)
+
+    def _pass(self, data: FilterData, pooled: "Pooled", *, rows: bool, leading: int | None) -> Array:
+        """Return the rows of the pass, or their moments."""
+        modes, delay = pooled.modes, self.delay
         if self.periodic:
-            data = data._replace(u=self._u)
-        try:
-            condition, row, maps, found = filtered_submodels(
-                plain_array(theta), self.degrees, self.loop, self.delay, self.periodic, data, want_rows
-            )
-        except (ZeroDivisionError, np.linalg.LinAlgError):
-            return None
-        return (row, maps, found) if condition < MODAL_CONDITION_LIMIT else None
+            data, delay, states = self._in_steady_state(data, modes)
+            return modal_pass(data, modes, delay, rows=rows, leading=leading, states=states)
+        if not self.loop.closed:
+            return modal_pass(data, modes, delay, rows=rows, leading=leading)
+        clock = (data.interval, *split_delay(delay, data.interval))
+        v = kernels.loop_input(modes.poles, modes.residues, float(modes.direct.sum()), clock, *self.loop)
+        return modal_pass(data, modes, delay, rows=rows, leading=leading, instruments=v)
+
+    def _in_steady_state(self, data: FilterData, modes: Modes) -> tuple[FilterData, float, Array]:
+        """Return the record with its input late by whole intervals, the delay left, and states that come back."""
+        count, interval = data.y.size, data.interval
+        period = interval * count
+        shift, fraction = split_delay(self.delay, interval)
+        rolled = np.roll(data.u, shift)
+        # Two samples more: the last interval leads back to the first sample, where the next slope begins.
+        data, delay = data._replace(u=np.concatenate((rolled, rolled[:2]))), -fraction * interval
+        nothing = data._replace(use=np.zeros(count, dtype=bool))
+        decay, initial = np.exp(modes.poles * period), np.zeros((modes.poles.size, 5), np.complex128)
+        states = initial.copy()
+        modal_pass(nothing, modes, delay, states=states)
+        # z(T) = decay z(0) + what the period adds, the same at both ends; and w(T) = decay (w(0) + T z(0)) + …
+        initial[:, 0] = states[:, 0] / (1.0 - decay)
+        initial[:, 1] = (states[:, 1] + period * decay * initial[:, 0]) / (1.0 - decay)
+        # What filters see of the output depends on the output of the model, so it comes second; and once round, back at
+        # the first sample.
+        states, once_round = initial.copy(), np.append(data.y, data.y[0])
+        whole = nothing._replace(y=once_round, use=np.zeros(count + 1, dtype=bool))
+        modal_pass(whole, modes, delay, states=states)
+        initial[:, 2] = states[:, 2] / (1.0 - decay)
+        return data, delay, initial
 
     def _general_rows(self, data: FilterData, theta: Array) -> tuple[Array, Array, Array, Array] | None:
-        """psi, phi, eps and the model output driven by z, submodel by submodel; any clock, repeated poles."""
+        """Return psi, phi, eps and the model output driven by z, submodel by submodel; any clock, repeated poles."""
         if self.periodic or not np.isfinite(theta).all():
             return None
         try:
-            return self._composed_rows(data, AdditiveModel.from_theta(theta, self.terms, self.delay))
+            source = data._replace(u=self._loop_input(data, theta)) if self.loop.closed else data
         except (DataError, np.linalg.LinAlgError, ZeroDivisionError):
-            # Coefficients that make no model, or one whose response overflows.
+            # Coefficients that make no model, or a loop whose signals overflow.
             return None
-
-    def _composed_rows(self, data: FilterData, model: AdditiveModel) -> tuple[Array, Array, Array, Array]:
-        """The same, of a model."""
-        source = data._replace(u=plain_array(self._loop_input(data, model))) if self.loop.closed else data
-        everywhere = data._replace(use=np.ones(data.y.size, dtype=bool))
-        outputs = [self._submodel_output(everywhere, part) for part in model.submodels]
+        parts = [part for part in _parts(theta, self.terms) if part is not None]
+        if len(parts) < len(self.terms):
+            return None
+        everywhere = data._replace(use=self._everywhere)
+        outputs = []
+        for part in parts:
+            rows, order = self._standard(everywhere, part), part.term.order
+            outputs.append(part.output(rows[:, :order], rows[:, order]))
         error = data.y - np.sum(outputs, axis=0)
-        psi, phi = np.empty((data.count, self.size)), np.empty((data.count, self.size))
-        total = np.zeros(data.count)
-        offset = 0
-        for part, term, output in zip(model.submodels, self.terms, outputs, strict=True):
-            width = term.size
-            left = source._replace(y=plain_array(error + output))
-            psi[:, offset : offset + width] = self._submodel_rows(left, part, term, instruments=True)
-            left = data._replace(y=left.y)
-            phi[:, offset : offset + width] = self._submodel_rows(left, part, term, instruments=False)
-            total += self._submodel_output(source, part)
-            offset += width
-        return psi, phi, error[data.use], total
+        psi, phi, total = [], [], np.zeros(data.count)
+        for part, output in zip(parts, outputs, strict=True):
+            left = plain_array(error + output)
+            order, n = part.term.order, part.term.poles
+            driven, measured = (self._standard(each._replace(y=left), part) for each in (source, data))
+            psi.append(part.instruments(driven[:, :order], driven[:, order], driven[:, order + 1 : order + n + 1]))
+            filtered = measured[:, order + n + 1 : order + 2 * n + 1]
+            phi.append(part.regressors(measured[:, :order], measured[:, order], filtered, left[data.use]))
+            total += part.output(driven[:, :order], driven[:, order])
+        return np.hstack(psi), np.hstack(phi), error[data.use], total
 
-    def _loop_input(self, data: FilterData, model: AdditiveModel) -> Array:
-        """Input of the noise-free loop of a model."""
+    def _standard(self, data: FilterData, part: Part) -> Array:
+        """Return the standard rows of one submodel; of a pure gain the input alone."""
+        if not part.term.order:
+            return standard_rows(data, np.ones(2), np.zeros(1), self.delay, "chain")[:, 1:2]
+        return standard_rows(data, part.a, part.b, self.delay, "chain", part.term.integrators)
+
+    def _loop_input(self, data: FilterData, theta: Array) -> Array:
+        """Return the input of the noise-free loop of a model."""
+        model = AdditiveModel.from_theta(theta, self.terms, self.delay)
         controller = DiscreteController(self.loop.numerator, self.loop.denominator)
         enters: Literal["controller", "input"] = "controller" if self.loop.at_controller else "input"
-        return simulate_loop(model, controller, self.loop.reference, np.zeros(data.y.size), data.interval, enters).u
-
-    def _submodel_output(self, data: FilterData, part: Submodel) -> Array:
-        """Output of one submodel."""
-        direct, a, b = _split_direct(part)
-        n = a.size - 1
-        rows = standard_rows(data, a, b, self.delay)
-        return np.asarray(rows[:, :n] @ _rising(b, n) + direct * rows[:, n])
-
-    def _submodel_rows(self, data: FilterData, part: Submodel, term: Term, *, instruments: bool) -> Array:
-        """Columns of psi or phi that belong to one submodel."""
-        direct, a, b = _split_direct(part)
-        n, order_at_origin = term.poles, term.integrators
-        highest = float(part.denominator[0])
-        columns = np.empty((data.count, term.size))
-        whole = n + order_at_origin
-        rows = standard_rows(data, a, b, self.delay)
-        if whole == 0:
-            columns[:, 0] = rows[:, 1]
-            return columns
-        # p^k/(p^l A) u for k = 0 … n + l, the highest by the equation of the filter.
-        driven = _with_highest(rows[:, :whole], rows[:, whole], a)
-        columns[:, n:] = driven[:, : term.zeros + 1] / highest
-        if n == 0:
-            return columns
-        if instruments:
-            # p^(k + l)/(p^l A) x, x the output of the submodel.
-            x = driven[:, :whole] @ _rising(b, whole)
-            strictly = _with_highest(rows[:, whole + 1 : 2 * whole + 1], x, a)
-            filtered = (strictly + direct * driven)[:, order_at_origin:]
-        else:
-            own = np.asarray(part.denominator, dtype=float) / highest
-            bank = standard_rows(data, own, np.zeros(1), self.delay)
-            filtered = _with_highest(bank[:, 2 * n + 1 : 3 * n + 1], data.y[data.use], own)
-        columns[:, :n] = -filtered[:, 1 : n + 1] / highest
-        return columns
+        nothing = np.zeros(data.y.size)
+        return plain_array(simulate_loop(model, controller, self.loop.reference, nothing, data.interval, enters).u)
 
 
-def _split_direct(part: Submodel) -> tuple[float, Array, Array]:
-    """Direct feed-through, monic denominator with the integrators, and what is left of the numerator."""
-    whole = np.concatenate((np.asarray(part.denominator, dtype=float), np.zeros(part.integrators)))
-    a = whole / whole[0]
-    b = np.asarray(part.numerator, dtype=float) / whole[0]
-    if b.size < a.size:
-        return 0.0, a, b
-    direct = float(b[0])
-    if a.size == 1:
-        # A filter needs a pole: any will do where nothing passes through it.
-        return direct, np.ones(2), np.zeros(1)
-    return direct, a, np.asarray((b - direct * a)[1:])
+def _parts(theta: Array, terms: Sequence[Term]) -> list[Part | None]:
+    """Return the submodels of parameters; None for one that has lost a pole."""
+    parts: list[Part | None] = []
+    first = 0
+    for term in terms:
+        own = theta[first : first + term.size]
+        parts.append(Part.of(own, term) if not term.poles or own[term.poles - 1] != 0.0 else None)
+        first += term.size
+    return parts
 
 
-def _rising(b: Array, count: int) -> Array:
-    """Coefficients of p^0, p^1, …, filled up with zeros."""
-    rising = np.zeros(count)
-    rising[: b.size] = b[::-1]
-    return rising
+class Pooled(NamedTuple):
+    """The modes of all submodels, and psi, phi and the model output driven by z as maps of the rows of a pass."""
+
+    modes: Modes
+    #: Shapes (q, p), (q, p) and (q,).
+    psi: Array
+    phi: Array
+    output: Array
 
 
-def _with_highest(lower: Array, driving: Array, a: Array) -> Array:
-    """Columns ``p^k/A s``, k = 0 … n, from those below n and s itself."""
-    return np.column_stack((lower, driving - lower @ a[:0:-1]))
+def pooled_modes(parts: Sequence[Part], forms: Sequence[ModalForm], closed: bool) -> Pooled:
+    """Return the modes of all submodels as those of one pass."""
+    poles = np.concatenate([form.poles for form in forms])
+    owner = np.repeat(np.arange(len(parts)), [form.poles.size for form in forms]).astype(np.int64)
+    residues = np.concatenate([form.residues for form in forms])
+    modes = Modes(poles, owner, residues, np.array([part.direct for part in parts]))
+    n = modes.width
+    v, error, u = 2 * n, 2 * n + 1, 5 * n + 2 if closed else 2 * n
+    width = u + 1 if closed else 3 * n + 2
+    psi, phi, output = [], [], np.zeros(width)
+    first = 0
+    for part, form in zip(parts, forms, strict=True):
+        own, order, poles_of = form.modes.width, part.term.order, part.term.poles
+        # Columns of the standard rows from the rows of the pass, driven by z and by the measured input.
+        z, w = first + np.arange(own), n + first + np.arange(own)
+        places = np.concatenate((z, w, [v, error], 2 * n + 2 + z))
+        of_u = places.copy()
+        if closed:
+            of_u[: 2 * own] += 3 * n + 2
+            of_u[2 * own] = u
+        driven, measured = np.zeros((width, len(form.mapping))), np.zeros((width, len(form.mapping)))
+        driven[places[: form.mapping.shape[1]]] = form.mapping.T
+        measured[of_u[: form.mapping.shape[1]]] = form.mapping.T
+        strictly, filtered = order + 1, order + 1 + poles_of
+        own_output = part.output(measured[:, :order], measured[:, order])
+        left = own_output.copy()
+        left[error] += 1.0
+        psi.append(part.instruments(driven[:, :order], driven[:, order], driven[:, strictly:filtered]))
+        phi.append(
+            part.regressors(measured[:, :order], measured[:, order], measured[:, filtered : filtered + poles_of], left)
+        )
+        output += part.output(driven[:, :order], driven[:, order])
+        first += own
+    return Pooled(modes, np.hstack(psi), np.hstack(phi), output)
+
+
+# --- free responses -------------------------------------------------------------------------------------------------
+
+
+def free_response_size(terms: Sequence[Term]) -> int:
+    """Return the number of parameters of the free responses."""
+    return sum(term.order for term in terms)
+
+
+def free_response(
+    theta: Array, free: Array, terms: Sequence[Term], elapsed: Array
+) -> tuple[Array, Array, Array] | None:
+    r"""Return what initial conditions add to the output, and its derivatives to theta and to the conditions.
+
+    The free response of submodel i after the first sample is that of ``C_i / (p^l A_i)`` to an impulse,
+    ``C_i = c_0 + … + c_(n+l-1) p^(n+l-1)``, hence
+
+    .. math:: \frac{\partial x}{\partial c_k} = \frac{p^k}{p^l A_i}\delta, \qquad
+              \frac{\partial x}{\partial a_k} = -\frac{p^k C_i}{p^l A_i^2}\delta .
+
+    None where a submodel has lost a pole.
+    """
+    response = np.zeros(elapsed.size)
+    by_theta, by_free = np.zeros((elapsed.size, theta.size)), np.zeros((elapsed.size, free.size))
+    first, first_free = 0, 0
+    for term in terms:
+        own, last = theta[first : first + term.poles], first_free + term.order
+        if term.order:
+            driving = Term(term.poles, term.order - 1, term.integrators)
+            (part,) = _parts(np.concatenate((own, free[first_free:last])), [driving])
+            if part is None:
+                return None
+            driven, behind = _impulse_responses(part, elapsed)
+            nothing = np.zeros(elapsed.size)
+            derivatives = part.instruments(driven, nothing, behind)
+            by_theta[:, first : first + term.poles] = derivatives[:, : term.poles]
+            by_free[:, first_free:last] = derivatives[:, term.poles :]
+            response += part.output(driven, nothing)
+        first, first_free = first + term.size, last
+    return response, by_theta, by_free
+
+
+def _impulse_responses(part: Part, elapsed: Array) -> tuple[Array, Array]:
+    """Return ``p^k/(p^l A)`` of an impulse, and ``p^k/A`` of what B/(p^l A) makes of it, columns."""
+    n, order, form = part.term.poles, part.term.order, part.modal()
+    if form is None:
+        both = double_chain(part.a, part.b, part.term.integrators)
+        return both.signals(both.after_impulse(elapsed), part.term.integrators)
+    # z and w of each mode.
+    singles: list[Array] = []
+    for pole in form.poles:
+        response = np.exp(pole * elapsed)
+        singles += [response.real, response.imag] if pole.imag else [response.real]
+    impulse = np.column_stack([*singles, *(elapsed * single for single in singles)])
+    rows = impulse @ form.mapping[:, : impulse.shape[1]].T
+    return rows[:, :order], rows[:, order + 1 : order + 1 + n]

@@ -9,7 +9,7 @@ from numba import njit
 
 from ctid_cli.arrays import Array, IntArray
 from ctid_cli.errors import OptionError
-from ctid_cli.filtering.exponential import held_step
+from ctid_cli.filtering.realisation import held_step
 from ctid_cli.frequency.decoding import Decoding, bounded_roots, decoding_memory, flag_uncertain, root_sensitivities
 from ctid_cli.frequency.flags import GAP, STARTING, UNDETERMINED
 from ctid_cli.frequency.inputs import require_bounds, samples_in

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.filtering.exponential import held_step
 from ctid_cli.filtering.filter_data import plain_array, split_delay
-from ctid_cli.filtering.realisation import chain, scaled_roots
+from ctid_cli.filtering.realisation import chain, held_step, scaled_roots
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.filtering.bank import modal_map, second_moments, standard_rows
+from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, modal_form, second_moments, standard_rows
 from ctid_cli.filtering.filter_data import filter_data, split_delay
-from ctid_cli.filtering.partial_fractions import MODAL_CONDITION_LIMIT
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
@@ -292,7 +291,7 @@ def test_laying_out_and_filtering_change_no_data():
 
 
 def test_partial_fractions_know_when_they_fail():
-    assert modal_map(*CASE_1)[0] < MODAL_CONDITION_LIMIT
-    assert modal_map(*CASE_2)[0] < MODAL_CONDITION_LIMIT
-    assert modal_map(np.poly([-1.0, -1.0]), np.ones(1))[0] == np.inf
-    assert modal_map(np.array([1.0, 1.0, 0.0]), np.ones(1))[0] == np.inf
+    assert modal_form(*CASE_1).condition < MODAL_CONDITION_LIMIT
+    assert modal_form(*CASE_2).condition < MODAL_CONDITION_LIMIT
+    assert modal_form(np.poly([-1.0, -1.0]), np.ones(1)).condition == np.inf
+    assert modal_form(np.array([1.0, 1.0, 0.0]), np.ones(1)).condition == np.inf

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import companion, expm
 
-from ctid_cli.filtering.free_response import free_response, free_response_size
+from ctid_cli.filtering.submodels import free_response, free_response_size
 from ctid_cli.models.additive import AdditiveModel, Term
 
 #: Degrees, then a_1 … a_n, b_0 … b_m of each submodel in turn.
@@ -77,5 +77,11 @@ def test_gain_has_no_free_response():
     assert (by_theta.shape, by_free.shape) == ((7, 1), (7, 0))
 
 
-def test_repeated_poles_have_none():
-    assert free_response(np.array([2.0, 1.0, 1.0]), np.ones(2), [Term(2, 0)], ELAPSED) is None
+def test_repeated_poles_are_the_limit_of_separate_ones():
+    # C/A with A = (1 + p)^2 and C = 1 + p: exp(-t).
+    theta, free = np.array([2.0, 1.0, 1.0]), np.ones(2)
+    x, by_theta, by_free = free_response(theta, free, [Term(2, 0)], ELAPSED)
+    np.testing.assert_allclose(x, np.exp(-ELAPSED), atol=1e-13)
+    near, near_theta, near_free = free_response(theta + [1e-4, 0, 0], free, [Term(2, 0)], ELAPSED)
+    for one, other in ((x, near), (by_theta, near_theta), (by_free, near_free)):
+        np.testing.assert_allclose(one, other, atol=1e-3)

@@ -6,8 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from ctid_cli.filtering.exponential import exponential_minus_identity, held_step
-from ctid_cli.filtering.realisation import chain, polynomial_roots, time_scale
+from ctid_cli.filtering.realisation import (
+    chain,
+    exponential_minus_identity,
+    held_step,
+    polynomial_roots,
+    time_scale,
+)
 
 POLES = [
     [-2.0],

@@ -4,8 +4,8 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from ctid_cli.filtering.row_sink import BLOCK
-from ctid_cli.filtering.step_weights import (
+from ctid_cli.filtering.kernels import (
+    BLOCK,
     CHANGE,
     DECAY_IM,
     DECAY_RE,
@@ -13,11 +13,11 @@ from ctid_cli.filtering.step_weights import (
     DOUBLE_RE,
     GAP,
     MOST_DOUBLINGS,
+    PARTS,
     SINGLE_IM,
     SINGLE_RE,
-    STEPS,
     VALUE,
-    held_steps,
+    _held_steps,
     step_weights,
 )
 
@@ -36,12 +36,11 @@ def in_block(pole, steps):
     """The weights of a block of steps over the powers of each, shape (BLOCK, 5)."""
     found = []
     for value, change in ((1.0, 0.0), (0.0, 1.0)):
-        block = np.zeros(STEPS)
-        for part, filling in ((GAP, steps), (VALUE, value), (CHANGE, change)):
-            block[part : part + BLOCK] = filling
-        held_steps(pole, steps.max(), BLOCK, block)
+        block = np.zeros((PARTS, BLOCK))
+        block[GAP], block[VALUE], block[CHANGE] = steps, value, change
+        _held_steps(pole, steps.max(), BLOCK, block)
         pairs = ((DECAY_RE, DECAY_IM), (SINGLE_RE, SINGLE_IM), (DOUBLE_RE, DOUBLE_IM))
-        found.append([block[re : re + BLOCK] + 1j * block[im : im + BLOCK] for re, im in pairs])
+        found.append([block[re] + 1j * block[im] for re, im in pairs])
     (decay, start, w_start), (_, change, w_change) = found
     return np.array([decay, start / steps, change / steps, w_start / steps**2, w_change / steps**2]).T
 

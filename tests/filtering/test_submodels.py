@@ -5,12 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ctid_cli.filtering.bank import MOST_MODAL_INTEGRATORS
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.filtering.row_sink import BLOCK
+from ctid_cli.filtering.kernels import BLOCK
 from ctid_cli.filtering.sampled import simulate_additive
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.filtering.submodel_blocks import LoopData
+from ctid_cli.filtering.submodels import LoopData
 from ctid_cli.filtering.submodels import OPEN_LOOP, SubmodelFilter
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController
@@ -81,7 +82,8 @@ def assert_rows(rows, expected, tolerance):
 def assert_one_pass(submodels, theta, tolerance=1e-9):
     """The compiled pass applies, and the general route gives the same."""
     theta = np.array(theta)
-    assert submodels._run(submodels.data, theta, True) is not None
+    fast = all(term.integrators <= MOST_MODAL_INTEGRATORS for term in submodels.terms)
+    assert (submodels._pooled(theta) is not None) == fast
     assert_rows(submodels.rows(theta), submodels._general_rows(submodels.data, theta), tolerance)
 
 
@@ -214,7 +216,6 @@ def test_moments_are_the_products_of_the_rows(name, closed):
 def test_clock_that_is_not_recognised_as_regular_gives_the_same(terms, theta):
     data = filter_data(record(hold="foh"), 0.25)
     regular, irregular = (SubmodelFilter(d, terms, 0.25) for d in (data, data._replace(interval=0.0)))
-    assert irregular._run(irregular.data, np.array(theta), True) is None
     assert_rows(irregular.rows(np.array(theta)), regular.rows(np.array(theta)), 1e-9)
 
 
@@ -228,7 +229,7 @@ def test_repeated_poles_are_the_limit_of_separate_ones(gap, closed):
     submodels = SubmodelFilter(filter_data(record()), terms, 0.0, feedback(WEAK, 300) if closed else OPEN_LOOP)
     assert_rows(submodels.rows(theta), submodels._general_rows(submodels.data, theta), 1e-6)
     if gap == 0.0:
-        assert submodels._run(submodels.data, theta, True) is None
+        assert submodels._pooled(theta) is None
 
 
 PERIODIC = {name: SUMS[name] for name in ("real pole", "mode", "biproper", "gain", "two modes", "mixed")}
