@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.delay_grid import lowest_minima, quarter_periods, scan, search_grid
-from ctid_cli.estimation.delay_search import Minimum, best_of
+from ctid_cli.estimation.delay_grid import quarter_periods, scan, search_grid
+from ctid_cli.estimation.delay_search import Minimum, best_of, lowest_minima
 from ctid_cli.estimation.filtered_costs import HIGHEST, filtered_costs
 from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps
 from ctid_cli.estimation.measured_records import MeasuredRecords
@@ -141,8 +141,7 @@ def _search_levels(cost: RecordsCost) -> Found:
         svf_cutoffs=cutoffs,
         steps=LEVEL_EFFORT,
     )
-    levels = [(costs.behind(k), 0.5 * np.pi / cutoff) for k, cutoff in enumerate(cutoffs.tolist())]
-    delays, found, minima = search_grid(levels, bounds)
+    delays, found, minima = search_grid(costs, (0.5 * np.pi / cutoffs).tolist(), bounds)
     profile = Profile(delays, found, bandwidth, record.n_samples, float(cutoffs[0]))
     interval = measured.data[0].interval
     if interval > 0.0 and measured.plain:
