@@ -13,6 +13,8 @@ depend on B; where poles are so close that these would amplify rounding, the sta
 import cmath
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +26,7 @@ from ctid_cli.filtering.realisation import exponential_minus_identity, transitio
 from ctid_cli.filtering import kernels
 
 #: Samples that are filtered at a time, which bounds the memory of a long record.
-PIECE = 16_384
+PIECE = 4096
 
 
 class Record(NamedTuple):
@@ -47,7 +49,7 @@ def order_of(damping: Array) -> int:
     return damping.size + int(np.count_nonzero(damping >= 0.0))
 
 
-def poles_of(speed: Array, damping: Array) -> ComplexArray:
+def poles_of(speed: Array, damping: Array) -> list[complex]:
     """Return the poles, those of a section side by side, the upper or the faster one first."""
     poles: list[complex] = []
     for w, zeta in zip(speed.tolist(), damping.tolist(), strict=True):
@@ -59,7 +61,7 @@ def poles_of(speed: Array, damping: Array) -> ComplexArray:
             # The product of both is w^2: the slow one without cancellation.
             fast = w * (zeta + (zeta * zeta - 1.0) ** 0.5)
             poles += [complex(-fast), complex(-w * w / fast)]
-    return np.array(poles, dtype=complex)
+    return poles
 
 
 def chain_dynamics(speed: Array, damping: Array) -> tuple[Array, Array]:
@@ -119,17 +121,28 @@ def numerators(speed: Array, damping: Array) -> Array:
 def form_of(speed: Array, damping: Array, length: float) -> "Modal | Chain":
     """Return the form in which sections are filtered over a record of some length [s]."""
     poles = poles_of(speed, damping)
-    apart = np.abs(poles[:, None] - poles)
-    np.fill_diagonal(apart, np.inf)
-    # Poles whose resonances, or whose responses within the record, overlap nearly cancel each other: each such pair
-    # amplifies rounding by this, and twice that for the square of the denominator.
-    width = 1.0 / length - poles.real
-    with np.errstate(divide="ignore"):
-        overlap = np.maximum((width[:, None] + width) / apart, 1.0)
-    if np.max(np.prod(overlap, axis=1), initial=1.0) ** 2 < MODAL_CONDITION_LIMIT:
+    worst = 1.0
+    for i, pole in enumerate(poles):
+        # Poles whose resonances, or whose responses within the record, overlap nearly cancel each other: each such pair
+        # amplifies rounding by this factor, and by its square where the denominator is squared.
+        product = 1.0
+        for other in poles[:i] + poles[i + 1 :]:
+            apart = abs(pole - other)
+            product *= max(1.0, (2.0 / length - pole.real - other.real) / apart) if apart else inf
+        worst = max(worst, product)
+    if worst**2 < MODAL_CONDITION_LIMIT:
         return Modal.of(speed, damping, poles)
     F, g = chain_dynamics(speed, damping)
     return Chain(speed, damping, F, g, F, g)
+
+
+@lru_cache
+def _both_of_pairs(pairs: tuple[bool, ...]) -> ComplexArray:
+    """Return the map from real and imaginary parts of one pole of each pair, and from real poles, to all poles."""
+    whole = np.eye(len(pairs), dtype=complex)
+    upper = np.flatnonzero(pairs)
+    whole[upper, upper + 1], whole[upper + 1, upper], whole[upper + 1, upper + 1] = 1j, 1.0, -1j
+    return whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,29 +160,29 @@ class Modal:
     states: Array
 
     @classmethod
-    def of(cls, speed: Array, damping: Array, poles: ComplexArray) -> "Modal":
+    def of(cls, speed: Array, damping: Array, poles: list[complex]) -> "Modal":
         """Return the partial fractions of distinct poles."""
-        n = poles.size
-        upper = np.flatnonzero(poles.imag > 0.0)
-        whole = np.eye(n, dtype=complex)
-        whole[upper, upper + 1], whole[upper + 1, upper], whole[upper + 1, upper + 1] = 1j, 1.0, -1j
         # A state is its gain over the product of s - pole up to the end of its section, the first one of a pair times
         # s/w.
-        differences = poles[:, None] - poles
-        np.fill_diagonal(differences, 1.0)
-        products = np.cumprod(differences, axis=1)
-        weights, gain, row = np.zeros((n, n), dtype=complex), 1.0, 0
+        n, gain, first = len(poles), 1.0, 0
+        weights = np.zeros((n, n), dtype=complex)
+        products = [1.0 + 0.0j] * n
         for w, zeta in zip(speed.tolist(), damping.tolist(), strict=True):
-            last = row if zeta < 0.0 else row + 1
+            last = first if zeta < 0.0 else first + 1
+            for i in range(last + 1):
+                for k in range(first if i < first else 0, last + 1):
+                    if i != k:
+                        products[i] *= poles[i] - poles[k]
             gain *= (w or 1.0) if zeta < 0.0 else w * w
-            weights[last, : last + 1] = gain / products[: last + 1, last]
+            weights[last, : last + 1] = [gain / product for product in products[: last + 1]]
             if zeta >= 0.0:
-                weights[row, : last + 1] = weights[last, : last + 1] * poles[: last + 1] / w
-            row = last + 1
-        one_of_each = poles[poles.imag >= 0.0]
+                weights[first, : last + 1] = [gain / w * p / q for p, q in zip(poles[: last + 1], products, strict=False)]
+            first = last + 1
+        one_of_each = np.array([pole for pole in poles if pole.imag >= 0.0])
         count = one_of_each.size
         modes = Modes(one_of_each, np.zeros(count, np.int64), np.zeros((count, 2), complex), np.zeros(1))
-        return cls(damping, poles, modes, whole, weights, (weights @ whole).real)
+        whole = _both_of_pairs(tuple(pole.imag > 0.0 for pole in poles))
+        return cls(damping, np.array(poles), modes, whole, weights, (weights @ whole).real)
 
     def driving(self, output: Array, direct: float, free: Array) -> "Modal":
         """Return the form whose w serves ``x = output z + direct u`` and its free response."""

@@ -75,19 +75,6 @@ class Triangles(NamedTuple):
     rows: Array
 
 
-class Projected(NamedTuple):
-    """The least squares for given poles and delay."""
-
-    squared_error: float
-    #: Weights of the states, and of u itself.
-    output: Array
-    direct: float
-    #: Weights of the states of the free response, and offset, of each record: shapes (K, n) and (K,).
-    free: Array
-    offset: Array
-    triangles: Triangles
-
-
 class Slopes(NamedTuple):
     """Derivatives of half the squared error to the logarithmic coordinates and, last, the delay [1/s]."""
 
@@ -119,10 +106,11 @@ def weights_of(problem: Problem, speed: Array, damping: Array) -> Weights | None
     return Weights(whole[:, count:], given)
 
 
-class _Eliminated:
-    """The span of what is eliminated, in the triangles of all records."""
+class Span:
+    """What is eliminated, and what it leaves of the output, in the triangles of all records."""
 
     def __init__(self, problem: Problem, triangles: Triangles, weights: Weights | None) -> None:
+        self.triangles = triangles
         form, columns, _, rows = triangles
         self.n, self.shared = columns.n, problem.zeros + 1
         self.proper = min(self.shared, self.n)
@@ -166,6 +154,19 @@ class _Eliminated:
         return self.weights.given + self.weights.basis @ found[:free], found[free:]
 
 
+class Projected(NamedTuple):
+    """The least squares for given poles and delay."""
+
+    squared_error: float
+    #: Weights of the states, and of u itself.
+    output: Array
+    direct: float
+    #: Weights of the states of the free response, and offset, of each record: shapes (K, n) and (K,).
+    free: Array
+    offset: Array
+    span: "Span"
+
+
 def project(problem: Problem, speed: Array, damping: Array, delay: Delay, *, slopes_too: bool = False) -> Projected:
     """Eliminate numerator, free responses and offsets for given sections, fastest first.
 
@@ -174,11 +175,11 @@ def project(problem: Problem, speed: Array, damping: Array, delay: Delay, *, slo
     form = form_of(*problem.sections(speed, damping), problem.length)
     second = slopes_too and isinstance(form, Modal)
     triangles = _triangles(problem, [form] * len(problem.records), delay, second)
-    eliminated = _Eliminated(problem, triangles, weights_of(problem, speed, damping))
-    shared, own = eliminated.solution()
-    n, records = eliminated.n, len(problem.records)
+    span = Span(problem, triangles, weights_of(problem, speed, damping))
+    shared, own = span.solution()
+    n, records = span.n, len(problem.records)
     output, free, offset = np.zeros(n), np.zeros((records, n)), np.zeros(records)
-    output[n - eliminated.proper :] = shared[: eliminated.proper]
+    output[n - span.proper :] = shared[: span.proper]
     if problem.free_response or problem.constant:
         own = own.reshape(records, -1)
         if problem.free_response:
@@ -186,8 +187,8 @@ def project(problem: Problem, speed: Array, damping: Array, delay: Delay, *, slo
         if problem.constant:
             offset = own[:, -1]
     direct = float(shared[n]) if shared.size > n else 0.0
-    squared_error = float(eliminated.residual @ eliminated.residual)
-    return Projected(squared_error, output, direct, free, offset, triangles)
+    squared_error = float(span.residual @ span.residual)
+    return Projected(squared_error, output, direct, free, offset, span)
 
 
 def _triangles(problem: Problem, forms: list[Modal] | list[Chain], delay: Delay, second: bool) -> Triangles:
@@ -203,12 +204,12 @@ def slopes(
     problem: Problem, speed: Array, damping: Array, delay: Delay, projected: Projected, delay_free: bool
 ) -> Slopes:
     """Exact gradient, and Kaufman's J'J, at what :func:`project` gave for the same sections and delay."""
-    triangles, output, direct = projected.triangles, projected.output, projected.direct
+    span, output, direct = projected.span, projected.output, projected.direct
+    triangles = span.triangles
     if not triangles.columns.second or triangles.delay != delay:
         forms = [triangles.form.driving(output, direct, free) for free in projected.free]
-        triangles = _triangles(problem, forms, delay, True)
-    form, columns, _, rows = triangles
-    eliminated = _Eliminated(problem, triangles, weights_of(problem, speed, damping))
+        span = Span(problem, _triangles(problem, forms, delay, True), weights_of(problem, speed, damping))
+    form, columns, _, rows = span.triangles
     n = speed.size + int(np.count_nonzero(damping >= 0.0))
     psi = np.zeros((*rows.shape[:2], n + delay_free))
     states = 2 * columns.n
@@ -222,6 +223,6 @@ def slopes(
         psi[:, :, n] = -(rows[:, :, : columns.n] @ of_z + of_u * rows[:, :, columns.u])
     psi = psi.reshape(-1, n + delay_free)
     # (I - P): what the eliminated coefficients would follow is no effect of the poles.
-    psi -= eliminated.left @ (eliminated.left.T @ psi)
-    residual = eliminated.residual
+    psi -= span.left @ (span.left.T @ psi)
+    residual = span.residual
     return Slopes(float(residual @ residual), -(psi.T @ residual), psi.T @ psi)
