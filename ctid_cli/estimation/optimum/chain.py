@@ -56,7 +56,9 @@ def poles_of(speed: Array, damping: Array) -> list[complex]:
         if zeta < 0.0:
             poles.append(complex(-w))
         elif zeta < 1.0:
-            poles += [w * complex(-zeta, swing) for swing in ((1.0 - zeta * zeta) ** 0.5, -((1.0 - zeta * zeta) ** 0.5))]
+            poles += [
+                w * complex(-zeta, swing) for swing in ((1.0 - zeta * zeta) ** 0.5, -((1.0 - zeta * zeta) ** 0.5))
+            ]
         else:
             # The product of both is w^2: the slow one without cancellation.
             fast = w * (zeta + (zeta * zeta - 1.0) ** 0.5)
@@ -176,7 +178,9 @@ class Modal:
             gain *= (w or 1.0) if zeta < 0.0 else w * w
             weights[last, : last + 1] = [gain / product for product in products[: last + 1]]
             if zeta >= 0.0:
-                weights[first, : last + 1] = [gain / w * p / q for p, q in zip(poles[: last + 1], products, strict=False)]
+                weights[first, : last + 1] = [
+                    gain / w * p / q for p, q in zip(poles[: last + 1], products, strict=False)
+                ]
             first = last + 1
         one_of_each = np.array([pole for pole in poles if pole.imag >= 0.0])
         count = one_of_each.size
@@ -198,9 +202,7 @@ class Modal:
             states[:, 0] /= missing
             states[:, 1] = (states[:, 1] + record.period * (1.0 - missing) * states[:, 0]) / missing
         for data, delay in pieces(record.data, record.delay):
-            yield modal_pass(
-                data, self.modes, delay, rows=True, double=second, filter_output=False, states=states
-            )
+            yield modal_pass(data, self.modes, delay, rows=True, double=second, filter_output=False, states=states)
 
     def free(self, elapsed: Array, second: bool) -> Array:
         """Return rows ``[z, w]`` after an impulse, transposed."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.optimum.chain import Chain, Modal, form_of, numerators, polynomial
-from ctid_cli.estimation.optimum.triangle import Columns, Delay, columns_of, triangle_of
+from ctid_cli.estimation.optimum.triangle import Columns, Delay, triangle_of
 from ctid_cli.filtering.filter_data import FilterData
 
 #: Singular values of the scaled columns below this fraction of the largest count as zero.
@@ -194,7 +194,7 @@ def project(problem: Problem, speed: Array, damping: Array, delay: Delay, *, slo
 def _triangles(problem: Problem, forms: list[Modal] | list[Chain], delay: Delay, second: bool) -> Triangles:
     """Return the triangles of all records, each in its form."""
     n = forms[0].states.shape[0]
-    columns = columns_of(n, second, problem.free_response, problem.constant)
+    columns = Columns.of(n, second, problem.free_response, problem.constant)
     each = zip(forms, problem.records, problem.periods, strict=True)
     rows = np.stack([triangle_of(form, columns, delay, data, period) for form, data, period in each])
     return Triangles(forms[0], columns, delay, rows)

@@ -43,6 +43,12 @@ class Columns(NamedTuple):
     free: int
     offset: int
 
+    @classmethod
+    def of(cls, n: int, second: bool, free: bool, offset: bool) -> "Columns":
+        """Return the columns of rows with or without w, free response and constant."""
+        states = 2 * n if second else n
+        return cls(n, states - n, states if free else 0, int(offset))
+
     @property
     def u(self) -> int:
         """The input."""
@@ -62,12 +68,6 @@ class Columns(NamedTuple):
     def size(self) -> int:
         """Number of columns."""
         return self.u + 2 + self.free + self.offset
-
-
-def columns_of(n: int, second: bool, free: bool, offset: bool) -> Columns:
-    """Return the columns of rows with or without w, free response and constant."""
-    states = 2 * n if second else n
-    return Columns(n, states - n, states if free else 0, int(offset))
 
 
 def rows_of(form: Modal | Chain, columns: Columns, delay: Delay, data: FilterData, period: float) -> Iterator[Array]:
