@@ -32,6 +32,8 @@ MODAL_CONDITION_LIMIT = 1e4
 MOST_MODAL_INTEGRATORS = 2
 
 Form = Literal["auto", "modal", "chain"]
+#: A delay [s]; on a regular clock also the breaks by which the read-out lags, and the fraction of an interval beyond.
+Place = float | tuple[int, float]
 #: No input besides the first, nothing that is not wanted.
 NOTHING, NO_ROWS = np.zeros(0), np.zeros((0, 0))
 
@@ -84,7 +86,7 @@ def modal_form(a: Array, b: Array, integrators: int = 0) -> ModalForm:
 def modal_pass(
     data: FilterData,
     modes: Modes,
-    delay: float,
+    delay: Place,
     *,
     rows: bool = False,
     double: bool = True,
@@ -119,7 +121,7 @@ def modal_output(data: FilterData, modes: Modes, delay: float) -> Array:
 def _run(
     data: FilterData,
     modes: Modes,
-    delay: float,
+    delay: Place,
     layout: tuple[int, int, int],
     states: ComplexArray | None,
     instruments: Array | None,
@@ -132,7 +134,7 @@ def _run(
         states = np.zeros((modes.poles.size, 5), np.complex128)
     output = data.y, data.y_foh
     if data.interval > 0.0:
-        clock = (data.interval, *split_delay(delay, data.interval))
+        clock = (data.interval, *_place(delay, data.interval))
         own = instruments is None
         driving = (data.u if own else instruments, bool(data.input_foh and own))
         measured = NOTHING if own else data.u
@@ -144,8 +146,13 @@ def _run(
         )
 
 
+def _place(delay: Place, interval: float) -> tuple[int, float]:
+    """Return the breaks by which the read-out lags, and the fraction of an interval that is read beyond."""
+    return delay if isinstance(delay, tuple) else split_delay(delay, interval)
+
+
 def chain_states(
-    dynamics: Array, gain: Array, w0: float, data: FilterData, delay: float, initial: Array | None = None
+    dynamics: Array, gain: Array, w0: float, data: FilterData, delay: Place, initial: Array | None = None
 ) -> Array:
     """Return ``[z, u]`` at all samples for the chain ``z' = w0 (F z + g u)``, shape (N, n + 1)."""
     initial = np.zeros(gain.size) if initial is None else initial
@@ -159,7 +166,7 @@ def chain_states(
         instants = (data.t - delay) * w0
         breaks = data.tu * w0, data.u, data.input_foh
         return np.asarray(kernels.irregular_states(*table, *breaks, instants, data.slack * w0, initial)[:, :-1])
-    shift, fraction = split_delay(delay, data.interval)
+    shift, fraction = _place(delay, data.interval)
     count, late = data.t.size, min(shift, data.t.size)
     values, changes = np.zeros(count), np.zeros(count)
     values[late:] = data.u[: count - late]

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
-from ctid_cli.estimation.optimum.chain import polynomial
+from ctid_cli.estimation.optimum.chain import order_of, poles_of, polynomial, polynomial_slopes
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.triangle import Delay
 
@@ -178,18 +178,7 @@ class Point:
     @property
     def poles(self) -> ComplexArray:
         """Poles [rad/s], shape (n,)."""
-        found: list[complex] = []
-        for w, zeta in zip(self.speed.tolist(), self.damping.tolist(), strict=True):
-            if zeta < 0:
-                found.append(complex(-w))
-            elif zeta < 1:
-                swing = sqrt(1 - zeta * zeta)
-                found += [w * complex(-zeta, swing), w * complex(-zeta, -swing)]
-            else:
-                # The product of both is w^2: the slow one without cancellation.
-                fast = w * (zeta + sqrt(zeta * zeta - 1))
-                found += [complex(-fast), complex(-w * w / fast)]
-        return np.array(found, dtype=complex)
+        return np.array(poles_of(self.speed, self.damping), dtype=complex)
 
     @property
     def denominator(self) -> Array:
@@ -198,8 +187,7 @@ class Point:
 
     def jacobian(self) -> Array:
         """Derivatives of ``ln w, ln zeta`` (or ln p) of all sections to the coordinates, block diagonal."""
-        n = np.where(self.damping < 0, 1, 2).sum()
-        result, k = np.eye(n), 0
+        result, k = np.eye(order_of(self.damping)), 0
         for zeta, edge in zip(self.damping.tolist(), self.edge.tolist(), strict=True):
             if edge:
                 swing = 1 - zeta * zeta
@@ -209,13 +197,7 @@ class Point:
 
     def denominator_slopes(self) -> Array:
         """Derivatives of ``a_1 ... a_n`` to the coordinates, shape (n, n)."""
-        n, columns = self.poles.size, []
-        for i, (w, zeta) in enumerate(zip(self.speed.tolist(), self.damping.tolist(), strict=True)):
-            others = polynomial(np.delete(self.speed, i), np.delete(self.damping, i))
-            own = [[w]] if zeta < 0 else [[2 * zeta * w, 2 * w * w], [2 * zeta * w, 0.0]]
-            columns += [np.convolve(others, slope) for slope in own]
-        slopes = np.column_stack([np.pad(column, (n - column.size, 0)) for column in columns])
-        return np.asarray(slopes @ self.jacobian())
+        return np.asarray(polynomial_slopes(self.speed, self.damping) @ self.jacobian())
 
     def whole_sections(self, chosen: BoolArray) -> BoolArray:
         """All coordinates, or poles, of the sections of which one is chosen."""

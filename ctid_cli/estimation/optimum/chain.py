@@ -1,105 +1,88 @@
-r"""Sections in a row, fastest first: the state space that every column and every derivative is read from.
+r"""Sections in a row, fastest first, and the two ways to their signals: partial fractions and a state space.
 
 Section i has unit static gain, ``p/(s + p)`` or ``w^2/(s^2 + 2 zeta w s + w^2)``, and is driven by the output of the
-section before it. The state ``s/w`` times the output stands before the output itself, so that state i of n has, over
-the common denominator, a numerator of degree ``n-1-i``: the last m + 1 states span all ``B/A u`` of degree m, and no
-polynomial, no root and no partial fraction is ever formed. Real poles may meet and become a pair.
+section before it; an integrator, of speed 0, is ``1/s``. The state ``s/w`` times the output stands before the output
+itself, so that state i of n has, over the common denominator, a numerator of degree ``n-1-i``: the last m + 1 states
+span all ``B/A u`` of degree m. Real poles may meet and become a pair.
+
+The *rows* of a form are ``z``, from which one map leads to the states of the sections, and ``w``, from which with z
+another one leads to the derivatives of ``x = B/A u`` to the poles. Partial fractions are fast, and their rows do not
+depend on B; where poles are so close that these would amplify rounding, the state space takes over.
 """
 
+import cmath
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from math import inf
+from typing import NamedTuple
+
 import numpy as np
-from numba import njit
 
-from ctid_cli.arrays import Array
-from ctid_cli.filtering.exponential import place
+from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, Modes, Place, chain_states, modal_pass
+from ctid_cli.filtering.filter_data import FilterData
+from ctid_cli.filtering.realisation import exponential_minus_identity, transitions
+from ctid_cli.filtering import kernels
+
+#: Samples that are filtered at a time, which bounds the memory of a long record.
+PIECE = 4096
 
 
-@njit(cache=True, nogil=True)
+class Record(NamedTuple):
+    """A record as a form filters it."""
+
+    data: FilterData
+    delay: Place
+    #: Period [s] of an input that repeats itself, else 0; and what leads through one up to where the data begin.
+    period: float = 0.0
+    once: FilterData | None = None
+
+    @property
+    def undelayed(self) -> Place:
+        """No delay."""
+        return (0, 0.0) if self.data.interval > 0.0 else 0.0
+
+
 def order_of(damping: Array) -> int:
-    """Number of poles: a real pole, marked by a negative damping, has one, a pair two."""
-    n = 0
-    for i in range(damping.size):
-        n += 1 if damping[i] < 0.0 else 2
-    return n
+    """Return the number of poles: a real pole, marked by a negative damping, has one, a pair two."""
+    return damping.size + int(np.count_nonzero(damping >= 0.0))
 
 
-@njit(cache=True, nogil=True)
+def poles_of(speed: Array, damping: Array) -> list[complex]:
+    """Return the poles, those of a section side by side, the upper or the faster one first."""
+    poles: list[complex] = []
+    for w, zeta in zip(speed.tolist(), damping.tolist(), strict=True):
+        if zeta < 0.0:
+            poles.append(complex(-w))
+        elif zeta < 1.0:
+            poles += [
+                w * complex(-zeta, swing) for swing in ((1.0 - zeta * zeta) ** 0.5, -((1.0 - zeta * zeta) ** 0.5))
+            ]
+        else:
+            # The product of both is w^2: the slow one without cancellation.
+            fast = w * (zeta + (zeta * zeta - 1.0) ** 0.5)
+            poles += [complex(-fast), complex(-w * w / fast)]
+    return poles
+
+
 def chain_dynamics(speed: Array, damping: Array) -> tuple[Array, Array]:
-    """Dynamics F and gain g of ``z' = F z + g v``."""
+    """Return dynamics F and gain g of ``z' = F z + g v``."""
     n = order_of(damping)
-    F, g = np.zeros((n, n)), np.zeros(n)
-    row = 0
-    for i in range(speed.size):
-        w = speed[i]
-        entry = row  # where the section is driven
+    F, g, row = np.zeros((n, n)), np.zeros(n), 0
+    for w, zeta in zip(speed.tolist(), damping.tolist(), strict=True):
+        if row == 0:
+            g[0] = w or 1.0
+        else:
+            F[row, row - 1] = w or 1.0
         # A pair has the states (s/w) x and x: x' = w (s/w) x, and ((s/w) x)' = -2 zeta w (s/w) x - w x + w v.
-        if damping[i] < 0.0:
+        if zeta < 0.0:
             F[row, row] = -w
             row += 1
         else:
-            F[row, row], F[row, row + 1] = -2.0 * damping[i] * w, -w
-            F[row + 1, row] = w
+            F[row, row], F[row, row + 1], F[row + 1, row] = -2.0 * zeta * w, -w, w
             row += 2
-        if entry == 0:
-            g[0] = w
-        else:
-            F[entry, entry - 1] = w
     return F, g
-
-
-@njit(cache=True, nogil=True)
-def driven_chain(F: Array, g: Array, output: Array, direct: float) -> tuple[Array, Array]:
-    """The chain with a second one behind it, driven by ``x = output z + direct v``."""
-    n = g.size
-    dynamics, gain = np.zeros((2 * n, 2 * n)), np.zeros(2 * n)
-    # Both have the same poles; no partial fraction needs them to be distinct.
-    place(dynamics, 0, 0, F)
-    place(dynamics, n, n, F)
-    for i in range(n):
-        gain[i] = g[i]
-        gain[n + i] = g[i] * direct
-        for j in range(n):
-            dynamics[n + i, j] = g[i] * output[j]
-    return dynamics, gain
-
-
-@njit(cache=True, nogil=True)
-def _times(row: Array, F: Array, constant: float, linear: float, quadratic: float) -> Array:
-    """``row (constant + linear F + quadratic F^2)``: a signal read by ``row`` passed through that polynomial of s."""
-    once = row @ F
-    if quadratic == 0.0:
-        return constant * row + linear * once
-    return constant * row + linear * once + quadratic * (once @ F)
-
-
-@njit(cache=True, nogil=True)
-def logarithmic_slopes(speed: Array, damping: Array, F: Array) -> Array:
-    """Readings of ``d ln A/d alpha_j v`` from the states of a chain driven by v, shape (n, n).
-
-    With section j ``s^2 + 2 zeta w s + w^2``: ``(2 zeta w s + 2 w^2)/section`` for ln w and ``2 zeta w s/section`` for
-    ln zeta; ``p/(s + p)`` for the ln p of a real pole.
-    """
-    n = F.shape[0]
-    slopes = np.zeros((n, n))
-    last, coordinate = -1, 0
-    for j in range(speed.size):
-        w, zeta = speed[j], damping[j]
-        last += 1 if zeta < 0.0 else 2
-        # 1/A_j v is read by one entry, A_j the product of the sections up to j. Times the numerator, and times the
-        # sections before j, from the slowest: each cancels its own dynamics from the row before a faster one is met,
-        # so that nothing large is ever subtracted.
-        for kind in range(1 if zeta < 0.0 else 2):
-            row = np.zeros(n)
-            row[last] = 1.0
-            if zeta >= 0.0:
-                row = _times(row, F, 2.0 if kind == 0 else 0.0, 2.0 * zeta / w, 0.0)
-            for i in range(j - 1, -1, -1):
-                if damping[i] < 0.0:
-                    row = _times(row, F, 1.0, 1.0 / speed[i], 0.0)
-                else:
-                    row = _times(row, F, 1.0, 2.0 * damping[i] / speed[i], 1.0 / speed[i] ** 2)
-            slopes[coordinate] = row
-            coordinate += 1
-    return slopes
 
 
 def polynomial(speed: Array, damping: Array) -> Array:
@@ -110,6 +93,17 @@ def polynomial(speed: Array, damping: Array) -> Array:
     return product
 
 
+def polynomial_slopes(speed: Array, damping: Array) -> Array:
+    """Derivatives of its coefficients ``a_1 ... a_n`` to ln w and ln zeta, or ln p, of each section, shape (n, n)."""
+    columns = []
+    for i, (w, zeta) in enumerate(zip(speed.tolist(), damping.tolist(), strict=True)):
+        others = polynomial(np.delete(speed, i), np.delete(damping, i))
+        own = [[w]] if zeta < 0 else [[2 * zeta * w, 2 * w * w], [2 * zeta * w, 0.0]]
+        columns += [np.convolve(others, slope) for slope in own]
+    n = len(columns)
+    return np.column_stack([np.pad(column, (n - column.size, 0)) for column in columns])
+
+
 def numerators(speed: Array, damping: Array) -> Array:
     """Numerators of the states over the monic polynomial, descending powers, shape (n, n)."""
     n = order_of(damping)
@@ -117,10 +111,218 @@ def numerators(speed: Array, damping: Array) -> Array:
     gain, row = 1.0, 0
     for i, (w, zeta) in enumerate(zip(speed.tolist(), damping.tolist(), strict=True)):
         rest = polynomial(speed[i + 1 :], damping[i + 1 :])
-        gain *= w if zeta < 0 else w * w
+        gain *= (w or 1.0) if zeta < 0 else w * w
         if zeta >= 0:
             result[row, n - 1 - rest.size : n - 1] = gain / w * rest
             row += 1
         result[row, n - rest.size :] = gain * rest
         row += 1
     return result
+
+
+def form_of(speed: Array, damping: Array, length: float) -> "Modal | Chain":
+    """Return the form in which sections are filtered over a record of some length [s]."""
+    poles = poles_of(speed, damping)
+    worst = 1.0
+    for i, pole in enumerate(poles):
+        # Poles whose resonances, or whose responses within the record, overlap nearly cancel each other: each such pair
+        # amplifies rounding by this factor, and by its square where the denominator is squared.
+        product = 1.0
+        for other in poles[:i] + poles[i + 1 :]:
+            apart = abs(pole - other)
+            product *= max(1.0, (2.0 / length - pole.real - other.real) / apart) if apart else inf
+        worst = max(worst, product)
+    if worst**2 < MODAL_CONDITION_LIMIT:
+        return Modal.of(speed, damping, poles)
+    F, g = chain_dynamics(speed, damping)
+    return Chain(speed, damping, F, g, F, g)
+
+
+@lru_cache
+def _both_of_pairs(pairs: tuple[bool, ...]) -> ComplexArray:
+    """Return the map from real and imaginary parts of one pole of each pair, and from real poles, to all poles."""
+    whole = np.eye(len(pairs), dtype=complex)
+    upper = np.flatnonzero(pairs)
+    whole[upper, upper + 1], whole[upper + 1, upper], whole[upper + 1, upper + 1] = 1j, 1.0, -1j
+    return whole
+
+
+@dataclass(frozen=True, eq=False)
+class Modal:
+    """Partial fractions: z is ``1/(s - p) u`` of each pole and w is ``1/(s - p)^2 u``, real and imaginary parts."""
+
+    damping: Array
+    poles: ComplexArray
+    #: The modes of a pass, one of each pair.
+    modes: Modes
+    #: From z to the modes of all poles, shape (n, n).
+    whole: ComplexArray
+    #: States of the sections from the modes of all poles, and from z, shape (n, n).
+    weights: ComplexArray
+    states: Array
+
+    @classmethod
+    def of(cls, speed: Array, damping: Array, poles: list[complex]) -> "Modal":
+        """Return the partial fractions of distinct poles."""
+        # A state is its gain over the product of s - pole up to the end of its section, the first one of a pair times
+        # s/w.
+        n, gain, first = len(poles), 1.0, 0
+        weights = np.zeros((n, n), dtype=complex)
+        products = [1.0 + 0.0j] * n
+        for w, zeta in zip(speed.tolist(), damping.tolist(), strict=True):
+            last = first if zeta < 0.0 else first + 1
+            for i in range(last + 1):
+                for k in range(first if i < first else 0, last + 1):
+                    if i != k:
+                        products[i] *= poles[i] - poles[k]
+            gain *= (w or 1.0) if zeta < 0.0 else w * w
+            weights[last, : last + 1] = [gain / product for product in products[: last + 1]]
+            if zeta >= 0.0:
+                weights[first, : last + 1] = [
+                    gain / w * p / q for p, q in zip(poles[: last + 1], products, strict=False)
+                ]
+            first = last + 1
+        one_of_each = np.array([pole for pole in poles if pole.imag >= 0.0])
+        count = one_of_each.size
+        modes = Modes(one_of_each, np.zeros(count, np.int64), np.zeros((count, 2), complex), np.zeros(1))
+        whole = _both_of_pairs(tuple(pole.imag > 0.0 for pole in poles))
+        return cls(damping, np.array(poles), modes, whole, weights, (weights @ whole).real)
+
+    def driving(self, output: Array, direct: float, free: Array) -> "Modal":
+        """Return the form whose w serves ``x = output z + direct u`` and its free response."""
+        return self
+
+    def forced(self, record: Record, second: bool) -> Iterator[Array]:
+        """Yield ``[z, w, u, y]`` of the used samples, piece by piece."""
+        states = np.zeros((self.modes.poles.size, 5), complex)
+        if record.once is not None:
+            modal_pass(record.once, self.modes, record.undelayed, filter_output=False, states=states)
+            # z(T) = decay z(0) + what the period adds, the same at both ends; and w(T) = decay (w(0) + T z(0)) + …
+            missing = -np.expm1(self.modes.poles * record.period)
+            states[:, 0] /= missing
+            states[:, 1] = (states[:, 1] + record.period * (1.0 - missing) * states[:, 0]) / missing
+        for data, delay in pieces(record.data, record.delay):
+            yield modal_pass(data, self.modes, delay, rows=True, double=second, filter_output=False, states=states)
+
+    def free(self, elapsed: Array, second: bool) -> Array:
+        """Return rows ``[z, w]`` after an impulse, transposed."""
+        rows = np.empty((2 if second else 1, self.poles.size, elapsed.size))
+        row = 0
+        for pole in self.modes.poles.tolist():
+            decay = np.exp(pole.real * elapsed)
+            if pole.imag:
+                rows[0, row] = decay * np.cos(pole.imag * elapsed)
+                rows[0, row + 1] = decay * np.sin(pole.imag * elapsed)
+                row += 2
+            else:
+                rows[0, row] = decay
+                row += 1
+        if second:
+            np.multiply(rows[0], elapsed, out=rows[1])
+        return rows.reshape(-1, elapsed.size)
+
+    def rate(self, output: Array) -> tuple[Array, float]:
+        """Return the weights of z and of u in the derivative of ``x = output z`` to time."""
+        residues = output @ self.weights
+        return ((residues * self.poles) @ self.whole).real, float(residues.sum().real)
+
+    def slopes(self, output: Array, direct: float) -> Array:
+        """Return the map from ``[z, w]`` to the derivatives of x to the coordinates, B being fixed, shape (2 n, n)."""
+        residues = output @ self.weights
+        moved = np.zeros((self.poles.size, self.poles.size), complex)
+        k = 0
+        for zeta in self.damping.tolist():
+            moved[k, k] = self.poles[k]
+            if zeta >= 0.0:
+                # Both poles grow with w; with zeta the faster one grows and the slower one falls, -w (zeta +- root).
+                root = cmath.sqrt(zeta * zeta - 1.0) * (1.0 if zeta >= 1.0 else -1.0)
+                moved[k + 1, k] = self.poles[k + 1]
+                moved[k, k + 1], moved[k + 1, k + 1] = zeta / root * self.poles[k], -zeta / root * self.poles[k + 1]
+                k += 1
+            k += 1
+        # dx/dp_i = 1/(s - p_i) x, and 1/((s - p_i)(s - p_k)) is a difference of two fractions.
+        inverse = self.poles[:, None] - self.poles
+        np.fill_diagonal(inverse, 1.0)
+        inverse = 1.0 / inverse
+        np.fill_diagonal(inverse, 0.0)
+        single = moved * (direct + inverse @ residues)[:, None] + residues[:, None] * (inverse @ moved)
+        return np.vstack((self.whole.T @ single, self.whole.T @ (moved * residues[:, None]))).real
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """A state space: z are the states of the sections, and w those of a second chain that x drives."""
+
+    speed: Array
+    damping: Array
+    dynamics: Array
+    gain: Array
+    #: Those of the free response.
+    free_dynamics: Array
+    free_gain: Array
+
+    @property
+    def states(self) -> Array:
+        """Return the map from z to the states of the sections."""
+        return np.eye(order_of(self.damping))
+
+    def driving(self, output: Array, direct: float, free: Array) -> "Chain":
+        """Return the form whose w is driven by ``x = output z + direct u``, and by the free response."""
+        F, g = self.dynamics, self.gain
+        double = np.kron(np.eye(2), F)
+        double[g.size :, : g.size] = np.outer(g, output)
+        double_free = np.kron(np.eye(2), F)
+        double_free[g.size :, : g.size] = np.outer(g, free)
+        gain = np.concatenate((g, g * direct))
+        return replace(
+            self, dynamics=double, gain=gain, free_dynamics=double_free, free_gain=np.concatenate((g, 0.0 * g))
+        )
+
+    def forced(self, record: Record, second: bool) -> Iterator[Array]:
+        """Yield ``[z, w, u, y]`` of the used samples."""
+        initial = np.zeros(self.gain.size)
+        if record.once is not None:
+            # From rest to the end of a period x_N is left over: x0 = x_N + Phi^N x0. With X = Phi^N - I, which the
+            # exponential gives without cancellation, X x0 = -x_N.
+            end = chain_states(self.dynamics, self.gain, 1.0, record.once, record.undelayed)[-1, :-1]
+            initial = np.linalg.solve(exponential_minus_identity(self.dynamics * record.period), -end)
+        data = record.data
+        states = chain_states(self.dynamics, self.gain, 1.0, data, record.delay, initial)
+        yield np.column_stack((states, data.y))[data.use]
+
+    def free(self, elapsed: Array, second: bool) -> Array:
+        """Return rows ``[z, w]`` after an impulse, transposed."""
+        table = transitions(self.free_dynamics, 0.0 * self.free_gain, float(elapsed[-1]))
+        breaks = np.zeros(1), np.zeros(1), False
+        return np.asarray(kernels.irregular_states(*table, *breaks, elapsed, 0.0, self.free_gain)[:, :-2].T)
+
+    def rate(self, output: Array) -> tuple[Array, float]:
+        """Return the weights of z and of u in the derivative of ``x = output z`` to time."""
+        n = output.size
+        return output @ self.dynamics[:n, :n], float(output @ self.gain[:n])
+
+    def slopes(self, output: Array, direct: float) -> Array:
+        """Return the map from ``[z, w]`` to the derivatives of x to the coordinates, B being fixed, shape (2 n, n)."""
+        table, slopes = numerators(self.speed, self.damping), polynomial_slopes(self.speed, self.damping)
+        return np.vstack((np.zeros_like(table), -np.linalg.solve(table.T, slopes)))
+
+
+def pieces(data: FilterData, delay: Place) -> Iterator[tuple[FilterData, Place]]:
+    """Yield the pieces of a record, each with the input from the break on that its states stand at."""
+    count, begin = data.t.size, 0
+    if count <= PIECE:
+        yield data, delay
+        return
+    for first in range(0, count, PIECE):
+        last = min(first + PIECE, count)
+        own = slice(first, last)
+        part = data._replace(t=data.t[own], y=data.y[own], use=data.use[own])
+        if isinstance(delay, tuple):
+            shift, fraction = delay
+            begin = max(first - shift, 0)
+            end = max(last - shift, begin) + 1
+            yield part._replace(u=data.u[begin:end]), (shift - first + begin, fraction)
+        else:
+            yield part._replace(tu=data.tu[begin:], u=data.u[begin:]), delay
+            reached = np.searchsorted(data.tu, data.t[last - 1] - delay + data.slack, side="right")
+            begin = max(int(reached) - 1, 0)

@@ -109,14 +109,14 @@ class Descent:
         self.count = used.size
         self.floor = ROUNDING**2 * float(used @ used)
 
-    def value(self, point: Point) -> Projected:
-        """Least squares for the poles and delay of a point."""
+    def value(self, point: Point, *, slopes_too: bool = False) -> Projected:
+        """Least squares for the poles and delay of a point, from where derivatives may be asked for, too."""
         self.evaluations += 1
-        return project(self.problem, point.speed, point.damping, point.delay)
+        return project(self.problem, point.speed, point.damping, point.delay, slopes_too=slopes_too)
 
     def local(self, point: Point, projected: Projected | None = None) -> Local:
         """Gradient and curvature at a point; the delay counts in quarter periods."""
-        projected = self.value(point) if projected is None else projected
+        projected = self.value(point, slopes_too=True) if projected is None else projected
         self.evaluations += 1
         delay = point.delay
         if self.box.delay_free and delay.seconds < self.box.beyond_edges:
@@ -296,7 +296,7 @@ class Descent:
             trial = self._moved(here.point, step)
             if trial is None:
                 continue
-            found = self.value(trial)
+            found = self.value(trial, slopes_too=True)
             if found.squared_error < here.squared_error:
                 return step, trial, found
         return None

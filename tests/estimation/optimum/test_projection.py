@@ -5,9 +5,10 @@ import pytest
 from scipy.linalg import block_diag
 
 from ctid_cli.estimation.optimum.box import Box, point_of
-from ctid_cli.estimation.optimum.chain import chain_dynamics, logarithmic_slopes, numerators
+from ctid_cli.estimation.optimum import chain
+from ctid_cli.estimation.optimum.chain import Chain, Modal, chain_dynamics, form_of, numerators, poles_of
 from ctid_cli.estimation.optimum.projection import Problem, project, slopes
-from ctid_cli.estimation.optimum.triangle import MOMENTS, ChainState, Delay, rows_of
+from ctid_cli.estimation.optimum.triangle import Columns, Delay, rows_of, triangle_of
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.signals.record import Record
 from tests.estimation.optimum.dense import columns_of, left_over, squared_error
@@ -139,25 +140,48 @@ def test_double_poles_are_no_special_case():
     assert below + above == pytest.approx(2 * together, rel=1e-10)
 
 
-def test_states_and_slopes_have_the_transfer_functions_that_they_claim():
-    F, g = chain_dynamics(SPEED, DAMPING)
-    rows, slopes_of = numerators(SPEED, DAMPING), logarithmic_slopes(SPEED, DAMPING, F)
+@pytest.mark.parametrize("length", [100.0, 1e-6])
+def test_states_and_slopes_have_the_transfer_functions_that_they_claim(length):
+    # Within a very short record all responses overlap.
+    form, rows = form_of(SPEED, DAMPING, length), numerators(SPEED, DAMPING)
+    assert isinstance(form, Modal if length > 1.0 else Chain)
+    output, direct = np.array([0.3, -0.2, 0.5, 1.0]), 0.7
     for s in (0.3j, 1.0 + 2.0j, 5.0j):
-        states = np.linalg.solve(s * np.eye(4) - F, g)
-        np.testing.assert_allclose(states, [np.polyval(row, s) for row in rows] / np.polyval(DENOMINATOR, s))
+        states = np.array([np.polyval(row, s) for row in rows]) / np.polyval(DENOMINATOR, s)
+        x = output @ states + direct
+        if isinstance(form, Modal):
+            single = 1.0 / (s - form.poles)
+            z, w = (np.linalg.solve(form.whole, signal) for signal in (single, single**2))
+        else:
+            z = np.linalg.solve(s * np.eye(4) - form.dynamics, form.gain)
+            w = z * x
+        np.testing.assert_allclose(form.states @ z, states)
         # d ln A: p/(s + p), and (2 zeta w s + 2 w^2, 2 zeta w s)/(s^2 + 2 zeta w s + w^2).
         middle = s * s + 1.32 * s + 4.84
-        expected = [4 / (s + 4), (1.32 * s + 9.68) / middle, 1.32 * s / middle, 0.4 / (s + 0.4)]
-        np.testing.assert_allclose(slopes_of @ states, expected)
+        logarithmic = np.array([4 / (s + 4), (1.32 * s + 9.68) / middle, 1.32 * s / middle, 0.4 / (s + 0.4)])
+        np.testing.assert_allclose(np.concatenate((z, w)) @ form.slopes(output, direct), -logarithmic * x)
+        of_z, of_u = form.rate(output)
+        np.testing.assert_allclose(of_z @ z + of_u, s * (output @ states))
+
+
+def test_poles_of_a_section_meet_and_part():
+    np.testing.assert_allclose(
+        poles_of(np.array([2.0, 1.0]), np.array([1.25, 0.6])), [-4, -1, -0.6 + 0.8j, -0.6 - 0.8j]
+    )
+    assert poles_of(np.array([2.0]), np.array([1.0])) == [-2, -2]
+    F, _ = chain_dynamics(np.array([2.0, 1.0]), np.array([1.25, 0.6]))
+    np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(F)), [-4, -1, -0.6 - 0.8j, -0.6 + 0.8j])
 
 
 @pytest.mark.parametrize("regular", [True, False])
-def test_a_free_response_that_is_over_leaves_the_moments_of_all_rows(regular):
-    rng = np.random.default_rng(3)
-    data = filter_data(record_of(MODEL, rng, samples=400, regular=regular))
-    F, g = chain_dynamics(np.array([40.0 / np.ptp(data.t) * 10]), np.array([-1.0]))
-    chain = ChainState(F, g, F, g)
-    every = rows_of(chain, Delay(0.3, -1), data, 0.0, np.eye(5))
-    assert np.abs(every[-1, 2]) < 1e-100 < np.abs(every[0, 2])
-    triangle = rows_of(chain, Delay(0.3, -1), data, 0.0, MOMENTS)
-    assert triangle.T @ triangle == pytest.approx(every.T @ every, rel=1e-10, abs=1e-12)
+@pytest.mark.parametrize("damping", [1.0, 0.3])
+def test_a_long_record_is_filtered_piece_by_piece(monkeypatch, regular, damping):
+    data = filter_data(record_of(MODEL, np.random.default_rng(3), samples=400, regular=regular))
+    form = form_of(np.array([2.0]), np.array([damping]), 100.0)
+    columns = Columns.of(2, False, True, True)
+    (whole,) = rows_of(form, columns, Delay(0.8, -1), data, 0.0)
+    monkeypatch.setattr(chain, "PIECE", 37)
+    found = np.hstack(list(rows_of(form, columns, Delay(0.8, -1), data, 0.0)))
+    np.testing.assert_allclose(found, whole, atol=1e-12)
+    triangle = triangle_of(form, columns, Delay(0.8, -1), data, 0.0)
+    np.testing.assert_allclose(triangle.T @ triangle, whole @ whole.T, rtol=1e-10, atol=1e-12)
