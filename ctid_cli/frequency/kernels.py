@@ -370,7 +370,14 @@ def root_real_parts(coefficients: Array, work: Array, roots: Array) -> bool:
         companion[0, k] = -coefficients[k + 1] * factor
     for k in range(1, n):
         companion[k, k - 1] = 1.0
-    roots[:] = np.sort(np.linalg.eigvals(companion).real * scale)[::-1]
+    parts = np.linalg.eigvals(companion).real
+    # Sorted by insertion: NumPy's sort would take long to compile.
+    for i in range(n):
+        part, place = parts[i] * scale, i
+        while place > 0 and roots[place - 1] < part:
+            roots[place] = roots[place - 1]
+            place -= 1
+        roots[place] = part
     # Conjugate roots have one real part, but for rounding.
     for i in range(1, n):
         if roots[i - 1] - roots[i] <= CONJUGATE * scale:
@@ -984,6 +991,14 @@ def begin_anew(fit: Fit, compared: int) -> None:
 
 
 @njit(cache=True, nogil=True)
+def add_halves(older: Array, newer: Array, gram: Array) -> None:
+    """Add the moments of both halves; an expression of whole arrays would take long to compile."""
+    for i in range(gram.shape[0]):
+        for j in range(gram.shape[1]):
+            gram[i, j] = older[i, j] + newer[i, j]
+
+
+@njit(cache=True, nogil=True)
 def halves_differ(clock: DelayClock, fit: Fit, work: Workspace) -> bool:
     """Whether the newer half alone fits so much better than the whole that the older one is of another signal."""
     n = work.scales.size
@@ -996,7 +1011,7 @@ def halves_differ(clock: DelayClock, fit: Fit, work: Workspace) -> bool:
     # A fit to so few rows that it says nothing must not condemn the others, unless it is exact.
     judges = judge(fit.newer, trial[0], span, span, clock, trial[1:], work)[1]
     judges = judges or alone * levels[NEWER] <= EXACT * fit.newer[n, n]
-    gram[:] = fit.older + fit.newer
+    add_halves(fit.older, fit.newer, gram)
     if not (judges and levels[OLDER] > 0.0 and factorise(gram, 0.0, work.factor, work.scales)):
         return False
     # Mean squared residual of one fit to both halves, against that of the newer half alone; then the rounding of sums.
@@ -1015,7 +1030,7 @@ def join_halves(mixed: bool, compared: int, fit: Fit) -> None:
         levels[OLDER] = levels[RESIDUAL] = 0.0
         fit.older[:] = 0.0
         fit.check[:] = 0.0
-    fit.older[:] += fit.newer
+    add_halves(fit.older, fit.newer, fit.older)
     fit.newer[:] = 0.0
     levels[OLDER] += levels[NEWER]
     levels[NEWER] = 0.0
@@ -1028,7 +1043,7 @@ def refresh(clock: DelayClock, settings: Restarting, fit: Fit, work: Workspace) 
     """Estimate, alarm level and verdict from all rows."""
     n = work.scales.size
     theta, frequencies, levels, counters, gram = fit.estimate[0], fit.estimate[1], fit.levels, fit.counters, work.gram
-    gram[:] = fit.older + fit.newer
+    add_halves(fit.older, fit.newer, gram)
     # Tones that the rows do not tell apart leave a singular matrix; the last estimate is then kept, marked.
     counters[VERDICT] = UNDETERMINED
     if not factorise(gram, 0.0, work.factor, work.scales):
