@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
@@ -44,35 +43,26 @@ class _Likelihood(NamedTuple):
     variance: float
 
 
-@njit(cache=True, nogil=True)
 def levinson(partial: Array) -> tuple[Array, Array, Array]:
     """Coefficients ``(1, c_1 ... c_r)``, their slopes by the partial correlations, and autocovariances over s^2.
 
     Shapes (r + 1,), (r, r + 1) and (r + 1,).
     """
     r = partial.size
-    c, slopes, covariances = np.zeros(r + 1), np.zeros((r, r + 1)), np.zeros(r + 1)
-    c[0] = 1.0
-    variance = 1.0 / np.prod(1.0 - partial**2)
-    covariances[0] = variance
-    for k in range(r):
-        value = partial[k]
+    c, slopes, covariances = np.eye(1, r + 1)[0], np.zeros((r, r + 1)), np.zeros(r + 1)
+    covariances[0] = variance = 1.0 / np.prod(1.0 - partial**2)
+    for k, value in enumerate(partial):
         # The model of order k predicts the next autocovariance, but for the partial correlation.
-        covariances[k + 1] = -value * variance
-        for j in range(1, k + 1):
-            covariances[k + 1] -= c[j] * covariances[k + 1 - j]
+        covariances[k + 1] = -value * variance - c[1 : k + 1] @ covariances[k:0:-1]
         variance *= 1.0 - value * value
         # c of order k + 1 is c of order k plus the partial correlation times the same backwards; so are its slopes.
-        backwards = c[: k + 2][::-1].copy()
-        for i in range(k):
-            turned = slopes[i, : k + 2][::-1].copy()
-            slopes[i, : k + 2] += value * turned
+        backwards = c[k + 1 :: -1].copy()
+        slopes[:k, : k + 2] += value * slopes[:k, k + 1 :: -1]
         slopes[k, : k + 2] = backwards
         c[: k + 2] += value * backwards
     return c, slopes, covariances
 
 
-@njit(cache=True, nogil=True)
 def restricted_likelihood(products: Array, count: int, blocks: int, partial: Array) -> _Likelihood:
     """The criterion from products of the columns (Q, e) at pairs of lags, shape (lags, lags, p + 1, p + 1).
 
@@ -82,38 +72,23 @@ def restricted_likelihood(products: Array, count: int, blocks: int, partial: Arr
     p, r = products.shape[2] - 1, partial.size
     left = count - p
     c, slopes, covariances = levinson(partial)
-    gram = np.zeros((p + 1, p + 1))
-    for i in range(r + 1):
-        for j in range(r + 1):
-            gram += c[i] * c[j] * products[i, j]
+    products = products[: r + 1, : r + 1]
     # Cholesky's factor of (Q, e)' V^-1 (Q, e): its last diagonal entry is what the sensitivities do not explain.
-    factor = np.linalg.cholesky(gram)
+    factor = np.linalg.cholesky(np.tensordot(np.outer(c, c), products))
     squared = factor[p, p] ** 2
-    criterion = left * np.log(squared / left)
     # d criterion = sum W d(gram): with L the factor, its inverse's last row is the residual's combination.
     inverse = np.linalg.inv(factor)
-    weight = np.zeros((p + 1, p + 1))
-    for k in range(p):
-        criterion += 2.0 * np.log(factor[k, k])
-        weight += np.outer(inverse[k], inverse[k])
-    weight += left * np.outer(inverse[p], inverse[p])
-    by_coefficient = np.zeros(r + 1)
-    for i in range(r + 1):
-        for j in range(r + 1):
-            by_coefficient[i] += 2.0 * c[j] * np.sum(products[i, j] * weight)
-    gradient = slopes @ by_coefficient
-    for k in range(r):
-        # |V| = prod (1 - partial_k^2)^-k for each experiment.
-        one = 1.0 - partial[k] ** 2
-        criterion -= blocks * (k + 1) * np.log(one)
-        gradient[k] += 2.0 * blocks * (k + 1) * partial[k] / one
+    weight = inverse[:p].T @ inverse[:p] + left * np.outer(inverse[p], inverse[p])
+    gradient = slopes @ (2.0 * np.tensordot(products, weight) @ c)
+    # |V| = prod (1 - partial_k^2)^-k for each experiment.
+    orders, one = np.arange(1, r + 1), 1.0 - partial**2
+    criterion = left * np.log(squared / left) + 2.0 * np.log(np.diag(factor)[:p]).sum()
+    criterion -= blocks * (orders @ np.log(one))
+    gradient += 2.0 * blocks * orders * partial / one
     # The coefficients have the information of a regression on the samples before, N R(i - j) / s^2, twice in -2 ln L.
-    toeplitz = np.zeros((r, r))
-    for i in range(r):
-        for j in range(r):
-            toeplitz[i, j] = 2.0 * left * covariances[abs(i - j)]
-    steps = slopes[:, 1:].copy()
-    return _Likelihood(criterion, gradient, steps @ toeplitz @ steps.T, squared / left)
+    toeplitz = 2.0 * left * covariances[np.abs(np.subtract.outer(orders, orders))]
+    steps = slopes[:, 1:]
+    return _Likelihood(float(criterion), gradient, steps @ toeplitz @ steps.T, float(squared / left))
 
 
 def fit_residual_noise(psi: Sequence[Array], residuals: Sequence[Array]) -> NoiseModel:
