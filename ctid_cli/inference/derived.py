@@ -7,8 +7,7 @@ from functools import partial
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
-from ctid_cli.inference.quantile import normal_quantile
-from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.inference.intervals import UncertainValue, normal_quantile
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import pole_jacobian
 from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
@@ -18,7 +17,6 @@ GAIN_UNIT = "output unit/input unit"
 HELD = "A pole is held at a bound of the admissible models, where the record does not determine it."
 #: A quantity that changes by less than this fraction where a free pole changes by its own size is held [-].
 UNMOVED = 1e-6
-
 #: Standard errors to each side of a quantity with a given gradient by the leading parameters.
 Quantile = Callable[[Array], float]
 

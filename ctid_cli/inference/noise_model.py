@@ -1,13 +1,32 @@
 """Autoregressive model of stationary output noise, from residuals on a regular clock."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.beside import Rows, row_blocks
+
+#: Rows of a block: a few dozen columns of them stay in the processor's cache.
+ROWS = 4096
+
+
+class Rows(Protocol):
+    """Columns that are made, or looked up, a block of rows at a time."""
+
+    def __len__(self) -> int:
+        """Number of rows."""
+
+    def __getitem__(self, rows: slice, /) -> Array:
+        """Some rows, shape (count, columns)."""
+
+
+def row_blocks(count: int) -> Iterator[slice]:
+    """Slices that cover so many rows."""
+    return (slice(first, min(first + ROWS, count)) for first in range(0, count, ROWS))
+
 
 #: Share of the energy of a noise that is rounding.
 ROUNDING = 1e-17

@@ -26,8 +26,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.filtering.sampled import simulate_additive
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.derived import submodel_poles
-from ctid_cli.inference.finite_record import sensitivities
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.sensitivities import Structure, sensitivities
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import pole_jacobian, unfactored
 from ctid_cli.models.transfer_function import TransferFunction

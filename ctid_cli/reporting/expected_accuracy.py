@@ -11,9 +11,14 @@ from ctid_cli.arrays import Array
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import BiasedError, DataError
 from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.inference.accuracy import ParameterAccuracy
-from ctid_cli.inference.asymptotic import limiting_accuracy, output_variance, require_uncorrelated_input
-from ctid_cli.inference.finite_record import finite_record_covariance, sensitivities
+from ctid_cli.inference.bounds import (
+    ParameterAccuracy,
+    finite_record_covariance,
+    limiting_accuracy,
+    output_variance,
+    require_uncorrelated_input,
+)
+from ctid_cli.inference.sensitivities import sensitivities
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import factored, unfactored

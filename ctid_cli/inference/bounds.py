@@ -1,6 +1,9 @@
-"""Accuracy that refined instrumental variables reach on long records, known before any data are taken."""
+"""Accuracy that theory gives: Cramér-Rao bounds of a record, and the limit for long records."""
+
+from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -8,19 +11,126 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import BiasedError, DataError
+from ctid_cli.filtering.bank import second_moments
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.loop import NO_GAIN
 from ctid_cli.filtering.sampled import sampled_model
-from ctid_cli.inference.accuracy import ParameterAccuracy
-from ctid_cli.inference.covariance import sandwich, unit_inverse
-from ctid_cli.inference.sensitivity_system import DiscreteSystem, sensitivity_system
-from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.inference.covariance import sandwich, unit_inverse, white_noise_covariance
+from ctid_cli.inference.sensitivities import DiscreteSystem, Structure, sensitivity_system
+from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.factoring import factored, factored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.record import Enters
+from ctid_cli.signals.record import Enters, Record
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterAccuracy:
+    """Parameters of the true system and the covariance of their estimates."""
+
+    model: AdditiveModel | TransferFunction
+    names: tuple[str, ...]
+    #: Their true values, shape (p,).
+    values: Array
+    #: Covariance of their estimates, shape (p, p).
+    covariance: Array
+
+    @classmethod
+    def of(
+        cls, model: AdditiveModel | TransferFunction, covariance: Array, zeros: int | None = None, delay: bool = False
+    ) -> ParameterAccuracy:
+        """Accuracy of the parameters of a model, or of a fraction with more zeros or with its delay estimated too."""
+        if isinstance(model, AdditiveModel):
+            return cls(model, model.names, model.theta, covariance)
+        own = model.numerator.size - 1
+        m = own if zeros is None else zeros
+        parts = [model.denominator[1:], np.zeros(m - own), model.numerator, np.full(int(delay), model.delay)]
+        return cls(model, Structure(model.order, m, delay).names, np.concatenate(parts), covariance)
+
+    @property
+    def standard_errors(self) -> Array:
+        """Square roots of the variances, in the units of the parameters, shape (p,)."""
+        errors: Array = np.sqrt(np.diag(self.covariance))
+        return errors
+
+    def factored(self, terms: Sequence[Term] | None = None) -> ParameterAccuracy:
+        """Accuracy of the submodels into which an estimated transfer function is factored, by the delta method."""
+        if isinstance(self.model, AdditiveModel):
+            return self
+        additive = factored(self.model, terms)
+        # The delay is the same in both forms.
+        own = len(self.names) - int(self.names[-1] == "delay")
+        size, delays = additive.theta.size, len(self.names) - own
+        jacobian = np.zeros((size + delays, len(self.names)))
+        jacobian[:size, :own] = factored_jacobian(self.model, additive, own - self.model.order)
+        jacobian[size:, own:] = np.eye(delays)
+        names, values = additive.names + self.names[own:], np.concatenate([additive.theta, self.values[own:]])
+        return ParameterAccuracy(additive, names, values, jacobian @ self.covariance @ jacobian.T)
+
+
+def finite_record_covariance(psi: Array, autocovariances: ArrayLike) -> Array:
+    r"""Covariance of an unweighted output-error estimate from one record with noise of known autocovariances.
+
+    With ``M = psi' psi`` and the covariance matrix R of the noise, ``M^-1 psi' R psi M^-1``, to first order in the
+    noise: ``sigma^2 M^-1`` for white noise. Unlike the limit of long records it knows the start from rest, which counts
+    as long as the memory of the system or of its loop is not short against the record.
+    """
+    from scipy.linalg import matmul_toeplitz
+
+    lags = np.atleast_1d(np.asarray(autocovariances, dtype=float))
+    count, size = psi.shape
+    found = unit_inverse(psi.T @ psi) if count >= size else None
+    if found is None:
+        return np.full((size, size), np.nan)
+    inverse, scale = found
+    scaled = psi * scale
+    first_column = np.zeros(count)
+    first_column[: lags.size] = lags[:count]
+    coloured = lags[0] * scaled if lags.size == 1 else matmul_toeplitz(first_column, scaled)
+    return sandwich(inverse, scale, scaled.T @ coloured)
+
+
+def cramer_rao_bound(
+    model: TransferFunction,
+    record: Record,
+    noise_standard_deviation: float,
+    start: float = 0.0,
+    estimate_delay: bool = True,
+) -> Array:
+    """Cramér-Rao bound for white Gaussian output noise.
+
+    Parameters
+    ----------
+    model : TransferFunction
+        The true, strictly proper system.
+    record : Record
+        Instants and input; its outputs are not used, but missing ones count as missing.
+    noise_standard_deviation : float
+        Standard deviation of the noise [output unit].
+    start : float, default 0.0
+        Samples earlier than this after the first input break [s] are not used.
+    estimate_delay : bool, default True
+        Whether the delay is unknown too.
+
+    Returns
+    -------
+    ndarray, shape (p, p)
+        Lower bound of the covariance of ``(a_1 … a_n, b_0 … b_m[, delay])``.
+
+    Notes
+    -----
+    ``sigma^2 (sum psi psi')^-1`` with the exact sensitivities psi of the simulated output at these instants.
+    """
+    structure = Structure(model.order, model.numerator.size - 1, estimate_delay)
+    data = filter_data(record, start)
+    moments = second_moments(data, model.denominator, model.numerator, model.delay)
+    # N - p and the sum of squares are chosen so that their ratio is the known variance.
+    squared_error = noise_standard_deviation**2 * (data.count - structure.size)
+    return white_noise_covariance(structure.hessian(moments), squared_error, data.count)
+
 
 #: What the estimator's instruments are made from: the input, or the noise-free input of the loop.
 Instruments = Literal["open_loop", "closed_loop"]
-
 #: Noise that is white: its filter has the numerator and the denominator 1.
 WHITE: tuple[Sequence[float], Sequence[float]] = ((1.0,), (1.0,))
 
