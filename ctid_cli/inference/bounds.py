@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -11,16 +12,16 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import BiasedError, DataError
-from ctid_cli.filtering.bank import second_moments
-from ctid_cli.filtering.filter_data import filter_data
-from ctid_cli.filtering.loop import NO_GAIN
+from ctid_cli.filtering.loop import loop_radius, simulate_loop
 from ctid_cli.filtering.sampled import sampled_model
-from ctid_cli.inference.covariance import sandwich, unit_inverse, white_noise_covariance
-from ctid_cli.inference.sensitivities import DiscreteSystem, Structure, sensitivity_system
+from ctid_cli.inference.covariance import sandwich, unit_inverse
+from ctid_cli.inference.sensitivities import Structure, sensitivities
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import factored, factored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.noise import Noise
 from ctid_cli.signals.record import Enters, Record
 
 
@@ -66,6 +67,110 @@ class ParameterAccuracy:
         jacobian[size:, own:] = np.eye(delays)
         names, values = additive.names + self.names[own:], np.concatenate([additive.theta, self.values[own:]])
         return ParameterAccuracy(additive, names, values, jacobian @ self.covariance @ jacobian.T)
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedForm:
+    """The true system in the form in which an estimator has it."""
+
+    model: AdditiveModel | TransferFunction
+    #: Degree of the numerator of a fraction; None for that of the model.
+    zeros: int | None
+    #: Samples before this time [s] are not used; None where the delay is known.
+    delay_from: float | None
+    instruments: Instruments
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedAccuracy:
+    """What theory says of one estimator on one kind of data."""
+
+    parameters: ParameterAccuracy
+    #: Whether it is the limit for long records.
+    limit: bool
+    #: How it was computed, in words.
+    formula: str
+
+
+def accuracy_of_long_records(
+    form: EstimatedForm,
+    interval: float,
+    samples: int,
+    noise: Noise,
+    deviation: float,
+    controller: DiscreteController | None = None,
+    enters: Enters = "controller",
+) -> ExpectedAccuracy:
+    """Limit for long records, with white Gaussian noise of a deviation as the input, or as the reference of a loop."""
+    # A level relative to the output counts from its mean square; a loop has none.
+    power = [] if controller else [np.sqrt([output_variance(form.model, interval, deviation)])]
+    parameters = limiting_accuracy(
+        form.model,
+        interval,
+        controller,
+        standard_deviation=deviation,
+        innovation_variance=noise.innovation_variance_of(*power),
+        noise_filter=noise.filter,
+        samples=samples,
+        enters=enters,
+        instruments=form.instruments if controller else "closed_loop",
+        zeros=form.zeros,
+    )
+    product, matrices = "sigma^2 M^-1", "M = E psi psi'"
+    if noise.coloured:
+        product = "M^-1 Sigma M^-1"
+        matrices += ", Sigma = sigma_e^2 cov(H psi), H the filter and sigma_e^2 the innovation variance of the noise"
+    formula = (
+        f"the limit for long records, {product} / N with {matrices}, psi {_psi_in_words(form, controller)}; summed "
+    )
+    formula += f"over responses to a pulse, as the {'reference' if controller else 'input'} is white Gaussian noise"
+    return ExpectedAccuracy(parameters, True, formula)
+
+
+def accuracy_of_records(
+    form: EstimatedForm,
+    system: AdditiveModel | TransferFunction,
+    records: Sequence[Record],
+    noise: Noise,
+    why_no_limit: str,
+) -> ExpectedAccuracy:
+    """Accuracy on simulated records of a system, averaged over them."""
+    covariance = np.mean([_record_covariance(form, system, record, noise) for record in records], axis=0)
+    if not np.isfinite(covariance).all():
+        raise DataError("the data would not determine the parameters, even without noise")
+    parameters = ParameterAccuracy.of(form.model, covariance, form.zeros, form.delay_from is not None)
+    # Instruments other than the input itself are not the best there are, nor is least squares where there are outliers.
+    best = form.instruments == "open_loop" and noise.gaussian
+    start = f"{'the Cramér-Rao bound ' if best else ''}sigma^2 (psi' psi)^-1"
+    if noise.coloured:
+        start = "(psi' psi)^-1 psi' R psi (psi' psi)^-1, R the covariance matrix of the noise"
+    sets = len(records)
+    where = "in the first data set" if sets == 1 else f"averaged over the first {sets} data sets"
+    formula = f"{start}, psi {_psi_in_words(form, records[0].loop)}, {where}, as {why_no_limit}"
+    return ExpectedAccuracy(parameters, False, formula)
+
+
+def _record_covariance(
+    form: EstimatedForm, system: AdditiveModel | TransferFunction, record: Record, noise: Noise
+) -> Array:
+    """Covariance of an estimate from one data set; NaN where it does not determine the parameters."""
+    signal = record.input
+    if form.instruments == "closed_loop" and record.loop is not None:
+        loop, interval = record.loop, record.interval or 0.0
+        u = simulate_loop(system, loop.controller, loop.reference, 0.0, interval, loop.enters).u
+        signal = HeldSignal(record.t, u)
+    psi = sensitivities(form.model, signal, record.t, form.zeros, estimate_delay=form.delay_from is not None)
+    # Nothing is learnt from outputs that are missing; the others keep their distances.
+    psi = psi * record.valid[:, None]
+    if form.delay_from is not None:
+        psi = psi[record.t >= record.input.t[0] + form.delay_from]
+    lags = np.arange(psi.shape[0] if noise.coloured else 1)
+    return finite_record_covariance(psi, noise.autocovariance(lags, record.noise_free))
+
+
+def _psi_in_words(form: EstimatedForm, loop: object | None) -> str:
+    where = "noise-free loop" if form.instruments == "closed_loop" else "loop, noise included"
+    return "the sensitivities of the output to the parameters" + ("" if loop is None else f" in the {where}")
 
 
 def finite_record_covariance(psi: Array, autocovariances: ArrayLike) -> Array:
@@ -121,16 +226,20 @@ def cramer_rao_bound(
     -----
     ``sigma^2 (sum psi psi')^-1`` with the exact sensitivities psi of the simulated output at these instants.
     """
-    structure = Structure(model.order, model.numerator.size - 1, estimate_delay)
-    data = filter_data(record, start)
-    moments = second_moments(data, model.denominator, model.numerator, model.delay)
-    # N - p and the sum of squares are chosen so that their ratio is the known variance.
-    squared_error = noise_standard_deviation**2 * (data.count - structure.size)
-    return white_noise_covariance(structure.hessian(moments), squared_error, data.count)
+    psi = sensitivities(model, record.input, record.t, estimate_delay=estimate_delay)
+    slack = 1e-9 * (record.interval or 0.0)
+    used = record.valid & (record.t >= record.input.t[0] + start - slack)
+    return finite_record_covariance(psi[used], noise_standard_deviation**2)
 
 
 #: What the estimator's instruments are made from: the input, or the noise-free input of the loop.
 Instruments = Literal["open_loop", "closed_loop"]
+#: A controller that does nothing.
+OPEN = DiscreteController([0.0], [1.0])
+#: Amplitude at which the response to a pulse counts as died away: its square is below rounding.
+FORGOTTEN = 1e-12
+#: Longest response to a pulse that is summed [samples], and the least magnitude of a pole that its length allows for.
+LONGEST_MEMORY, DEADBEAT = 2_000_000, 0.1
 #: Noise that is white: its filter has the numerator and the denominator 1.
 WHITE: tuple[Sequence[float], Sequence[float]] = ((1.0,), (1.0,))
 
@@ -156,32 +265,35 @@ def limiting_accuracy(
     .. math:: \operatorname{cov} \sqrt N\,\hat\theta = M^{-1} \Sigma M^{-1}, \qquad
               \Sigma = \sum_\tau R_v(\tau)\, E\,\psi(t+\tau)\psi(t)' = \sigma_e^2 \operatorname{cov} H(q)\psi,
 
-    which for white noise is ``sigma^2 M^-1``, the Cramér-Rao bound. Both covariances solve discrete Lyapunov equations.
+    which for white noise is ``sigma^2 M^-1``, the Cramér-Rao bound. Both covariances are sums over the exact responses
+    to one pulse, which solve the discrete Lyapunov equations of the sampled system.
 
     In a closed loop psi are driven by its noise-free input, ``S r``. With the input itself, ``u = S (r - v)`` for a
     reference that enters at the controller, and white noise, psi has the part of the noise too: feedback then is a
     second reference, and the variances are somewhat smaller [1]_. That needs a sample of delay around the loop.
     """
+    from scipy.signal import lfilter  # slow to import
+
     # Without a controller what drives the loop is the input, and no noise comes back.
     if controller is None:
-        controller, enters = DiscreteController([0.0], [1.0]), "input"
-    loop = _in_loop(sensitivity_system(model, interval, zeros), controller, enters)
-    if loop.radius >= 1.0:
-        wrong = "the system, or its loop, is not stable: there is no limit for long records"
-        raise DataError(f"{wrong}; its sampled poles reach the magnitude {loop.radius:.6g}, and must stay below 1")
+        controller, enters = OPEN, "input"
+    count = _memory(model, interval, controller, noise_filter)
+    pulse, times = np.zeros(count), interval * np.arange(count)
+    pulse[0] = 1.0
+    inputs: list[Array] = [standard_deviation * simulate_loop(model, controller, pulse, 0.0, interval, enters).u]
     # What drives the instruments besides the reference: the noise, where they come from the input itself.
-    gain = float(np.ravel(noise_filter[0])[0] / np.ravel(noise_filter[1])[0])
-    fed_back = float(np.sqrt(innovation_variance)) * abs(gain) if instruments == "open_loop" else 0.0
-    deviations = [standard_deviation, fed_back]
-    found = unit_inverse(_covariance(loop, deviations)[1:, 1:])
+    if instruments == "open_loop":
+        gain = float(np.ravel(noise_filter[0])[0] / np.ravel(noise_filter[1])[0])
+        noise = math.sqrt(innovation_variance) * gain * pulse
+        inputs.append(simulate_loop(model, controller, np.zeros(count), noise, interval, enters).u)
+    responses = [sensitivities(model, HeldSignal(times, u), times, zeros) for u in inputs]
+    found = unit_inverse(_moments(responses))
     if found is None:
         wrong = "the parameters are not determined, even by endless data"
         raise DataError(f"{wrong}: some have no effect of their own, as where a pole cancels a zero or a gain is zero")
     inverse, scale = found
-    # H(q) psi is psi driven by inputs filtered by H, one filter for each.
-    filters = DiscreteSystem(*(np.asarray(np.kron(np.eye(2), part), dtype=float) for part in _filter(noise_filter)))
-    sigma = innovation_variance * _covariance(loop.after(filters), deviations)[1:, 1:]
-    covariance = sandwich(inverse, scale, sigma * np.outer(scale, scale), samples)
+    filtered = [lfilter(*noise_filter, psi * scale, axis=0) for psi in responses]
+    covariance = sandwich(inverse, scale, innovation_variance * _moments(filtered), samples)
     return ParameterAccuracy.of(model, covariance, zeros)
 
 
@@ -201,49 +313,33 @@ def require_uncorrelated_input(
 
 def output_variance(model: AdditiveModel | TransferFunction, interval: float, input_deviation: float) -> float:
     """Variance of the noise-free output of a stable model, for white noise held between the samples as the input."""
-    return float(_covariance(sensitivity_system(model, interval), [input_deviation])[0, 0])
+    pulse = np.zeros(_memory(model, interval, OPEN, WHITE))
+    pulse[0] = input_deviation
+    x = simulate_loop(model, OPEN, pulse, 0.0, interval, "input").x
+    return float(x @ x)
 
 
-def _in_loop(system: DiscreteSystem, controller: DiscreteController, enters: str) -> DiscreteSystem:
-    """Close a loop around the first output of a system; the inputs then are the reference and the output noise."""
-    A, B, C, D = system.A, system.B, system.C[:1], system.D[:1]
-    Ac, Bc, Cc, Dc = controller.state_space()
-    order = controller.order
-    at_controller = enters == "controller"
-    # From (r, v) to what the controller sees, and past it; x is still to be subtracted from the former.
-    error, straight = np.array([[float(at_controller), -1.0]]), np.array([[float(not at_controller), 0.0]])
-    denominator = 1.0 + float(Dc[0, 0] * D[0, 0])
-    if abs(denominator) <= NO_GAIN:
-        raise DataError("model and controller react at once with a loop gain of -1: the loop has no solution")
-    u_states = np.hstack([-Dc @ C, Cc]) / denominator
-    u_inputs = (Dc @ error + straight) / denominator
-    e_states = np.hstack([-C, np.zeros((1, order))]) - D @ u_states
-    e_inputs = error - D @ u_inputs
-    n = A.shape[0]
-    A_loop = np.vstack([np.hstack([A, np.zeros((n, order))]), np.hstack([np.zeros((order, n)), Ac])])
-    A_loop = A_loop + np.vstack([B @ u_states, Bc @ e_states])
-    B_loop = np.vstack([B @ u_inputs, Bc @ e_inputs])
-    C_loop = np.hstack([system.C, np.zeros((system.C.shape[0], order))]) + system.D @ u_states
-    return DiscreteSystem(A_loop, B_loop, C_loop, system.D @ u_inputs)
+def _memory(
+    model: AdditiveModel | TransferFunction,
+    interval: float,
+    controller: DiscreteController,
+    noise_filter: tuple[ArrayLike, ArrayLike],
+) -> int:
+    """Samples after which the responses to one pulse have died away."""
+    # Integrators of a submodel are in the loop only, the poles that its sensitivities repeat outside of it too.
+    denominators = [s.denominator for s in model.submodels] if isinstance(model, AdditiveModel) else [model.denominator]
+    own = np.exp(interval * np.concatenate([np.roots(part) for part in denominators]).real).max(initial=0.0)
+    radius = max(loop_radius(model, controller, interval), float(own))
+    if radius >= 1.0:
+        wrong = "the system, or its loop, is not stable: there is no limit for long records"
+        raise DataError(f"{wrong}; its sampled poles reach the magnitude {radius:.6g}, and must stay below 1")
+    slowest = max(radius, float(np.abs(np.roots(np.ravel(noise_filter[1]))).max(initial=0.0)), DEADBEAT)
+    count = math.ceil(math.log(FORGOTTEN) / math.log(slowest) + model.delay / interval) + controller.order
+    if count > LONGEST_MEMORY:
+        raise DataError(f"the system forgets too slowly for a limit of long records: it takes {count} samples")
+    return count
 
 
-def _filter(noise_filter: tuple[ArrayLike, ArrayLike]) -> tuple[Array, Array, Array, Array]:
-    """State space of a filter in powers of q^-1."""
-    parts = [np.atleast_1d(np.asarray(part, dtype=float)) for part in noise_filter]
-    length = max(part.size for part in parts)
-    return DiscreteController(*(np.pad(part, (0, length - part.size)) for part in parts)).state_space()
-
-
-def _covariance(system: DiscreteSystem, deviations: Sequence[float]) -> Array:
-    """Stationary covariance of the outputs of a stable system under independent white inputs."""
-    size = np.asarray(deviations, dtype=float)
-    B, D = system.B * size, system.D * size
-    # P = sum A^k B B' A^k', by doubling: sums of squares only, so small variances keep their digits.
-    P, power = B @ B.T, system.A
-    while np.abs(power).max(initial=0.0) > 0.0:
-        step = power @ P @ power.T
-        P = P + step
-        power = power @ power
-        if (np.abs(step) <= 1e-17 * np.sqrt(np.outer(np.diag(P), np.diag(P)))).all():
-            break
-    return np.asarray(system.C @ P @ system.C.T + D @ D.T)
+def _moments(responses: Sequence[Array]) -> Array:
+    """Covariance of outputs driven by independent white noises, from the responses to one pulse of each."""
+    return np.asarray(np.sum([response.T @ response for response in responses], axis=0))
