@@ -278,7 +278,7 @@ def limiting_accuracy(
     if controller is None:
         controller, enters = OPEN, "input"
     count = _memory(model, interval, controller, noise_filter)
-    pulse, times = np.zeros(count), interval * np.arange(count)
+    pulse, times = np.zeros(count), np.asarray(interval * np.arange(count), dtype=float)
     pulse[0] = 1.0
     inputs: list[Array] = [standard_deviation * simulate_loop(model, controller, pulse, 0.0, interval, enters).u]
     # What drives the instruments besides the reference: the noise, where they come from the input itself.

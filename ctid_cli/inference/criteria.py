@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
-from ctid_cli.inference.residual_tests import all_white
+from ctid_cli.inference.residual_tests import all_white, orthonormal
 
 
 def fit_percent(y: ArrayLike, x: ArrayLike) -> float:
@@ -129,13 +129,22 @@ def shared_noise(residuals: Sequence[Array]) -> NoiseModel:
 
 
 def squared_innovations(residuals: Sequence[Array], psi: Sequence[Array], noise: NoiseModel) -> float:
-    """V of a fit; the first samples of each record, without those before them, are left out."""
+    r"""V of a fit; the first samples of each record, without those before them, are left out.
+
+    Criteria that count parameters take residuals as independent. Coloured noise is made white first, by one autoregressive
+    model for all fits, so that their criteria remain comparable: with c(q) that model and e, psi the residuals and
+    sensitivities of a fit,
+
+    .. math:: V = \min_x \| c(q) (e - \psi x) \|^2
+
+    is the squared innovation of the fit by generalised least squares, one Gauss-Newton step from that by least squares.
+    """
     order = noise.order
     errors = np.concatenate([noise.innovations(e)[order:] for e in residuals])
     left = float(errors @ errors)
     if order and psi[0].shape[1]:
         columns = np.concatenate([np.column_stack([noise.innovations(c)[order:] for c in block.T]) for block in psi])
-        along = _orthonormal(columns).T @ errors
+        along = (columns @ orthonormal(columns, RANK)).T @ errors
         left -= float(along @ along)
     return left
 
@@ -151,7 +160,8 @@ def cross_validated_errors(residuals: Sequence[Array], psi: Sequence[Array]) -> 
     Without block B, ``e_B + Q_B (I - Q_B'Q_B)^-1 Q_B' e_B``, Q an orthonormal basis of the sensitivities. Directions
     that hardly anything but the block itself determines, such as the state before it, are taken from it.
     """
-    basis = _orthonormal(np.concatenate(psi))
+    stacked = np.concatenate(psi)
+    basis = stacked @ orthonormal(stacked, RANK)
     splits = np.cumsum([e.size for e in residuals])[:-1]
     found = []
     for e, q in zip(residuals, np.split(basis, splits), strict=True):
@@ -162,11 +172,3 @@ def cross_validated_errors(residuals: Sequence[Array], psi: Sequence[Array]) -> 
             parts.append(e[rows] + told @ ((told.T @ e[rows]) / (1.0 - own[own < OWN])))
         found.append(np.concatenate(parts))
     return tuple(found)
-
-
-def _orthonormal(columns: Array) -> Array:
-    """Basis of what the columns span."""
-    length = np.linalg.norm(columns, axis=0)
-    scaled = columns[:, length > 0] / length[length > 0]
-    left, values, _ = np.linalg.svd(scaled, full_matrices=False)
-    return np.asarray(left[:, values > RANK * values.max(initial=0.0)])

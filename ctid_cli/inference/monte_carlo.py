@@ -364,7 +364,16 @@ def block_ends(at_most: int) -> Iterator[int]:
 
 
 def decide(until: Until, estimators: Sequence[Replications], at_most: int) -> Decision:
-    """Look at the intervals at the end of each block, up to the first one that leaves none too wide."""
+    """Look at the intervals at the end of each block, up to the first one that leaves none too wide.
+
+    Data sets come in blocks. At the end of each the 95 % intervals of all measures of all estimators are looked at, and the
+    data cell has enough data sets once none is wider than asked for. Looking again and again favours samples that seem
+    more precise than they are, so that an interval at the end holds the truth a little less often than one from a number of
+    data sets fixed before (Y. S. Chow and H. Robbins, On the asymptotic theory of fixed-width sequential confidence
+    intervals for the mean, Annals of Mathematical Statistics 36 (1965) 457-462). Blocks that grow keep the looks few, and
+    the first one is large enough for the widths themselves to be known: of percentages up to 98 and of nearly normal
+    errors the intervals hold the truth in 93 % of the cases or more, without a correction (docs/measures.md).
+    """
     stored = min(len(one.errors) for one in estimators)
     finished, widest = 0, None
     for end in block_ends(at_most):

@@ -13,28 +13,43 @@ and of a submodel ``B/(p^l A)`` of a sum, whose coefficients go by the powers of
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, ComplexArray, IndexArray
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.sampled import simulate_additive
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.derived import submodel_poles
+from ctid_cli.inference.derived import pole_slopes
 from ctid_cli.inference.sensitivities import Structure, sensitivities
 from ctid_cli.models.additive import AdditiveModel, Submodel
-from ctid_cli.models.factoring import pole_jacobian, unfactored
+from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 
 Number = TypeVar("Number", np.float64, np.complex128)
 Model = TransferFunction | AdditiveModel
 _COEFFICIENT = re.compile(r"(?:g\d+_)?[ab](\d+)|delay")
+
+
+class _Part(NamedTuple):
+    """A fraction ``B/(p^l A)`` of a model, and the powers of p that its parameters multiply."""
+
+    numerator: Array
+    denominator: Array
+    integrators: int
+    a_powers: range
+    b_powers: range
+
+    @classmethod
+    def of_submodel(cls, part: Submodel) -> _Part:
+        """Lay out a submodel of a sum, whose coefficients go by rising powers."""
+        term = part.term()
+        a_powers, b_powers = range(1, term.poles + 1), range(term.zeros + 1)
+        return cls(part.numerator, part.denominator, part.integrators, a_powers, b_powers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,47 +121,47 @@ class Parametric:
         found[:, mine] = every[:, places]
         return found
 
-    # --- frequency response ------------------------------------------------------------------------
+    @cached_property
+    def _parts(self) -> list[_Part]:
+        model = self.model
+        if isinstance(model, AdditiveModel):
+            return [_Part.of_submodel(part) for part in model.submodels]
+        n, m = model.order, self.zeros
+        return [_Part(model.numerator, model.denominator, 0, range(n - 1, -1, -1), range(m, -1, -1))]
 
     def frequency_slopes(self, frequencies: Array) -> ComplexArray:
         """Derivatives of ``G(j w)``, shape (N, p)."""
-        s, model = np.asarray(1j * frequencies, dtype=complex), self.model
-        late = np.exp(-s * model.delay)
-        if isinstance(model, AdditiveModel):
-            columns: list[ComplexArray] = [
-                column * late for part in model.submodels for column in _submodel_slopes(part, s)
-            ]
-        else:
-            over: ComplexArray = np.asarray(np.polyval(model.denominator, s), dtype=complex)
-            plain: ComplexArray = np.asarray(np.polyval(model.numerator, s) / over, dtype=complex)
-            columns = [-(s**k) / over * plain * late for k in range(model.order - 1, -1, -1)]
-            columns += [s**k / over * late for k in range(self.zeros, -1, -1)]
-        columns.append(-s * model.frequency_response(frequencies))
-        return np.asarray(self._among_all(np.column_stack(columns)))
-
-    # --- responses over time -----------------------------------------------------------------------
+        s = np.asarray(1j * frequencies, dtype=complex)
+        delayed = np.exp(-s * self.model.delay)
+        columns: list[ComplexArray] = []
+        for part in self._parts:
+            own = np.polyval(part.denominator, s)
+            over = s**part.integrators * own / delayed
+            response = np.polyval(part.numerator, s) / over
+            columns += [np.asarray(-(s**k) / own * response) for k in part.a_powers]
+            columns += [np.asarray(s**k / over) for k in part.b_powers]
+        columns.append(-s * self.model.frequency_response(frequencies))
+        return self._among_all(np.column_stack(columns))
 
     def simulated(self, signal: HeldSignal, times: Array) -> Array:
         """Output from rest."""
-        if not self.differentiated and isinstance(self.model, AdditiveModel):
-            return simulate_additive(self.model, signal, times)
         return np.asarray(np.sum([simulate(part, signal, times) for part in self._fractions], axis=0))
 
     def output_slopes(self, signal: HeldSignal, times: Array) -> Array:
         """Derivatives of the output from rest, shape (N, p)."""
-        model, more = self.model, int(self.differentiated)
-        if not isinstance(model, AdditiveModel):
-            found = sensitivities(self._fractions[0], signal, times, self.zeros + more, estimate_delay=True)
-            # What a differentiator is behind has no constant term.
-            return self._among_all(np.delete(found, np.s_[found.shape[1] - 1 - more : found.shape[1] - 1], axis=1))
         columns = []
-        for part in self._submodels:
-            found = sensitivities(AdditiveModel([part], model.delay), signal, times)
-            columns.append(np.delete(found, np.s_[part.term().poles : part.term().poles + more], axis=1))
         delay = np.zeros((times.size, 1))
-        if "delay" in self.names:
-            for one in self._fractions:
-                delay += sensitivities(one, signal, times, estimate_delay=True)[:, -1:]
+        # What a differentiator is behind has no constant term: the numerator has one more coefficient without it.
+        more = int(self.differentiated)
+        if isinstance(self.model, AdditiveModel):
+            for part in self._submodels:
+                found = sensitivities(AdditiveModel([part], self.model.delay), signal, times)
+                columns.append(np.delete(found, np.s_[part.term().poles : part.term().poles + more], axis=1))
+            if "delay" in self.names:
+                delay += sum(sensitivities(one, signal, times, estimate_delay=True)[:, -1:] for one in self._fractions)
+        else:
+            found = sensitivities(self._fractions[0], signal, times, self.zeros + more, estimate_delay=True)
+            columns, delay = [found[:, : found.shape[1] - 1 - more]], found[:, -1:]
         return self._among_all(np.hstack([*columns, delay]))
 
     @property
@@ -164,9 +179,7 @@ class Parametric:
     def _submodels(self) -> list[Submodel]:
         """The submodels of a sum, differentiated where that is asked for."""
         assert isinstance(self.model, AdditiveModel)
-        if not self.differentiated:
-            return list(self.model.submodels)
-        return [Submodel(_times_p(s.numerator), s.denominator, s.integrators) for s in self.model.submodels]
+        return [Submodel(self._driven(s.numerator), s.denominator, s.integrators) for s in self.model.submodels]
 
     @property
     def _fractions(self) -> list[TransferFunction]:
@@ -175,38 +188,20 @@ class Parametric:
         if isinstance(model, AdditiveModel):
             parts = [part.transfer_function() for part in self._submodels]
             return [TransferFunction(part.numerator, part.denominator, model.delay) for part in parts]
-        b = _times_p(model.numerator) if self.differentiated else model.numerator
-        return [TransferFunction(b, model.denominator, model.delay)]
+        return [TransferFunction(self._driven(model.numerator), model.denominator, model.delay)]
 
-    # --- poles -------------------------------------------------------------------------------------
+    def _driven(self, numerator: Array) -> Array:
+        """A numerator times p where the model is differentiated."""
+        return np.append(numerator, 0.0) if self.differentiated else numerator
 
     def poles(self) -> tuple[ComplexArray, ComplexArray]:
-        """Poles, and their derivatives, shape (n, p)."""
-        model = self.model
-        if not isinstance(model, AdditiveModel):
-            slopes = np.zeros((model.order, len(self.every)), dtype=complex)
-            slopes[:, : model.order] = pole_jacobian(model.denominator, model.poles)
-            return model.poles, self._among_all(slopes)
+        """Poles, and their derivatives, shape (n, p); integrators of submodels stay where they are."""
         rows, found, first = [], [], 0
-        for part in model.submodels:
-            poles, jacobian = submodel_poles(part)
-            slopes = np.zeros((part.order, len(self.every)), dtype=complex)
-            # Integrators come last and stay where they are.
-            slopes[: poles.size, first : first + poles.size] = jacobian
+        for part in self._parts:
+            poles, jacobian = pole_slopes(part.denominator, part.a_powers)
+            slopes = np.zeros((poles.size + part.integrators, len(self.every)), dtype=complex)
+            slopes[: poles.size, first : first + len(part.a_powers)] = jacobian
             found.append(np.concatenate((poles, np.zeros(part.integrators))))
             rows.append(slopes)
-            first += part.term().size
+            first += len(part.a_powers) + len(part.b_powers)
         return np.concatenate(found), self._among_all(np.vstack(rows))
-
-
-def _submodel_slopes(part: Submodel, s: ComplexArray) -> Sequence[ComplexArray]:
-    """Derivatives of the frequency response of a submodel without delay by its parameters."""
-    over = s**part.integrators * np.polyval(part.denominator, s)
-    plain = np.polyval(part.numerator, s) / over
-    term = part.term()
-    of_denominator = [-(s**k) / np.polyval(part.denominator, s) * plain for k in range(1, term.poles + 1)]
-    return of_denominator + [s**k / over for k in range(term.zeros + 1)]
-
-
-def _times_p(numerator: Array) -> Array:
-    return np.append(numerator, 0.0)

@@ -1,9 +1,9 @@
-r"""A model's output and its sensitivities to the parameters as one discrete-time system driven by the held input.
+r"""Derivatives of the simulated output by the parameters.
 
-For every submodel ``B/(p^l A)`` of an additive model, and for an unfactored transfer function as the only one with
-``l = 0``, two chains of states are driven one by the other: ``1/(p^l A)`` by the input, ``1/A`` by the output of the
-first. They hold all sensitivities, so the input is filtered once. The first chain is the submodel itself; a
-controller closed around it feeds back the same states that the sensitivities read, and no integrator appears twice.
+With ``theta = (a_1 … a_n, b_0 … b_m)`` and the delay last, the derivatives of the simulated output x are
+
+.. math:: \partial x/\partial a_i = -p^{n-i}/A\,x, \quad \partial x/\partial b_j = p^{m-j}/A\,u(t-\tau), \quad
+          \partial x/\partial\tau = -p\,x.
 """
 
 from __future__ import annotations

@@ -1,4 +1,13 @@
-"""A frequency response by averaging over segments under Hann windows: robust and simple, but leakage stays."""
+r"""Estimates of a frequency response without a model: by local polynomials, from periods, and by averages.
+
+Of a signal on a regular clock of interval h the samples tell the sum of its spectrum over all frequencies that look
+alike. With ``w_s = 2 pi/h``, an input held between its samples has the spectrum ``H(w) U(w)`` at every one of them,
+
+.. math:: H_{zoh} = \frac{1 - e^{-jwh}}{jwh}, \quad H_{foh} = \Big(\frac{\sin(wh/2)}{wh/2}\Big)^2, \quad H_{bl} = 1,
+
+the last one below half of w_s only. The output over the input and H is ``G(jw) + sum_m G(j(w + m w_s)) H(w + m w_s) /
+H(w)``, m ≠ 0: the response and its images, which a hold leaves the smaller the faster the clock.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -76,7 +85,7 @@ TOO_WIDE = 2.0
 #: Equations whose columns, scaled to one length, have a greater condition number say nothing of the response.
 SINGULAR = 1e6
 #: Lines on which the input has less than this share of its greatest amplitude do not excite.
-EXCITED = 1e-8
+LEAST_AMPLITUDE = 1e-8
 
 
 class _LocalFit(NamedTuple):
@@ -96,6 +105,13 @@ def local_polynomial(
     """Response from spectra at the frequencies ``base, 2 base, …`` at up to ``points`` of them.
 
     Without a half-width each centre has half of the greatest one that fits the lines as well as the least one does.
+
+    Between the finite spectra of a record the system holds up to a transient T, which is as smooth as the response:
+    ``Y(k) = G(k) U(k) + T(k) + V(k)``. Around each line G and T are polynomials of degree 2 in the number of the line, six
+    complex parameters, found by least squares over ``2 n + 1`` lines. The residuals give the variance of V, and with it
+    that of G. Leakage is thus estimated, not windowed away.
+
+    R. Pintelon and J. Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed., Wiley, 2012, chapter 7.
     """
     lines = u.size
     least = half_width or HALF_WIDTHS[0]
@@ -167,7 +183,7 @@ def _fit(u: ComplexArray, y: ComplexArray, centres: IntArray, n: int) -> _LocalF
     powers = place[:, :, None] ** np.arange(DEGREE + 1) * present[:, :, None]
     columns = np.concatenate((powers * inputs[:, :, None], powers), axis=2)
     lengths = np.linalg.norm(columns, axis=1, keepdims=True)
-    excited = lengths[:, 0, 0] > EXCITED * float(np.abs(u).max())
+    excited = lengths[:, 0, 0] > LEAST_AMPLITUDE * float(np.abs(u).max())
     scaled = columns / np.where(lengths > 0, lengths, 1.0)
     left, singular, right = np.linalg.svd(scaled, full_matrices=False)
     determined = excited & (singular[:, -1] * SINGULAR > singular[:, 0])
@@ -227,9 +243,9 @@ def _choose(excess: Array, determined: BoolArray, widths: IntArray) -> IntArray:
 REPEATED = 1e-3
 #: Lines on which the input has less than this share of its greatest power do not excite, nor those that stand out of
 #: the input's noise by less than so many times its variance.
-EXCITED, ABOVE_NOISE = 1e-6, 10.0
-#: Lines on each side of one of the input from which transient and noise are read, and the degree of the polynomial.
-BETWEEN, DEGREE = 4, 2
+LEAST_POWER, ABOVE_NOISE = 1e-6, 10.0
+#: Lines on each side of one of the input from which transient and noise are read.
+BETWEEN = 4
 #: Unexcited lines on each side of an excited one from which the distortion on it is read.
 DETECTION = 3
 #: A kind of unexcited lines tells the distortions from this number on.
@@ -276,7 +292,21 @@ def find_period(u: Array) -> int | None:
 
 
 def from_periods(signals: Sequence[tuple[Array, Array]], period: int, interval: float) -> ResponseLines:
-    """Response from inputs and outputs that repeat after ``period`` samples, each a realisation of its own."""
+    r"""Response from inputs and outputs that repeat after ``period`` samples, each a realisation of its own.
+
+    The DFT of M whole periods has the input on every M-th line only. On the lines between, input and output hold noise and
+    the transient of a start that has not settled, which is smooth over frequency. A polynomial of degree 2 through the
+    nearest of these lines gives the transient on the line of the input, which is taken out, and its residuals the variances
+    and the covariance of the noise, noise on the input included. With the lines U and Y the response is Y/U, of variance
+
+    .. math:: \sigma_G^2 = |G|^2 \Big(\frac{\sigma_Y^2}{|Y|^2} + \frac{\sigma_U^2}{|U|^2}
+              - 2 \mathrm{Re} \frac{\sigma_{YU}^2}{Y U^*}\Big).
+
+    Nonlinear distortions repeat with the input, so that periods do not show them. They show on lines that the input does
+    not excite, and in the differences between realisations of the input.
+
+    R. Pintelon and J. Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed., Wiley, 2012, chapters 2-4.
+    """
     found = [_periods(u, y, period) for u, y in signals]
     excited = np.flatnonzero(np.all([_excited(one) for one in found], axis=0))
     if not excited.size:
@@ -332,7 +362,7 @@ def _periods(u: Array, y: Array, period: int) -> _Periods:
 
 def _excited(one: _Periods) -> BoolArray:
     power = np.abs(one.inputs) ** 2
-    return np.asarray((power > EXCITED * power.max()) & (power > ABOVE_NOISE * one.input_noise))
+    return np.asarray((power > LEAST_POWER * power.max()) & (power > ABOVE_NOISE * one.input_noise))
 
 
 def _response(one: _Periods, lines: IntArray) -> tuple[ComplexArray, Array]:
@@ -384,7 +414,7 @@ SHARED = 1 / 36
 #: The shortest segment [samples].
 SHORTEST = 16
 #: Lines on which the input has less than this share of its greatest power do not excite.
-EXCITED = 1e-12
+LEAST_AVERAGE_POWER = 1e-12
 
 
 def welch(u: Array, y: Array, interval: float, length: int | None, time_unit: str) -> ResponseLines:
@@ -403,7 +433,7 @@ def welch(u: Array, y: Array, interval: float, length: int | None, time_unit: st
     uu, yy = (np.mean(np.abs(part) ** 2, axis=0) for part in (inputs, outputs))
     yu = np.mean(outputs * inputs.conj(), axis=0)
     # The window joins the first line with the mean that was removed.
-    kept = (np.arange(uu.size) >= 2) & (uu > EXCITED * uu.max()) & (np.arange(uu.size) < size / 2)
+    kept = (np.arange(uu.size) >= 2) & (uu > LEAST_AVERAGE_POWER * uu.max()) & (np.arange(uu.size) < size / 2)
     uu, yy, yu = uu[kept], yy[kept], yu[kept]
     coherence = np.minimum(np.abs(yu) ** 2 / np.maximum(uu * yy, np.finfo(float).tiny), 1.0)
     count = begins.size / (1.0 + 2.0 * SHARED * (begins.size - 1) / begins.size)

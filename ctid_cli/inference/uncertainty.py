@@ -192,9 +192,21 @@ UNSAFE = 0.5
 def shifts_of_ends(
     model: Parametric, law: Uncertainty, records: Sequence[Record], used: Sequence[BoolArray], psi: Sequence[Array]
 ) -> Array:
-    """By how much either end of each parameter's interval would move, in half-widths; NaN of held ones, shape (p,).
+    r"""By how much either end of each parameter's interval would move, in half-widths; NaN of held ones, shape (p,).
 
     Infinite where a model at an end has no finite output.
+
+    An interval reaches q standard errors to each side. At its end the most likely other parameters are
+    ``theta + d``, ``d = q C e_k / s_k``, and the output is ``x(theta + d)``. Of the part that the linearisation does not
+    have, ``x(theta + d) - x(theta) - Psi d``, the estimate would take
+
+    .. math:: M^{-1} \sum_t \psi_t \left( x_t(\theta + d) - x_t(\theta) - \psi_t' d \right),
+
+    which moves the end of the interval of parameter k; in half-widths of it, a curvature in the sense of [1]_.
+
+    References
+    ----------
+    .. [1] D. M. Bates and D. G. Watts, *Nonlinear Regression Analysis and Its Applications*, Wiley, 1988, chapter 7.
     """
     covariance, reach = law.covariance, law.quantiles()
     found = np.full(len(covariance), np.nan)
