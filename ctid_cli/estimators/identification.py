@@ -24,9 +24,9 @@ from ctid_cli.inference.criteria import fit_percent, r_squared
 from ctid_cli.inference.fit import FilledLater, FittedModel, Status
 from ctid_cli.inference.intervals import BIASED, CostOfDelay, DelayInterval, UncertainValue
 from ctid_cli.inference.model_responses import Estimated
-from ctid_cli.inference.parametric import Parametric
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.response_test import AnswerTest, answer_test
+from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import DRAWS, UNSAFE, Covariance, Progress, Uncertainty, shifts_of_ends
 from ctid_cli.signals.record import Record
 from ctid_cli.text import ShownAsTable

@@ -131,9 +131,9 @@ def shared_noise(residuals: Sequence[Array]) -> NoiseModel:
 def squared_innovations(residuals: Sequence[Array], psi: Sequence[Array], noise: NoiseModel) -> float:
     r"""V of a fit; the first samples of each record, without those before them, are left out.
 
-    Criteria that count parameters take residuals as independent. Coloured noise is made white first, by one autoregressive
-    model for all fits, so that their criteria remain comparable: with c(q) that model and e, psi the residuals and
-    sensitivities of a fit,
+    Criteria that count parameters take residuals as independent. Coloured noise is made white first, by one
+    autoregressive model for all fits, so that their criteria remain comparable: with c(q) that model and e, psi the
+    residuals and sensitivities of a fit,
 
     .. math:: V = \min_x \| c(q) (e - \psi x) \|^2
 

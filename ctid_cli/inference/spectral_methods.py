@@ -107,9 +107,9 @@ def local_polynomial(
     Without a half-width each centre has half of the greatest one that fits the lines as well as the least one does.
 
     Between the finite spectra of a record the system holds up to a transient T, which is as smooth as the response:
-    ``Y(k) = G(k) U(k) + T(k) + V(k)``. Around each line G and T are polynomials of degree 2 in the number of the line, six
-    complex parameters, found by least squares over ``2 n + 1`` lines. The residuals give the variance of V, and with it
-    that of G. Leakage is thus estimated, not windowed away.
+    ``Y(k) = G(k) U(k) + T(k) + V(k)``. Around each line G and T are polynomials of degree 2 in the number of the line,
+    six complex parameters, found by least squares over ``2 n + 1`` lines. The residuals give the variance of V, and
+    with it that of G. Leakage is thus estimated, not windowed away.
 
     R. Pintelon and J. Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed., Wiley, 2012, chapter 7.
     """
@@ -294,18 +294,20 @@ def find_period(u: Array) -> int | None:
 def from_periods(signals: Sequence[tuple[Array, Array]], period: int, interval: float) -> ResponseLines:
     r"""Response from inputs and outputs that repeat after ``period`` samples, each a realisation of its own.
 
-    The DFT of M whole periods has the input on every M-th line only. On the lines between, input and output hold noise and
-    the transient of a start that has not settled, which is smooth over frequency. A polynomial of degree 2 through the
-    nearest of these lines gives the transient on the line of the input, which is taken out, and its residuals the variances
-    and the covariance of the noise, noise on the input included. With the lines U and Y the response is Y/U, of variance
+    The DFT of M whole periods has the input on every M-th line only. On the lines between, input and output hold noise
+    and the transient of a start that has not settled, which is smooth over frequency. A polynomial of degree 2 through
+    the nearest of these lines gives the transient on the line of the input, which is taken out, and its residuals the
+    variances and the covariance of the noise, noise on the input included. With the lines U and Y the response is Y/U,
+    of variance
 
     .. math:: \sigma_G^2 = |G|^2 \Big(\frac{\sigma_Y^2}{|Y|^2} + \frac{\sigma_U^2}{|U|^2}
               - 2 \mathrm{Re} \frac{\sigma_{YU}^2}{Y U^*}\Big).
 
-    Nonlinear distortions repeat with the input, so that periods do not show them. They show on lines that the input does
-    not excite, and in the differences between realisations of the input.
+    Nonlinear distortions repeat with the input, so that periods do not show them. They show on lines that the input
+    does not excite, and in the differences between realisations of the input.
 
-    R. Pintelon and J. Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed., Wiley, 2012, chapters 2-4.
+    R. Pintelon and J. Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed., Wiley, 2012, chapters
+    2-4.
     """
     found = [_periods(u, y, period) for u, y in signals]
     excited = np.flatnonzero(np.all([_excited(one) for one in found], axis=0))

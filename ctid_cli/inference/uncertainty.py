@@ -11,8 +11,8 @@ from ctid_cli.errors import DataError
 from ctid_cli.inference.covariance import robust_covariance, white_noise_covariance
 from ctid_cli.inference.intervals import student_quantile
 from ctid_cli.inference.noise_model import NoiseModel
-from ctid_cli.inference.parametric import Parametric
 from ctid_cli.inference.residual_tests import all_white
+from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record
 
@@ -196,9 +196,9 @@ def shifts_of_ends(
 
     Infinite where a model at an end has no finite output.
 
-    An interval reaches q standard errors to each side. At its end the most likely other parameters are
-    ``theta + d``, ``d = q C e_k / s_k``, and the output is ``x(theta + d)``. Of the part that the linearisation does not
-    have, ``x(theta + d) - x(theta) - Psi d``, the estimate would take
+    An interval reaches q standard errors to each side. At its end the most likely other parameters are ``theta + d``,
+    ``d = q C e_k / s_k``, and the output is ``x(theta + d)``. Of the part that the linearisation does not have,
+    ``x(theta + d) - x(theta) - Psi d``, the estimate would take
 
     .. math:: M^{-1} \sum_t \psi_t \left( x_t(\theta + d) - x_t(\theta) - \psi_t' d \right),
 
