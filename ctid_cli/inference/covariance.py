@@ -6,8 +6,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
-from ctid_cli.inference.residual_likelihood import fit_residual_noise
+from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model, fit_residual_noise
 from ctid_cli.text import listed
 
 #: Beyond this condition number the inverse holds no correct digit: NaN says so, a tidy number would not.
