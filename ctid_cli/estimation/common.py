@@ -17,9 +17,8 @@ from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
-from ctid_cli.inference.diagnostics import percent_from_r_squared
-from ctid_cli.inference.fit import Fit, IterationRecord
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.criteria import percent_from_r_squared
+from ctid_cli.inference.fit import Fit, IterationRecord, Status
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty, estimate_uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction

@@ -13,7 +13,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.estimation.iteration import Equations, Problem, Steps, iterate, solve_scaled, with_best
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Status
 
 #: The smallest delay step, as a fraction of the range of the delay.
 SMALLEST_STEP = 1e-5

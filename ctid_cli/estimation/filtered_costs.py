@@ -12,7 +12,7 @@ from ctid_cli.estimation.stability import reflect_unstable
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.spectra import HeldSpectrum, lowpass_weight, record_spectra
 from ctid_cli.filtering.spectral_kernels import least_cost, projected_moments
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.signals.record import Record
 
 #: Highest frequency, as a multiple of the highest cut-off: a filter of order 10 passes 3e-4 of the power there.

@@ -17,9 +17,9 @@ from ctid_cli.estimation.optimum.pilot import liveliest_parts
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.output_error import Layout
 from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
-from ctid_cli.inference.answer import output_bandwidth
-from ctid_cli.inference.faults import outliers
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.input_response import output_bandwidth
+from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.inference.signal_features import outliers
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, Offset, OutputHold

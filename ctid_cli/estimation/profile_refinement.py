@@ -13,8 +13,8 @@ from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.output_error import Layout, sensitivities
-from ctid_cli.inference.loss import Weighting
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.robust_loss import Weighting
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 
 #: Random starts, so many and so many for each pole.

@@ -14,7 +14,7 @@ from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.sampled_problem import CUTOFFS, at_known_delay, least_squares_starts
 from ctid_cli.filtering.lowpass import Lowpass
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.sensitivities import Structure
 
 #: Local minima of the profile that are refined.
 MINIMA = 3

@@ -22,8 +22,7 @@ from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.submodels import InitialState
 from ctid_cli.inference.derived import additive_derived
 from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.quantile import normal_quantile
-from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.inference.intervals import UncertainValue, normal_quantile
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Term, names_of
 from ctid_cli.models.factoring import unfactored

@@ -19,14 +19,11 @@ from ctid_cli.estimation.output_error import Layout, sensitivities
 from ctid_cli.estimation.profile_refinement import Refinement
 from ctid_cli.estimation.profile_search import Profile, search_delay
 from ctid_cli.estimation.robust_fit import RobustFit, robust_fit
-from ctid_cli.inference.bootstrap import Progress
-from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.later import FilledLater
-from ctid_cli.inference.loss import Loss, Weighting, weighted
-from ctid_cli.inference.robust import nearly_regular
-from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.inference.status import Status
-from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty, estimate_uncertainty
+from ctid_cli.inference.covariance import nearly_regular
+from ctid_cli.inference.fit import FilledLater, Fit, Status
+from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
+from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import InitialState, LossKind, Offset, OutputHold

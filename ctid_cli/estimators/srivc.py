@@ -14,9 +14,8 @@ from ctid_cli.estimation.iteration import StepRule, Steps, iterate
 from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, cutoffs_of, least_squares_starts
 from ctid_cli.estimation.stability import with_stable_denominator
 from ctid_cli.filtering.filter_data import filter_data
-from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Fit, Status
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian

@@ -38,9 +38,8 @@ from ctid_cli.estimation.iteration import GUARDED, Iterated, Steps, Variant, ite
 from ctid_cli.estimation.sampled_problem import SampledProblem, cutoffs_around, least_squares_starts
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
-from ctid_cli.inference.answer import output_bandwidth
-from ctid_cli.inference.fit import Fit, IterationRecord
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Fit, IterationRecord, Status
+from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import OutputHold

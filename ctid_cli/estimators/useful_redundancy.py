@@ -19,10 +19,9 @@ from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.estimators.printed_redundancy import PrintedSearch, printed_search
 from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.filter_set import FilterSet
-from ctid_cli.inference.answer import output_bandwidth
-from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Fit, Status
+from ctid_cli.inference.input_response import output_bandwidth
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import OutputHold

@@ -9,12 +9,17 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.spectra import record_spectra
-from ctid_cli.inference.answer import analyse_answer
-from ctid_cli.inference.input_moves import input_moves
-from ctid_cli.inference.local_polynomial import local_polynomial
-from ctid_cli.inference.periodic_response import find_period, from_periods
-from ctid_cli.inference.response_lines import ResponseLines, hold_factor, images
-from ctid_cli.inference.welch_response import welch
+from ctid_cli.inference.input_response import analyse_answer
+from ctid_cli.inference.signal_features import input_moves
+from ctid_cli.inference.spectral_methods import (
+    ResponseLines,
+    find_period,
+    from_periods,
+    hold_factor,
+    images,
+    local_polynomial,
+    welch,
+)
 from ctid_cli.signals.checks import require_choice, require_integer
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record, named

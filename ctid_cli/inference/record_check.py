@@ -7,13 +7,11 @@ from typing import Any, Literal
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.answer import Answer, DelayHint, analyse_answer, regular_grid
-from ctid_cli.inference.faults import outliers, quantum, saturated
-from ctid_cli.inference.input_moves import InputMoves, input_moves
+from ctid_cli.inference.input_response import Answer, DelayHint, analyse_answer, regular_grid
+from ctid_cli.inference.signal_features import InputMoves, input_moves, outliers, quantum, saturated
 from ctid_cli.signals.record import Record
 
 Level = Literal["ok", "note", "warning", "problem"]
-
 #: From the best to the worst.
 LEVELS: tuple[Level, ...] = ("ok", "note", "warning", "problem")
 #: An interval longer than this many median intervals is a gap.

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctid_cli.inference import record_check
-from ctid_cli.inference.answer_test import AnswerTest, answer_test
 from ctid_cli.inference.record_check import Examined, Finding, Level, RecordReport
+from ctid_cli.inference.response_test import AnswerTest, answer_test
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from ctid_cli.text import listed

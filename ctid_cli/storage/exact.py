@@ -14,7 +14,7 @@ from typing import Any, Literal, NoReturn, Union, get_args, get_origin, get_type
 import numpy as np
 
 from ctid_cli.errors import DataError
-from ctid_cli.inference.later import FilledLater
+from ctid_cli.inference.fit import FilledLater
 
 #: Numbers that JSON does not have.
 _NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}

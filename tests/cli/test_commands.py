@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from ctid_cli.inference import precision
+from ctid_cli.inference import monte_carlo
 
 COMMANDS = ["init", "run", "status", "table", "show", "export", "validate", "schema"]
 
@@ -82,7 +82,7 @@ def test_validate_counts_the_work(ctid, tiny):
 
 
 def test_a_run_until_it_is_precise_says_how_far_it_is(ctid, tiny, tmp_path, monkeypatch):
-    monkeypatch.setattr(precision, "AT_LEAST", 4)
+    monkeypatch.setattr(monte_carlo, "AT_LEAST", 4)
     until = "seed: 1, until: {percent_half_width: 49, rmse_relative: 0.45}, at_most: 200"
     tiny.write_text(tiny.read_text(encoding="utf-8").replace("runs: 2, seed: 1", until), encoding="utf-8")
     option = ("--out", tmp_path / "results")

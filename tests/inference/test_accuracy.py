@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ctid_cli.inference.accuracy import ParameterAccuracy
+from ctid_cli.inference.bounds import ParameterAccuracy
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import factored, factored_jacobian, unfactored, unfactored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.inference.derived import additive_derived, derived_parameters
-from ctid_cli.inference.quantile import normal_quantile
+from ctid_cli.inference.intervals import normal_quantile
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import factored, factored_jacobian, unfactored, unfactored_jacobian
 

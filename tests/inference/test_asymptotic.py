@@ -6,8 +6,8 @@ from scipy.signal import cont2discrete, lfilter, tf2ss
 
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.inference.asymptotic import WHITE, limiting_accuracy, output_variance, require_uncorrelated_input
-from ctid_cli.inference.finite_record import sensitivities
+from ctid_cli.inference.bounds import WHITE, limiting_accuracy, output_variance, require_uncorrelated_input
+from ctid_cli.inference.sensitivities import sensitivities
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import factored, factored_jacobian, unfactored

@@ -5,9 +5,8 @@ import pytest
 from scipy.linalg import matmul_toeplitz
 from scipy.stats import chi2
 
-from ctid_cli.inference.beside import ROWS, Rest, SideBySide, constant, orthonormal, rest_of
-from ctid_cli.inference.noise_model import NoiseModel
-from ctid_cli.inference.residuals import dependence
+from ctid_cli.inference.noise_model import ROWS, NoiseModel
+from ctid_cli.inference.residual_tests import Rest, SideBySide, constant, dependence, orthonormal, rest_of
 
 RNG = np.random.default_rng(5)
 

@@ -5,9 +5,8 @@ import numpy as np
 from ctid_cli.filtering.bank import second_moments
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.conditioning import describe_conditioning
-from ctid_cli.inference.covariance import condition_number, white_noise_covariance
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.covariance import condition_number, describe_conditioning, white_noise_covariance
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.excitation import Prbs
 from ctid_cli.signals.record import Record

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.finite_record import cramer_rao_bound
+from ctid_cli.inference.bounds import cramer_rao_bound
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.excitation import Prbs
 from ctid_cli.signals.held import HeldSignal

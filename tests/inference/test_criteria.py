@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from ctid_cli.inference.criteria import information_criteria, r_t_squared, young_information_criterion
-from ctid_cli.inference.diagnostics import r_squared
+from ctid_cli.inference.criteria import information_criteria, r_squared, r_t_squared, young_information_criterion
 
 
 def test_information_criteria_by_hand():

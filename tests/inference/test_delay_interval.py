@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import f, t
 
-from ctid_cli.inference.delay_interval import CostOfDelay
-from ctid_cli.inference.quantile import student_quantile
+from ctid_cli.inference.intervals import CostOfDelay, student_quantile
 
 
 def profile_likelihood_interval(squared_error_at, estimate, smallest, count, parameters, bounds, level=0.95, **more):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from ctid_cli.inference.faults import growth_time, outliers, residual_outliers, saturated, stood_still
+from ctid_cli.inference.signal_features import growth_time, outliers, residual_outliers, saturated, stood_still
 
 
 def test_one_sample_in_twenty_may_be_wild():

@@ -5,9 +5,9 @@ import pytest
 from scipy.linalg import toeplitz
 
 from ctid_cli.filtering.sampled import simulate_additive
-from ctid_cli.inference.asymptotic import limiting_accuracy
+from ctid_cli.inference.bounds import cramer_rao_bound, finite_record_covariance, limiting_accuracy
 from ctid_cli.inference.covariance import white_noise_covariance
-from ctid_cli.inference.finite_record import cramer_rao_bound, finite_record_covariance, sensitivities
+from ctid_cli.inference.sensitivities import sensitivities
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
 from ctid_cli.signals.held import HeldSignal

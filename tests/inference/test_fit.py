@@ -9,10 +9,9 @@ from ctid_cli.estimators.additive_srivc import AdditiveFit
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.useful_redundancy import RedundantFit
 from ctid_cli.frequency.tracking import FrequencyTrack
-from ctid_cli.inference.diagnostics import fit_percent, r_squared
-from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.criteria import fit_percent, r_squared
+from ctid_cli.inference.fit import Fit, Status
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record

@@ -6,7 +6,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.input_dependence import input_dependence
+from ctid_cli.inference.residual_tests import input_dependence
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record

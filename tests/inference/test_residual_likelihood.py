@@ -7,10 +7,9 @@ from scipy.optimize import approx_fprime
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from ctid_cli.inference.noise_model import NoiseModel
-from ctid_cli.inference.quantile import student_quantile
-from ctid_cli.inference.residual_likelihood import _products, fit_residual_noise, levinson, restricted_likelihood
-from ctid_cli.inference.robust import robust_covariance
+from ctid_cli.inference.covariance import robust_covariance
+from ctid_cli.inference.intervals import student_quantile
+from ctid_cli.inference.noise_model import NoiseModel, _products, fit_residual_noise, levinson, restricted_likelihood
 
 
 def slow_rows(count, rng, columns=3):

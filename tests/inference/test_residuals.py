@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from ctid_cli.inference.residuals import residual_tests
+from ctid_cli.inference.residual_tests import residual_tests
 
 
 def test_whiteness_by_hand():

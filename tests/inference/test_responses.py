@@ -9,9 +9,8 @@ import pytest
 from ctid_cli import AdditiveModel, HeldSignal, Submodel, TransferFunction
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.estimators.additive_srivc import AdditiveFit
-from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.parametric import Parametric
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Fit, Status
+from ctid_cli.inference.sensitivities import Parametric
 
 NUMBERS = (Status.CONVERGED, 0.1, 90.0, 0.99, 100, 3, 12.0)
 T = np.linspace(0.0, 10.0, 101)

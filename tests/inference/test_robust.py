@@ -5,9 +5,8 @@ import pytest
 from scipy.linalg import block_diag, toeplitz
 from scipy.signal import lfilter
 
-from ctid_cli.inference.covariance import white_noise_covariance
-from ctid_cli.inference.residual_likelihood import fit_residual_noise
-from ctid_cli.inference.robust import robust_covariance
+from ctid_cli.inference.covariance import robust_covariance, white_noise_covariance
+from ctid_cli.inference.noise_model import fit_residual_noise
 
 
 def regressors(count, seed=0, pole=0.95):

@@ -14,8 +14,8 @@ from ctid_cli.estimators.identification import identify
 from ctid_cli.estimators.srivc import Srivc
 from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.quantile import student_quantile
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Status
+from ctid_cli.inference.intervals import student_quantile
 from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.reporting.estimate import parameters

@@ -20,10 +20,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.filtering import kernels
 from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, Modes, Place, chain_states, modal_pass
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.filtering.realisation import exponential_minus_identity, transitions
-from ctid_cli.filtering import kernels
 
 #: Samples that are filtered at a time, which bounds the memory of a long record.
 PIECE = 4096

@@ -56,12 +56,12 @@ class Columns(NamedTuple):
 
     @property
     def free_z(self) -> slice:
-        """z of the free response."""
+        """Z of the free response."""
         return slice(self.u + 2, self.u + 2 + self.n)
 
     @property
     def free_states(self) -> slice:
-        """z and w of the free response."""
+        """Z and w of the free response."""
         return slice(self.u + 2, self.size - self.offset)
 
     @property

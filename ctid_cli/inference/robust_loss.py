@@ -15,8 +15,8 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.inference.later import FilledLater
-from ctid_cli.inference.quantile import robust_deviation
+from ctid_cli.inference.fit import FilledLater
+from ctid_cli.inference.intervals import robust_deviation
 
 #: The losses that are not squares.
 RobustKind = Literal["huber", "tukey"]

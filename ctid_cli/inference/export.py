@@ -7,8 +7,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
-from ctid_cli.inference.bands import SystemWithDelay
-from ctid_cli.inference.responses import Estimated
+from ctid_cli.inference.model_responses import Estimated, SystemWithDelay
 from ctid_cli.models.transfer_function import TransferFunction
 
 #: What MATLAB calls units of time, by the labels that files use.

@@ -1,5 +1,6 @@
 """Tests of the residuals: whether they are white, and whether they still depend on the input."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -7,9 +8,85 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.beside import Rest, Rows, SideBySide, constant, row_blocks
-from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
-from ctid_cli.inference.quantile import chi_square_tail, normal_quantile
+from ctid_cli.inference.intervals import normal_quantile, robust_deviation
+from ctid_cli.inference.noise_model import NoiseModel, Rows, autoregress, fit_noise_model, row_blocks
+from ctid_cli.signals.record import Record
+
+
+def normal_tail(z: float) -> float:
+    """Probability that a standard normal variable exceeds z."""
+    return 0.5 * math.erfc(z / math.sqrt(2.0))
+
+
+def chi_square_tail(degrees_of_freedom: int, x: float) -> float:
+    """Probability that a chi-square variable exceeds x."""
+    from scipy.special import chdtrc
+
+    return float(chdtrc(degrees_of_freedom, x))
+
+
+@dataclass(frozen=True, eq=False)
+class SideBySide:
+    """The columns of several."""
+
+    parts: tuple[Rows, ...]
+
+    def __len__(self) -> int:
+        return len(self.parts[0])
+
+    def __getitem__(self, rows: slice, /) -> Array:
+        return np.column_stack([part[rows] for part in self.parts])
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """What others leave of columns, by least squares."""
+
+    columns: Rows
+    beside: Rows
+    weights: Array
+
+    @classmethod
+    def of(cls, columns: Rows, beside: Rows) -> "Rest":
+        """Project columns on others."""
+        combined = orthonormal(beside)
+        along = [(beside[rows] @ combined).T @ columns[rows] for rows in row_blocks(len(beside))]
+        return cls(columns, beside, combined @ np.sum(along, axis=0))
+
+    def __len__(self) -> int:
+        return len(self.columns)
+
+    def __getitem__(self, rows: slice, /) -> Array:
+        rest: Array = self.columns[rows] - self.beside[rows] @ self.weights
+        return rest
+
+
+def constant(count: int) -> Array:
+    """A column of ones that takes no memory."""
+    return np.broadcast_to(1.0, (count, 1))
+
+
+def rest_of(e: Array, beside: Rows) -> Array:
+    """What columns leave of one."""
+    rest = Rest.of(e[:, None], beside)
+    return np.concatenate([rest[rows][:, 0] for rows in row_blocks(e.size)])
+
+
+def orthonormal(columns: Rows, least: float | None = None) -> Array:
+    """Weights with which columns become orthonormal ones of the same span, shape (columns, rank).
+
+    Directions with less than a least share of the largest singular value are rounding.
+    """
+    triangle = columns[:0]
+    for rows in row_blocks(len(columns)):
+        triangle = np.asarray(np.linalg.qr(np.vstack((triangle, columns[rows])), mode="r"))
+    lengths = np.linalg.norm(triangle, axis=0)
+    # A column of zeros has no length to divide by: the rounding of its weights would grow beyond bounds.
+    lengths[lengths == 0] = 1.0
+    _, values, vectors = np.linalg.svd(triangle / lengths, full_matrices=False)
+    kept = values > (len(columns) * np.finfo(float).eps if least is None else least) * values[0]
+    return np.asarray(vectors[kept].T / values[kept] / lengths[:, None])
+
 
 #: Fewer residuals than this are not tested.
 FEWEST_TESTED = 20
@@ -186,3 +263,119 @@ def dependence(e: Array, columns: Rows, noise: NoiseModel, beside: Rows) -> Depe
     statistic = float(np.sum((vectors[:, kept].T @ products) ** 2 / values[kept]))
     freedom = int(kept.sum())
     return Dependence(statistic, freedom, chi_square_tail(freedom, statistic) if freedom else np.nan)
+
+
+#: Inputs looked at, in sampling intervals: before the instant at which the model uses them, and after the residual.
+PAST, FUTURE = 25, 10
+#: A delay that is too long leaves out inputs this many intervals later.
+LATE = 3
+#: Time constants of a further pole, from the sampling interval to this fraction of the record.
+TRIED, LONGEST = 6, 0.2
+#: Earlier inputs and simulated outputs from which a controller's next move is told, and the delays of its answer.
+ORDER, ANSWERS = 4, 3
+#: Steps of the robust regression, and the residual in robust standard deviations from which on it counts no more.
+REWEIGHTED, CLIPPED = 8, 1.5
+
+
+@dataclass(frozen=True)
+class InputDependence:
+    """Probabilities of a dependence like this if there is none [-]."""
+
+    #: Of the residuals on what one more pole, and a zero, would add to the output.
+    pole_p_value: float
+    #: Share of the variance of the residuals that these would explain [-].
+    pole_share: float
+    #: Of the input on residuals before it, and the share of these that its moves foretell.
+    feedback_p_value: float
+    feedback_share: float
+
+
+def input_dependence(e: Array, x: Array, psi: Array, t: Array, record: Record, delay: float) -> InputDependence | None:
+    r"""Test residuals at instants t against earlier and later inputs; None in too short a record.
+
+    Earlier and later count the samples, whose instants are those at which a controller acts.
+
+    The model is contained in that with one more pole and zero, ``B (s + z) / (A (s + p))`` with z = p; its derivative
+    there is the simulated output x behind ``1/(s + p)``, and a few p span what a pole could add.
+
+    Later inputs are freed of what earlier ones tell of them (Sims' test of causality): dynamics that the model misses
+    correlate the residuals with the future of an input that is correlated itself, but only by way of its past.
+    """
+    interval = float(np.median(np.diff(record.t)))
+    past, future = min(PAST, t.size // 8), min(FUTURE, t.size // 16)
+    inside = slice(int(np.searchsorted(t, record.t[0] + delay)) + past, t.size - future)
+    if future < ORDER or inside.stop - inside.start < 2 * (past + future + psi.shape[1]):
+        return None
+    behind = _behind_a_pole(x - x[0], np.geomspace(1.0, LONGEST * t.size, TRIED))
+    e, x, psi = e[inside] - e[inside].mean(), x[inside], psi[inside]
+    noise = fit_noise_model([e])
+    if not noise.innovation_variance > 0:
+        return None
+    beside = SideBySide((constant(e.size), psi))
+    pole = dependence(e, behind[inside], noise, beside)
+    share = 1.0 - _power(rest_of(e, SideBySide((beside, behind[inside])))) / _power(rest_of(e, beside))
+    del behind  # as large as all that follows
+
+    def inputs(shift: float, steps: range) -> Array:
+        """A look at the input so many samples from each residual, without a copy for every column."""
+        values = record.input.at(t - shift) - record.input.mean
+        looks = np.lib.stride_tricks.sliding_window_view(values, len(steps))
+        return looks[inside.start + min(steps) : inside.stop + min(steps), :: steps.step]
+
+    earlier = inputs(delay, range(min(LATE, int(delay / interval)), -past, -1))
+    known = SideBySide((beside, earlier))
+    # Between its samples an input along straight lines has moved before the residual.
+    first = 0 if record.input.hold == "zoh" else 1
+    later = dependence(e, inputs(0.0, range(first, first + future)), noise, known)
+    found = [(later.p_value, (later.statistic - later.freedom) / e.size)] if later.freedom else []
+    if not first:
+        z = _answer_at_once(rest_of(e, known), x, inputs(0.0, range(0, -ORDER - 1, -1)))
+        found.append((2 * ANSWERS * normal_tail(z), z * z / e.size))
+    likely, told = min(found, default=(1.0, 0.0))
+    return InputDependence(pole.p_value, share, min(1.0, len(found) * likely), told)
+
+
+def _answer_at_once(e: Array, x: Array, u: Array) -> float:
+    """How far the input moves with residuals of the last instants, in standard deviations of what chance gives.
+
+    What the input and the simulated output were does not tell all moves: those of a reference that is held are rare
+    and large, and would drown the answer to the noise. So they are clipped. Residuals that are white and independent
+    of the input are independent of any function of it.
+    """
+    blocks, inputs = list(row_blocks(e.size - ORDER)), u[ORDER:]
+    outputs = np.lib.stride_tricks.sliding_window_view(x, ORDER)[1:]
+    before = SideBySide((constant(len(inputs)), inputs[:, 1:], outputs))
+    weights = orthonormal(before, 1e-10)
+    now = rest = inputs[:, 0]
+    weight = np.ones(now.size)
+    for _ in range(REWEIGHTED):
+        gram, products = np.zeros((weights.shape[1],) * 2), np.zeros(weights.shape[1])
+        for rows in blocks:
+            basis = before[rows] @ weights
+            weighted = weight[rows, None] * basis
+            gram += weighted.T @ basis
+            products += weighted.T @ now[rows]
+        moving = weights @ np.linalg.lstsq(gram, products)[0]
+        rest = np.concatenate([now[rows] - before[rows] @ moving for rows in blocks])
+        scale = robust_deviation(rest)
+        if not scale > 1e-9 * float(np.ptp(now)):
+            return 0.0
+        weight = 1.0 / np.maximum(np.abs(rest) / scale, 1.0)
+    moves = np.clip(rest / scale, -CLIPPED, CLIPPED)
+    white = fit_noise_model([e]).innovations(e)
+    scores = [moves * white[ORDER - k : e.size - k] for k in range(ANSWERS)]
+    return max(abs(float(score.sum())) / float(np.sqrt(score @ score)) for score in scores)
+
+
+def _behind_a_pole(x: Array, time_constants: Array) -> Array:
+    """Samples behind first-order filters with the given time constants in samples."""
+    columns = np.empty((x.size, time_constants.size))
+    for column, p in zip(columns.T, np.exp(-1.0 / time_constants), strict=True):
+        behind = (1.0 - p) * x[:, None]
+        autoregress(behind, np.array([1.0, -p]))
+        column[:] = behind[:, 0]
+    return columns
+
+
+def _power(e: Array) -> float:
+    return float(e @ e)

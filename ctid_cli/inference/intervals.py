@@ -1,9 +1,78 @@
-"""Confidence interval of the delay from the profile of the cost."""
+"""Quantiles, estimates with their intervals, and the interval of the delay from the profile of the cost."""
 
+from __future__ import annotations
+
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
+
+from ctid_cli.arrays import Array
+
+
+def normal_quantile(level: float = 0.95) -> float:
+    """Half the width of a two-sided interval of that probability [standard errors]."""
+    return NormalDist().inv_cdf(0.5 + level / 2)
+
+
+def student_quantile(degrees_of_freedom: float, level: float = 0.95) -> float:
+    """The same where the standard error itself is known only as well as these degrees of freedom tell."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(degrees_of_freedom, 0.5 + level / 2))
+
+
+def robust_deviation(x: Array) -> float:
+    """Standard deviation from the median size of values about zero, which outliers hardly change."""
+    return 1.4826 * float(np.median(np.abs(x)))
+
+
+#: Standard errors to each side of a normal estimate.
+NORMAL = normal_quantile()
+#: Why a fit that ignores the loop of its record has no standard errors.
+BIASED = (
+    "There are no standard errors: the input answers to the output through a loop that this fit ignores, and the "
+    "residuals are coloured, so that the estimate is biased."
+)
+
+
+@dataclass(frozen=True)
+class UncertainValue:
+    """An estimate with its accuracy, all in its unit; NaN stands for what is not defined."""
+
+    name: str
+    estimate: float
+    standard_error: float = math.nan
+    #: Confidence interval.
+    low: float = math.nan
+    high: float = math.nan
+    unit: str = ""
+    #: Of a parameter: free, fixed, at bound or undetermined.
+    status: str = "free"
+    #: Why there is no standard error.
+    reason: str = ""
+
+    @classmethod
+    def symmetric(
+        cls,
+        name: str,
+        estimate: float,
+        standard_error: float,
+        unit: str = "",
+        quantile: float = NORMAL,
+        reason: str = "",
+    ) -> UncertainValue:
+        """An interval that reaches so many standard errors to both sides."""
+        reach = quantile * standard_error
+        return cls(name, estimate, standard_error, estimate - reach, estimate + reach, unit, reason=reason)
+
+    @property
+    def relative_percent(self) -> float:
+        """Standard error relative to the estimate [%]."""
+        return 100 * self.standard_error / abs(self.estimate) if self.estimate else math.nan
+
 
 #: The rise of the cost two standard errors away is called quadratic if its square root is right to this share.
 QUADRATIC_TOLERANCE = 0.1

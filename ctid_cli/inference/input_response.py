@@ -1,4 +1,4 @@
-"""What a record shows of the answer of the output to its input, before any model: its band and its delay."""
+"""Bandwidth and delay of the response to the input, from a record without a model."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.inference.faults import outliers
-from ctid_cli.inference.input_moves import InputMoves, input_moves
-from ctid_cli.inference.quantile import robust_deviation
+from ctid_cli.inference.intervals import robust_deviation
+from ctid_cli.inference.signal_features import InputMoves, input_moves, outliers
 from ctid_cli.signals.record import Record
 
 #: Share of the power of the answer that its band holds.

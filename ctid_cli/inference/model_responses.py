@@ -7,24 +7,126 @@ quantiles of what the drawn models answer: it need not be symmetric, and knows w
 what an uncertain delay does to the first instants of a step response.
 """
 
-from collections.abc import Callable, Iterator
+from __future__ import annotations
+
+from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError, UsageError
-from ctid_cli.inference.bands import FrequencyBand, PoleBand, ResponseBand
 from ctid_cli.inference.derived import indistinct
-from ctid_cli.inference.parametric import Model, Parametric
-from ctid_cli.inference.quantile import normal_quantile
+from ctid_cli.inference.sensitivities import Model, Parametric
 from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.signals.checks import require_increasing
 from ctid_cli.signals.held import HeldSignal
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseBand:
+    """A response over time with its pointwise confidence band.
+
+    Parameters
+    ----------
+    t : ndarray, shape (N,)
+        Instants [s].
+    value : ndarray, shape (N,)
+        Response of the estimate [output unit]; of an impulse response per second.
+    standard_error : ndarray, shape (N,)
+        Standard error of each value; NaN where it is not defined.
+    lower, upper : ndarray, shape (N,)
+        Ends of the interval of each instant; a band that holds the whole curve is wider.
+    level : float
+        Confidence level of each interval [-].
+    """
+
+    t: Array = field(repr=False)
+    value: Array = field(repr=False)
+    standard_error: Array = field(repr=False)
+    lower: Array = field(repr=False)
+    upper: Array = field(repr=False)
+    level: float
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyBand:
+    """A frequency response with pointwise confidence bands of gain and phase.
+
+    Parameters
+    ----------
+    frequencies : ndarray, shape (N,)
+        Angular frequencies [rad/s].
+    value : ndarray of complex, shape (N,)
+        ``G(j w)`` of the estimate, delay included [output unit/input unit].
+    covariance : ndarray, shape (N, 2, 2)
+        Covariance of real and imaginary part: ellipses of a Nyquist plot.
+    gain : ndarray, shape (N,)
+        ``|G|`` [output unit/input unit].
+    gain_error, gain_lower, gain_upper : ndarray, shape (N,)
+        Its standard error and the ends of its interval, never below zero.
+    phase : ndarray, shape (N,)
+        Phase [rad], continuous over the frequency.
+    phase_error, phase_lower, phase_upper : ndarray, shape (N,)
+        Its standard error and the ends of its interval [rad].
+    level : float
+        Confidence level of each interval [-].
+    """
+
+    frequencies: Array = field(repr=False)
+    value: ComplexArray = field(repr=False)
+    covariance: Array = field(repr=False)
+    gain: Array = field(repr=False)
+    gain_error: Array = field(repr=False)
+    gain_lower: Array = field(repr=False)
+    gain_upper: Array = field(repr=False)
+    phase: Array = field(repr=False)
+    phase_error: Array = field(repr=False)
+    phase_lower: Array = field(repr=False)
+    phase_upper: Array = field(repr=False)
+    level: float
+
+
+@dataclass(frozen=True, eq=False)
+class PoleBand:
+    """Poles with their uncertainty.
+
+    Parameters
+    ----------
+    value : ndarray of complex, shape (n,)
+        Poles of the estimate [rad/s].
+    covariance : ndarray, shape (n, 2, 2)
+        Covariance of real and imaginary part [rad^2/s^2]; NaN of a pole that the data cannot tell from another.
+    standard_error : ndarray, shape (n,)
+        ``sqrt(var Re p + var Im p)`` [rad/s].
+    lower, upper : ndarray of complex, shape (n,)
+        Ends of the intervals of real and imaginary part, each by itself [rad/s].
+    reach : ndarray, shape (n,)
+        Axes of the ellipse that holds a complex pole with probability ``level``, over those of the covariance [-].
+    level : float
+        Confidence level [-].
+    """
+
+    value: ComplexArray
+    covariance: Array = field(repr=False)
+    standard_error: Array
+    lower: ComplexArray = field(repr=False)
+    upper: ComplexArray = field(repr=False)
+    reach: Array = field(repr=False)
+    level: float
+
+
+class SystemWithDelay(NamedTuple):
+    """A model as an object of another library."""
+
+    system: Any
+    #: Delay that is not part of the object [s].
+    delay: float
+
 
 #: Whether bands come from a linearisation or from drawn parameters.
 Bands = Literal["linearised", "sampled"]
@@ -40,14 +142,17 @@ class Estimated:
     """A model with the joint law of the parameters of its fit."""
 
     parametric: Parametric
-    #: Of all parameters; NaN throughout where it is not defined, NaN at single ones that are held, shape (p, p).
-    reported: Array
-    #: Standard errors to each side of a quantity with a given gradient, at a level.
-    quantile: Callable[[Array, float], float]
-    #: Whether that is the same for all quantities, which saves asking for each.
-    alike: bool
-    #: Of the t distribution that parameters are drawn from; infinite for the normal one.
-    degrees_of_freedom: float = np.inf
+    law: Uncertainty
+
+    @classmethod
+    def of(cls, model: Model, names: tuple[str, ...], law: Uncertainty) -> Estimated:
+        """Join a model, the names of all parameters of its fit, and their law."""
+        return cls(Parametric(model, names), law)
+
+    @cached_property
+    def reported(self) -> Array:
+        """Covariance of all parameters; NaN where it is not defined or a parameter is held, shape (p, p)."""
+        return self.law.covariance
 
     @cached_property
     def covariance(self) -> Array:
@@ -57,17 +162,16 @@ class Estimated:
             return self.reported
         return np.where(held[:, None] | held, 0.0, self.reported)
 
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Of the t distribution that parameters are drawn from [-]; infinite for the normal one."""
+        return self.law.degrees_of_freedom if self.law.bootstrap is None else np.inf
+
     def deviations(self, slopes: Array) -> Array:
         """Standard errors of quantities from their gradients, shape (N, p)."""
         with np.errstate(invalid="ignore"):
             variances = np.maximum(np.einsum("ni,ij,nj->n", slopes, self.covariance, slopes), 0.0)
         return np.asarray(np.sqrt(variances))
-
-    def reach(self, slopes: Array, level: float) -> Array:
-        """Standard errors to each side of these quantities."""
-        if self.alike:
-            return np.full(len(slopes), self.quantile(slopes[0], level)) if len(slopes) else np.zeros(0)
-        return np.array([self.quantile(row, level) for row in slopes])
 
     def draws(self) -> Iterator[Parametric]:
         """Models with drawn parameters; those that are none are left out."""
@@ -80,18 +184,6 @@ class Estimated:
         for change in normal @ (vectors * np.sqrt(np.maximum(values, 0.0))).T:
             with suppress(DataError):
                 yield self.parametric.at(change)
-
-
-def with_covariance(model: Model, names: tuple[str, ...], covariance: Array) -> Estimated:
-    """A model whose parameters have normal intervals."""
-    return Estimated(Parametric(model, names), covariance, lambda _, level: normal_quantile(level), alike=True)
-
-
-def with_uncertainty(model: Model, names: tuple[str, ...], uncertainty: Uncertainty, *, defined: bool) -> Estimated:
-    """A model whose parameters have the intervals of an uncertainty, or none at all."""
-    covariance = uncertainty.covariance if defined else np.full((len(names), len(names)), np.nan)
-    t = uncertainty.degrees_of_freedom if uncertainty.bootstrap is None else np.inf
-    return Estimated(Parametric(model, names), covariance, uncertainty.quantile, uncertainty.bootstrap is None, t)
 
 
 def simulated(
@@ -123,7 +215,10 @@ def frequency_response(found: Estimated, frequencies: ArrayLike | None, level: f
         relative = slopes / value[:, None]
     gain_error, phase_error = found.deviations(relative.real), found.deviations(relative.imag)
     if bands == "linearised" or not np.isfinite(found.covariance).all():
-        wide, turn = found.reach(relative.real, level) * gain_error, found.reach(relative.imag, level) * phase_error
+        wide, turn = (
+            found.law.reach(relative.real, level) * gain_error,
+            found.law.reach(relative.imag, level) * phase_error,
+        )
         lower, upper, low_phase, high_phase = gain * np.exp(-wide), gain * np.exp(wide), phase - turn, phase + turn
     else:
         drawn = np.array([one.model.frequency_response(w) for one in found.draws()])
@@ -147,11 +242,11 @@ def poles(found: Estimated, level: float) -> PoleBand:
     covariance = np.einsum("nki,ij,nlj->nkl", parts, found.covariance, parts)
     for k in range(value.size):
         others = np.arange(value.size) != k
-        if indistinct(value, k, slopes[k], others, found.covariance, lambda row: found.quantile(row, level)):
+        if indistinct(value, k, slopes[k], others, found.covariance, lambda row: found.law.quantile(row, level)):
             covariance[k] = np.nan
     with np.errstate(invalid="ignore"):
         errors = np.sqrt(np.maximum(np.einsum("nkk->nk", covariance), 0.0))
-    half = found.reach(slopes.real, level) * errors[:, 0] + 1j * found.reach(slopes.imag, level) * errors[:, 1]
+    half = found.law.reach(slopes.real, level) * errors[:, 0] + 1j * found.law.reach(slopes.imag, level) * errors[:, 1]
     reach = np.full(value.size, _ellipse(level, found.degrees_of_freedom))
     return PoleBand(value, covariance, np.hypot(*errors.T), value - half, value + half, reach, level)
 
@@ -166,7 +261,7 @@ def _over_time(
     value, slopes = model.simulated(signal, t), model.output_slopes(signal, t)
     errors = found.deviations(slopes)
     if bands == "linearised" or not np.isfinite(found.covariance).all():
-        half = found.reach(slopes, level) * errors
+        half = found.law.reach(slopes, level) * errors
         lower, upper = value - half, value + half
     else:
         behind = (one.derivative if model.differentiated else one for one in found.draws())
