@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import comb
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.estimation.delay_search import Minimum
@@ -93,7 +94,7 @@ class FilteredCosts(NamedTuple):
 
         ``A Y = B U + T`` divided by the filter F reads ``Y = -sum (a_i - f_i) (jw)^(n-i)/F Y + B/F U + T/F``.
         """
-        svf = np.poly(np.full(self.poles, -cutoff))
+        svf = comb(self.poles, np.arange(self.poles + 1)) * cutoff ** np.arange(self.poles + 1)
         gram, _ = projected_moments(*data, svf, np.zeros(self.zeros + 1))
         lengths = np.diag(gram)
         solved, theta = solve_scaled(gram, gram[:, -1], lengths, lengths, self.size - 1)
