@@ -38,6 +38,8 @@ class FilteredCosts(NamedTuple):
     spreads: Array
     poles: int
     zeros: int
+    #: Poles at the origin besides; with any the mean is left out.
+    integrators: int
     #: How hard to work at each delay.
     steps: Steps
 
@@ -72,6 +74,8 @@ class FilteredCosts(NamedTuple):
 
     def inputs(self, delay: float, reach: int) -> ComplexArray:
         """Spectrum of the delayed input at the first frequencies."""
+        if self.integrators:
+            return self.input.at(delay, np.ones(reach))[1:]
         return self.input.at(delay, np.ones(reach - 1))
 
     def least(self, k: int, inputs: ComplexArray, delay: float, starts: Iterable[Array], own: bool) -> Minimum:
@@ -84,7 +88,7 @@ class FilteredCosts(NamedTuple):
             tried += [] if start is None else [start]
         best = Minimum(np.zeros(self.size), np.inf)
         for start in tried:
-            theta, squared_error, step = least_cost(*data, start, self.poles, *self.effort)
+            theta, squared_error, step = least_cost(*data, start, self.poles, self.integrators, *self.effort)
             if squared_error < best.squared_error:
                 best = Minimum(np.append(theta, delay), squared_error, step)
         return best
@@ -95,7 +99,7 @@ class FilteredCosts(NamedTuple):
         ``A Y = B U + T`` divided by the filter F reads ``Y = -sum (a_i - f_i) (jw)^(n-i)/F Y + B/F U + T/F``.
         """
         svf = comb(self.poles, np.arange(self.poles + 1)) * cutoff ** np.arange(self.poles + 1)
-        gram, _ = projected_moments(*data, svf, np.zeros(self.zeros + 1))
+        gram, _ = projected_moments(*data, svf, np.zeros(self.zeros + 1), self.integrators)
         lengths = np.diag(gram)
         solved, theta = solve_scaled(gram, gram[:, -1], lengths, lengths, self.size - 1)
         if not solved:
@@ -139,13 +143,14 @@ def filtered_costs(
     start: float,
     svf_cutoffs: Array,
     steps: Steps,
+    integrators: int = 0,
 ) -> FilteredCosts:
     """Costs of one record behind filters; samples earlier than ``start`` after the first input are not used."""
     highest = HIGHEST * max(lowpass.cutoff for lowpass in lowpasses)
-    spectra = record_spectra(record, start, highest, greatest_delay)
+    spectra = record_spectra(record, start, highest, greatest_delay, keep_mean=integrators == 0)
     w = spectra.frequencies
     weights = np.array([lowpass_weight(w, lowpass) for lowpass in lowpasses])
     reach = (weights >= NEGLIGIBLE_WEIGHT * weights.max(axis=1, keepdims=True)).sum(axis=1)
     spreads = weights @ (np.where(w > 0.0, 2.0, 0.0) * np.abs(spectra.outputs) ** 2)
-    sizes = structure.poles, structure.zeros
+    sizes = structure.poles, structure.zeros, integrators
     return FilteredCosts(w, spectra.outputs, spectra.input, weights, reach, svf_cutoffs, spreads, *sizes, steps)

@@ -260,24 +260,33 @@ def _transient(w: Array, power: Array, remainder: ComplexArray, n: int) -> tuple
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def projected_moments(
-    frequencies: Array, outputs: ComplexArray, inputs: ComplexArray, weights: Array, a: Array, b: Array
+    frequencies: Array,
+    outputs: ComplexArray,
+    inputs: ComplexArray,
+    weights: Array,
+    a: Array,
+    b: Array,
+    integrators: int,
 ) -> tuple[Array, float]:
     """Moments of the columns (dx/da, dx/db, dx/dtau, eps), the transient projected out of all.
 
-    Every column is ``(jw)^r/A`` times a signal: dx/da takes the model's output, or where B is zero the measured one,
-    dx/db the input, dx/dtau ``jw B U``. All products of columns are therefore sums of powers of w times few products of
-    signals, as in a Hankel matrix. Also returns the power of the model's output.
+    Every column is ``(jw)^r/(p^l A)`` times a signal: dx/da takes the model's output, or where B is zero the measured
+    one, dx/db the input, dx/dtau ``jw B U``. All products of columns are therefore sums of powers of w times few
+    products of signals, as in a Hankel matrix. Also returns the power of the model's output. With integrators no
+    frequency may be zero.
     """
     n, m, count = a.size - 1, b.size - 1, inputs.size
+    order = n + integrators
     # In units of the highest frequency powers of w stay below one.
     unit = frequencies[count - 1] if frequencies[count - 1] > 0.0 else 1.0
     size, measured = n + m + 3, True
-    den, num, scale = np.ones(n + 1), np.empty(m + 1), np.ones(size)
+    den, num, scale = np.zeros(order + 1), np.empty(m + 1), np.ones(size)
+    den[0] = 1.0
     for i in range(1, n + 1):
         den[i] = a[i] / unit**i
         scale[i - 1] = unit ** (-i)
     for j in range(m + 1):
-        scale[n + j] = unit ** (m - n - j)
+        scale[n + j] = unit ** (m - order - j)
         num[j] = b[j] * scale[n + j]
         measured = measured and b[j] == 0.0
     scale[n + m + 1] = unit
@@ -294,10 +303,10 @@ def projected_moments(
         power[k] = side[k] * gain
         drive[k] = _at(num, w[k]) * inputs[k]
         remainder[k] = at * outputs[k] - drive[k]
-    factor, polynomial = _transient(w, power, remainder, n)
+    factor, polynomial = _transient(w, power, remainder, order)
 
     # Power sums of the products of all pairs of signals.
-    sums = np.zeros((2 * n - 1, PAIRS))
+    sums = np.zeros((2 * order - 1, PAIRS))
     signals, re, im = np.ones(5, np.complex128), np.empty(PAIRS), np.empty(PAIRS)
     output_power = 0.0
     for k in range(count):
@@ -315,7 +324,7 @@ def projected_moments(
                 im[lane] = signals[i].real * signals[j].imag - signals[i].imag * signals[j].real
                 lane += 1
         scaled = power[k]
-        for q in range(2 * n - 1):
+        for q in range(2 * order - 1):
             part = re if q % 2 == 0 else im
             for lane in range(PAIRS):
                 sums[q, lane] += scaled * part[lane]
@@ -324,22 +333,22 @@ def projected_moments(
     # Signal, power of jw and sign of every column.
     signal, exponent, sign = np.empty(size, np.int64), np.zeros(size, np.int64), np.ones(size)
     for i in range(n):
-        signal[i], exponent[i], sign[i] = OUTPUT, n - 1 - i, -1.0
+        signal[i], exponent[i], sign[i] = OUTPUT, order - 1 - i, -1.0
     for j in range(m + 1):
         signal[n + j], exponent[n + j] = INPUT, m - j
     signal[n + m + 1], sign[n + m + 1] = DRIVE, -1.0
     signal[size - 1] = ERROR
 
-    projected = np.zeros((size, n))
+    projected = np.zeros((size, order))
     for j in range(size - 1):  # the error is orthogonal to the transient already
-        for i in range(n):
+        for i in range(order):
             projected[j, i] = sign[j] * _product(sums, _lane(ONE, signal[j]), i, exponent[j])
         _forward(factor, projected[j])
     gram = np.empty((size, size))
     for i in range(size):
         for j in range(i, size):
             total = sign[i] * sign[j] * _product(sums, _lane(signal[i], signal[j]), exponent[i], exponent[j])
-            for h in range(n):
+            for h in range(order):
                 total -= projected[i, h] * projected[j, h]
             gram[i, j] = total * scale[i] * scale[j]
             gram[j, i] = gram[i, j]
@@ -446,6 +455,7 @@ def least_cost(
     weights: Array,
     start: Array,
     poles: int,
+    integrators: int,
     max_iterations: int,
     tolerance: float,
     halvings: int,
@@ -462,11 +472,11 @@ def least_cost(
     for i in range(poles):
         denominator[i + 1] = start[i]
     # At a zero numerator the output error is what B explains: one step is the minimum.
-    gram, power = projected_moments(frequencies, outputs, inputs, weights, denominator, b)
+    gram, power = projected_moments(frequencies, outputs, inputs, weights, denominator, b, integrators)
     fitted = _solve(gram, gram[:, -1].copy(), free, free - poles, step)
     for i in range(poles, free):
         b[i - poles] = theta[i] = step[i] if fitted else start[i]
-    gram, power = projected_moments(frequencies, outputs, inputs, weights, denominator, b)
+    gram, power = projected_moments(frequencies, outputs, inputs, weights, denominator, b, integrators)
     squared_error = gram[free + 1, free + 1]
     if not math.isfinite(squared_error):
         return theta, np.inf, np.nan
@@ -487,7 +497,7 @@ def least_cost(
             for i in range(poles, free):
                 b[i - poles] = theta[i] + fraction * step[i]
             if _is_stable(denominator) or _mirror(denominator):
-                tried, its_power = projected_moments(frequencies, outputs, inputs, weights, denominator, b)
+                tried, its_power = projected_moments(frequencies, outputs, inputs, weights, denominator, b, integrators)
                 bound = squared_error - SUFFICIENT_FALL * 2.0 * fraction * max(slope, 0.0)
                 if tried[free + 1, free + 1] <= bound + ROUNDING * (power + its_power):
                     accepted = True
