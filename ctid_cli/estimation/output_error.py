@@ -12,9 +12,9 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.optimum.box import ANYWHERE, point_of
-from ctid_cli.estimation.optimum.chain import chain_dynamics, numerators
-from ctid_cli.estimation.optimum.projection import Problem, twice
-from ctid_cli.estimation.optimum.triangle import rows_of
+from ctid_cli.estimation.optimum.chain import Chain, chain_dynamics, numerators
+from ctid_cli.estimation.optimum.projection import Problem
+from ctid_cli.estimation.optimum.triangle import Columns, rows_of
 from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 
@@ -82,16 +82,16 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) 
     powers = np.linalg.inv(numerators(point.speed, point.damping))
     direct = b[0] if m == n else 0.0
     output = ((b - direct * a)[1:] if m == n else np.concatenate((np.zeros(n - 1 - m), b))) @ powers
+    columns = Columns.of(n, second=True, free=layout.initial_state, offset=layout.offset)
     result = []
     for k, (data, period) in enumerate(zip(problem.records, problem.periods, strict=True)):
         first = layout.first(k)
         own = theta[first : first + layout.own]
-        state = own[:n] if layout.initial_state else None
-        chain = twice(F, g, output, direct, None if state is None else state @ powers)
+        state = own[:n] if layout.initial_state else np.zeros(n)
+        form = Chain(point.speed, point.damping, F, g, F, g).driving(output, direct, state @ powers)
         # Columns of the rows that are wanted, each a combination of the states, the input and what else stands there.
-        wanted = np.zeros((chain.gain.size + chain.free_start.size + 3, layout.size + 1))
-        states, driven, now = wanted[:n], wanted[n : 2 * n], wanted[2 * n]
-        alone, driven_alone = wanted[2 * n + 1 : 3 * n + 1], wanted[3 * n + 1 : 4 * n + 1]
+        wanted = np.zeros((columns.size, layout.size + 1))
+        states, driven, now, measured = wanted[:n], wanted[n : 2 * n], wanted[columns.u], wanted[columns.u + 1]
         driven[:, :n] = -powers.T
         filtered = powers.T
         coefficients = np.column_stack((-filtered @ a[1:], filtered))[:, n - m :]
@@ -101,12 +101,13 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) 
         if structure.delay:
             states[:, n + m + 1], now[n + m + 1] = -(output @ F), -(output @ g)
         if layout.initial_state:
+            alone, driven_alone = wanted[columns.free_states][:n], wanted[columns.free_states][n:]
             driven_alone[:, :n] = -powers.T
             alone[:, first : first + n] = powers.T
         if layout.offset:
-            wanted[-2, first + layout.own - 1] = 1.0
-        states[:, -1], now[-1], wanted[-1, -1] = -output, -direct, 1.0
+            wanted[-1, first + layout.own - 1] = 1.0
+        states[:, -1], now[-1], measured[-1] = -output, -direct, 1.0
         wanted[:, -1] -= wanted[:, first : first + layout.own] @ own
-        rows = rows_of(chain, point.delay, data, period, wanted)
+        rows = np.vstack([part.T @ wanted for part in rows_of(form, columns, point.delay, data, period)])
         result.append((rows[:, :-1], rows[:, -1].copy()))
     return result

@@ -25,6 +25,8 @@ CLOSE = 0.01
 #: A search is given up for a lower known minimum once the fall that a step promises is, so many times, less than what
 #: parts them (after the first few steps), or once the squared error is still so many times higher.
 HOPELESS, FIRST_STEPS, PATIENCE, FAR = 30.0, 3, 12, 4.0
+#: A step is another one if it differs by more than this fraction of its length.
+ANOTHER = 0.1
 #: Step of the differences of the gradient; eigenvalues below this fraction of the largest have no sign.
 DIFFERENCE, FLAT = 1e-4, 1e-9
 #: Differences to one side will do where the least eigenvalue exceeds their error by this factor.
@@ -166,7 +168,7 @@ class Descent:
         """
         here = self.local(start)
         lowest = min((other.squared_error for other in known), default=np.inf)
-        damping, factor, slow = 1e-3, 2.0, 0
+        damping, factor, slow, falls = 1e-3, 2.0, 0, [np.inf]
         scale = np.zeros(here.gradient.size)
         for taken in range(most_steps):
             here = self._faced(here)
@@ -178,12 +180,15 @@ class Descent:
             scaled, slope = ways.reduced(here.gradient, here.curvature)
             promise = _promise(scaled, slope)[0] if slope.size else 0.0
             arrived = promise <= near * max(here.squared_error, self.floor)
-            if arrived or _hopeless(taken, here.squared_error, promise, lowest):
+            if arrived or _hopeless(taken, here.squared_error, min(promise, sum(falls)), lowest):
                 break
+            lower, rejected = None, np.full(here.gradient.size, np.inf)
             for _ in range(MOST_REJECTIONS):
                 step = ways.whole(np.linalg.solve(scaled + damping * np.eye(slope.size), -slope))
                 step /= max(1.0, float(np.abs(step).max()))
-                lower = self._lower(here, self._whole_and_to_edge(here.point, step))
+                # Where steps are cut to their greatest length, more damping hardly changes them at first.
+                if np.abs(step - rejected).max() > ANOTHER * np.abs(step).max():
+                    lower, rejected = self._lower(here, self._whole_and_to_edge(here.point, step)), step
                 if lower is not None:
                     break
                 damping, factor = damping * factor, factor * 2.0
@@ -195,6 +200,7 @@ class Descent:
             damping *= max(1.0 / 3.0, 1.0 - (2.0 * fall / promised - 1.0) ** 3) if promised > 0 else 1.0
             damping, factor = max(damping, 1e-12), 2.0
             slow = slow + 1 if fall < 1e-9 * here.squared_error else 0
+            falls = [*falls[-2:], fall]
             same = np.array_equal(trial.damping < 0, here.point.damping < 0)
             here = self.local(trial, found)
             if not same:
