@@ -148,13 +148,54 @@ def _both_of_pairs(pairs: tuple[bool, ...]) -> ComplexArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Modal:
-    """Partial fractions: z is ``1/(s - p) u`` of each pole and w is ``1/(s - p)^2 u``, real and imaginary parts."""
+class Fractions:
+    """Fractions: z is ``1/(s - p) u`` of each pole and w is ``1/(s - p)^2 u``, real and imaginary parts."""
+
+    #: The modes of a pass, one of each pair.
+    modes: Modes
+
+    @staticmethod
+    def modes_of(poles: ComplexArray) -> Modes:
+        """Return modes that have no output."""
+        count = poles.size
+        return Modes(poles, np.zeros(count, np.int64), np.zeros((count, 2), complex), np.zeros(1))
+
+    def forced(self, record: Record, second: bool) -> Iterator[Array]:
+        """Yield ``[z, w, u, y]`` of the used samples, piece by piece."""
+        modes, states = self.modes, np.zeros((self.modes.poles.size, 5), complex)
+        if record.once is not None:
+            modal_pass(record.once, modes, record.undelayed, filter_output=False, states=states)
+            # z(T) = decay z(0) + what the period adds, the same at both ends; and w(T) = decay (w(0) + T z(0)) + …
+            missing = -np.expm1(modes.poles * record.period)
+            states[:, 0] /= missing
+            states[:, 1] = (states[:, 1] + record.period * (1.0 - missing) * states[:, 0]) / missing
+        for data, delay in pieces(record.data, record.delay):
+            yield modal_pass(data, modes, delay, rows=True, double=second, filter_output=False, states=states)
+
+    def free(self, elapsed: Array, second: bool) -> Array:
+        """Return rows ``[z, w]`` after an impulse, transposed."""
+        rows = np.empty((2 if second else 1, self.modes.width, elapsed.size))
+        row = 0
+        for pole in self.modes.poles.tolist():
+            decay = np.exp(pole.real * elapsed)
+            if pole.imag:
+                rows[0, row] = decay * np.cos(pole.imag * elapsed)
+                rows[0, row + 1] = decay * np.sin(pole.imag * elapsed)
+                row += 2
+            else:
+                rows[0, row] = decay
+                row += 1
+        if second:
+            np.multiply(rows[0], elapsed, out=rows[1])
+        return rows.reshape(-1, elapsed.size)
+
+
+@dataclass(frozen=True, eq=False)
+class Modal(Fractions):
+    """Sections as partial fractions."""
 
     damping: Array
     poles: ComplexArray
-    #: The modes of a pass, one of each pair.
-    modes: Modes
     #: From z to the modes of all poles, shape (n, n).
     whole: ComplexArray
     #: States of the sections from the modes of all poles, and from z, shape (n, n).
@@ -182,44 +223,13 @@ class Modal:
                     gain / w * p / q for p, q in zip(poles[: last + 1], products, strict=False)
                 ]
             first = last + 1
-        one_of_each = np.array([pole for pole in poles if pole.imag >= 0.0])
-        count = one_of_each.size
-        modes = Modes(one_of_each, np.zeros(count, np.int64), np.zeros((count, 2), complex), np.zeros(1))
+        modes = cls.modes_of(np.array([pole for pole in poles if pole.imag >= 0.0]))
         whole = _both_of_pairs(tuple(pole.imag > 0.0 for pole in poles))
-        return cls(damping, np.array(poles), modes, whole, weights, (weights @ whole).real)
+        return cls(modes, damping, np.array(poles), whole, weights, (weights @ whole).real)
 
     def driving(self, output: Array, direct: float, free: Array) -> "Modal":
         """Return the form whose w serves ``x = output z + direct u`` and its free response."""
         return self
-
-    def forced(self, record: Record, second: bool) -> Iterator[Array]:
-        """Yield ``[z, w, u, y]`` of the used samples, piece by piece."""
-        states = np.zeros((self.modes.poles.size, 5), complex)
-        if record.once is not None:
-            modal_pass(record.once, self.modes, record.undelayed, filter_output=False, states=states)
-            # z(T) = decay z(0) + what the period adds, the same at both ends; and w(T) = decay (w(0) + T z(0)) + …
-            missing = -np.expm1(self.modes.poles * record.period)
-            states[:, 0] /= missing
-            states[:, 1] = (states[:, 1] + record.period * (1.0 - missing) * states[:, 0]) / missing
-        for data, delay in pieces(record.data, record.delay):
-            yield modal_pass(data, self.modes, delay, rows=True, double=second, filter_output=False, states=states)
-
-    def free(self, elapsed: Array, second: bool) -> Array:
-        """Return rows ``[z, w]`` after an impulse, transposed."""
-        rows = np.empty((2 if second else 1, self.poles.size, elapsed.size))
-        row = 0
-        for pole in self.modes.poles.tolist():
-            decay = np.exp(pole.real * elapsed)
-            if pole.imag:
-                rows[0, row] = decay * np.cos(pole.imag * elapsed)
-                rows[0, row + 1] = decay * np.sin(pole.imag * elapsed)
-                row += 2
-            else:
-                rows[0, row] = decay
-                row += 1
-        if second:
-            np.multiply(rows[0], elapsed, out=rows[1])
-        return rows.reshape(-1, elapsed.size)
 
     def rate(self, output: Array) -> tuple[Array, float]:
         """Return the weights of z and of u in the derivative of ``x = output z`` to time."""

@@ -25,6 +25,8 @@ CLOSE = 0.01
 #: A search is given up for a lower known minimum once the fall that a step promises is, so many times, less than what
 #: parts them (after the first few steps), or once the squared error is still so many times higher.
 HOPELESS, FIRST_STEPS, PATIENCE, FAR = 30.0, 3, 12, 4.0
+#: The same for what so many steps have fallen: between the kinks of an irregular clock steps promise more than they do.
+CRAWLING, REMEMBERED = 100.0, 7
 #: A step is another one if it differs by more than this fraction of its length.
 ANOTHER = 0.1
 #: Step of the differences of the gradient; eigenvalues below this fraction of the largest have no sign.
@@ -168,7 +170,7 @@ class Descent:
         """
         here = self.local(start)
         lowest = min((other.squared_error for other in known), default=np.inf)
-        damping, factor, slow, falls = 1e-3, 2.0, 0, [np.inf]
+        damping, factor, slow, falls = 1e-3, 2.0, 0, [np.inf] * REMEMBERED
         scale = np.zeros(here.gradient.size)
         for taken in range(most_steps):
             here = self._faced(here)
@@ -180,7 +182,7 @@ class Descent:
             scaled, slope = ways.reduced(here.gradient, here.curvature)
             promise = _promise(scaled, slope)[0] if slope.size else 0.0
             arrived = promise <= near * max(here.squared_error, self.floor)
-            if arrived or _hopeless(taken, here.squared_error, min(promise, sum(falls)), lowest):
+            if arrived or _hopeless(taken, here.squared_error, promise, sum(falls), lowest):
                 break
             lower, rejected = None, np.full(here.gradient.size, np.inf)
             for _ in range(MOST_REJECTIONS):
@@ -200,7 +202,7 @@ class Descent:
             damping *= max(1.0 / 3.0, 1.0 - (2.0 * fall / promised - 1.0) ** 3) if promised > 0 else 1.0
             damping, factor = max(damping, 1e-12), 2.0
             slow = slow + 1 if fall < 1e-9 * here.squared_error else 0
-            falls = [*falls[-2:], fall]
+            falls = [*falls[1:], fall]
             same = np.array_equal(trial.damping < 0, here.point.damping < 0)
             here = self.local(trial, found)
             if not same:
@@ -405,9 +407,10 @@ def _alike(here: Local, other: Local, box: Box) -> bool:
     return bool(np.abs(away).max() < CLOSE and abs(later) < CLOSE)
 
 
-def _hopeless(taken: int, squared_error: float, promise: float, lowest: float) -> bool:
+def _hopeless(taken: int, squared_error: float, promise: float, fallen: float, lowest: float) -> bool:
     """Whether a search will not come down to the lowest known minimum."""
-    too_flat = taken >= FIRST_STEPS and squared_error - HOPELESS * promise > lowest
+    least = min(HOPELESS * promise, CRAWLING * fallen)
+    too_flat = taken >= FIRST_STEPS and squared_error - least > lowest
     return too_flat or (taken >= PATIENCE and squared_error > FAR * lowest)
 
 
