@@ -57,15 +57,11 @@ class Ladder(Nest):
         if poles <= LOOKED_AT:
             others += self._alone(zeros, poles)
         descent = self.descent(zeros)
-        others.sort(key=lambda point: descent.value(point).squared_error)
+        points = contained + descent.sorted(others)[:REFINED]
+        if poles <= LOOKED_AT:
+            points += self._along_delay(zeros, descent.sorted(points)[:1])[1:]
         self.evaluations += descent.evaluations
-        points = contained + others[:REFINED]
-        if poles > LOOKED_AT:
-            return points
-        return [
-            *points,
-            *self._along_delay(zeros, sorted(points, key=lambda p: descent.value(p).squared_error)[:1])[1:],
-        ]
+        return points
 
     def _with_poles(self, poles: int, zeros: int, new_zeros: int, added: int) -> list[Point]:
         """The best pole or pair beside those of a smaller model, by elimination alone."""

@@ -25,8 +25,8 @@ from ctid_cli.filtering.filter_data import FilterData
 
 #: Singular values of the scaled columns below this fraction of the largest count as zero.
 RANK_TOLERANCE = 1e-11
-#: Models whose squared errors are found together.
-AT_ONCE = 32
+#: Models times samples whose squared errors are found together: what fits into the second cache of a processor.
+TOGETHER = 12_000
 
 
 class Problem(NamedTuple):
@@ -208,8 +208,9 @@ def squared_errors(problem: Problem, sections: Sequence[tuple[Array, Array]], de
         modal = []
     for k in set(range(len(forms))) - set(modal):
         errors[k] = project(problem, *sections[k], delay).squared_error
-    for first in range(0, len(modal), AT_ONCE):
-        own = modal[first : first + AT_ONCE]
+    at_once = max(TOGETHER // sum(data.t.size for data in problem.records), 1)
+    for first in range(0, len(modal), at_once):
+        own = modal[first : first + at_once]
         group = [form for k in own if isinstance(form := forms[k], Modal)]
         columns = Columns.of(group[0].poles.size, False, problem.free_response, problem.constant)
         each = zip(problem.records, problem.periods, strict=True)

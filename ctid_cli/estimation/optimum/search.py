@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.estimation.optimum.box import TOUCH, Box, Point, at_bounds, box_of, frozen, moved_by, point_of, widened
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_space
-from ctid_cli.estimation.optimum.projection import Problem, Projected, project, slopes
+from ctid_cli.estimation.optimum.projection import Problem, Projected, project, slopes, squared_errors
+from ctid_cli.estimation.optimum.triangle import Delay
 
 #: Fall of the squared error that Newton's step may promise, as a fraction of it, at a minimum; what Newton's steps aim
 #: at, and where a descent leaves the rest to them.
@@ -117,6 +118,21 @@ class Descent:
         """Least squares for the poles and delay of a point, from where derivatives may be asked for, too."""
         self.evaluations += 1
         return project(self.problem, point.speed, point.damping, point.delay, slopes_too=slopes_too)
+
+    def squared_errors(self, points: Sequence[Point]) -> Array:
+        """Return the squared errors at many points of one order, to compare them."""
+        self.evaluations += len(points)
+        errors, of_delay = np.zeros(len(points)), dict[Delay, list[int]]()
+        for k, point in enumerate(points):
+            of_delay.setdefault(point.delay, []).append(k)
+        for delay, places in of_delay.items():
+            sections = [(points[k].speed, points[k].damping) for k in places]
+            errors[places] = squared_errors(self.problem, sections, delay)
+        return errors
+
+    def sorted(self, points: Sequence[Point]) -> list[Point]:
+        """Return points by rising squared error."""
+        return [points[k] for k in np.argsort(self.squared_errors(points), kind="stable")]
 
     def local(self, point: Point, projected: Projected | None = None) -> Local:
         """Gradient and curvature at a point; the delay counts in quarter periods."""

@@ -156,10 +156,9 @@ class Nest:
             if 0 <= m <= n and n > 0:
                 others += self._grown(n, m, zeros, poles - n)
         descent = self.descent(zeros)
-        others.sort(key=lambda point: descent.value(point).squared_error)
-        first.sort(key=lambda point: descent.value(point).squared_error)
+        points = descent.sorted(first) + descent.sorted(others)[:REFINED]
         self.evaluations += descent.evaluations
-        return self._along_delay(zeros, first + others[:REFINED])
+        return self._along_delay(zeros, points)
 
     def with_known(self, poles: int, zeros: int, known: KnownCoefficients, points: Iterable[Point]) -> "Nest":
         """Return a nest of the models of a structure that have known coefficients.
@@ -174,7 +173,7 @@ class Nest:
             starts += self.resonances(poles, zeros) + nest.random_points(poles)
         moved = [point for point in (known.met(start, self.box) for start in starts) if point is not None]
         descent = nest.descent(zeros)
-        moved.sort(key=lambda point: descent.value(point).squared_error)
+        moved = descent.sorted(moved)
         nest.evaluations += descent.evaluations
         nest.refine(poles, zeros, nest._along_delay(zeros, moved))
         return nest
@@ -217,13 +216,14 @@ class Nest:
         self, zeros: int, roots: ComplexArray, places: Iterable[tuple[float, float, float]]
     ) -> list[tuple[float, float, Point]]:
         """Squared errors, frequencies and points with a pair of each imaginary part and damping, at each delay."""
-        descent, found = self.descent(zeros), []
+        descent, frequencies, points = self.descent(zeros), [], []
         for w, zeta, tau in places:
             pair = w * complex(-zeta, 1.0)
-            point = point_of(np.concatenate((roots, [pair, pair.conjugate()])), tau, self.box)
-            found.append((descent.value(point).squared_error, w, point))
+            frequencies.append(w)
+            points.append(point_of(np.concatenate((roots, [pair, pair.conjugate()])), tau, self.box))
+        errors = descent.squared_errors(points).tolist()
         self.evaluations += descent.evaluations
-        return found
+        return list(zip(errors, frequencies, points, strict=True))
 
     def close_delays(self, poles: int, zeros: int) -> list[Point]:
         """Return starts with the best poles at delays within half a sampling interval of the best one.
@@ -258,7 +258,7 @@ class Nest:
     ) -> list[tuple[Array, Point]]:
         """Poles, or pairs of some dampings, added to given ones, the best first by elimination alone; and where."""
         descent = self.descent(zeros)
-        found: list[tuple[float, Array, Point]] = []
+        found: list[tuple[Array, Point]] = []
         slowest, box = self.box.spread[0], self.box
         frequencies = np.geomspace(slowest, box.fastest, count + 2)[1:-1]
         if added == 1 and box.slowest < slowest:
@@ -269,9 +269,10 @@ class Nest:
                 pole = w * complex(-zeta, np.sqrt(1 - zeta * zeta))
                 new = [pole, pole.conjugate()] if added == 2 else [complex(-w)]
                 point = point_of(np.concatenate((roots, new)), delay, self.box)
-                found.append((descent.value(point).squared_error, np.array([np.log(w), np.log(zeta)]), point))
+                found.append((np.array([np.log(w), np.log(zeta)]), point))
+        errors = descent.squared_errors([point for _, point in found])
         self.evaluations += descent.evaluations
-        return [(where, point) for _, where, point in sorted(found, key=lambda entry: entry[0])]
+        return [found[k] for k in np.argsort(errors, kind="stable")]
 
     def _along_delay(self, zeros: int, points: list[Point]) -> list[Point]:
         """Further starts at the minima of the profile over the delay, for the poles of the best start."""
@@ -280,7 +281,7 @@ class Nest:
         descent = self.descent(zeros)
         best = points[0]
         trials = [point_of(best.poles, delay, self.box) for delay in self._delays(MOST_DELAYS)]
-        errors = np.array([descent.value(trial).squared_error for trial in trials])
+        errors = descent.squared_errors(trials)
         self.evaluations += descent.evaluations
         return points + [trials[k] for k in _lowest_minima(errors, KEPT)]
 
