@@ -20,10 +20,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.filtering import kernels
 from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, Modes, Place, chain_states, modal_pass
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.filtering.realisation import exponential_minus_identity, transitions
-from ctid_cli.filtering import kernels
 
 #: Samples that are filtered at a time, which bounds the memory of a long record.
 PIECE = 4096
@@ -120,7 +120,7 @@ def numerators(speed: Array, damping: Array) -> Array:
     return result
 
 
-def form_of(speed: Array, damping: Array, length: float) -> "Modal | Chain":
+def form_of(speed: Array, damping: Array, length: float) -> "Form":
     """Return the form in which sections are filtered over a record of some length [s]."""
     poles = poles_of(speed, damping)
     worst = 1.0
@@ -279,9 +279,10 @@ class Chain:
     def driving(self, output: Array, direct: float, free: Array) -> "Chain":
         """Return the form whose w is driven by ``x = output z + direct u``, and by the free response."""
         F, g = self.dynamics, self.gain
-        double = np.kron(np.eye(2), F)
+        double = np.zeros((2 * g.size, 2 * g.size))
+        double[: g.size, : g.size] = double[g.size :, g.size :] = F
         double[g.size :, : g.size] = np.outer(g, output)
-        double_free = np.kron(np.eye(2), F)
+        double_free = double.copy()
         double_free[g.size :, : g.size] = np.outer(g, free)
         gain = np.concatenate((g, g * direct))
         return replace(
@@ -295,7 +296,7 @@ class Chain:
             # From rest to the end of a period x_N is left over: x0 = x_N + Phi^N x0. With X = Phi^N - I, which the
             # exponential gives without cancellation, X x0 = -x_N.
             end = chain_states(self.dynamics, self.gain, 1.0, record.once, record.undelayed)[-1, :-1]
-            initial = np.linalg.solve(exponential_minus_identity(self.dynamics * record.period), -end)
+            initial = np.asarray(np.linalg.solve(exponential_minus_identity(self.dynamics * record.period), -end))
         data = record.data
         states = chain_states(self.dynamics, self.gain, 1.0, data, record.delay, initial)
         yield np.column_stack((states, data.y))[data.use]
@@ -315,6 +316,10 @@ class Chain:
         """Return the map from ``[z, w]`` to the derivatives of x to the coordinates, B being fixed, shape (2 n, n)."""
         table, slopes = numerators(self.speed, self.damping), polynomial_slopes(self.speed, self.damping)
         return np.vstack((np.zeros_like(table), -np.linalg.solve(table.T, slopes)))
+
+
+#: A form of the sections.
+Form = Modal | Chain
 
 
 def pieces(data: FilterData, delay: Place) -> Iterator[tuple[FilterData, Place]]:

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.optimum.chain import Chain, Modal, form_of, numerators, polynomial
+from ctid_cli.estimation.optimum.chain import Form, Modal, form_of, numerators, polynomial
 from ctid_cli.estimation.optimum.triangle import Columns, Delay, triangle_of, triangles_of
 from ctid_cli.filtering.filter_data import FilterData
 
@@ -71,7 +71,7 @@ class Weights(NamedTuple):
 class Triangles(NamedTuple):
     """The rows of all records in one form."""
 
-    form: Modal | Chain
+    form: Form
     columns: Columns
     delay: Delay
     #: Shape (K, q, q).
@@ -218,12 +218,12 @@ def squared_errors(problem: Problem, sections: Sequence[tuple[Array, Array]], de
         phi, y = _columns(problem, columns, rows, np.stack([form.states for form in group])[:, None])
         whole = np.concatenate((phi, y[:, :, None]), axis=2)
         lengths = np.linalg.norm(whole, axis=1, keepdims=True)
-        left = np.linalg.qr(whole / np.where(lengths > 0.0, lengths, 1.0), mode="r")[:, -1, -1]
+        left = np.asarray(np.linalg.qr(whole / np.where(lengths > 0.0, lengths, 1.0), mode="r"))[:, -1, -1]
         errors[own] = (left * lengths[:, 0, -1]) ** 2
     return errors
 
 
-def _triangles(problem: Problem, forms: list[Modal] | list[Chain], delay: Delay, second: bool) -> Triangles:
+def _triangles(problem: Problem, forms: Sequence[Form], delay: Delay, second: bool) -> Triangles:
     """Return the triangles of all records, each in its form."""
     n = forms[0].states.shape[0]
     columns = Columns.of(n, second, problem.free_response, problem.constant)

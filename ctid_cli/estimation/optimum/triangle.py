@@ -1,7 +1,7 @@
 r"""The rows of all used samples of a record, reduced by orthogonal transformations to a triangle.
 
-With Z the rows ``[z, w, u, y, free z, free w, 1]`` of all used samples, ``Z = Q R``: whatever is asked of linear maps of
-these rows (projections, residuals, sums of squares) is asked of the same maps of R. Second moments would square the
+With Z the rows ``[z, w, u, y, free z, free w, 1]`` of all used samples, ``Z = Q R``: whatever is asked of linear maps
+of these rows (projections, residuals, sums of squares) is asked of the same maps of R. Second moments would square the
 condition; this costs little more, so that one route serves the search and its end.
 """
 
@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.optimum.chain import Chain, Fractions, Modal, Record
-from ctid_cli.filtering.bank import Place
+from ctid_cli.estimation.optimum.chain import Chain, Form, Fractions, Modal, Record
 from ctid_cli.filtering.filter_data import FilterData, split_delay
 
 
@@ -22,13 +21,11 @@ class Delay(NamedTuple):
     seconds: float
     cell: int
 
-    def place(self, interval: float) -> Place:
+    def place(self, interval: float) -> tuple[int, float]:
         """Return the breaks by which the read-out lags, and the fraction, 0 to 1, of an interval read beyond that.
 
-        At a sample a cell is closed on both sides: each has its own slope there. On an irregular clock, the delay.
+        At a sample a cell is closed on both sides: each has its own slope there.
         """
-        if interval == 0.0:
-            return self.seconds
         if self.cell < 0:
             return split_delay(self.seconds, interval)
         return self.cell + 1, min(max(self.cell + 1 - self.seconds / interval, 0.0), 1.0)
@@ -56,12 +53,12 @@ class Columns(NamedTuple):
 
     @property
     def free_z(self) -> slice:
-        """z of the free response."""
+        """Z of the free response."""
         return slice(self.u + 2, self.u + 2 + self.n)
 
     @property
     def free_states(self) -> slice:
-        """z and w of the free response."""
+        """Z and w of the free response."""
         return slice(self.u + 2, self.size - self.offset)
 
     @property
@@ -70,7 +67,9 @@ class Columns(NamedTuple):
         return self.u + 2 + self.free + self.offset
 
 
-def rows_of(form: Fractions | Chain, columns: Columns, delay: Delay, data: FilterData, period: float) -> Iterator[Array]:
+def rows_of(
+    form: Fractions | Chain, columns: Columns, delay: Delay, data: FilterData, period: float
+) -> Iterator[Array]:
     """Yield the rows of the used samples, transposed, piece by piece."""
     second, done, record = columns.second > 0, 0, _record(delay, data, period)
     elapsed = data.t[data.use] if columns.free else data.t
@@ -85,13 +84,13 @@ def rows_of(form: Fractions | Chain, columns: Columns, delay: Delay, data: Filte
         yield rows
 
 
-def triangle_of(form: Modal | Chain, columns: Columns, delay: Delay, data: FilterData, period: float) -> Array:
+def triangle_of(form: Form, columns: Columns, delay: Delay, data: FilterData, period: float) -> Array:
     """Return a triangle with the second moments of the rows of all used samples."""
     triangle: Array | None = None
     for rows in rows_of(form, columns, delay, data, period):
         # R <- qr[R; piece]: memory is that of one piece, however long the record.
         whole = rows if triangle is None else np.hstack((triangle.T, rows))
-        triangle = np.linalg.qr(whole.T, mode="r")
+        triangle = np.asarray(np.linalg.qr(whole.T, mode="r"))
     assert triangle is not None
     missing = columns.size - len(triangle)
     return np.pad(triangle, ((0, missing), (0, 0))) if missing else triangle
@@ -114,7 +113,8 @@ def triangles_of(forms: list[Modal], columns: Columns, delay: Delay, data: Filte
     triangles = np.zeros((len(forms), 0, columns.size))
     for rows in rows_of(Fractions(Fractions.modes_of(poles)), whole, delay, data, period):
         own = rows[rows_of_forms].transpose(0, 2, 1)
-        triangles = np.linalg.qr(np.concatenate((triangles, own), axis=1) if triangles.size else own, mode="r")
+        whole_piece = np.concatenate((triangles, own), axis=1) if triangles.size else own
+        triangles = np.asarray(np.linalg.qr(whole_piece, mode="r"))
     missing = columns.size - triangles.shape[1]
     return np.pad(triangles, ((0, 0), (0, missing), (0, 0)))
 
@@ -122,7 +122,7 @@ def triangles_of(forms: list[Modal], columns: Columns, delay: Delay, data: Filte
 def _record(delay: Delay, data: FilterData, period: float) -> Record:
     """Return a record as it is filtered; one whose input repeats itself begins with the period before its samples."""
     if not period:
-        return Record(data, delay.place(data.interval))
+        return Record(data, delay.place(data.interval) if data.interval > 0.0 else delay.seconds)
     if data.interval > 0.0:
         shift, fraction = delay.place(data.interval)
         # The last interval leads back to the first break, where the next slope begins.

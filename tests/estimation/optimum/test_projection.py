@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from ctid_cli.estimation.optimum.box import Box, point_of
 from ctid_cli.estimation.optimum import chain
+from ctid_cli.estimation.optimum.box import Box, point_of
 from ctid_cli.estimation.optimum.chain import Chain, Modal, chain_dynamics, form_of, numerators, poles_of
 from ctid_cli.estimation.optimum.projection import Problem, project, slopes
 from ctid_cli.estimation.optimum.triangle import Columns, Delay, rows_of, triangle_of
