@@ -15,7 +15,7 @@ from ctid_cli.estimation.optimum.box import ANYWHERE, point_of
 from ctid_cli.estimation.optimum.chain import Chain, chain_dynamics, numerators
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.triangle import Columns, rows_of
-from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.inference.sensitivity import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 
 
@@ -72,44 +72,45 @@ class Layout:
 def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) -> list[tuple[Array, Array]]:
     """Derivatives of the simulated output to the parameters, and the output error, at the used samples of each record.
 
-    The delay is that of theta where it is a parameter.
+    The delay is that of theta where it is a parameter. The last coefficients of the denominator are zero where the
+    problem has integrators.
     """
     structure, n, m = layout.structure, layout.structure.poles, layout.structure.zeros
     a, b = np.concatenate(([1.0], theta[:n])), theta[n : n + m + 1]
-    point = point_of(np.roots(a).astype(complex), theta[n + m + 1] if structure.delay else delay, ANYWHERE)
+    stable = np.roots(a[: n + 1 - problem.integrators]).astype(complex)
+    point = point_of(stable, theta[n + m + 1] if structure.delay else delay, ANYWHERE)
     sections = problem.sections(point.speed, point.damping)
     F, g = chain_dynamics(*sections)
-    # From the states to p^(N-1)/A ... 1/A. With as many zeros as poles B/A = b0 + B'/A, and
-    # p^N/A u = u - sum a_i p^(N-i)/A u.
-    order = g.size
+    # From the states to p^(n-1)/A ... 1/A. With n zeros B/A = b0 + B'/A, and p^n/A u = u - sum a_i p^(n-i)/A u.
     powers = np.linalg.inv(numerators(*sections))
-    direct = b[0] if m == order else 0.0
-    output = ((b - direct * a)[1:] if m == order else np.concatenate((np.zeros(order - 1 - m), b))) @ powers
-    of_b = np.column_stack((-powers.T @ a[1:], powers.T))[:, -m - 1 :] if m == order else powers.T[:, -m - 1 :]
-    columns = Columns.of(order, True, layout.initial_state, layout.offset)
-    z, w, free_z = slice(0, order), slice(order, 2 * order), columns.free_z
-    free_w = slice(free_z.stop, free_z.stop + order)
+    direct = b[0] if m == n else 0.0
+    output = ((b - direct * a)[1:] if m == n else np.concatenate((np.zeros(n - 1 - m), b))) @ powers
+    columns = Columns.of(n, second=True, free=layout.initial_state, offset=layout.offset)
     result = []
     for k, (data, period) in enumerate(zip(problem.records, problem.periods, strict=True)):
         first = layout.first(k)
         own = theta[first : first + layout.own]
-        state = own[:order] @ powers if layout.initial_state else np.zeros(order)
-        form = Chain(*sections, F, g, F, g).driving(output, direct, state)
-        # What is wanted are combinations of the rows.
+        state = own[:n] if layout.initial_state else np.zeros(n)
+        form = Chain(*sections, F, g, F, g).driving(output, direct, state @ powers)
+        # Columns of the rows that are wanted, each a combination of the states, the input and what else stands there.
         wanted = np.zeros((columns.size, layout.size + 1))
-        wanted[w, :n] = -powers.T[:, :n]
-        wanted[z, n : n + m + 1] = of_b
-        if m == order:
-            wanted[columns.u, n] = 1.0
+        states, driven, now, measured = wanted[:n], wanted[n : 2 * n], wanted[columns.u], wanted[columns.u + 1]
+        driven[:, :n] = -powers.T
+        filtered = powers.T
+        coefficients = np.column_stack((-filtered @ a[1:], filtered))[:, n - m :]
+        states[:, n : n + m + 1] = coefficients
+        if m == n:
+            now[n] = 1.0
         if structure.delay:
-            wanted[z, n + m + 1], wanted[columns.u, n + m + 1] = -(output @ F), -(output @ g)
+            states[:, n + m + 1], now[n + m + 1] = -(output @ F), -(output @ g)
         if layout.initial_state:
-            wanted[free_w, :n] = -powers.T[:, :n]
-            wanted[free_z, first : first + order] = powers.T
+            alone, driven_alone = wanted[columns.free_states][:n], wanted[columns.free_states][n:]
+            driven_alone[:, :n] = -powers.T
+            alone[:, first : first + n] = powers.T
         if layout.offset:
             wanted[-1, first + layout.own - 1] = 1.0
-        wanted[z, -1], wanted[columns.u, -1], wanted[columns.u + 1, -1] = -output, -direct, 1.0
+        states[:, -1], now[-1], measured[-1] = -output, -direct, 1.0
         wanted[:, -1] -= wanted[:, first : first + layout.own] @ own
-        rows = np.hstack(list(rows_of(form, columns, point.delay, data, period))).T @ wanted
+        rows = np.vstack([part.T @ wanted for part in rows_of(form, columns, point.delay, data, period)])
         result.append((rows[:, :-1], rows[:, -1].copy()))
     return result

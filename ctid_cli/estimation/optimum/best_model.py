@@ -106,12 +106,12 @@ def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, opt
     nest.refine(poles, zeros, points)
     if options.nested:
         nest.refine(poles, zeros, nest.close_delays(poles, zeros))
-    found = _least(nest, poles, zeros, options.nested and options.fewer_poles)
+    found = least(nest, poles, zeros, options.nested and options.fewer_poles)
     in_doubt = (found.tried > 1 and found.agree == 1) or not found.ending.optimal
     if options.nested or not in_doubt:
         return found
     nest.refine(poles, zeros, nest.random_points(poles))
-    return _least(nest, poles, zeros, False)
+    return least(nest, poles, zeros, False)
 
 
 def _with_known(problem: Problem, box: Box, poles: int, options: SearchOptions) -> Optimum:
@@ -139,15 +139,15 @@ def _with_known(problem: Problem, box: Box, poles: int, options: SearchOptions) 
             f"no model with the fixed {given} has all its poles where they are searched: {box.in_words()}; "
             "change or drop the fixed value"
         )
-    return _least(nest, poles, zeros, False)
+    return least(nest, poles, zeros, False)
 
 
 def _from_part(problem: Problem, part: Problem, box: Box, poles: int, options: SearchOptions) -> Optimum | None:
     """The search of a part, followed on the whole records; None where they say more, or something else, than it."""
     zeros, fewer = problem.zeros, options.fewer_poles
     pilot = Nest(part, box_of(part, options.delays), options.random_starts, options.seed)
-    expected = _least(pilot, poles, zeros, fewer)
-    found = _least(Nest(problem, box, options.random_starts, options.seed, pilot), poles, zeros, fewer)
+    expected = least(pilot, poles, zeros, fewer)
+    found = least(Nest(problem, box, options.random_starts, options.seed, pilot), poles, zeros, fewer)
     count, part_count = (sum(data.count for data in one.records) for one in (problem, part))
     power = sum(data.count * float(np.var(data.y_used)) for data in problem.records)
     if found.squared_error > min(AS_GOOD * expected.squared_error * count / part_count, (1 - EXPLAINED) * power):
@@ -155,23 +155,18 @@ def _from_part(problem: Problem, part: Problem, box: Box, poles: int, options: S
     return replace(found, tried=expected.tried, agree=expected.agree)
 
 
-def _least(nest: Nest, poles: int, zeros: int, fewer_poles: bool) -> Optimum:
+def least(nest: Nest, poles: int, zeros: int, fewer_poles: bool) -> Optimum:
     """The least squared error that a nest knows of a structure."""
-    best: Judged | None = None
-    lost = 0
     # With a pole at infinity a model of one pole less, whatever its zeros, is in the closure of the structure.
-    fewest = max(zeros + int(nest.box.delay_free), 1)
-    for missing in range(poles - fewest + 1 if fewer_poles else 1):
-        descent = nest.descent(zeros)
-        found = descent.settle(nest.optima(poles - missing, zeros)[0])
-        nest.evaluations += descent.evaluations
-        if best is None or found.local.squared_error < best.local.squared_error * (1 - 1e-9):
-            best, lost = found, missing
-    assert best is not None
-    least = best.local.squared_error
+    fewest = max(zeros + int(nest.box.delay_free), 1) if fewer_poles else poles
+    found = [nest.settled(n, zeros) for n in range(poles, fewest - 1, -1)] or [nest.settled(poles, zeros)]
+    errors = [judged.local.squared_error for judged in found]
+    # Such a pole costs nothing: a smaller model must be worse by more than rounding to lose.
+    lost = next(k for k, error in enumerate(errors) if error <= min(errors) * (1 + 1e-9))
     ends = np.array(nest.ends(poles - lost, zeros))
-    agree = int(np.count_nonzero(ends <= max(least, float(ends.min())) * (1 + SAME) + nest.descent(zeros).floor))
-    return optimum(best, lost, ends.size, agree, nest)
+    level = max(min(errors), float(ends.min()))
+    agree = int(np.count_nonzero(ends <= level * (1 + SAME) + nest.descent(zeros).floor))
+    return _optimum(found[lost], lost, ends.size, agree, nest)
 
 
 def problem_of(records: Sequence[FilterData], zeros: int, options: SearchOptions) -> Problem:
@@ -190,7 +185,7 @@ def _one_period(data: FilterData, period: float) -> FilterData:
     return data._replace(tu=data.tu[within].copy(), u=data.u[within].copy(), interval=0.0)
 
 
-def optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Optimum:
+def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Optimum:
     """The model in coefficients of polynomials."""
     point, projected = best.local.point, best.local.projected
     a, known, n = point.denominator, nest.known, point.poles.size

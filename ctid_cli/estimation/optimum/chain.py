@@ -120,7 +120,7 @@ def numerators(speed: Array, damping: Array) -> Array:
     return result
 
 
-def form_of(speed: Array, damping: Array, length: float) -> "Modal | Chain":
+def form_of(speed: Array, damping: Array, length: float) -> "Form":
     """Return the form in which sections are filtered over a record of some length [s]."""
     poles = poles_of(speed, damping)
     worst = 1.0
@@ -148,13 +148,54 @@ def _both_of_pairs(pairs: tuple[bool, ...]) -> ComplexArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Modal:
-    """Partial fractions: z is ``1/(s - p) u`` of each pole and w is ``1/(s - p)^2 u``, real and imaginary parts."""
+class Fractions:
+    """Fractions: z is ``1/(s - p) u`` of each pole and w is ``1/(s - p)^2 u``, real and imaginary parts."""
+
+    #: The modes of a pass, one of each pair.
+    modes: Modes
+
+    @staticmethod
+    def modes_of(poles: ComplexArray) -> Modes:
+        """Return modes that have no output."""
+        count = poles.size
+        return Modes(poles, np.zeros(count, np.int64), np.zeros((count, 2), complex), np.zeros(1))
+
+    def forced(self, record: Record, second: bool) -> Iterator[Array]:
+        """Yield ``[z, w, u, y]`` of the used samples, piece by piece."""
+        modes, states = self.modes, np.zeros((self.modes.poles.size, 5), complex)
+        if record.once is not None:
+            modal_pass(record.once, modes, record.undelayed, filter_output=False, states=states)
+            # z(T) = decay z(0) + what the period adds, the same at both ends; and w(T) = decay (w(0) + T z(0)) + …
+            missing = -np.expm1(modes.poles * record.period)
+            states[:, 0] /= missing
+            states[:, 1] = (states[:, 1] + record.period * (1.0 - missing) * states[:, 0]) / missing
+        for data, delay in pieces(record.data, record.delay):
+            yield modal_pass(data, modes, delay, rows=True, double=second, filter_output=False, states=states)
+
+    def free(self, elapsed: Array, second: bool) -> Array:
+        """Return rows ``[z, w]`` after an impulse, transposed."""
+        rows = np.empty((2 if second else 1, self.modes.width, elapsed.size))
+        row = 0
+        for pole in self.modes.poles.tolist():
+            decay = np.exp(pole.real * elapsed)
+            if pole.imag:
+                rows[0, row] = decay * np.cos(pole.imag * elapsed)
+                rows[0, row + 1] = decay * np.sin(pole.imag * elapsed)
+                row += 2
+            else:
+                rows[0, row] = decay
+                row += 1
+        if second:
+            np.multiply(rows[0], elapsed, out=rows[1])
+        return rows.reshape(-1, elapsed.size)
+
+
+@dataclass(frozen=True, eq=False)
+class Modal(Fractions):
+    """Sections as partial fractions."""
 
     damping: Array
     poles: ComplexArray
-    #: The modes of a pass, one of each pair.
-    modes: Modes
     #: From z to the modes of all poles, shape (n, n).
     whole: ComplexArray
     #: States of the sections from the modes of all poles, and from z, shape (n, n).
@@ -182,44 +223,13 @@ class Modal:
                     gain / w * p / q for p, q in zip(poles[: last + 1], products, strict=False)
                 ]
             first = last + 1
-        one_of_each = np.array([pole for pole in poles if pole.imag >= 0.0])
-        count = one_of_each.size
-        modes = Modes(one_of_each, np.zeros(count, np.int64), np.zeros((count, 2), complex), np.zeros(1))
+        modes = cls.modes_of(np.array([pole for pole in poles if pole.imag >= 0.0]))
         whole = _both_of_pairs(tuple(pole.imag > 0.0 for pole in poles))
-        return cls(damping, np.array(poles), modes, whole, weights, (weights @ whole).real)
+        return cls(modes, damping, np.array(poles), whole, weights, (weights @ whole).real)
 
     def driving(self, output: Array, direct: float, free: Array) -> "Modal":
         """Return the form whose w serves ``x = output z + direct u`` and its free response."""
         return self
-
-    def forced(self, record: Record, second: bool) -> Iterator[Array]:
-        """Yield ``[z, w, u, y]`` of the used samples, piece by piece."""
-        states = np.zeros((self.modes.poles.size, 5), complex)
-        if record.once is not None:
-            modal_pass(record.once, self.modes, record.undelayed, filter_output=False, states=states)
-            # z(T) = decay z(0) + what the period adds, the same at both ends; and w(T) = decay (w(0) + T z(0)) + …
-            missing = -np.expm1(self.modes.poles * record.period)
-            states[:, 0] /= missing
-            states[:, 1] = (states[:, 1] + record.period * (1.0 - missing) * states[:, 0]) / missing
-        for data, delay in pieces(record.data, record.delay):
-            yield modal_pass(data, self.modes, delay, rows=True, double=second, filter_output=False, states=states)
-
-    def free(self, elapsed: Array, second: bool) -> Array:
-        """Return rows ``[z, w]`` after an impulse, transposed."""
-        rows = np.empty((2 if second else 1, self.poles.size, elapsed.size))
-        row = 0
-        for pole in self.modes.poles.tolist():
-            decay = np.exp(pole.real * elapsed)
-            if pole.imag:
-                rows[0, row] = decay * np.cos(pole.imag * elapsed)
-                rows[0, row + 1] = decay * np.sin(pole.imag * elapsed)
-                row += 2
-            else:
-                rows[0, row] = decay
-                row += 1
-        if second:
-            np.multiply(rows[0], elapsed, out=rows[1])
-        return rows.reshape(-1, elapsed.size)
 
     def rate(self, output: Array) -> tuple[Array, float]:
         """Return the weights of z and of u in the derivative of ``x = output z`` to time."""
@@ -269,9 +279,10 @@ class Chain:
     def driving(self, output: Array, direct: float, free: Array) -> "Chain":
         """Return the form whose w is driven by ``x = output z + direct u``, and by the free response."""
         F, g = self.dynamics, self.gain
-        double = np.kron(np.eye(2), F)
+        double = np.zeros((2 * g.size, 2 * g.size))
+        double[: g.size, : g.size] = double[g.size :, g.size :] = F
         double[g.size :, : g.size] = np.outer(g, output)
-        double_free = np.kron(np.eye(2), F)
+        double_free = double.copy()
         double_free[g.size :, : g.size] = np.outer(g, free)
         gain = np.concatenate((g, g * direct))
         return replace(
@@ -285,7 +296,7 @@ class Chain:
             # From rest to the end of a period x_N is left over: x0 = x_N + Phi^N x0. With X = Phi^N - I, which the
             # exponential gives without cancellation, X x0 = -x_N.
             end = chain_states(self.dynamics, self.gain, 1.0, record.once, record.undelayed)[-1, :-1]
-            initial = np.linalg.solve(exponential_minus_identity(self.dynamics * record.period), -end)
+            initial = np.asarray(np.linalg.solve(exponential_minus_identity(self.dynamics * record.period), -end))
         data = record.data
         states = chain_states(self.dynamics, self.gain, 1.0, data, record.delay, initial)
         yield np.column_stack((states, data.y))[data.use]
@@ -305,6 +316,10 @@ class Chain:
         """Return the map from ``[z, w]`` to the derivatives of x to the coordinates, B being fixed, shape (2 n, n)."""
         table, slopes = numerators(self.speed, self.damping), polynomial_slopes(self.speed, self.damping)
         return np.vstack((np.zeros_like(table), -np.linalg.solve(table.T, slopes)))
+
+
+#: A form of the sections.
+Form = Modal | Chain
 
 
 def pieces(data: FilterData, delay: Place) -> Iterator[tuple[FilterData, Place]]:

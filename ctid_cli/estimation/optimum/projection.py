@@ -13,17 +13,20 @@ L. Kaufman, "A variable projection method for solving separable nonlinear least 
 49-57. doi:10.1007/BF01932995
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.optimum.chain import Chain, Modal, form_of, numerators, polynomial
-from ctid_cli.estimation.optimum.triangle import Columns, Delay, triangle_of
+from ctid_cli.estimation.optimum.chain import Form, Modal, form_of, numerators, polynomial
+from ctid_cli.estimation.optimum.triangle import Columns, Delay, triangle_of, triangles_of
 from ctid_cli.filtering.filter_data import FilterData
 
 #: Singular values of the scaled columns below this fraction of the largest count as zero.
 RANK_TOLERANCE = 1e-11
+#: Models times samples whose squared errors are found together: what fits into the second cache of a processor.
+TOGETHER = 12_000
 
 
 class Problem(NamedTuple):
@@ -68,7 +71,7 @@ class Weights(NamedTuple):
 class Triangles(NamedTuple):
     """The rows of all records in one form."""
 
-    form: Modal | Chain
+    form: Form
     columns: Columns
     delay: Delay
     #: Shape (K, q, q).
@@ -106,30 +109,35 @@ def weights_of(problem: Problem, speed: Array, damping: Array) -> Weights | None
     return Weights(whole[:, count:], given)
 
 
+def _columns(problem: Problem, columns: Columns, rows: Array, states: Array) -> tuple[Array, Array]:
+    """Return the columns Phi, and y, from the triangles of all records; further axes in front are further models."""
+    *many, records, q, _ = rows.shape
+    n, shared = columns.n, problem.zeros + 1
+    proper, own = min(shared, n), n * problem.free_response + columns.offset
+    # The numerator is common to all records; a free response and an offset are zero outside their own.
+    phi = np.zeros((*many, records, q, shared + records * own))
+    # The last m + 1 states of the chain span B/A u; of degree n there is u itself besides.
+    to_states = np.swapaxes(states, -1, -2)
+    phi[..., :proper] = rows[..., :n] @ to_states[..., n - proper :]
+    if shared > n:
+        phi[..., n] = rows[..., columns.u]
+    for k in range(records if own else 0):
+        place, record = shared + k * own, slice(k, k + 1)
+        if problem.free_response:
+            phi[..., record, :, place : place + n] = rows[..., record, :, columns.free_z] @ to_states
+        if columns.offset:
+            phi[..., record, :, place + own - 1] = rows[..., record, :, -1]
+    return phi.reshape(*many, records * q, -1), rows[..., columns.u + 1].reshape(*many, -1)
+
+
 class Span:
     """What is eliminated, and what it leaves of the output, in the triangles of all records."""
 
     def __init__(self, problem: Problem, triangles: Triangles, weights: Weights | None) -> None:
-        self.triangles = triangles
-        form, columns, _, rows = triangles
-        self.n, self.shared = columns.n, problem.zeros + 1
+        self.triangles, self.weights = triangles, weights
+        self.n, self.shared = triangles.columns.n, problem.zeros + 1
         self.proper = min(self.shared, self.n)
-        self.weights = weights
-        records, q, _ = rows.shape
-        own = self.n * problem.free_response + columns.offset
-        # The numerator is common to all records; a free response and an offset are zero outside their own.
-        phi = np.zeros((records, q, self.shared + records * own))
-        # The last m + 1 states of the chain span B/A u; of degree n there is u itself besides.
-        phi[:, :, : self.proper] = rows[:, :, : self.n] @ form.states[self.n - self.proper :].T
-        if self.shared > self.n:
-            phi[:, :, self.n] = rows[:, :, columns.u]
-        for k in range(records if own else 0):
-            place = self.shared + k * own
-            if problem.free_response:
-                phi[k, :, place : place + self.n] = rows[k, :, columns.free_z] @ form.states.T
-            if columns.offset:
-                phi[k, :, place + own - 1] = rows[k, :, -1]
-        phi, y = phi.reshape(records * q, -1), rows[:, :, columns.u + 1].ravel()
+        phi, y = _columns(problem, triangles.columns, triangles.rows, triangles.form.states)
         if weights is not None:
             both = phi[:, : self.shared]
             phi, y = np.hstack((both @ weights.basis, phi[:, self.shared :])), y - both @ weights.given
@@ -191,7 +199,31 @@ def project(problem: Problem, speed: Array, damping: Array, delay: Delay, *, slo
     return Projected(squared_error, output, direct, free, offset, span)
 
 
-def _triangles(problem: Problem, forms: list[Modal] | list[Chain], delay: Delay, second: bool) -> Triangles:
+def squared_errors(problem: Problem, sections: Sequence[tuple[Array, Array]], delay: Delay) -> Array:
+    """Return the squared errors of many sections of one order at one delay, to compare starts."""
+    forms = [form_of(*problem.sections(*own), problem.length) for own in sections]
+    errors = np.zeros(len(forms))
+    modal = [k for k, form in enumerate(forms) if isinstance(form, Modal)]
+    if np.isfinite(problem.numerator).any():
+        modal = []
+    for k in set(range(len(forms))) - set(modal):
+        errors[k] = project(problem, *sections[k], delay).squared_error
+    at_once = max(TOGETHER // sum(data.t.size for data in problem.records), 1)
+    for first in range(0, len(modal), at_once):
+        own = modal[first : first + at_once]
+        group = [form for k in own if isinstance(form := forms[k], Modal)]
+        columns = Columns.of(group[0].poles.size, False, problem.free_response, problem.constant)
+        each = zip(problem.records, problem.periods, strict=True)
+        rows = np.stack([triangles_of(group, columns, delay, *record) for record in each], axis=1)
+        phi, y = _columns(problem, columns, rows, np.stack([form.states for form in group])[:, None])
+        whole = np.concatenate((phi, y[:, :, None]), axis=2)
+        lengths = np.linalg.norm(whole, axis=1, keepdims=True)
+        left = np.asarray(np.linalg.qr(whole / np.where(lengths > 0.0, lengths, 1.0), mode="r"))[:, -1, -1]
+        errors[own] = (left * lengths[:, 0, -1]) ** 2
+    return errors
+
+
+def _triangles(problem: Problem, forms: Sequence[Form], delay: Delay, second: bool) -> Triangles:
     """Return the triangles of all records, each in its form."""
     n = forms[0].states.shape[0]
     columns = Columns.of(n, second, problem.free_response, problem.constant)

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.estimation.optimum.box import TOUCH, Box, Point, at_bounds, box_of, frozen, moved_by, point_of, widened
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_space
-from ctid_cli.estimation.optimum.projection import Problem, Projected, project, slopes
+from ctid_cli.estimation.optimum.projection import Problem, Projected, project, slopes, squared_errors
+from ctid_cli.estimation.optimum.triangle import Delay
 
 #: Fall of the squared error that Newton's step may promise, as a fraction of it, at a minimum; what Newton's steps aim
 #: at, and where a descent leaves the rest to them.
@@ -25,6 +26,10 @@ CLOSE = 0.01
 #: A search is given up for a lower known minimum once the fall that a step promises is, so many times, less than what
 #: parts them (after the first few steps), or once the squared error is still so many times higher.
 HOPELESS, FIRST_STEPS, PATIENCE, FAR = 30.0, 3, 12, 4.0
+#: The same for what so many steps have fallen: between the kinks of an irregular clock steps promise more than they do.
+CRAWLING, REMEMBERED = 100.0, 7
+#: A step is another one if it differs by more than this fraction of its length.
+ANOTHER = 0.1
 #: Step of the differences of the gradient; eigenvalues below this fraction of the largest have no sign.
 DIFFERENCE, FLAT = 1e-4, 1e-9
 #: Differences to one side will do where the least eigenvalue exceeds their error by this factor.
@@ -114,6 +119,21 @@ class Descent:
         self.evaluations += 1
         return project(self.problem, point.speed, point.damping, point.delay, slopes_too=slopes_too)
 
+    def squared_errors(self, points: Sequence[Point]) -> Array:
+        """Return the squared errors at many points of one order, to compare them."""
+        self.evaluations += len(points)
+        errors, of_delay = np.zeros(len(points)), dict[Delay, list[int]]()
+        for k, point in enumerate(points):
+            of_delay.setdefault(point.delay, []).append(k)
+        for delay, places in of_delay.items():
+            sections = [(points[k].speed, points[k].damping) for k in places]
+            errors[places] = squared_errors(self.problem, sections, delay)
+        return errors
+
+    def sorted(self, points: Sequence[Point]) -> list[Point]:
+        """Return points by rising squared error."""
+        return [points[k] for k in np.argsort(self.squared_errors(points), kind="stable")]
+
     def local(self, point: Point, projected: Projected | None = None) -> Local:
         """Gradient and curvature at a point; the delay counts in quarter periods."""
         projected = self.value(point, slopes_too=True) if projected is None else projected
@@ -166,7 +186,7 @@ class Descent:
         """
         here = self.local(start)
         lowest = min((other.squared_error for other in known), default=np.inf)
-        damping, factor, slow = 1e-3, 2.0, 0
+        damping, factor, slow, falls = 1e-3, 2.0, 0, [np.inf] * REMEMBERED
         scale = np.zeros(here.gradient.size)
         for taken in range(most_steps):
             here = self._faced(here)
@@ -178,12 +198,15 @@ class Descent:
             scaled, slope = ways.reduced(here.gradient, here.curvature)
             promise = _promise(scaled, slope)[0] if slope.size else 0.0
             arrived = promise <= near * max(here.squared_error, self.floor)
-            if arrived or _hopeless(taken, here.squared_error, promise, lowest):
+            if arrived or _hopeless(taken, here.squared_error, promise, sum(falls), lowest):
                 break
+            lower, rejected = None, np.full(here.gradient.size, np.inf)
             for _ in range(MOST_REJECTIONS):
                 step = ways.whole(np.linalg.solve(scaled + damping * np.eye(slope.size), -slope))
                 step /= max(1.0, float(np.abs(step).max()))
-                lower = self._lower(here, self._whole_and_to_edge(here.point, step))
+                # Where steps are cut to their greatest length, more damping hardly changes them at first.
+                if np.abs(step - rejected).max() > ANOTHER * np.abs(step).max():
+                    lower, rejected = self._lower(here, self._whole_and_to_edge(here.point, step)), step
                 if lower is not None:
                     break
                 damping, factor = damping * factor, factor * 2.0
@@ -195,6 +218,7 @@ class Descent:
             damping *= max(1.0 / 3.0, 1.0 - (2.0 * fall / promised - 1.0) ** 3) if promised > 0 else 1.0
             damping, factor = max(damping, 1e-12), 2.0
             slow = slow + 1 if fall < 1e-9 * here.squared_error else 0
+            falls = [*falls[1:], fall]
             same = np.array_equal(trial.damping < 0, here.point.damping < 0)
             here = self.local(trial, found)
             if not same:
@@ -399,9 +423,10 @@ def _alike(here: Local, other: Local, box: Box) -> bool:
     return bool(np.abs(away).max() < CLOSE and abs(later) < CLOSE)
 
 
-def _hopeless(taken: int, squared_error: float, promise: float, lowest: float) -> bool:
+def _hopeless(taken: int, squared_error: float, promise: float, fallen: float, lowest: float) -> bool:
     """Whether a search will not come down to the lowest known minimum."""
-    too_flat = taken >= FIRST_STEPS and squared_error - HOPELESS * promise > lowest
+    least = min(HOPELESS * promise, CRAWLING * fallen)
+    too_flat = taken >= FIRST_STEPS and squared_error - least > lowest
     return too_flat or (taken >= PATIENCE and squared_error > FAR * lowest)
 
 

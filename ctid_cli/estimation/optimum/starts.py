@@ -1,7 +1,8 @@
 """Where searches start: from the optima of the smaller models, from given estimates, and at random."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,12 +10,8 @@ from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.estimation.optimum.box import LIMITS, Box, Point, point_of
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
-from ctid_cli.estimation.optimum.search import Descent, Local
+from ctid_cli.estimation.optimum.search import Descent, Judged, Local
 
-#: Poles tried beside those of a smaller model, and how many of them are refined.
-FREQUENCIES, DAMPINGS, REFINED = 24, (0.02, 0.1, 0.5), 3
-#: A pair alone has minima at every peak of the noise: so much more is tried, and refined.
-DENSER, MORE = 4, 2
 #: Evaluations times samples that are spent on pairs of the least damping: up to 1,000 samples all frequencies that
 #: these resolve. The best of them, and delays, that are looked at together.
 RESOLVED, LOOKED_AT = 1_000_000, 16
@@ -32,6 +29,32 @@ FAST = 0.25
 MOST_DELAYS = 100
 
 
+class Effort(NamedTuple):
+    """What is tried for a structure."""
+
+    #: Frequencies of a pole, and of a pair, that is added to a smaller model; dampings of a pair.
+    poles: int
+    pairs: int
+    dampings: tuple[float, ...]
+    #: How many of these are looked at, and how many of all are refined beside what the structure contains.
+    looked_at: int
+    refined: int
+    #: How many poles by themselves are looked at, and at so many times more frequencies: a pair has a minimum at every
+    #: peak of the noise.
+    alone: int
+    denser: int
+    #: Whether a pole and a zero are also added at a time, from a single pole on, and models as fast as their input are
+    #: starts, too.
+    spine: bool
+    #: Up to so many poles the whole range of the delay is looked at.
+    along_delay: float
+
+
+#: For one structure; and for a range of them, where each has been found from many others.
+THOROUGH = Effort(24, 24, (0.02, 0.1, 0.5), looked_at=3, refined=3, alone=6, denser=4, spine=True, along_delay=np.inf)
+QUICK = Effort(12, 20, (0.03, 0.3), looked_at=1, refined=2, alone=3, denser=1, spine=False, along_delay=2)
+
+
 class Nest:
     """The optima of a structure and of all that it contains, each found from those below it."""
 
@@ -43,8 +66,10 @@ class Nest:
         seed: int,
         pilot: "Nest | None" = None,
         known: KnownCoefficients = NOTHING,
+        effort: Effort = THOROUGH,
     ) -> None:
         self.problem, self.box, self.random_starts, self.seed = problem, box, random_starts, seed
+        self.effort = effort
         #: Known coefficients; with these only the one structure is searched that has them.
         self.known = known
         #: The same for a part of the records, from whose optima the searches start.
@@ -53,6 +78,7 @@ class Nest:
         self._found: dict[tuple[int, int], list[Local]] = {}
         self._ends: dict[tuple[int, int], list[float]] = {}
         self._spines: dict[int, Local] = {}
+        self._judged: dict[Local, Judged] = {}
 
     def descent(self, zeros: int) -> Descent:
         """Searches with a numerator of that degree."""
@@ -87,7 +113,7 @@ class Nest:
             points = [] if poles > 1 else self._alone(0, 1)
             for added in range(1, min(poles - 1, 2) + 1):
                 before = self._spine(poles - added).point
-                points += self._extended(poles - 1, before.poles, before.delay.seconds, added)
+                points += self._extended(poles - 1, before.poles, before.delay.seconds, added, self.effort.looked_at)
             points = self._along_delay(poles - 1, points)
             descent = self.descent(poles - 1)
             self._spines[poles] = min(map(descent.descend, points), key=lambda local: local.squared_error)
@@ -96,12 +122,23 @@ class Nest:
 
     def _alone(self, zeros: int, poles: int) -> list[Point]:
         """The best single poles, or single pairs."""
-        middle = 0.5 * (self.box.delays[0] + self.box.delays[1])
-        return self._extended(zeros, np.zeros(0, dtype=complex), middle, poles, DENSER, MORE)
+        middle = 0.5 * sum(self.box.delays)
+        if poles > 1 and not self.effort.spine:
+            middle = self.optima(1, 0)[0].point.delay.seconds
+        return self._extended(zeros, np.zeros(0, dtype=complex), middle, poles, self.effort.alone, self.effort.denser)
 
     def ends(self, poles: int, zeros: int) -> list[float]:
         """Squared errors at which the searches for a structure have ended."""
         return self._ends[poles, zeros]
+
+    def settled(self, poles: int, zeros: int) -> Judged:
+        """Return the lowest minimum of a structure to all digits, and its kind."""
+        lowest = self.optima(poles, zeros)[0]
+        if lowest not in self._judged:
+            descent = self.descent(zeros)
+            self._judged[lowest] = descent.settle(lowest)
+            self.evaluations += descent.evaluations
+        return self._judged[lowest]
 
     def refine(self, poles: int, zeros: int, points: Iterable[Point]) -> None:
         """Search from points, and keep the lowest minima."""
@@ -143,23 +180,25 @@ class Nest:
 
     def _from_below(self, poles: int, zeros: int) -> list[Point]:
         """Starts from smaller models, and along the delay."""
-        first, others = [self._spine(poles).point], []
-        if poles == 2:
-            first += self._alone(zeros, 2)
+        effort = self.effort
+        contained = [self._spine(poles).point] if effort.spine else []
+        others: list[Point] = []
+        if poles == 2 or (poles == 1 and not effort.spine):
+            contained += self._alone(zeros, poles)
         if zeros > 0:
-            first.append(self.optima(poles, zeros - 1)[0].point)
+            contained.append(self.optima(poles, zeros - 1)[0].point)
         if poles > 1 and zeros > 0:
             # Contained in this structure whatever the added pole is, as is the one before.
-            contained = self._grown(poles - 1, zeros - 1, zeros, 1)
-            first, others = first + contained[:1], contained[1:]
+            grown = self._grown(poles - 1, zeros - 1, zeros, 1)
+            contained, others = contained + grown[:1], grown[1:]
+        most_zeros = int(effort.spine or not self.box.delay_free)
         for n, m in ((poles - 1, zeros), (poles - 2, zeros - 2), (poles - 2, zeros)):
-            if 0 <= m <= n and n > 0:
+            if n > 0 and 0 <= m < n + most_zeros:
                 others += self._grown(n, m, zeros, poles - n)
         descent = self.descent(zeros)
-        others.sort(key=lambda point: descent.value(point).squared_error)
-        first.sort(key=lambda point: descent.value(point).squared_error)
+        points = descent.sorted(contained) + descent.sorted(others)[: effort.refined]
         self.evaluations += descent.evaluations
-        return self._along_delay(zeros, first + others[:REFINED])
+        return self._along_delay(zeros, points) if poles <= effort.along_delay else points
 
     def with_known(self, poles: int, zeros: int, known: KnownCoefficients, points: Iterable[Point]) -> "Nest":
         """Return a nest of the models of a structure that have known coefficients.
@@ -174,7 +213,7 @@ class Nest:
             starts += self.resonances(poles, zeros) + nest.random_points(poles)
         moved = [point for point in (known.met(start, self.box) for start in starts) if point is not None]
         descent = nest.descent(zeros)
-        moved.sort(key=lambda point: descent.value(point).squared_error)
+        moved = descent.sorted(moved)
         nest.evaluations += descent.evaluations
         nest.refine(poles, zeros, nest._along_delay(zeros, moved))
         return nest
@@ -189,7 +228,7 @@ class Nest:
         # Half of what separates two frequencies.
         resolution, highest = 0.5 * np.pi * self.box.spread[0], min(self.box.imaginary, self.box.fastest)
         count = min(int(highest / resolution), RESOLVED // samples)
-        if poles < 2 or count < FREQUENCIES:
+        if poles < 2 or count < self.effort.pairs:
             return []
         roots, delay = np.zeros(0, dtype=complex), 0.5 * sum(self.box.delays)
         if poles > 2:
@@ -208,22 +247,23 @@ class Nest:
         found = list(lowest.values())[: LOOKED_AT // 2]
         if self.box.imaginary < self.box.fastest:
             # A pair that alternates with the samples is another one at every delay.
-            places = [(self.box.imaginary, damping, tau) for damping in (zeta, *DAMPINGS) for tau in delays]
+            places = [(self.box.imaginary, damping, tau) for damping in (zeta, *self.effort.dampings) for tau in delays]
             edge = sorted(self._with_pairs(zeros, roots, places), key=lambda entry: entry[0])
-            found += [point for _, _, point in edge[:REFINED]]
+            found += [point for _, _, point in edge[: self.effort.refined]]
         return found
 
     def _with_pairs(
         self, zeros: int, roots: ComplexArray, places: Iterable[tuple[float, float, float]]
     ) -> list[tuple[float, float, Point]]:
         """Squared errors, frequencies and points with a pair of each imaginary part and damping, at each delay."""
-        descent, found = self.descent(zeros), []
+        descent, frequencies, points = self.descent(zeros), [], []
         for w, zeta, tau in places:
             pair = w * complex(-zeta, 1.0)
-            point = point_of(np.concatenate((roots, [pair, pair.conjugate()])), tau, self.box)
-            found.append((descent.value(point).squared_error, w, point))
+            frequencies.append(w)
+            points.append(point_of(np.concatenate((roots, [pair, pair.conjugate()])), tau, self.box))
+        errors = descent.squared_errors(points).tolist()
         self.evaluations += descent.evaluations
-        return found
+        return list(zip(errors, frequencies, points, strict=True))
 
     def close_delays(self, poles: int, zeros: int) -> list[Point]:
         """Return starts with the best poles at delays within half a sampling interval of the best one.
@@ -241,37 +281,33 @@ class Nest:
     def _grown(self, poles: int, zeros: int, new_zeros: int, added: int) -> list[Point]:
         """The best of a smaller structure with poles added, for another numerator."""
         point = self.optima(poles, zeros)[0].point
-        return self._extended(new_zeros, point.poles, point.delay.seconds, added)
+        return self._extended(new_zeros, point.poles, point.delay.seconds, added, self.effort.looked_at)
 
     def _extended(
-        self, zeros: int, roots: ComplexArray, delay: float, added: int, denser: int = 1, more: int = 1
+        self, zeros: int, roots: ComplexArray, delay: float, added: int, most: int, denser: int = 1
     ) -> list[Point]:
-        """The best few of all poles, or pairs, added to given ones."""
-        chosen: list[tuple[Array, Point]] = []
-        for where, point in self._beside_poles(roots, delay, zeros, added, denser * FREQUENCIES, DAMPINGS):
-            if len(chosen) < more * REFINED and all(np.abs(where - other).max() > APART for other, _ in chosen):
-                chosen.append((where, point))
-        return [point for _, point in chosen]
-
-    def _beside_poles(
-        self, roots: ComplexArray, delay: float, zeros: int, added: int, count: int, dampings: Sequence[float]
-    ) -> list[tuple[Array, Point]]:
-        """Poles, or pairs of some dampings, added to given ones, the best first by elimination alone; and where."""
-        descent = self.descent(zeros)
-        found: list[tuple[float, Array, Point]] = []
-        slowest, box = self.box.spread[0], self.box
+        """The best few of all poles, or pairs, added to given ones, by elimination alone."""
+        effort, box = self.effort, self.box
+        slowest, count = box.spread[0], denser * (effort.poles if added == 1 else effort.pairs)
         frequencies = np.geomspace(slowest, box.fastest, count + 2)[1:-1]
         if added == 1 and box.slowest < slowest:
             # One for all that are next to integrators.
             frequencies = np.append(frequencies, np.sqrt(box.slowest * slowest))
+        where, points = [], []
         for w in frequencies.tolist():
-            for zeta in dampings if added == 2 else (1.0,):
+            for zeta in effort.dampings if added == 2 else (1.0,):
                 pole = w * complex(-zeta, np.sqrt(1 - zeta * zeta))
                 new = [pole, pole.conjugate()] if added == 2 else [complex(-w)]
-                point = point_of(np.concatenate((roots, new)), delay, self.box)
-                found.append((descent.value(point).squared_error, np.array([np.log(w), np.log(zeta)]), point))
+                where.append((np.log(w), np.log(zeta)))
+                points.append(point_of(np.concatenate((roots, new)), delay, box))
+        descent, chosen = self.descent(zeros), list[int]()
+        order = np.argsort(descent.squared_errors(points), kind="stable").tolist()
         self.evaluations += descent.evaluations
-        return [(where, point) for _, where, point in sorted(found, key=lambda entry: entry[0])]
+        for k in order:
+            apart = all(np.abs(np.subtract(where[k], where[other])).max() > APART for other in chosen)
+            if apart and len(chosen) < most:
+                chosen.append(k)
+        return [points[k] for k in chosen]
 
     def _along_delay(self, zeros: int, points: list[Point]) -> list[Point]:
         """Further starts at the minima of the profile over the delay, for the poles of the best start."""
@@ -280,7 +316,7 @@ class Nest:
         descent = self.descent(zeros)
         best = points[0]
         trials = [point_of(best.poles, delay, self.box) for delay in self._delays(MOST_DELAYS)]
-        errors = np.array([descent.value(trial).squared_error for trial in trials])
+        errors = descent.squared_errors(trials)
         self.evaluations += descent.evaluations
         return points + [trials[k] for k in _lowest_minima(errors, KEPT)]
 

@@ -1,7 +1,7 @@
 r"""The rows of all used samples of a record, reduced by orthogonal transformations to a triangle.
 
-With Z the rows ``[z, w, u, y, free z, free w, 1]`` of all used samples, ``Z = Q R``: whatever is asked of linear maps of
-these rows (projections, residuals, sums of squares) is asked of the same maps of R. Second moments would square the
+With Z the rows ``[z, w, u, y, free z, free w, 1]`` of all used samples, ``Z = Q R``: whatever is asked of linear maps
+of these rows (projections, residuals, sums of squares) is asked of the same maps of R. Second moments would square the
 condition; this costs little more, so that one route serves the search and its end.
 """
 
@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.optimum.chain import Chain, Modal, Record
-from ctid_cli.filtering.bank import Place
+from ctid_cli.estimation.optimum.chain import Chain, Form, Fractions, Modal, Record
 from ctid_cli.filtering.filter_data import FilterData, split_delay
 
 
@@ -22,13 +21,11 @@ class Delay(NamedTuple):
     seconds: float
     cell: int
 
-    def place(self, interval: float) -> Place:
+    def place(self, interval: float) -> tuple[int, float]:
         """Return the breaks by which the read-out lags, and the fraction, 0 to 1, of an interval read beyond that.
 
-        At a sample a cell is closed on both sides: each has its own slope there. On an irregular clock, the delay.
+        At a sample a cell is closed on both sides: each has its own slope there.
         """
-        if interval == 0.0:
-            return self.seconds
         if self.cell < 0:
             return split_delay(self.seconds, interval)
         return self.cell + 1, min(max(self.cell + 1 - self.seconds / interval, 0.0), 1.0)
@@ -70,10 +67,11 @@ class Columns(NamedTuple):
         return self.u + 2 + self.free + self.offset
 
 
-def rows_of(form: Modal | Chain, columns: Columns, delay: Delay, data: FilterData, period: float) -> Iterator[Array]:
+def rows_of(
+    form: Fractions | Chain, columns: Columns, delay: Delay, data: FilterData, period: float
+) -> Iterator[Array]:
     """Yield the rows of the used samples, transposed, piece by piece."""
-    second, done = columns.second > 0, 0
-    record = _periodic(data, delay, period) if period else Record(data, delay.place(data.interval))
+    second, done, record = columns.second > 0, 0, _record(delay, data, period)
     elapsed = data.t[data.use] if columns.free else data.t
     for forced in form.forced(record, second):
         rows = np.empty((columns.size, len(forced)))
@@ -86,20 +84,45 @@ def rows_of(form: Modal | Chain, columns: Columns, delay: Delay, data: FilterDat
         yield rows
 
 
-def triangle_of(form: Modal | Chain, columns: Columns, delay: Delay, data: FilterData, period: float) -> Array:
+def triangle_of(form: Form, columns: Columns, delay: Delay, data: FilterData, period: float) -> Array:
     """Return a triangle with the second moments of the rows of all used samples."""
     triangle: Array | None = None
     for rows in rows_of(form, columns, delay, data, period):
         # R <- qr[R; piece]: memory is that of one piece, however long the record.
         whole = rows if triangle is None else np.hstack((triangle.T, rows))
-        triangle = np.linalg.qr(whole.T, mode="r")
+        triangle = np.asarray(np.linalg.qr(whole.T, mode="r"))
     assert triangle is not None
     missing = columns.size - len(triangle)
     return np.pad(triangle, ((0, missing), (0, 0))) if missing else triangle
 
 
-def _periodic(data: FilterData, delay: Delay, period: float) -> Record:
-    """Return a record whose input repeats itself, beginning with the period before its first sample."""
+def triangles_of(forms: list[Modal], columns: Columns, delay: Delay, data: FilterData, period: float) -> Array:
+    """Return the triangles of several forms of one order without w, from one pass of all their modes: (K, q, q)."""
+    poles, places = np.unique(np.concatenate([form.modes.poles for form in forms]), return_inverse=True)
+    widths = np.where(poles.imag > 0.0, 2, 1)
+    last = np.cumsum(widths)
+    # Of each form the rows among those of all modes.
+    each = [np.arange(last[place] - widths[place], last[place]) for place in places]
+    z, n = np.concatenate(each).reshape(len(forms), columns.n), int(last[-1])
+    whole = Columns.of(n, second=False, free=columns.free > 0, offset=columns.offset > 0)
+    others = np.array([n, n + 1, whole.size - 1])
+    chosen = [z, np.tile(others[:2], (len(forms), 1))]
+    chosen += [n + 2 + z] if columns.free else []
+    chosen += [np.tile(others[2:], (len(forms), 1))] if columns.offset else []
+    rows_of_forms = np.hstack(chosen)
+    triangles = np.zeros((len(forms), 0, columns.size))
+    for rows in rows_of(Fractions(Fractions.modes_of(poles)), whole, delay, data, period):
+        own = rows[rows_of_forms].transpose(0, 2, 1)
+        whole_piece = np.concatenate((triangles, own), axis=1) if triangles.size else own
+        triangles = np.asarray(np.linalg.qr(whole_piece, mode="r"))
+    missing = columns.size - triangles.shape[1]
+    return np.pad(triangles, ((0, 0), (0, missing), (0, 0)))
+
+
+def _record(delay: Delay, data: FilterData, period: float) -> Record:
+    """Return a record as it is filtered; one whose input repeats itself begins with the period before its samples."""
+    if not period:
+        return Record(data, delay.place(data.interval) if data.interval > 0.0 else delay.seconds)
     if data.interval > 0.0:
         shift, fraction = delay.place(data.interval)
         # The last interval leads back to the first break, where the next slope begins.
