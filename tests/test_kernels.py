@@ -4,9 +4,13 @@ import ast
 import importlib
 import importlib.util
 import inspect
+import os
 import pkgutil
+import shutil
+import subprocess
 import sys
 from functools import cache
+from pathlib import Path
 from types import CodeType
 
 import pytest
@@ -75,7 +79,7 @@ def foreign_names(function, module):
 def test_kernels_read_nothing_of_other_files():
     """Numba compares what it has on disk with the file of the function alone: of other files nothing may be read."""
     names = [name for _, name, _ in pkgutil.walk_packages(ctid_cli.__path__, "ctid_cli.")]
-    modules = [importlib.import_module(name) for name in names if not name.endswith("__main__")]
+    modules = [importlib.import_module(name) for name in names]
     found = {function: foreign_names(function, module) for module in modules for function in kernels_of(module)}
     assert len(found) > 50
     assert {f"{function.__module__}.{function.__name__}": names for function, names in found.items() if names} == {}
@@ -127,3 +131,58 @@ OWN = 3
 def test_flags_of_kernels_are_those_of_estimates():
     bits = list(Flag)[:8]
     assert [getattr(kernels, flag.name) for flag in bits] == bits
+
+
+#: A kernel that calls another one of its file, which reads a constant of it.
+SHORT_WORK = """
+import sys
+from ctid_cli.filtering import kernels
+assert kernels.__file__.startswith(sys.argv[1]), kernels.__file__
+print(kernels.step_weights(-0.5 + 0.3j, 1.0))
+"""
+CALLEE = ("0.5 + re * inner_re - im", "0.6 + re * inner_re - im")
+CONSTANT = ("math.factorial(k + 4)", "math.factorial(k + 5)")
+
+
+def copied_package(root):
+    """Copy the package without anything that was compiled."""
+    shutil.copytree(Path(ctid_cli.__file__).parent, root / "ctid_cli", ignore=shutil.ignore_patterns("__pycache__"))
+    return root / "ctid_cli" / "filtering"
+
+
+def computed(root, home):
+    """What the copy computes in a new process, with the caches that earlier ones have left."""
+    environment = os.environ | {"PYTHONPATH": str(root), "HOME": str(home)}
+    for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
+        environment.pop(name, None)
+    command = [sys.executable, "-c", SHORT_WORK, str(root)]
+    return subprocess.run(command, env=environment, cwd=root, capture_output=True, text=True, check=True).stdout
+
+
+def replaced(file, old, new, *, same_stamp=False):
+    """Edit a source; as an installer may, without a change of its size and time, the bytecode made anew."""
+    text, stat = file.read_text(), file.stat()
+    assert text.count(old) == 1
+    file.write_text(text.replace(old, new))
+    if same_stamp:
+        assert file.stat().st_size == stat.st_size
+        os.utime(file, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+        for bytecode in (file.parent / "__pycache__").glob("*.pyc"):
+            bytecode.unlink()
+
+
+@pytest.mark.parametrize("place", ["edited in place", "upgraded by an installer", "read-only"])
+def test_changes_of_callees_and_constants_are_computed_with(place, tmp_path):
+    """Whatever changes in a source, the next process computes with it, and nobody deletes anything."""
+    folder, home = copied_package(tmp_path / "site-packages"), tmp_path / "home"
+    if place == "read-only":
+        # Permissions do not stop root: where a file is in the way, nobody can make the folder of the caches.
+        for inner in {path.parent for path in (tmp_path / "site-packages").rglob("*.py")}:
+            (inner / "__pycache__").touch()
+    first = computed(tmp_path / "site-packages", home)
+    assert list((home if place == "read-only" else folder).rglob("kernels.step_weights-*.nbi"))
+    results = [first]
+    for change in (CALLEE, CONSTANT):
+        replaced(folder / "kernels.py", *change, same_stamp=place == "upgraded by an installer")
+        results.append(computed(tmp_path / "site-packages", home))
+    assert len(set(results)) == 3
