@@ -119,12 +119,6 @@ def test_frequency_and_damping_do_not_change_where_two_poles_meet_on_the_real_ax
     assert "so close to another" in rows[1]["g1_pole_1"].reason
 
 
-def test_poles_on_either_side_of_the_origin_have_no_natural_frequency():
-    rows = by_name(AdditiveModel([Submodel([1.0], [-0.25, 1.0, 1.0])]), 1e-6 * np.eye(3))
-    assert list(rows) == ["g1_pole_1", "g1_time_constant_1", "g1_pole_2", "g1_time_constant_2", "g1_static_gain"]
-    assert rows["g1_time_constant_1"].estimate * rows["g1_time_constant_2"].estimate == pytest.approx(-0.25)
-
-
 def test_accuracy_is_that_of_the_unfactored_model():
     # The same estimate in other coordinates: poles of a fraction, poles of its factors.
     covariance = random_covariance(TWO_MODES)
