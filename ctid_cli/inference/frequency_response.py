@@ -9,7 +9,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.spectra import record_spectra
-from ctid_cli.inference.input_response import analyse_answer
+from ctid_cli.inference.input_response import analyse_response
 from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.inference.spectral_methods import (
     ResponseLines,
@@ -340,7 +340,7 @@ def _on_any_clock(
 
 def _begins(record: Record) -> float:
     """Time before which the output does not answer [s]."""
-    hint = analyse_answer(record).delay
+    hint = analyse_response(record).delay
     return hint.early if hint is not None else 0.0
 
 

@@ -69,7 +69,7 @@ class DelayHint:
 
 
 @dataclass(frozen=True)
-class Answer:
+class InputResponse:
     """What the output shows of the input."""
 
     #: Frequency below which 95 % of the answer lies [rad/s]; the Nyquist frequency where no answer is seen.
@@ -101,16 +101,16 @@ def output_bandwidth(record: Record) -> float:
     of a fit as a function of the delay all the same. After an input of three steps or fewer, the bandwidth is
     that of a first-order system as fast as the answer.
     """
-    return analyse_answer(record).bandwidth
+    return analyse_response(record).bandwidth
 
 
-def analyse_answer(record: Record, moves: InputMoves | None = None) -> Answer:
+def analyse_response(record: Record, moves: InputMoves | None = None) -> InputResponse:
     """Band and delay of the answer of the output to the input."""
     moves = moves or input_moves(record)
     grid = regular_grid(record)
     nyquist = math.pi / grid.interval
     if moves.kind == "constant" or grid.u.size < 8 or not np.any(grid.y):
-        return Answer(nyquist)
+        return InputResponse(nyquist)
     if moves.kind == "steps":
         return _after_a_step(record, moves, nyquist)
     alignments = _peaks(np.abs(_cross_correlation(grid.u, grid.y, grid.u.size // 2)[grid.u.size // 2 :]))
@@ -123,8 +123,8 @@ def analyse_answer(record: Record, moves: InputMoves | None = None) -> Answer:
         visible, bandwidths = max(s.visible_up_to for s in spectra), best.bandwidths
     else:
         bandwidth, visible, bandwidths = nyquist, math.nan, (nyquist,)
-    timing = _first_answer(grid, bandwidths, moves)
-    return Answer(min(bandwidth, nyquist), visible, best.explained, best.input_band, *timing)
+    timing = _delay_and_period(grid, bandwidths, moves)
+    return InputResponse(min(bandwidth, nyquist), visible, best.explained, best.input_band, *timing)
 
 
 def regular_grid(record: Record) -> Grid:
@@ -261,7 +261,7 @@ def _filtered(x: Array, coefficients: Array) -> Array:
     return np.asarray(np.fft.irfft(np.fft.rfft(x, n) * np.fft.rfft(coefficients, n), n)[: x.size], dtype=float)
 
 
-def _first_answer(
+def _delay_and_period(
     grid: Grid, bandwidths: tuple[float, ...], moves: InputMoves
 ) -> tuple[DelayHint | None, float, float]:
     """Delay, period of the input, and the greatest answer before the input.
@@ -352,8 +352,8 @@ def _first_of_run(above: BoolArray, k: int, pause: int) -> int:
         k = max(0, k - pause) + int(earlier[0])
 
 
-def _after_a_step(record: Record, moves: InputMoves, nyquist: float) -> Answer:
-    """Answer to the first step of an input that moves seldom."""
+def _after_a_step(record: Record, moves: InputMoves, nyquist: float) -> InputResponse:
+    """InputResponse to the first step of an input that moves seldom."""
     t, y = record.t[record.valid], record.y[record.valid]
     begin = float(moves.changes[0])
     end = float(moves.changes[1]) if moves.changes.size > 1 else float(t[-1])
@@ -361,7 +361,7 @@ def _after_a_step(record: Record, moves: InputMoves, nyquist: float) -> Answer:
     after = (t > begin) & (t <= end)
     t, moved = t[after] - begin, np.abs(y[after] - np.median(rest))
     if moved.size < 8:
-        return Answer(nyquist)
+        return InputResponse(nyquist)
     steps = np.abs(np.diff(y))
     noise = robust_deviation(steps) / math.sqrt(2)
     quantum = float(steps[steps > 0].min()) if np.any(steps > 0) else 0.0
@@ -370,7 +370,7 @@ def _after_a_step(record: Record, moves: InputMoves, nyquist: float) -> Answer:
     beyond = moved > threshold
     onset = np.flatnonzero(beyond[:-2] & beyond[1:-1] & beyond[2:])
     if not onset.size:
-        return Answer(nyquist)
+        return InputResponse(nyquist)
     first = int(onset[0])
     doubled = first + int(np.argmax(moved[first:] > 2 * threshold))
     # Traced back along a parabola through the two, twice as far: the level at rest is not known exactly.
@@ -379,4 +379,4 @@ def _after_a_step(record: Record, moves: InputMoves, nyquist: float) -> Answer:
     settled = float(np.median(moved[-max(3, moved.size // 20) :]))
     rise = float(t[int(np.argmax(moved > 0.632 * settled))] - t[first])
     bandwidth = min(FIRST_ORDER / rise, nyquist) if rise > 0 else nyquist
-    return Answer(bandwidth, delay=DelayHint(early, float(t[first]), float(moved.max() / threshold)))
+    return InputResponse(bandwidth, delay=DelayHint(early, float(t[first]), float(moved.max() / threshold)))

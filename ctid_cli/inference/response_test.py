@@ -72,7 +72,7 @@ class AnswerTest:
         )
 
 
-def answer_test(
+def response_test(
     records: Sequence[Record],
     used: Sequence[BoolArray],
     delays: tuple[float, float],

@@ -36,7 +36,7 @@ def record_of(u, y, t=None):
 
 
 def outcome(*records, delays=(0.0, 10.0), **options):
-    return module.answer_test(records, [record.valid for record in records], delays, **options)
+    return module.response_test(records, [record.valid for record in records], delays, **options)
 
 
 def answering(rng, n=400, share=0.36, colour=(1.0,), model=FIRST_ORDER):
