@@ -85,23 +85,6 @@ def test_is_the_double_sum_over_all_pairs_of_samples():
     assert largest_relative_error(covariance_of([psi], [v]), M @ psi.T @ R @ psi @ M) < 1e-9
 
 
-def test_approaches_the_exact_covariance_of_known_noise():
-    count = 20_000
-    psi = regressors(count)
-    h = lfilter([1.0, 0.8], [1.0, -1.5, 0.7], np.append(1.0, np.zeros(300)))
-    R = np.zeros(count)
-    R[:301] = [h[: h.size - k] @ h[k:] for k in range(301)]
-    M = np.linalg.inv(psi.T @ psi)
-    sigma = R[0] * psi.T @ psi
-    for lag in range(1, 301):
-        product = psi[lag:].T @ psi[:-lag]
-        sigma += R[lag] * (product + product.T)
-    v = noise(np.random.default_rng(2), count)
-    assert largest_relative_error(covariance_of([psi], [v], True), M @ sigma @ M) < 0.1
-    assert largest_relative_error(covariance_of([psi], [v], False), M @ sigma @ M) < 0.35
-    assert largest_relative_error(white_noise_covariance(psi.T @ psi, v @ v, count), M @ sigma @ M) > 0.5
-
-
 def test_white_residuals_give_the_white_formula():
     psi = regressors(200)
     v = np.random.default_rng(4).standard_normal(200)

@@ -52,22 +52,6 @@ def test_second_order_in_closed_form(damping, frequency):
     assert rows["pole_1_real"].standard_error == pytest.approx(0.5e-3 * a1, rel=1e-6)
 
 
-def test_first_order_by_hand():
-    rows = by_name(TransferFunction([3.0], [1.0, 0.5]), [[0.0004, 0.001], [0.001, 0.01]])
-    assert list(rows) == ["pole_1", "time_constant_1", "static_gain"]
-    assert (rows["pole_1"].estimate, rows["pole_1"].unit) == (-0.5, "rad/s")
-    assert rows["time_constant_1"].estimate == 2.0
-    assert rows["time_constant_1"].standard_error == pytest.approx(0.02 / 0.25)
-    assert rows["time_constant_1"].low == pytest.approx(2.0 - 1.959964 * 0.08, rel=1e-6)
-    assert rows["time_constant_1"].unit == "s"
-    gain = rows["static_gain"]
-    # gradient (-b/a^2, 1/a) = (-12, 2)
-    assert (gain.estimate, gain.unit) == (6.0, "output unit/input unit")
-    assert gain.standard_error == pytest.approx(np.sqrt(144 * 0.0004 - 2 * 24 * 0.001 + 4 * 0.01))
-    narrow = by_name(TransferFunction([3.0], [1.0, 0.5]), np.diag([0.0004, 0.01]), quantile=lambda _: 0.7)["pole_1"]
-    assert narrow.high - narrow.low == pytest.approx(2 * 0.7 * 0.02, rel=1e-9)
-
-
 def test_near_repeated_poles_are_undetermined():
     a = np.poly([-1.0, -1.1, -20.0])
     tight = by_name(TransferFunction([1.0], a), np.diag([1e-8, 1e-8, 1e-8, 1e-4]))

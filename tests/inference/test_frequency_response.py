@@ -152,15 +152,6 @@ def test_the_phase_is_followed_where_it_is_known():
     assert any("No phase at" in note for note in found.notes)
 
 
-def test_local_polynomials_follow_a_long_delay():
-    model = TransferFunction([1.0], [0.5, 1.0], delay=20.03)
-    found = estimate_frequency_response(random_record(3, noise=0.05, model=model, warm_up=600))
-    low = found.frequencies < 3.0
-    true = sampled_response(model, found.frequencies)
-    assert np.median(np.abs(found.response - true)[low] / np.abs(true)[low]) < 0.05
-    assert np.mean((np.abs(found.response - true) <= found.radius())[low]) > 0.85
-
-
 def test_any_clock_covers():
     shares = []
     for seed in range(6):

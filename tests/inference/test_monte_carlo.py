@@ -41,12 +41,6 @@ def test_bias_deviation_and_mean_square_are_those_of_the_table_of_morris():
     assert found.error == pytest.approx(found.value / np.sqrt(2 * 19_999), rel=0.03)
 
 
-def test_intervals_reach_as_many_standard_errors_as_each_estimate_says():
-    sample = Sample(np.array([1.0, 2.0, 6.0]), np.array([0.6, 1.0, 2.0]), quantiles=np.array([1.6, 1.96, 3.1]))
-    assert monte_carlo.covered(sample).tolist() == [False, False, True]
-    assert monte_carlo.standard_error(sample._replace(widths=np.array([0.6, np.nan, 2.0]))).value > 0
-
-
 def test_nothing_is_said_of_nothing():
     nothing = Sample(np.empty(0), np.empty(0))
     for measure in MEASURES.values():

@@ -112,16 +112,6 @@ def test_nothing_to_test_is_said():
     assert "exactly zero" in zero.sentence
 
 
-def test_every_estimated_lag_takes_a_degree_of_freedom():
-    rng = np.random.default_rng(9)
-    u = rng.standard_normal(500)
-    u -= u.mean()
-    e = rng.standard_normal(500)
-    delayed = np.append(np.zeros(3), u[:-3])
-    assert residual_tests(e, u).cross_degrees_of_freedom == 51
-    assert residual_tests(e, u, sensitivities=np.column_stack((u, delayed))).cross_degrees_of_freedom == 49
-
-
 RNG = np.random.default_rng(5)
 
 

@@ -95,12 +95,6 @@ def test_the_share_is_that_of_least_squares(initial_state):
     assert found.explained == pytest.approx(best, rel=1e-6)
 
 
-def test_several_records_say_together_what_most_alone_do_not():
-    rng = np.random.default_rng(45)
-    records = [answering(rng, 100, share=0.08) for _ in range(6)]
-    assert outcome(*records).p_value <= 0.01 < np.median([outcome(record).p_value for record in records])
-
-
 def test_a_clock_with_holes_and_an_irregular_one():
     rng = np.random.default_rng(46)
     record = answering(rng)
