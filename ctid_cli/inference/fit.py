@@ -94,7 +94,7 @@ class FittedModel(ABC):
 
     with the joint covariance C of all parameters that the fit reports, the delay's among them, for white or coloured
     noise, and exact derivatives; intervals reach as many standard errors as those of the parameters do. ``sampled``
-    draws 1000 sets of parameters with that covariance and takes quantiles of what these models answer: slower, and
+    draws 1000 sets of parameters with that covariance and takes quantiles of what these models give: slower, and
     right where a quantity is not linear over a standard error, as a step response is not about an uncertain delay.
     Parameters that were given or lie at a bound are taken as known. Without a covariance all bands are NaN.
 
@@ -386,7 +386,7 @@ class Fit(FittedModel, ShownAsTable):
         What the covariance is from, and how many standard errors intervals reach; None where that is not known, and
         intervals are then those of the normal distribution.
     in_ignored_loop : bool, default False
-        Whether the input answers to the output through a loop of which the estimator knows nothing.
+        Whether the input responds to the output through a loop of which the estimator knows nothing.
     """
 
     model: TransferFunction

@@ -299,7 +299,7 @@ def estimate_frequency_response(
         _require_alike(every, period)
     if period is not None and method in ("auto", "periodic"):
         return _finished(from_periods(signals, period, interval), "periodic", first, time_unit)
-    # A long delay turns the phase fast: the output is advanced to where it begins to answer.
+    # A long delay turns the phase fast: the output is advanced to where it begins to respond.
     u, y = signals[0]
     shift = min(int(_begins(first) / interval), u.size // 2)
     u, y = u[: u.size - shift], y[shift:]
@@ -340,7 +340,7 @@ def _on_any_clock(
 
 
 def _begins(record: Record) -> float:
-    """Time before which the output does not answer [s]."""
+    """Time before which the output does not respond [s]."""
     hint = analyse_response(record).delay
     return hint.early if hint is not None else 0.0
 

@@ -3,7 +3,7 @@ r"""Responses of an estimated model with confidence bands, from the joint covari
 Linearised, a quantity g has the variance ``(dg/dtheta) C (dg/dtheta)'`` with exact derivatives, and its interval
 reaches as many standard errors to both sides as those of the parameters do. Sampled, parameters are drawn from the
 normal distribution with covariance C, or Student's t where C itself is uncertain, and the interval lies between
-quantiles of what the drawn models answer: it need not be symmetric, and knows what a linearisation does not, such as
+quantiles of what the drawn models give: it need not be symmetric, and knows what a linearisation does not, such as
 what an uncertain delay does to the first instants of a step response.
 """
 

@@ -101,11 +101,11 @@ class RecordReport:
     explained: float
     #: The same as a signal-to-noise ratio [dB].
     snr_db: float
-    #: Frequency below which 95 % of the answer to the input lies [rad/s].
+    #: Frequency below which 95 % of the response to the input lies [rad/s].
     output_bandwidth: float
-    #: Highest frequency at which the answer is seen [rad/s].
+    #: Highest frequency at which the response is seen [rad/s].
     visible_up_to: float
-    #: The output begins to answer between these times after a change of the input [s].
+    #: The output begins to respond between these times after a change of the input [s].
     delay_early: float
     delay_late: float
     starts: Start
@@ -242,7 +242,7 @@ def _trend(t: Array, y: Array) -> tuple[float, float, float]:
 def _start(
     record: Record, answer: InputResponse, deviation: float, explained: float
 ) -> Literal["flat", "moving", "unknown"]:
-    """Whether the output moves before it can answer to what happens in the record."""
+    """Whether the output moves before it can respond to what happens in the record."""
     t, y = record.t[record.valid], record.y[record.valid]
     if answer.delay is None or deviation == 0.0 or not (explained > 0 or math.isnan(answer.explained)):
         return "unknown"

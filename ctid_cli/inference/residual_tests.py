@@ -125,7 +125,7 @@ class ResidualTests:
     #: Probability of a larger statistic if the residuals are independent of the input [-]; NaN where it cannot be
     #: computed.
     cross_p_value: float
-    #: Whether the output is seen to answer to the input at all; else no dynamics can be missed.
+    #: Whether the output is seen to respond to the input at all; else no dynamics can be missed.
     answered: bool = True
 
     @property
@@ -339,7 +339,7 @@ def _feedback_score(e: Array, x: Array, u: Array) -> float:
     """How far the input moves with residuals of the last instants, in standard deviations of what chance gives.
 
     What the input and the simulated output were does not tell all moves: those of a reference that is held are rare
-    and large, and would drown the answer to the noise. So they are clipped. Residuals that are white and independent
+    and large, and would drown the response to the noise. So they are clipped. Residuals that are white and independent
     of the input are independent of any function of it.
     """
     blocks, inputs = list(row_blocks(e.size - ORDER)), u[ORDER:]
