@@ -20,7 +20,7 @@ from ctid_cli.estimation.profile_refinement import Refinement
 from ctid_cli.estimation.profile_search import Profile, search_delay
 from ctid_cli.estimation.robust_fit import RobustFit, robust_fit
 from ctid_cli.inference.covariance import nearly_regular
-from ctid_cli.inference.fit import FilledLater, Fit, Status
+from ctid_cli.inference.fit import DeferredFields, Fit, Status
 from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
@@ -37,7 +37,7 @@ class Starts(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MeasuredFit(FilledLater, Fit):
+class MeasuredFit(DeferredFields, Fit):
     """A fit with what belongs to the records.
 
     Parameters
@@ -86,7 +86,7 @@ class MeasuredFit(FilledLater, Fit):
         Names of the parameters that were fixed.
     """
 
-    later: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used")
+    deferred: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used")
 
     theta: Array = field(default_factory=lambda: np.zeros(0))
     initial_states: tuple[Array, ...] = ()

@@ -21,11 +21,11 @@ from ctid_cli.estimators.second_look_words import of_second_look
 from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
 from ctid_cli.inference.criteria import fit_percent, r_squared
-from ctid_cli.inference.fit import FilledLater, FittedModel, Status
+from ctid_cli.inference.fit import DeferredFields, FittedModel, Status
 from ctid_cli.inference.intervals import BIASED, CostOfDelay, DelayInterval, UncertainValue
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
-from ctid_cli.inference.response_test import AnswerTest, answer_test
+from ctid_cli.inference.response_test import AnswerTest, response_test
 from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import DRAWS, UNSAFE, Covariance, Progress, Uncertainty, shifts_of_ends
 from ctid_cli.signals.record import Record
@@ -41,10 +41,10 @@ DRAWN_DELAYS, DRAWN_INTERVALS = 24, 2.5
 
 
 @dataclass(frozen=True, eq=False)
-class Validation(FilledLater):
+class Validation(DeferredFields):
     """The model on a record that it was not estimated from."""
 
-    later: ClassVar[tuple[str, ...]] = ("record", "applied")
+    deferred: ClassVar[tuple[str, ...]] = ("record", "applied")
 
     name: str
     record: Record = field(repr=False)
@@ -57,7 +57,7 @@ class Validation(FilledLater):
 
 
 @dataclass(frozen=True, eq=False)
-class Identification(FilledLater, FittedModel, ShownAsTable):
+class Identification(DeferredFields, FittedModel, ShownAsTable):
     """A fit, its uncertainty, and its diagnostics.
 
     Parameters
@@ -88,7 +88,7 @@ class Identification(FilledLater, FittedModel, ShownAsTable):
         What it was estimated from.
     """
 
-    later: ClassVar[tuple[str, ...]] = ("records",)
+    deferred: ClassVar[tuple[str, ...]] = ("records",)
 
     options: Options
     fit: MeasuredFit | SubmodelsFit
@@ -183,7 +183,7 @@ def identify(
     residuals = np.concatenate(fit.residuals)
     output = np.concatenate([record.y[use] for record, use in zip(records, fit.used, strict=True)])
     answering = judging.answering(options, prepared.laid_out)
-    answer = answer_test(answering, fit.used, options.delay_bounds, options.initial_state)
+    answer = response_test(answering, fit.used, options.delay_bounds, options.initial_state)
     squared_error = float(residuals @ residuals) if fit.weighting is None else fit.cost * fit.count
     tests = tests_of(options, linear, records, answer)
     # What the data determine can be told even where no standard error can be given.

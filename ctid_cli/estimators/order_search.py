@@ -24,7 +24,7 @@ from ctid_cli.inference.criteria import (
 )
 from ctid_cli.inference.noise_model import NoiseModel
 from ctid_cli.inference.residual_tests import ResidualTests
-from ctid_cli.inference.response_test import AnswerTest, answer_test
+from ctid_cli.inference.response_test import AnswerTest, response_test
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import InitialState, Offset
@@ -365,7 +365,7 @@ class _Search:
     def answer(self) -> AnswerTest:
         """Whether there is anything to model."""
         measured, treatment = self.measured, self.measured.treatment
-        return answer_test(measured.records, measured.used(), treatment.delay_bounds, treatment.initial_state)
+        return response_test(measured.records, measured.used(), treatment.delay_bounds, treatment.initial_state)
 
     def result(self, orders: Sequence[FittedOrder]) -> OrderSearch:
         """All of them."""

@@ -59,18 +59,18 @@ class Status(Enum):
         return self in (Status.CONVERGED, Status.AT_BOUND, Status.RIDGE, Status.LEAST_SQUARES)
 
 
-class FilledLater:
+class DeferredFields:
     """A result whose numbers for single samples may be left out until somebody wants them.
 
-    A loaded result has a model and its covariance without its records; residuals need these. The fields that ``later``
-    names must have no default but a factory, so that the class has no such attributes.
+    A loaded result has a model and its covariance without its records; residuals need these. The fields that
+    ``deferred`` names must have no default but a factory, so that the class has no such attributes.
     """
 
-    later: ClassVar[tuple[str, ...]] = ()
+    deferred: ClassVar[tuple[str, ...]] = ()
 
     def leave_out(self, fill: Callable[[], Mapping[str, Any]]) -> None:
-        """Forget the fields of ``later``; the first of them that is asked for fills them all."""
-        for name in self.later:
+        """Forget the fields of ``deferred``; the first of them that is asked for fills them all."""
+        for name in self.deferred:
             self.__dict__.pop(name, None)
         self.__dict__["_fill"] = fill
 
@@ -78,10 +78,10 @@ class FilledLater:
 
         def __getattr__(self, name: str) -> Any:
             fill = self.__dict__.get("_fill")
-            if fill is None or name not in self.later:
+            if fill is None or name not in self.deferred:
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
             values = fill()
-            self.__dict__.update({each: values[each] for each in self.later})
+            self.__dict__.update({each: values[each] for each in self.deferred})
             return self.__dict__[name]
 
 
@@ -94,7 +94,7 @@ class FittedModel(ABC):
 
     with the joint covariance C of all parameters that the fit reports, the delay's among them, for white or coloured
     noise, and exact derivatives; intervals reach as many standard errors as those of the parameters do. ``sampled``
-    draws 1000 sets of parameters with that covariance and takes quantiles of what these models answer: slower, and
+    draws 1000 sets of parameters with that covariance and takes quantiles of what these models give: slower, and
     right where a quantity is not linear over a standard error, as a step response is not about an uncertain delay.
     Parameters that were given or lie at a bound are taken as known. Without a covariance all bands are NaN.
 
@@ -386,7 +386,7 @@ class Fit(FittedModel, ShownAsTable):
         What the covariance is from, and how many standard errors intervals reach; None where that is not known, and
         intervals are then those of the normal distribution.
     in_ignored_loop : bool, default False
-        Whether the input answers to the output through a loop of which the estimator knows nothing.
+        Whether the input responds to the output through a loop of which the estimator knows nothing.
     """
 
     model: TransferFunction

@@ -13,15 +13,15 @@ from ctid_cli.inference.intervals import robust_deviation
 from ctid_cli.inference.signal_features import InputMoves, input_moves, outliers
 from ctid_cli.signals.record import Record
 
-#: Share of the power of the answer that its band holds.
+#: Share of the power of the response that its band holds.
 SHARE = 0.95
 #: Bands of the spectra are at least this many bins of the whole record wide, and at most so many per octave. Narrow
-#: ones resolve resonances, wide ones average over more noise; those that show more of the answer count.
+#: ones resolve resonances, wide ones average over more noise; those that show more of the response count.
 BINS = (8, 24)
 BANDS_PER_OCTAVE = 6
 #: Neighbouring bins under a Hann window are not independent: n of them count as n over this number.
 HANN_OVERLAP = 1.9
-#: Chance of a coherence like this without any answer, for a band that is sure by itself and for one of a pair.
+#: Chance of a coherence like this without any response, for a band that is sure by itself and for one of a pair.
 SURE, LIKELY = 1e-6, 1e-2
 #: Where the input has less than this fraction of its greatest density, the gain is no more than noise.
 EXCITED = 1e-3
@@ -33,11 +33,11 @@ HOLE = 3.0
 LONGEST_GRID = 1 << 19
 #: Bandwidth times time constant of a first-order system for 95 % of the power of its impulse response.
 FIRST_ORDER = 12.7
-#: The answer begins to be certain at this many standard deviations, or this fraction of its peak.
+#: The response begins to be certain at this many standard deviations, or this fraction of its peak.
 CERTAIN, CERTAIN_FRACTION = 5.0, 0.3
-#: Before that, an answer may have begun where it is above this many standard deviations.
+#: Before that, a response may have begun where it is above this many standard deviations.
 DOUBTFUL = 3.0
-#: An answer of the input to the output that is this many standard deviations of chance is none.
+#: A response of the input to the output that is this many standard deviations of chance is none.
 FED_BACK = 8.0
 #: An input repeats itself where its correlation with its own past is above this.
 REPEATS = 0.3
@@ -59,20 +59,20 @@ class Grid:
 
 @dataclass(frozen=True)
 class DelayHint:
-    """When the output begins to answer the input."""
+    """When the output begins to respond to the input."""
 
-    #: The answer begins between these times after a change of the input [s]; at ``late`` it is certain.
+    #: The response begins between these times after a change of the input [s]; at ``late`` it is certain.
     early: float
     late: float
-    #: Greatest answer over the standard deviation of what chance gives [-].
+    #: Greatest response over the standard deviation of what chance gives [-].
     strength: float
 
 
 @dataclass(frozen=True)
-class Answer:
+class InputResponse:
     """What the output shows of the input."""
 
-    #: Frequency below which 95 % of the answer lies [rad/s]; the Nyquist frequency where no answer is seen.
+    #: Frequency below which 95 % of the response lies [rad/s]; the Nyquist frequency where no response is seen.
     bandwidth: float
     #: Highest frequency at which output and input are coherent [rad/s]; nan where they are nowhere.
     visible_up_to: float = math.nan
@@ -82,49 +82,49 @@ class Answer:
     delay: DelayHint | None = None
     #: Time after which the input repeats itself [s]; nan where it does not.
     period: float = math.nan
-    #: Greatest answer of the input to the output, that is at negative lags, over the standard deviation of what chance
-    #: gives [-]; nan where it cannot be told. Feedback shows here.
+    #: Greatest response of the input to the output, that is at negative lags, over the standard deviation of what
+    #: chance gives [-]; nan where it cannot be told. Feedback shows here.
     before: float = math.nan
 
     @property
     def fed_back(self) -> bool:
-        """Whether the input seems to answer the output."""
+        """Whether the input seems to respond to the output."""
         return self.before > FED_BACK and self.delay is not None and self.before >= 0.2 * self.delay.strength
 
 
 def output_bandwidth(record: Record) -> float:
-    """Frequency below which 95 % of the answer of the output to the input lies.
+    """Frequency below which 95 % of the response of the output to the input lies.
 
-    The power of the answer is the power of the output times its squared coherence with the input, which leaves out
+    The power of the response is the power of the output times its squared coherence with the input, which leaves out
     the noise, whatever its colour. Power is counted twice, as it is and divided by that of the input where there is
     any, and the larger of the two bandwidths is returned: a resonance that this input hardly excites bends the cost
     of a fit as a function of the delay all the same. After an input of three steps or fewer, the bandwidth is
     that of a first-order system as fast as the answer.
     """
-    return analyse_answer(record).bandwidth
+    return analyse_response(record).bandwidth
 
 
-def analyse_answer(record: Record, moves: InputMoves | None = None) -> Answer:
-    """Band and delay of the answer of the output to the input."""
+def analyse_response(record: Record, moves: InputMoves | None = None) -> InputResponse:
+    """Band and delay of the response of the output to the input."""
     moves = moves or input_moves(record)
     grid = regular_grid(record)
     nyquist = math.pi / grid.interval
     if moves.kind == "constant" or grid.u.size < 8 or not np.any(grid.y):
-        return Answer(nyquist)
+        return InputResponse(nyquist)
     if moves.kind == "steps":
         return _after_a_step(record, moves, nyquist)
     alignments = _peaks(np.abs(_cross_correlation(grid.u, grid.y, grid.u.size // 2)[grid.u.size // 2 :]))
     spectra = [_Spectra.of(grid, shift, bins) for shift in alignments for bins in BINS]
     best = max(spectra, key=lambda s: s.explained)
-    # Of those that show the answer at all, whatever alignment shows it at the highest frequency is right there.
+    # Of those that show the response at all, whatever alignment shows it at the highest frequency is right there.
     spectra = [s for s in spectra if s.explained > 0.5 * best.explained]
     bandwidth = max((b for s in spectra for b in s.bandwidths), default=math.nan)
     if math.isfinite(bandwidth):
         visible, bandwidths = max(s.visible_up_to for s in spectra), best.bandwidths
     else:
         bandwidth, visible, bandwidths = nyquist, math.nan, (nyquist,)
-    timing = _first_answer(grid, bandwidths, moves)
-    return Answer(min(bandwidth, nyquist), visible, best.explained, best.input_band, *timing)
+    timing = _delay_and_period(grid, bandwidths, moves)
+    return InputResponse(min(bandwidth, nyquist), visible, best.explained, best.input_band, *timing)
 
 
 def regular_grid(record: Record) -> Grid:
@@ -205,7 +205,7 @@ class _Spectra:
 
     @property
     def bandwidths(self) -> tuple[float, ...]:
-        """The band of the answer as it is, and that of the answer to an equally strong input everywhere."""
+        """The band of the response as it is, and that of the response to an equally strong input everywhere."""
         if not self.answer.any():
             return ()
         width = np.diff(self.edges)
@@ -261,13 +261,13 @@ def _filtered(x: Array, coefficients: Array) -> Array:
     return np.asarray(np.fft.irfft(np.fft.rfft(x, n) * np.fft.rfft(coefficients, n), n)[: x.size], dtype=float)
 
 
-def _first_answer(
+def _delay_and_period(
     grid: Grid, bandwidths: tuple[float, ...], moves: InputMoves
 ) -> tuple[DelayHint | None, float, float]:
-    """Delay, period of the input, and the greatest answer before the input.
+    """Delay, period of the input, and the greatest response before the input.
 
     The correlation of the whitened input with the equally filtered output is the impulse response in noise. The
-    output does not answer before the input moves, so negative lags show what chance gives.
+    output does not respond before the input moves, so negative lags show what chance gives.
     """
     n, h = grid.u.size, grid.interval
     # Holding makes a value depend on those of one hold before, so that is how far the whitening has to look.
@@ -283,7 +283,7 @@ def _first_answer(
         return None, math.nan, math.nan
     own = _cross_correlation(u, u, n // 2)[n // 2 :] / float(np.mean(u**2))
     again = np.flatnonzero(own[4 * hold :] > REPEATS)
-    # The answer to a periodic input is periodic too: every lag within one period shows it, or its tail.
+    # The response to a periodic input is periodic too: every lag within one period shows it, or its tail.
     period = 4 * hold + int(np.argmax(own[4 * hold :])) if again.size else 0
     longest = min(n // 3, period - 1) if period else n // 3
     r = _cross_correlation(u, y, longest) / power
@@ -333,11 +333,11 @@ class _Picture:
         return float(np.abs(self.z[: max(self.longest - self.width, 1)]).max())
 
     def onset(self, pause: int, interval: float) -> DelayHint:
-        """Where the answer that holds the peak begins, which no pause of ``pause`` lags interrupts."""
+        """Where the response that holds the peak begins, which no pause of ``pause`` lags interrupts."""
         peak = int(np.argmax(self.after))
         sure = _first_of_run(self.after > max(CERTAIN, CERTAIN_FRACTION * self.strength), peak, pause)
         begin = _first_of_run(self.after > DOUBTFUL, sure, max(2, pause // 4))
-        # A smooth answer rises out of the noise late, the later the slower it is.
+        # A smooth response rises out of the noise late, the later the slower it is.
         margin = max(self.width / 2 + 1, 0.5 * (peak - begin))
         late = (sure + self.width // 2 + 1) * interval
         return DelayHint(max(begin - margin, 0.0) * interval, late, self.strength)
@@ -352,8 +352,8 @@ def _first_of_run(above: BoolArray, k: int, pause: int) -> int:
         k = max(0, k - pause) + int(earlier[0])
 
 
-def _after_a_step(record: Record, moves: InputMoves, nyquist: float) -> Answer:
-    """Answer to the first step of an input that moves seldom."""
+def _after_a_step(record: Record, moves: InputMoves, nyquist: float) -> InputResponse:
+    """InputResponse to the first step of an input that moves seldom."""
     t, y = record.t[record.valid], record.y[record.valid]
     begin = float(moves.changes[0])
     end = float(moves.changes[1]) if moves.changes.size > 1 else float(t[-1])
@@ -361,7 +361,7 @@ def _after_a_step(record: Record, moves: InputMoves, nyquist: float) -> Answer:
     after = (t > begin) & (t <= end)
     t, moved = t[after] - begin, np.abs(y[after] - np.median(rest))
     if moved.size < 8:
-        return Answer(nyquist)
+        return InputResponse(nyquist)
     steps = np.abs(np.diff(y))
     noise = robust_deviation(steps) / math.sqrt(2)
     quantum = float(steps[steps > 0].min()) if np.any(steps > 0) else 0.0
@@ -370,7 +370,7 @@ def _after_a_step(record: Record, moves: InputMoves, nyquist: float) -> Answer:
     beyond = moved > threshold
     onset = np.flatnonzero(beyond[:-2] & beyond[1:-1] & beyond[2:])
     if not onset.size:
-        return Answer(nyquist)
+        return InputResponse(nyquist)
     first = int(onset[0])
     doubled = first + int(np.argmax(moved[first:] > 2 * threshold))
     # Traced back along a parabola through the two, twice as far: the level at rest is not known exactly.
@@ -379,4 +379,4 @@ def _after_a_step(record: Record, moves: InputMoves, nyquist: float) -> Answer:
     settled = float(np.median(moved[-max(3, moved.size // 20) :]))
     rise = float(t[int(np.argmax(moved > 0.632 * settled))] - t[first])
     bandwidth = min(FIRST_ORDER / rise, nyquist) if rise > 0 else nyquist
-    return Answer(bandwidth, delay=DelayHint(early, float(t[first]), float(moved.max() / threshold)))
+    return InputResponse(bandwidth, delay=DelayHint(early, float(t[first]), float(moved.max() / threshold)))

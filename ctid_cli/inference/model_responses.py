@@ -3,7 +3,7 @@ r"""Responses of an estimated model with confidence bands, from the joint covari
 Linearised, a quantity g has the variance ``(dg/dtheta) C (dg/dtheta)'`` with exact derivatives, and its interval
 reaches as many standard errors to both sides as those of the parameters do. Sampled, parameters are drawn from the
 normal distribution with covariance C, or Student's t where C itself is uncertain, and the interval lies between
-quantiles of what the drawn models answer: it need not be symmetric, and knows what a linearisation does not, such as
+quantiles of what the drawn models give: it need not be symmetric, and knows what a linearisation does not, such as
 what an uncertain delay does to the first instants of a step response.
 """
 
@@ -167,11 +167,22 @@ class Estimated:
         """Of the t distribution that parameters are drawn from [-]; infinite for the normal one."""
         return self.law.degrees_of_freedom if self.law.bootstrap is None else np.inf
 
-    def deviations(self, slopes: Array) -> Array:
-        """Standard errors of quantities from their gradients, shape (N, p)."""
+    def intervals(self, slopes: Array, level: float) -> tuple[Array, Array]:
+        """Standard errors of quantities from their gradients, shape (N, p), and half the widths of their intervals."""
         with np.errstate(invalid="ignore"):
             variances = np.maximum(np.einsum("ni,ij,nj->n", slopes, self.covariance, slopes), 0.0)
-        return np.asarray(np.sqrt(variances))
+        errors = np.asarray(np.sqrt(variances))
+        return errors, self.law.reach(slopes, level) * errors
+
+    def of_parts(self, slopes: ComplexArray) -> Array:
+        """Covariances of real and imaginary parts from their gradients, shape (N, 2, 2)."""
+        parts = np.stack((slopes.real, slopes.imag), axis=1)
+        return np.asarray(np.einsum("nki,ij,nlj->nkl", parts, self.covariance, parts))
+
+    @property
+    def linear_only(self) -> bool:
+        """Whether there is no covariance to draw parameters with."""
+        return not np.isfinite(self.covariance).all()
 
     def draws(self) -> Iterator[Parametric]:
         """Models with drawn parameters; those that are none are left out."""
@@ -213,12 +224,9 @@ def frequency_response(found: Estimated, frequencies: ArrayLike | None, level: f
     slopes = found.parametric.frequency_slopes(w)
     with np.errstate(invalid="ignore", divide="ignore"):
         relative = slopes / value[:, None]
-    gain_error, phase_error = found.deviations(relative.real), found.deviations(relative.imag)
-    if bands == "linearised" or not np.isfinite(found.covariance).all():
-        wide, turn = (
-            found.law.reach(relative.real, level) * gain_error,
-            found.law.reach(relative.imag, level) * phase_error,
-        )
+    gain_error, wide = found.intervals(relative.real, level)
+    phase_error, turn = found.intervals(relative.imag, level)
+    if bands == "linearised" or found.linear_only:
         lower, upper, low_phase, high_phase = gain * np.exp(-wide), gain * np.exp(wide), phase - turn, phase + turn
     else:
         drawn = np.array([one.model.frequency_response(w) for one in found.draws()])
@@ -226,8 +234,7 @@ def frequency_response(found: Estimated, frequencies: ArrayLike | None, level: f
             turned = np.angle(drawn / value)
         lower, upper = _quantiles(np.abs(drawn), level)
         low_phase, high_phase = (phase + end for end in _quantiles(turned, level))
-    parts = np.stack((slopes.real, slopes.imag), axis=1)
-    covariance = np.einsum("nki,ij,nlj->nkl", parts, found.covariance, parts)
+    covariance = found.of_parts(slopes)
     return FrequencyBand(
         w, value, covariance, gain, gain * gain_error, lower, upper, phase, phase_error, low_phase, high_phase, level
     )
@@ -238,8 +245,7 @@ def poles(found: Estimated, level: float) -> PoleBand:
     _check(level, "linearised")
     value, slopes = found.parametric.poles()
     slopes[~np.isfinite(slopes).all(axis=1)] = np.nan
-    parts = np.stack((slopes.real, slopes.imag), axis=1)
-    covariance = np.einsum("nki,ij,nlj->nkl", parts, found.covariance, parts)
+    covariance = found.of_parts(slopes)
     for k in range(value.size):
         others = np.arange(value.size) != k
         if indistinct(value, k, slopes[k], others, found.covariance, lambda row: found.law.quantile(row, level)):
@@ -259,9 +265,8 @@ def _over_time(
 ) -> ResponseBand:
     _check(level, bands)
     value, slopes = model.simulated(signal, t), model.output_slopes(signal, t)
-    errors = found.deviations(slopes)
-    if bands == "linearised" or not np.isfinite(found.covariance).all():
-        half = found.law.reach(slopes, level) * errors
+    errors, half = found.intervals(slopes, level)
+    if bands == "linearised" or found.linear_only:
         lower, upper = value - half, value + half
     else:
         behind = (one.derivative if model.differentiated else one for one in found.draws())

@@ -125,7 +125,7 @@ class ResidualTests:
     #: Probability of a larger statistic if the residuals are independent of the input [-]; NaN where it cannot be
     #: computed.
     cross_p_value: float
-    #: Whether the output is seen to answer to the input at all; else no dynamics can be missed.
+    #: Whether the output is seen to respond to the input at all; else no dynamics can be missed.
     answered: bool = True
 
     @property
@@ -329,17 +329,17 @@ def input_dependence(e: Array, x: Array, psi: Array, t: Array, record: Record, d
     later = dependence(e, inputs(0.0, range(first, first + future)), noise, known)
     found = [(later.p_value, (later.statistic - later.freedom) / e.size)] if later.freedom else []
     if not first:
-        z = _answer_at_once(rest_of(e, known), x, inputs(0.0, range(0, -ORDER - 1, -1)))
+        z = _feedback_score(rest_of(e, known), x, inputs(0.0, range(0, -ORDER - 1, -1)))
         found.append((2 * ANSWERS * normal_tail(z), z * z / e.size))
     likely, told = min(found, default=(1.0, 0.0))
     return InputDependence(pole.p_value, share, min(1.0, len(found) * likely), told)
 
 
-def _answer_at_once(e: Array, x: Array, u: Array) -> float:
+def _feedback_score(e: Array, x: Array, u: Array) -> float:
     """How far the input moves with residuals of the last instants, in standard deviations of what chance gives.
 
     What the input and the simulated output were does not tell all moves: those of a reference that is held are rare
-    and large, and would drown the answer to the noise. So they are clipped. Residuals that are white and independent
+    and large, and would drown the response to the noise. So they are clipped. Residuals that are white and independent
     of the input are independent of any function of it.
     """
     blocks, inputs = list(row_blocks(e.size - ORDER)), u[ORDER:]

@@ -1,7 +1,7 @@
-"""Whether outputs answer to their inputs at all: the best of many simple responses against noise of its own colour.
+"""Whether outputs respond to their inputs at all: the best of many simple responses against noise of its own colour.
 
 The statistic is the largest share of the output that one response of a dictionary explains. What it is without an
-answer is seen on simulated noise, searched in the same way: the search over poles and delays is in the distribution.
+response is seen on simulated noise, searched in the same way: the search over poles and delays is in the distribution.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,7 +30,7 @@ FEWEST_DELAYS, MOST_DELAYS = 12, 48
 MOST_SAMPLES = 2000
 #: Shares of the false alarms that are given to the tests of the signals as they are, of what is new in them, and of
 #: the likelihood. The second alone sees anything after fast inputs in slow noise, and the third after few steps, where
-#: the output itself looks like slow noise and what the answer leaves of it does not.
+#: the output itself looks like slow noise and what the response leaves of it does not.
 WEIGHTS = (0.4, 0.2, 0.4)
 #: Most lags of the autoregression in the likelihood.
 MOST_LAGS = 8
@@ -60,7 +60,7 @@ class AnswerTest:
 
     @property
     def seen(self) -> bool:
-        """Whether an answer is seen; what cannot be tested is not denied."""
+        """Whether a response is seen; what cannot be tested is not denied."""
         return not self.p_value > LEVEL
 
     @property
@@ -72,13 +72,13 @@ class AnswerTest:
         )
 
 
-def answer_test(
+def response_test(
     records: Sequence[Record],
     used: Sequence[BoolArray],
     delays: tuple[float, float],
     initial_state: InitialState = "rest",
 ) -> AnswerTest:
-    """Test the answer of the outputs to the inputs, at the used samples of records of one system.
+    """Test the response of the outputs to the inputs, at the used samples of records of one system.
 
     Each record has an offset of its own, and a free response where it is estimated. The largest share is looked for
     in the signals as they are, and in the signals behind the filter that makes the output white; a third test asks how

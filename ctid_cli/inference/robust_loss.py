@@ -15,7 +15,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.inference.fit import FilledLater
+from ctid_cli.inference.fit import DeferredFields
 from ctid_cli.inference.intervals import robust_deviation
 
 #: The losses that are not squares.
@@ -60,10 +60,10 @@ class Loss:
 
 
 @dataclass(frozen=True, eq=False)
-class Weighting(FilledLater):
+class Weighting(DeferredFields):
     """How a loss counts the output errors of several records."""
 
-    later: ClassVar[tuple[str, ...]] = ("weights", "pseudo_errors")
+    deferred: ClassVar[tuple[str, ...]] = ("weights", "pseudo_errors")
 
     losses: tuple[Loss, ...]
     #: Weights of the used samples of each record, 0 to 1 [-].

@@ -85,11 +85,6 @@ class Structure:
         """Standard row of the output error."""
         return 3 * self.poles + 1
 
-    def hessian(self, moments: Array) -> Array:
-        """``sum psi psi'`` from the second moments of the standard rows."""
-        rows = self.sensitivity_rows
-        return np.asarray(moments[np.ix_(rows, rows)] * np.outer(self.signs, self.signs))
-
 
 def sensitivities(
     model: AdditiveModel | TransferFunction,

@@ -11,7 +11,7 @@ from ctid_cli.inference.intervals import robust_deviation
 from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.signals.record import Record
 
-#: An input with at most this many changes gives single answers in time and no averages over frequency.
+#: An input with at most this many changes gives single responses in time and no averages over frequency.
 FEW_CHANGES = 3
 #: An input that takes at most this many values moves between levels.
 FEW_LEVELS = 20
@@ -115,7 +115,7 @@ def far_off(y: Array) -> tuple[IntArray, Array]:
     padded = np.pad(y, 2, mode="edge")
     rest = y - np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
     spread = robust_deviation(rest)
-    # The fast part of an answer leaves its own medians behind, everywhere and not at one sample in ten.
+    # The fast part of a response leaves its own medians behind, everywhere and not at one sample in ten.
     usual = float(np.quantile(np.abs(rest), 0.9))
     step = quantum(y)
     limit = max(OUTLIER * spread, 6 * usual, 0.2 * float(y.std()), 0.0 if math.isnan(step) else 4 * step)

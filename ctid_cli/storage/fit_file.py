@@ -142,7 +142,7 @@ class StoredFit:
 
     def _weights(self) -> dict[str, Any]:
         weighting = self._samples()["weighting"]
-        return {name: getattr(weighting, name) for name in Weighting.later}
+        return {name: getattr(weighting, name) for name in Weighting.deferred}
 
     def _applied(self) -> dict[str, Any]:
         assert self.validation is not None

@@ -1,18 +1,26 @@
-"""Asymptotic accuracy against known numbers, frequency-domain integrals and sums over impulse responses."""
+"""Bounds of the accuracy, against known numbers, integrals over the unit circle, and finite differences."""
 
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, lfilter, tf2ss
+from scipy.signal import cont2discrete, tf2ss
 
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.inference.bounds import WHITE, limiting_accuracy, output_variance, require_uncorrelated_input
-from ctid_cli.inference.sensitivities import sensitivities
-from ctid_cli.models.additive import AdditiveModel, Submodel
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.inference.bounds import (
+    WHITE,
+    ParameterAccuracy,
+    cramer_rao_bound,
+    limiting_accuracy,
+    output_variance,
+    require_uncorrelated_input,
+)
+from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.controller import DiscreteController
-from ctid_cli.models.factoring import factored, factored_jacobian, unfactored
+from ctid_cli.models.factoring import factored, unfactored, unfactored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.excitation import Prbs
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.streams import stream
 
 INTERVAL = 0.05
 
@@ -90,11 +98,11 @@ def spectra(model, z):
     """Responses of the sensitivities of an additive model to its input, and of the model, on the unit circle."""
     rows, total = [], 0.0
     for submodel in model.submodels:
-        b, a = submodel.numerator, submodel.denominator
-        square = np.polymul(a, a)
+        b, a, integrators = submodel.numerator, submodel.denominator, np.zeros(submodel.integrators)
+        whole, square = np.append(a, integrators), np.append(np.polymul(a, a), integrators)
         rows += [-sampled_response(np.append(b, np.zeros(k)), square, z) for k in range(1, a.size)]
-        rows += [sampled_response(np.append(1.0, np.zeros(k)), a, z) for k in range(b.size)]
-        total = total + sampled_response(b, a, z)
+        rows += [sampled_response(np.append(1.0, np.zeros(k)), whole, z) for k in range(b.size)]
+        total = total + sampled_response(b, whole, z)
     return np.array(rows), total
 
 
@@ -108,7 +116,8 @@ def sandwich(rows, power, noise_power):
     return inverse @ integral(rows, power * noise_power) @ inverse
 
 
-Z = np.exp(2j * np.pi * np.arange(8192) / 8192)
+# Half a step beside zero frequency, where integrators are infinite.
+Z = np.exp(2j * np.pi * (np.arange(8192) + 0.5) / 8192)
 H_POWER = np.abs((1 + 0.5 / Z) / (1 - 0.85 / Z)) ** 2
 
 
@@ -119,60 +128,9 @@ def test_open_loop_is_an_integral_over_the_unit_circle():
     assert largest_relative_error(accuracy.covariance, expected) < 1e-8
 
 
-@pytest.mark.parametrize("enters", ["controller", "input"])
-def test_closed_loop_is_an_integral_over_the_unit_circle(enters):
-    rows, G = spectra(TWO_MODES, Z)
-    # The integrator of the controller makes 1/(1 + G C) vanish at zero frequency, where C alone is infinite.
-    numerator, denominator = (np.polyval(part, Z) for part in (PID.numerator, PID.denominator))
-    S = (numerator if enters == "controller" else denominator) / (denominator + G * numerator)
-    power = 0.25 * np.abs(S) ** 2
-    options = {"standard_deviation": 0.5, "innovation_variance": 0.01, "enters": enters, "samples": 1}
-    accuracy = limiting_accuracy(TWO_MODES, INTERVAL, PID, **options)
-    assert largest_relative_error(accuracy.covariance, sandwich(rows, power, 0.01)) < 1e-8
-    coloured = limiting_accuracy(TWO_MODES, INTERVAL, PID, noise_filter=COLOURED, **options)
-    assert largest_relative_error(coloured.covariance, sandwich(rows, power, 0.01 * H_POWER)) < 1e-8
-    # Where the reference enters at the input, the noise still comes through the controller.
-    noise = 0.01 * np.abs(numerator / (denominator + G * numerator)) ** 2
-    direct = limiting_accuracy(TWO_MODES, INTERVAL, PID, instruments="open_loop", **options)
-    assert largest_relative_error(direct.covariance, sandwich(rows, power + noise, 0.01)) < 1e-8
-
-
-def pulse(count, values=(1.0,)):
-    samples = np.zeros(count)
-    samples[: len(values)] = values
-    return HeldSignal(INTERVAL * np.arange(count), samples)
-
-
-def sum_of_responses(psi, standard_deviation, innovation_variance, noise_filter=((1.0,), (1.0,))):
-    """The sandwich from impulse responses of psi, ``E psi psi' = sum over their samples``."""
-    assert np.abs(psi[-1]).max() < 1e-9 * np.abs(psi).max()  # they have died away
-    inverse = np.linalg.inv(standard_deviation**2 * psi.T @ psi)
-    filtered = lfilter(*noise_filter, psi, axis=0)
-    sigma = innovation_variance * standard_deviation**2 * filtered.T @ filtered
-    return inverse @ sigma @ inverse
-
-
 FAST = AdditiveModel([Submodel([0.5, 1.0], [0.04, 0.1, 1.0]), Submodel([0.7], [0.5, 1.0])], 0.13)
-
-
-def test_a_delay_matters_in_open_loop_only_by_its_fraction_of_an_interval():
-    options = {"standard_deviation": 2.0, "innovation_variance": 0.3, "noise_filter": COLOURED, "samples": 1}
-    count = 1200
-    times = INTERVAL * np.arange(count)
-    for model in (FAST, unfactored(FAST)):
-        expected = sum_of_responses(sensitivities(model, pulse(count), times), 2.0, 0.3, COLOURED)
-        accuracy = limiting_accuracy(model, INTERVAL, **options)
-        assert largest_relative_error(accuracy.covariance, expected) < 1e-8
-    moved = [
-        limiting_accuracy(AdditiveModel(FAST.submodels, delay), INTERVAL, **options).covariance
-        for delay in (0.0, 0.13, 0.43)
-    ]
-    np.testing.assert_allclose(moved[2], moved[1], rtol=1e-9)
-    assert largest_relative_error(moved[0], moved[1]) > 0.01
-
-
 RIGID = AdditiveModel([Submodel([0.4], [0.3, 1.0], integrators=1), Submodel([0.1], [0.01, 0.1, 1.0])])
-DOUBLE = AdditiveModel([Submodel([0.2, 0.4], [1.0], integrators=2), Submodel([0.1], [0.02, 0.1, 1.0])], 0.02)
+DOUBLE = AdditiveModel([Submodel([0.2, 0.4], [1.0], integrators=2), Submodel([0.1], [0.02, 0.1, 1.0])])
 # As many zeros as poles: the output answers to the input at once, also round the loop.
 DIRECT = AdditiveModel([Submodel([0.02, 0.3, 1.0], [0.04, 0.1, 1.0]), Submodel([0.7], [0.5, 1.0])])
 DIRECT_RIGID = AdditiveModel([Submodel([0.1, 0.2, 0.4], [0.3, 1.0], integrators=1)])
@@ -184,33 +142,33 @@ STIFF = DiscreteController.from_pid(8.0, 0.0, 8.0)
 @pytest.mark.parametrize("enters", ["controller", "input"])
 @pytest.mark.parametrize(
     ("model", "controller"),
-    [(FAST, PD), (RIGID, STIFF), (DOUBLE, STIFF), (DIRECT, PD), (DIRECT_RIGID, FIRM)],
-    ids=["delay", "1 integrator", "2 integrators", "direct", "direct, 1 integrator"],
+    [(TWO_MODES, PID), (RIGID, STIFF), (DOUBLE, STIFF), (DIRECT, PD), (DIRECT_RIGID, FIRM)],
+    ids=["modes", "1 integrator", "2 integrators", "direct", "direct, 1 integrator"],
 )
-def test_closed_loop_is_a_sum_over_impulse_responses(model, controller, enters):
-    count = 1200
-    z = simulate_loop(model, controller, pulse(count).values, 0.0, INTERVAL, enters).u
-    psi = sensitivities(model, pulse(count, z), INTERVAL * np.arange(count))
-    options = {"standard_deviation": 1.5, "innovation_variance": 0.1, "enters": enters, "samples": 1}
-    accuracy = limiting_accuracy(model, INTERVAL, controller, noise_filter=COLOURED, **options)
-    assert largest_relative_error(accuracy.covariance, sum_of_responses(psi, 1.5, 0.1, COLOURED)) < 1e-7
-    white = limiting_accuracy(model, INTERVAL, controller, **options)
-    assert largest_relative_error(white.covariance, sum_of_responses(psi, 1.5, 0.1)) < 1e-7
+def test_closed_loop_is_an_integral_over_the_unit_circle(model, controller, enters):
+    rows, G = spectra(model, Z)
+    numerator, denominator = (np.polyval(part, Z) for part in (controller.numerator, controller.denominator))
+    S = (numerator if enters == "controller" else denominator) / (denominator + G * numerator)
+    power = 0.25 * np.abs(S) ** 2
+    options = {"standard_deviation": 0.5, "innovation_variance": 0.01, "enters": enters, "samples": 1}
+    accuracy = limiting_accuracy(model, INTERVAL, controller, **options)
+    assert largest_relative_error(accuracy.covariance, sandwich(rows, power, 0.01)) < 1e-7
+    coloured = limiting_accuracy(model, INTERVAL, controller, noise_filter=COLOURED, **options)
+    assert largest_relative_error(coloured.covariance, sandwich(rows, power, 0.01 * H_POWER)) < 1e-7
+    # Where the reference enters at the input, the noise still comes through the controller.
+    noise = 0.01 * np.abs(numerator / (denominator + G * numerator)) ** 2
+    direct = limiting_accuracy(model, INTERVAL, controller, instruments="open_loop", **options)
+    assert largest_relative_error(direct.covariance, sandwich(rows, power + noise, 0.01)) < 1e-7
 
 
-def test_a_loop_without_a_controller_is_open():
-    open_loop = limiting_accuracy(FAST, INTERVAL, **OPEN)
-    loop = limiting_accuracy(
-        FAST,
-        INTERVAL,
-        DiscreteController([0.0], [1.0]),
-        standard_deviation=1.0,
-        innovation_variance=0.02,
-        noise_filter=COLOURED,
-        samples=1,
-        enters="input",
-    )
-    np.testing.assert_allclose(loop.covariance, open_loop.covariance, rtol=1e-9)
+def test_a_delay_matters_in_open_loop_only_by_its_fraction_of_an_interval():
+    options = {"standard_deviation": 2.0, "innovation_variance": 0.3, "noise_filter": COLOURED, "samples": 1}
+    moved = [
+        limiting_accuracy(AdditiveModel(FAST.submodels, delay), INTERVAL, **options).covariance
+        for delay in (0.0, 0.13, 0.43)
+    ]
+    np.testing.assert_allclose(moved[2], moved[1], rtol=1e-9)
+    assert largest_relative_error(moved[0], moved[1]) > 0.01
 
 
 def test_a_reaction_at_once_of_the_model_is_solved_for():
@@ -224,12 +182,8 @@ def test_a_reaction_at_once_of_the_model_is_solved_for():
         limiting_accuracy(gain, INTERVAL, DiscreteController([-0.5], [1.0]), **CLOSED)
 
 
-def test_standard_errors_follow_the_units_and_the_number_of_samples():
+def test_standard_errors_follow_the_unit_of_time():
     base = limiting_accuracy(FOUR_MODES, INTERVAL, **OPEN)
-    longer = limiting_accuracy(FOUR_MODES, INTERVAL, **OPEN | {"samples": 400})
-    np.testing.assert_allclose(longer.standard_errors, np.sqrt(np.diag(base.covariance)) / 20)
-    louder = limiting_accuracy(FOUR_MODES, INTERVAL, **OPEN | {"standard_deviation": 10.0})
-    np.testing.assert_allclose(100 * louder.covariance, base.covariance, rtol=1e-9)
     # In another unit of time, c of the old one: a_k scales with c^-k.
     unit = 1e-3
     scaled = AdditiveModel(
@@ -250,37 +204,6 @@ def test_the_two_forms_tell_the_same_of_one_submodel():
     assert expected.factored() is expected
 
 
-def test_factoring_passes_the_covariance_on_by_its_derivatives():
-    model = unfactored(TWO_MODES)
-    accuracy = limiting_accuracy(model, INTERVAL, PID, **CLOSED)
-    jacobian = factored_jacobian(model, factored(model))
-    expected = jacobian @ accuracy.covariance @ jacobian.T
-    assert largest_relative_error(accuracy.factored().covariance, expected) < 1e-9
-
-
-def test_a_longer_numerator_costs_accuracy():
-    model = unfactored(TWO_MODES)
-    short = limiting_accuracy(model, INTERVAL, PID, **CLOSED)
-    long = limiting_accuracy(model, INTERVAL, PID, zeros=3, **CLOSED)
-    assert short.names == ("a1", "a2", "a3", "a4", "b0", "b1", "b2")
-    assert long.names == ("a1", "a2", "a3", "a4", "b0", "b1", "b2", "b3")
-    assert (np.diag(long.covariance)[:4] > np.diag(short.covariance)[:4]).all()
-    assert long.values[4] == 0.0
-    # The derivatives of factoring by differences, the leading coefficient of the numerator moved from zero.
-    steps = 1e-6 * np.append(np.abs(long.values[:4]), np.full(4, 100.0))
-    columns = []
-    for k, step in enumerate(steps):
-        moved = []
-        for sign in (1, -1):
-            theta = long.values.copy()
-            theta[k] += sign * step
-            moved.append(factored(TransferFunction(theta[4:], np.append(1.0, theta[:4]))).theta)
-        columns.append((moved[0] - moved[1]) / (2 * step))
-    jacobian = np.column_stack(columns)
-    expected = jacobian @ long.covariance @ jacobian.T
-    assert largest_relative_error(long.factored().covariance, expected) < 1e-5
-
-
 def test_refusals_say_why():
     with pytest.raises(DataError, match="no limit for long records"):
         limiting_accuracy(RIGID, INTERVAL, **OPEN)
@@ -296,3 +219,104 @@ def test_refusals_say_why():
     for model in (silent, cancelling):
         with pytest.raises(DataError, match="some have no effect of their own"):
             limiting_accuracy(model, INTERVAL, **OPEN)
+
+
+MODEL = AdditiveModel([Submodel([0.3, 3.0], [0.25, 0.25, 1.0]), Submodel([0.5], [0.2, 1.0])], 0.4)
+
+
+def spread(size):
+    root = np.random.default_rng(2).standard_normal((size, size))
+    return root @ root.T
+
+
+def test_names_and_values():
+    fraction = unfactored(MODEL)
+    found = ParameterAccuracy.of(fraction, spread(7), delay=True)
+    assert found.names == ("a1", "a2", "a3", "b0", "b1", "b2", "delay")
+    np.testing.assert_array_equal(found.values, [*fraction.denominator[1:], *fraction.numerator, 0.4])
+    found = ParameterAccuracy.of(TransferFunction([3.0], [1.0, 1.0, 2.0]), spread(4), zeros=1)
+    assert found.names == ("a1", "a2", "b0", "b1")
+    np.testing.assert_array_equal(found.values, [1, 2, 0, 3])
+    assert ParameterAccuracy.of(MODEL, spread(6)).names == MODEL.names
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+def test_factoring_undoes_the_sum(delay):
+    # The covariance of the sum's coefficients, from that of the submodels, leads back to it.
+    jacobian = unfactored_jacobian(MODEL)
+    jacobian = np.block([[jacobian, np.zeros((6, delay))], [np.zeros((delay, 6)), np.eye(delay)]])
+    expected = spread(6 + delay)
+    model = unfactored(MODEL)
+    accuracy = ParameterAccuracy.of(model, jacobian @ expected @ jacobian.T, delay=bool(delay))
+    back = accuracy.factored()
+    assert back.names == MODEL.names + ("delay",) * delay
+    np.testing.assert_allclose(back.values, [*MODEL.theta, *[0.4] * delay], rtol=1e-12)
+    np.testing.assert_allclose(back.covariance, expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(back.standard_errors, np.sqrt(np.diag(expected)), rtol=1e-9)
+    assert back.factored() is back
+
+
+def test_terms_choose_the_submodels():
+    model = TransferFunction([3.0, 5.0], [1.0, 3.0, 2.0])
+    accuracy = ParameterAccuracy.of(model, spread(4))
+    assert accuracy.factored().names == ("g1_a1", "g1_b0", "g2_a1", "g2_b0")
+    terms = (Term(2, 1),)
+    together = accuracy.factored(terms)
+    assert together.names == ("g1_a1", "g1_a2", "g1_b0", "g1_b1")
+    np.testing.assert_allclose(together.values, factored(model, terms).theta)
+
+
+CASE_1 = TransferFunction([2.0], [0.25, 0.7, 1.0], 8.0)
+CASE_2 = TransferFunction([-6400.0, 1600.0], [1.0, 5.0, 408.0, 416.0, 1600.0], 8.0)
+
+
+def record(model, clock_period, regular=True, n=4000, interval=0.05):
+    rng = stream(1, "sampling", 0)
+    t = interval * np.arange(n) if regular else np.cumsum(rng.uniform(0.2, 1.8, n)) * interval
+    held = Prbs(stages=10, clock_period=clock_period).generate(t, stream(1, "input", 0))
+    return Record(t, simulate(model, held, t), held)
+
+
+def information(model, r, start, delay_is_free):
+    """Sum of squares of the sensitivities, by central differences of the simulated output."""
+    theta = np.concatenate((model.denominator[1:], model.numerator, [model.delay] * delay_is_free))
+    n = model.order
+    columns = []
+    for k, value in enumerate(theta):
+        step = 1e-6 * abs(value)
+        moved = []
+        for sign in (1, -1):
+            p = theta.copy()
+            p[k] += sign * step
+            delay = p[-1] if delay_is_free else model.delay
+            b = p[n : n + model.numerator.size]
+            moved.append(simulate(TransferFunction(b, np.append(1.0, p[:n]), delay), r.input, r.t))
+        columns.append((moved[0] - moved[1]) / (2 * step))
+    psi = np.column_stack(columns)[r.valid & (r.t >= r.input.t[0] + start - 1e-9)]
+    return psi.T @ psi
+
+
+@pytest.mark.parametrize("estimate_delay", [True, False])
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize(("model", "interval"), [(CASE_1, 0.05), (CASE_2, 0.01)])
+def test_bound_is_that_of_finite_differences(model, interval, regular, estimate_delay):
+    r = record(model, 10 * interval, regular, n=3000, interval=interval)
+    y = r.y.copy()
+    y[1200:1300] = np.nan
+    r = Record(r.t, y, r.input)
+    bound = cramer_rao_bound(model, r, 0.3, start=9.0, estimate_delay=estimate_delay)
+    expected = 0.3**2 * np.linalg.inv(information(model, r, 9.0, estimate_delay))
+    deviations = np.sqrt(np.diag(expected))
+    assert np.abs((bound - expected) / np.outer(deviations, deviations)).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("clock", "expected"),
+    [(1, [0.0267, 0.0308, 0.0693, 0.00192]), (4, [0.0295, 0.0353, 0.0781, 0.00238])],
+)
+def test_known_bounds_of_the_second_order_benchmark(clock, expected):
+    # Standard deviations of a1, a2, b0 and the delay at 15 dB, from an independent implementation; they move by a
+    # few per cent with the phase of the input, which is drawn here and was drawn there.
+    r = record(CASE_1, clock * 0.05)
+    noise = np.sqrt(np.mean(r.y**2) / 10**1.5)
+    np.testing.assert_allclose(np.sqrt(np.diag(cramer_rao_bound(CASE_1, r, noise, 15.0))), expected, rtol=0.1)

@@ -32,23 +32,6 @@ def test_a_parabola_gives_the_t_interval(curvature, level):
     assert not interval.open_high
 
 
-def test_it_is_linear_regressions_interval():
-    rng = np.random.default_rng(1)
-    x = rng.standard_normal((30, 2))
-    y = x @ [1.0, 0.3] + rng.standard_normal(30)
-    theta = np.linalg.lstsq(x, y, rcond=None)[0]
-    smallest = float(np.sum((y - x @ theta) ** 2))
-
-    def profile(value):
-        rest = y - value * x[:, 0]
-        return float(np.sum((rest - x[:, 1] * (x[:, 1] @ rest) / (x[:, 1] @ x[:, 1])) ** 2))
-
-    interval = profile_likelihood_interval(profile, theta[0], smallest, 30, 2, (-9.0, 9.0))
-    error = np.sqrt(np.linalg.inv(x.T @ x)[0, 0] * smallest / 28)
-    assert interval.high - theta[0] == pytest.approx(t.ppf(0.975, 28) * error, rel=1e-5)
-    assert theta[0] - interval.low == pytest.approx(t.ppf(0.975, 28) * error, rel=1e-5)
-
-
 def test_an_asymmetric_profile_in_closed_form():
     # S = 1 + (ln tau)^2
     allowed = f.ppf(0.95, 1, 97) / 97
@@ -83,23 +66,6 @@ def test_a_failed_fit_ends_the_interval_and_a_second_basin_is_not_entered():
         return 8.0 + 50 * min((delay - 2) ** 2, (delay - 7) ** 2)
 
     assert profile_likelihood_interval(basins, 2.0, 8.0, 20, 4, (0.0, 10.0)).high < 2.5
-
-
-def test_undefined_and_refused():
-    interval = profile_likelihood_interval(parabola(), 2.0, 8.0, 4, 4, (0.0, 10.0))
-    assert np.isnan([interval.low, interval.high]).all()
-    assert np.isnan(profile_likelihood_interval(parabola(), 2.0, 8.0, 20, 4, (0.0, 9.0), inflation=np.nan).low)
-
-
-def test_few_evaluations():
-    calls = []
-
-    def counted(delay):
-        calls.append(delay)
-        return parabola()(delay)
-
-    profile_likelihood_interval(counted, 2.0, 8.0, 20, 4, (0.0, 10.0))
-    assert len(calls) < 50
 
 
 def test_when_the_quadratic_interval_is_doubtful():

@@ -5,14 +5,12 @@ import pytest
 from scipy.linalg import toeplitz
 
 from ctid_cli.filtering.sampled import simulate_additive
-from ctid_cli.inference.bounds import cramer_rao_bound, finite_record_covariance, limiting_accuracy
-from ctid_cli.inference.covariance import white_noise_covariance
+from ctid_cli.inference.bounds import finite_record_covariance, limiting_accuracy
 from ctid_cli.inference.sensitivities import sensitivities
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.noise import ArmaNoise
-from ctid_cli.signals.record import Record
 
 MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([0.1, 1.0], [0.025, 0.01, 1.0])], 0.13)
 BODY = AdditiveModel([Submodel([0.2, 0.4], [0.3, 1.0], integrators=1), Submodel([0.1], [0.01, 0.1, 1.0])])
@@ -77,12 +75,6 @@ def test_covariance_is_the_double_sum_over_all_pairs_of_samples():
     )
 
 
-def test_white_noise_gives_the_white_formula():
-    psi = sensitivities(MODES, held(), clock(False))
-    expected = white_noise_covariance(psi.T @ psi, 0.3 * (400 - psi.shape[1]), 400)
-    np.testing.assert_allclose(finite_record_covariance(psi, 0.3), expected, rtol=1e-9)
-
-
 def test_long_records_approach_the_limit():
     count = 20_000
     times = 0.05 * np.arange(count)
@@ -109,12 +101,3 @@ def test_covariance_is_undefined_where_the_data_say_nothing():
     assert np.isnan(finite_record_covariance(np.ones((50, 2)), 1.0)).all()
     assert np.isnan(finite_record_covariance(np.zeros((50, 2)), [1.0, 0.5])).all()
     assert np.isnan(finite_record_covariance(np.ones((1, 2)), 1.0)).all()
-
-
-@pytest.mark.parametrize("regular", [True, False])
-def test_with_an_estimated_delay_it_is_the_cramer_rao_bound(regular):
-    model = unfactored(AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])], 0.13))
-    signal, times = held("foh"), clock(regular)
-    psi = sensitivities(model, signal, times, estimate_delay=True)
-    expected = cramer_rao_bound(model, Record(times, np.zeros(400), signal), 0.3)
-    np.testing.assert_allclose(finite_record_covariance(psi, 0.09), expected, rtol=1e-6)

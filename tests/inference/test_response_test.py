@@ -36,7 +36,7 @@ def record_of(u, y, t=None):
 
 
 def outcome(*records, delays=(0.0, 10.0), **options):
-    return module.answer_test(records, [record.valid for record in records], delays, **options)
+    return module.response_test(records, [record.valid for record in records], delays, **options)
 
 
 def answering(rng, n=400, share=0.36, colour=(1.0,), model=FIRST_ORDER):
@@ -95,22 +95,6 @@ def test_the_share_is_that_of_least_squares(initial_state):
     assert found.explained == pytest.approx(best, rel=1e-6)
 
 
-def test_units_and_offsets_do_not_matter():
-    record = answering(np.random.default_rng(44), 150, share=0.05)
-    here = outcome(record)
-    scaled = record_of(1e3 * record.input.values, 5.0 - 1e-3 * record.y, 1e-3 * record.t)
-    there = outcome(scaled, delays=(0.0, 0.01))
-    assert there.p_value == here.p_value
-    assert there.explained == pytest.approx(here.explained, rel=1e-6)
-    assert there.by_chance == pytest.approx(here.by_chance, rel=1e-6)
-
-
-def test_several_records_say_together_what_most_alone_do_not():
-    rng = np.random.default_rng(45)
-    records = [answering(rng, 100, share=0.08) for _ in range(6)]
-    assert outcome(*records).p_value <= 0.01 < np.median([outcome(record).p_value for record in records])
-
-
 def test_a_clock_with_holes_and_an_irregular_one():
     rng = np.random.default_rng(46)
     record = answering(rng)
@@ -119,19 +103,6 @@ def test_a_clock_with_holes_and_an_irregular_one():
     t = np.cumsum(rng.uniform(0.2, 1.8, 400))
     x = simulate(FIRST_ORDER, record.input, t)
     assert outcome(Record(t, x / x.std() + noise(rng, 400), record.input)).seen
-
-
-def test_means_of_a_delayed_response_are_those_of_its_samples():
-    rng, delays = np.random.default_rng(47), np.array([0.0, 0.3, 2.0, 700.25])
-    count, width = 3 * module.MOST_SAMPLES, 3
-    record = record_of(rng.standard_normal(count), rng.standard_normal(count))
-    output = module._Output.of(record, record.valid, False, rng)
-    response = rng.standard_normal(count)
-    shifted = np.interp(record.t[:, None] - delays, record.t, response, left=0.0)
-    expected = shifted.reshape(-1, width, delays.size).mean(axis=1)
-    # Where the response begins, its running sum begins half a sample before.
-    inside = np.arange(len(expected))[:, None] * width > delays + 1
-    np.testing.assert_allclose(output._delayed(response, delays)[inside], expected[inside], atol=1e-12)
 
 
 def test_a_long_record_is_averaged_and_a_fast_answer_is_still_seen():

@@ -118,15 +118,6 @@ def test_pointwise_bands_cover_at_their_level():
     assert np.abs(hits / 6.0 - 95.0).max() < 4 * 100 * np.sqrt(0.95 * 0.05 / 600), hits / 6.0
 
 
-def test_the_delay_counts():
-    known = fitted(names=("a1", "a2", "b0", "b1"), covariance=1e-6 * np.eye(4))
-    free = fitted(covariance=np.diag([1e-6, 1e-6, 1e-6, 1e-6, 1e-4]))
-    assert (free.step_response([1.0]).standard_error > 2 * known.step_response([1.0]).standard_error).all()
-    one, other = free.frequency_response(W), known.frequency_response(W)
-    np.testing.assert_allclose(one.gain_error, other.gain_error, rtol=1e-9)
-    np.testing.assert_allclose(one.phase_error**2, other.phase_error**2 + 1e-4 * W**2, rtol=1e-9)
-
-
 def test_what_is_held_is_known_and_what_is_not_defined_is_nan():
     held = np.diag([1e-6, np.nan, 1e-6, 1e-6, np.nan])
     held[1] = held[:, 1] = held[4] = held[:, 4] = np.nan
@@ -140,16 +131,6 @@ def test_what_is_held_is_known_and_what_is_not_defined_is_nan():
         assert np.isnan(unknown.frequency_response(bands=bands).phase_upper).all()
         assert np.isfinite(unknown.simulate(SIGNAL, bands=bands).value).all()
     assert np.isnan(unknown.poles().standard_error).all()
-
-
-def test_a_sum_answers_as_its_fraction_does():
-    model = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.5, 1.0])], 0.2)
-    fit = fitted(model, model.names, covariance=1e-4 * np.eye(5))
-    np.testing.assert_allclose(fit.step_response(T).value, fitted(fit.model, ()).step_response(T).value, atol=1e-12)
-    poles = fit.poles()
-    rows = {row.name: row for row in fit.derived()}
-    at = np.argmin(np.abs(poles.value - rows["g2_pole"].estimate))
-    assert poles.covariance[at, 0, 0] == pytest.approx(rows["g2_pole"].standard_error ** 2)
 
 
 def test_poles_that_cannot_be_told_apart_have_no_error():
@@ -199,13 +180,6 @@ def test_models_come_back_from_other_tools(name):
         back = TransferFunction(b, a, delay)
         np.testing.assert_allclose(back.frequency_response(W), model.frequency_response(W), rtol=1e-12)
         np.testing.assert_allclose(back.denominator, fit.model.denominator, rtol=1e-12)
-
-
-def test_a_pade_delay_is_part_of_the_system():
-    system, delay = fitted().to_control(pade=6)
-    assert delay == 0.0
-    w = np.array([0.5, 2.0, 5.0])
-    np.testing.assert_allclose(np.ravel(system(1j * w)), SECOND.frequency_response(w), rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["idtf", "tf"])
