@@ -239,7 +239,7 @@ OPEN = DiscreteController([0.0], [1.0])
 #: Amplitude at which the response to a pulse counts as died away: its square is below rounding.
 FORGOTTEN = 1e-12
 #: Longest response to a pulse that is summed [samples], and the least magnitude of a pole that its length allows for.
-LONGEST_MEMORY, DEADBEAT = 2_000_000, 0.1
+LONGEST_MEMORY, DEADBEAT = 1_000_000, 0.1
 #: Noise that is white: its filter has the numerator and the denominator 1.
 WHITE: tuple[Sequence[float], Sequence[float]] = ((1.0,), (1.0,))
 

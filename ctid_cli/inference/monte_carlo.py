@@ -160,7 +160,7 @@ def quantile(values: Array, level: float = 0.5) -> Measured:
 
 def bias(sample: Sample) -> Measured:
     """Mean error."""
-    return of_means(_mean, sample.errors, positive=False)
+    return of_means(lambda mean, _: mean, sample.errors, positive=False)
 
 
 def deviation(sample: Sample) -> Measured:
@@ -171,7 +171,7 @@ def deviation(sample: Sample) -> Measured:
 
 def mean_square(sample: Sample) -> Measured:
     """Mean square error."""
-    return of_means(_mean, sample.errors**2)
+    return of_means(lambda mean, _: mean, sample.errors**2)
 
 
 def root_mean_square(sample: Sample) -> Measured:
@@ -202,8 +202,7 @@ def error_ratio(sample: Sample) -> Measured:
 
 def covered(sample: Sample) -> BoolArray:
     """Which 95 % intervals hold the true value; a standard error that could not be computed covers nothing."""
-    hits: BoolArray = np.abs(sample.errors) <= sample.quantiles * sample.widths
-    return hits
+    return np.asarray(np.abs(sample.errors) <= sample.quantiles * sample.widths)
 
 
 def coverage(sample: Sample) -> Measured:
@@ -214,10 +213,6 @@ def coverage(sample: Sample) -> Measured:
 def efficiency(sample: Sample) -> Measured:
     """Least possible variance over the mean square error [%]."""
     return of_means(lambda mean, _: 100.0 * sample.bound / mean, sample.errors**2)
-
-
-def _mean(mean: Array, _: int) -> Array:
-    return mean
 
 
 def _root(mean: Array, _: int) -> Array:

@@ -95,11 +95,10 @@ def response_test(
         count = int(np.clip(abs(pole) * np.ptp(delays) + 1, FEWEST_DELAYS, MOST_DELAYS))
         grid = np.unique(np.linspace(*delays, count))
         as_they_are, new = zip(*(output.beside_own(pole, grid, free) for output in outputs), strict=True)
-        best = _better(as_they_are, shares[0])
+        series, best, slopes, useful = _better(as_they_are, shares[0])
         for output, part in zip(outputs, as_they_are, strict=True):
-            answer = part.responses[:, best.response] * best.slope
-            output.residual[:, best.series] = part.without_own(part.series[:, best.series]) - answer
-        testable |= best.useful | _better(new, shares[1]).useful
+            output.residual[:, series] = part.without_own(part.series[:, series]) - part.responses[:, best] * slopes
+        testable |= useful | _better(new, shares[1])[-1]
     if not testable:
         return AnswerTest(float("nan"), float("nan"), float("nan"))
     statistics = zip((*shares, sum(output.likelihood_gain for output in outputs)), WEIGHTS, strict=True)
@@ -109,18 +108,12 @@ def response_test(
     return AnswerTest(float(shares[0, 0]), by_chance, float(np.mean(smallest <= smallest[0])))
 
 
-class _Better(NamedTuple):
-    """Series of which a response explains more than any before; which response, and its slope."""
+def _better(parts: Sequence["_BesideOwn"], shares: Array) -> tuple[IndexArray, IndexArray, Array, bool]:
+    """Compare the responses of one pole in all records together; shares that they raise are raised in place.
 
-    series: IndexArray
-    response: IndexArray
-    slope: Array
-    #: Whether any response can be told from offset and free response.
-    useful: bool
-
-
-def _better(parts: Sequence["_BesideOwn"], shares: Array) -> _Better:
-    """The best responses of one pole in all records together; shares that they raise are raised in place."""
+    Returns the series of which a response explains more than any before, which response that is, its slope, and whether
+    any response can be told from offset and free response.
+    """
     products = sum(part.responses.T @ part.series for part in parts)
     power = sum(np.sum(part.responses**2, axis=0) for part in parts)
     useful = power > NOTHING_LEFT * sum(part.whole for part in parts)
@@ -130,7 +123,7 @@ def _better(parts: Sequence["_BesideOwn"], shares: Array) -> _Better:
     share = np.divide(fitted, total, out=np.zeros_like(total), where=total > 0.0)
     better = np.flatnonzero(share > shares)
     shares[better] = share[better]
-    return _Better(better, best[better], slopes[best[better], better], bool(useful.any()))
+    return better, best[better], slopes[best[better], better], bool(useful.any())
 
 
 class _BesideOwn(NamedTuple):
