@@ -27,6 +27,8 @@ class Layout:
     experiments: int = 1
     initial_state: bool = False
     offset: bool = False
+    #: Poles at the origin: that many of the last coefficients of the denominator are zero.
+    integrators: int = 0
 
     @property
     def own(self) -> int:

@@ -31,6 +31,8 @@ class SearchOptions:
     delays: tuple[float, float] = (0.0, 0.0)
     free_response: bool = False
     offset: bool = False
+    #: Poles at the origin, besides those that are searched.
+    integrators: int = 0
     #: Period [s] of each record that repeats for ever, 0 for another; by default none repeats.
     periods: Sequence[float] = ()
     #: Denominators and delays [s] that other estimators have found.
@@ -78,11 +80,13 @@ class Optimum:
     agree: int
     evaluations: int
     box: Box = field(repr=False)
+    #: Poles at the origin, which the denominator does not have.
+    integrators: int = 0
 
     @property
     def model(self) -> TransferFunction:
         """The model."""
-        return TransferFunction(self.numerator, self.denominator, self.delay)
+        return TransferFunction(self.numerator, np.append(self.denominator, np.zeros(self.integrators)), self.delay)
 
 
 def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, options: SearchOptions) -> Optimum:
@@ -158,7 +162,8 @@ def _from_part(problem: Problem, part: Problem, box: Box, poles: int, options: S
 def least(nest: Nest, poles: int, zeros: int, fewer_poles: bool) -> Optimum:
     """The least squared error that a nest knows of a structure."""
     # With a pole at infinity a model of one pole less, whatever its zeros, is in the closure of the structure.
-    fewest = max(zeros + int(nest.box.delay_free), 1) if fewer_poles else poles
+    integrators = nest.problem.integrators
+    fewest = max(zeros + int(nest.box.delay_free) - integrators, int(not integrators)) if fewer_poles else poles
     found = [nest.settled(n, zeros) for n in range(poles, fewest - 1, -1)] or [nest.settled(poles, zeros)]
     errors = [judged.local.squared_error for judged in found]
     # Such a pole costs nothing: a smaller model must be worse by more than rounding to lose.
@@ -173,7 +178,8 @@ def problem_of(records: Sequence[FilterData], zeros: int, options: SearchOptions
     """The records and what is eliminated with them."""
     periods = tuple(options.periods) or (0.0,) * len(records)
     data = tuple(_one_period(*pair) if pair[1] else pair[0] for pair in zip(records, periods, strict=True))
-    return Problem(data, zeros, options.free_response, options.offset, periods)
+    integrators = options.integrators
+    return Problem(data, zeros, options.free_response, options.offset, periods, integrators=integrators)
 
 
 def _one_period(data: FilterData, period: float) -> FilterData:
@@ -189,11 +195,11 @@ def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Opt
     """The model in coefficients of polynomials."""
     point, projected = best.local.point, best.local.projected
     a, known, n = point.denominator, nest.known, point.poles.size
-    over = numerators(point.speed, point.damping)
+    over = numerators(*nest.problem.sections(point.speed, point.damping))
     held = best.held[:n]
     b = projected.output @ over
     if projected.direct:
-        b = np.concatenate(([0.0], b)) + projected.direct * a
+        b = np.concatenate(([0.0], b)) + projected.direct * np.append(a, np.zeros(nest.problem.integrators))
     slopes = point.denominator_slopes()[:, ~held]
     if known is not NOTHING:
         # The same up to rounding.
@@ -220,4 +226,5 @@ def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Opt
         agree=agree,
         evaluations=nest.evaluations,
         box=nest.box,
+        integrators=nest.problem.integrators,
     )
