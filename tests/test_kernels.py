@@ -16,7 +16,7 @@ from types import CodeType
 import pytest
 
 import ctid_cli
-from ctid_cli.frequency import kernels
+from ctid_cli.frequency import frequency_kernels
 from ctid_cli.frequency.flags import Flag
 
 #: Packages that a kernel may use: Numba compiles what it knows of them into it.
@@ -112,7 +112,7 @@ from numba import njit
 from ctid_cli.arrays import Array
 from ctid_cli.frequency import inputs
 from ctid_cli.frequency.inputs import MOST_TONES
-from ctid_cli.frequency.kernels import Output
+from ctid_cli.frequency.frequency_kernels import Output
 from ctid_cli.frequency.prefilter import convolve
 OWN = 3
 """
@@ -130,7 +130,7 @@ OWN = 3
 
 def test_flags_of_kernels_are_those_of_estimates():
     bits = list(Flag)[:8]
-    assert [getattr(kernels, flag.name) for flag in bits] == bits
+    assert [getattr(frequency_kernels, flag.name) for flag in bits] == bits
 
 
 #: A kernel that calls another one of its file, which reads a constant of it.

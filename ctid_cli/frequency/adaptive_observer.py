@@ -7,8 +7,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
+from ctid_cli.frequency.frequency_kernels import Adaptation, Observer, advance_observer
 from ctid_cli.frequency.inputs import samples_in
-from ctid_cli.frequency.kernels import Adaptation, Observer, advance_observer
 from ctid_cli.frequency.tracking import OnlineEstimator, Recursion
 from ctid_cli.signals.checks import require_not_negative, require_positive
 

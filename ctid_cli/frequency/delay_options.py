@@ -7,8 +7,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
+from ctid_cli.frequency.frequency_kernels import DelayClock
 from ctid_cli.frequency.inputs import require_bounds
-from ctid_cli.frequency.kernels import DelayClock
 from ctid_cli.frequency.prefilter import impulse_response
 from ctid_cli.frequency.regression import delay_table, whole_delay
 from ctid_cli.frequency.tracking import OnlineEstimator

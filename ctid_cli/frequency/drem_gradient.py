@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from ctid_cli.frequency.kernels import Gains, Gradient
+from ctid_cli.frequency.frequency_kernels import Gains, Gradient
 from ctid_cli.frequency.mixing import MixingOptions
 from ctid_cli.frequency.regression import theta_of
 from ctid_cli.frequency.tracking import Recursion

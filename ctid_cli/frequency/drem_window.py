@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ctid_cli.frequency.kernels import SlidingWindow
+from ctid_cli.frequency.frequency_kernels import SlidingWindow
 from ctid_cli.frequency.mixing import MixingOptions
 from ctid_cli.frequency.regression import whole_delay
 from ctid_cli.frequency.tracking import Recursion

@@ -9,8 +9,8 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
 from ctid_cli.filtering.realisation import held_step
+from ctid_cli.frequency.frequency_kernels import UNDETERMINED, Chain, Filter, advance_filter
 from ctid_cli.frequency.inputs import require_bounds, samples_in
-from ctid_cli.frequency.kernels import UNDETERMINED, Chain, Filter, advance_filter
 from ctid_cli.frequency.tracking import OnlineEstimator, Recursion
 from ctid_cli.signals.checks import require_choice, require_not_negative, require_positive
 

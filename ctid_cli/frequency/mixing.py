@@ -6,7 +6,16 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.delay_options import DelayRegression
-from ctid_cli.frequency.kernels import DelayClock, Front, Gains, Gradient, Mixing, Output, SlidingWindow, advance_mixed
+from ctid_cli.frequency.frequency_kernels import (
+    DelayClock,
+    Front,
+    Gains,
+    Gradient,
+    Mixing,
+    Output,
+    SlidingWindow,
+    advance_mixed,
+)
 from ctid_cli.frequency.regression import minor_plan, whole_delay
 from ctid_cli.frequency.tracking import Recursion
 from ctid_cli.signals.checks import require_integer, require_positive

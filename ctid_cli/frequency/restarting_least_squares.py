@@ -7,7 +7,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.delay_options import ROWS_PER_TONE, DelayRegression
-from ctid_cli.frequency.kernels import DETECTOR_SPAN, Fit, Restarting, advance_restarting
+from ctid_cli.frequency.frequency_kernels import DETECTOR_SPAN, Fit, Restarting, advance_restarting
 from ctid_cli.frequency.tracking import Recursion
 from ctid_cli.signals.checks import require_choice, require_positive
 

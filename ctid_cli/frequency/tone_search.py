@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
-from ctid_cli.frequency.kernels import NUMBERS, ToneWindows, fit_windows
+from ctid_cli.frequency.frequency_kernels import NUMBERS, ToneWindows, fit_windows
 from ctid_cli.frequency.tone_tests import Line, find_changes, strongest_line
 from ctid_cli.frequency.whitening import Left, whiten
 from ctid_cli.processors import in_threads

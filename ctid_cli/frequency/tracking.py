@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.frequency_kernels import Output
 from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES, series_of
-from ctid_cli.frequency.kernels import Output
 from ctid_cli.frequency.prefilter import convolve, fast_convolve
 from ctid_cli.signals.checks import require_integer, require_positive
 from ctid_cli.text import ShownAsTable

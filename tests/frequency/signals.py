@@ -8,7 +8,7 @@ from ctid_cli.frequency.drem_gradient import DremGradient
 from ctid_cli.frequency.drem_window import DremWindow
 from ctid_cli.frequency.filter_regression import FilterRegression
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.kernels import decode, decoding_memory
+from ctid_cli.frequency.frequency_kernels import decode, decoding_memory
 from ctid_cli.frequency.regression import delay_table
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 

@@ -7,7 +7,7 @@ from scipy import signal
 from ctid_cli.frequency.adaptive_observer import AdaptiveObserver
 from ctid_cli.frequency.filter_regression import FilterRegression, derivative_rows
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.kernels import observer_slope, place_poles
+from ctid_cli.frequency.frequency_kernels import observer_slope, place_poles
 from tests.frequency.signals import INTERVAL, OMEGA, tones
 
 

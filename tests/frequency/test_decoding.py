@@ -6,7 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.kernels import (
+from ctid_cli.frequency.frequency_kernels import (
     cosine_sensitivities,
     flag_uncertain,
     propagate,

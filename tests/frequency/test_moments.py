@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ctid_cli.frequency.delay_options import second_lag
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.kernels import (
+from ctid_cli.frequency.frequency_kernels import (
     accumulate_row,
     check_consistency,
     factorise,
