@@ -31,8 +31,6 @@ class SearchOptions:
     delays: tuple[float, float] = (0.0, 0.0)
     free_response: bool = False
     offset: bool = False
-    #: Poles at the origin, besides those that are searched.
-    integrators: int = 0
     #: Period [s] of each record that repeats for ever, 0 for another; by default none repeats.
     periods: Sequence[float] = ()
     #: Denominators and delays [s] that other estimators have found.
@@ -48,16 +46,19 @@ class SearchOptions:
     seed: int = 0
     #: Coefficients that are known.
     known: KnownCoefficients = NOTHING
+    #: Poles at 0 besides. With free responses these hold the offset, too; no record may repeat itself.
+    integrators: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
     """The least output error that was found."""
 
-    #: Coefficients in descending powers, the denominator monic.
+    #: Coefficients in descending powers, the denominator monic and without the integrators.
     numerator: Array
     denominator: Array
     delay: float
+    integrators: int
     #: Of each record, coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers, and offset;
     #: zeros without them.
     free_responses: Array
@@ -80,8 +81,6 @@ class Optimum:
     agree: int
     evaluations: int
     box: Box = field(repr=False)
-    #: Poles at the origin, which the denominator does not have.
-    integrators: int = 0
 
     @property
     def model(self) -> TransferFunction:
@@ -212,6 +211,7 @@ def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Opt
         numerator=np.trim_zeros(b, "f") if b.any() else np.zeros(1),
         denominator=a,
         delay=point.delay.seconds,
+        integrators=nest.problem.integrators,
         free_responses=projected.free @ over,
         offsets=projected.offset,
         squared_error=best.local.squared_error,
@@ -226,5 +226,4 @@ def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Opt
         agree=agree,
         evaluations=nest.evaluations,
         box=nest.box,
-        integrators=nest.problem.integrators,
     )

@@ -27,9 +27,9 @@ CLOSE = 0.01
 #: parts them (after the first few steps), or once the squared error is still so many times higher.
 HOPELESS, FIRST_STEPS, PATIENCE, FAR = 30.0, 3, 12, 4.0
 #: The same for what so many steps have fallen: between the kinks of an irregular clock steps promise more than they do.
-CRAWLING, REMEMBERED = 100.0, 7
-#: A step is another one if it differs by more than this fraction of its length.
-ANOTHER = 0.1
+CRAWLING, REMEMBERED = 300.0, 7
+#: A step of the greatest length is another one if it differs by more than this.
+ANOTHER = 0.01
 #: Step of the differences of the gradient; eigenvalues below this fraction of the largest have no sign.
 DIFFERENCE, FLAT = 1e-4, 1e-9
 #: Differences to one side will do where the least eigenvalue exceeds their error by this factor.
@@ -198,14 +198,16 @@ class Descent:
             scaled, slope = ways.reduced(here.gradient, here.curvature)
             promise = _promise(scaled, slope)[0] if slope.size else 0.0
             arrived = not scale.size or promise <= near * max(here.squared_error, self.floor)
-            if arrived or _hopeless(taken, here.squared_error, promise, sum(falls), lowest):
+            fallen = sum(falls) if self.box.cell == 0.0 else np.inf
+            if arrived or _hopeless(taken, here.squared_error, promise, fallen, lowest):
                 break
             lower, rejected = None, np.full(here.gradient.size, np.inf)
             for _ in range(MOST_REJECTIONS):
                 step = ways.whole(np.linalg.solve(scaled + damping * np.eye(slope.size), -slope))
-                step /= max(1.0, float(np.abs(step).max()))
+                length = float(np.abs(step).max())
+                step /= max(1.0, length)
                 # Where steps are cut to their greatest length, more damping hardly changes them at first.
-                if np.abs(step - rejected).max() > ANOTHER * np.abs(step).max():
+                if length <= 1.0 or np.abs(step - rejected).max() > ANOTHER:
                     lower, rejected = self._lower(here, self._whole_and_to_edge(here.point, step)), step
                 if lower is not None:
                     break
@@ -425,8 +427,7 @@ def _alike(here: Local, other: Local, box: Box) -> bool:
 
 def _hopeless(taken: int, squared_error: float, promise: float, fallen: float, lowest: float) -> bool:
     """Whether a search will not come down to the lowest known minimum."""
-    least = min(HOPELESS * promise, CRAWLING * fallen)
-    too_flat = taken >= FIRST_STEPS and squared_error - least > lowest
+    too_flat = taken >= FIRST_STEPS and squared_error - min(HOPELESS * promise, CRAWLING * fallen) > lowest
     return too_flat or (taken >= PATIENCE and squared_error > FAR * lowest)
 
 
