@@ -107,11 +107,11 @@ def inadmissible(size: int) -> Equations:
 def solve_scaled(matrix: Array, right: Array, rows: Array, columns: Array, count: int) -> tuple[bool, Array]:
     """Solve the leading ``count`` equations with rows and columns brought to a common scale; zeros for the rest."""
     solution = np.zeros(right.size)
-    scales = np.sqrt(np.array((rows[:count], columns[:count])))
+    scales = np.array((rows[:count], columns[:count]))
     # Units of the parameters may differ by hundreds of decades: unscaled, elimination would pivot on units.
     if not ((scales > 0.0) & (scales < np.inf)).all():
         return False, solution
-    row, column = 1.0 / scales
+    row, column = 1.0 / np.sqrt(scales)
     try:
         unscaled = np.linalg.solve(matrix[:count, :count] * row[:, None] * column, right[:count] * row)
     except np.linalg.LinAlgError:

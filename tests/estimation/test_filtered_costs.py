@@ -1,59 +1,261 @@
-"""Costs of a record behind low-pass filters: those of its spectra, from the starts that they are given."""
+"""Fits to the spectra of a record behind low-pass filters, against columns written out and SciPy's least squares."""
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
-from ctid_cli.estimation.filtered_costs import filtered_costs, minima_behind_all, percents
+from ctid_cli.estimation.filtered_costs import filtered_costs, percents
+from ctid_cli.estimation.iteration import Steps, iterate
+from ctid_cli.estimation.sampled_problem import at_known_delay
+from ctid_cli.estimation.stability import reflect_unstable
+from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
+from ctid_cli.filtering.simulate import simulate
 from ctid_cli.filtering.spectra import lowpass_weight, record_spectra
+from ctid_cli.filtering.spectral_kernels import least_cost, projected_moments
 from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
-from tests.estimation.adapters import iterate, spectral_at, spectral_refit_numerator, steps
 from tests.estimators.records import CASE_1, CASE_2, SVF_CUTOFF, make_record, theta_of
 
-LONGEST = 15.0
+GREATEST = 12.0
 DEGREES = {CASE_1: Structure(2, 0), CASE_2: Structure(4, 1)}
-THOROUGH = {"max_iterations": 100, "tolerance": 1e-9, "variant": "gauss_newton", "halvings": 12}
+#: Frequencies up to about one and a half bandwidths [rad/s].
+HIGHEST = {CASE_1: 3.0, CASE_2: 40.0}
+THOROUGH = Steps(100, 1e-9, "gauss_newton", 12)
 CUTOFFS = [0.3, 1.0, 2.02]
 
 
-def costs_of(record, model=CASE_1, cutoffs=CUTOFFS, order=10):
-    lowpasses = [Lowpass(cutoff, order) for cutoff in cutoffs]
+def spectral_data(record, highest, delay, lowpass=None, keep_mean=True):
+    """Frequencies, output, delayed input and weights as the kernels take them."""
+    spectra = record_spectra(record, GREATEST, highest, GREATEST, keep_mean=keep_mean)
+    return spectra.frequencies, spectra.outputs, spectra.inputs(delay), lowpass_weight(spectra.frequencies, lowpass)
+
+
+def real_rows(data, columns):
+    """Weighted complex columns as real ones; a frequency above zero stands for its negative too."""
+    frequencies, _, _, weights = data
+    root = np.sqrt(weights * np.where(frequencies == 0, 1, 2))
+    weighted = root[:, None] * np.column_stack(columns)
+    return np.concatenate((weighted.real, weighted.imag))
+
+
+def columns_of(data, theta, poles):
+    """Columns (dx/da, dx/db, dx/dtau, eps) and the output, the transient projected out by an orthogonal basis."""
+    frequencies, y, u, _ = data
+    jw, a, b = 1j * frequencies, np.append(1.0, theta[:poles]), theta[poles:]
+    inverse = 1 / np.polyval(a, jw)
+    powers = np.column_stack([(jw / abs(jw[-1])) ** i * inverse for i in range(poles)])
+    basis, _ = np.linalg.qr(real_rows(data, [powers]))
+    forced = np.polyval(b, jw) * u * inverse
+    transient = np.linalg.lstsq(real_rows(data, [powers]), real_rows(data, [y - forced])[:, 0], rcond=None)[0]
+    x = forced + powers @ transient
+    columns = [-(jw ** (poles - i)) * x * inverse for i in range(1, poles + 1)]
+    columns += [jw ** (b.size - 1 - j) * u * inverse for j in range(b.size)]
+    columns = real_rows(data, [*columns, -jw * forced, y - x])
+    return columns - basis @ (basis.T @ columns), real_rows(data, [x])[:, 0]
+
+
+def disturbed(model):
+    theta = theta_of(model)
+    return theta * (1 + 0.05 * np.cos(np.arange(theta.size)))
+
+
+@pytest.mark.parametrize("model", [CASE_1, CASE_2])
+@pytest.mark.parametrize("lowpass", [None, Lowpass(1.3, 2)])
+@pytest.mark.parametrize("keep_mean", [True, False])
+def test_moments_are_products_of_projected_columns(model, lowpass, keep_mean):
+    data = spectral_data(make_record(model, snr_db=10, n=3000), HIGHEST[model], 7.9, lowpass, keep_mean)
+    theta, n = disturbed(model), model.order
+    columns, x = columns_of(data, theta, n)
+    gram, power = projected_moments(*data, np.append(1.0, theta[:n]), theta[n:])
+    scale = np.linalg.norm(columns, axis=0)
+    # The lowest frequencies alone carry what lies beyond 1e-6 of the greatest weight.
+    tolerance = 1e-9 if lowpass is None else 1e-5
+    expected = columns / scale
+    np.testing.assert_allclose(gram / np.outer(scale, scale), expected.T @ expected, rtol=0, atol=tolerance)
+    assert power == pytest.approx(x @ x, rel=tolerance)
+
+
+@pytest.mark.parametrize("lowpass", [None, Lowpass(30.0, 3)])
+@pytest.mark.parametrize("model", [CASE_1, CASE_2])
+def test_fit_is_where_scipy_ends(model, lowpass):
+    # By differences of the residual, scaled by the size of each parameter; the step of the delay too is the projection
+    # of the error on what the coefficients leave of its sensitivity.
+    data = spectral_data(make_record(model, snr_db=10, regular=False, n=4000), HIGHEST[model], 8.02, lowpass)
+    n, start = model.order, disturbed(model)
+    theta, squared_error, step = least_cost(*data, start, n, 100, 1e-12, 12)
+    found = least_squares(
+        lambda x: columns_of(data, x * start, n)[0][:, -1], np.ones(start.size), xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
+    assert squared_error == pytest.approx(2 * found.cost, rel=1e-9)
+    np.testing.assert_allclose(theta, found.x * start, rtol=1e-4)
+    columns, _ = columns_of(data, theta, n)
+    size = np.linalg.norm(columns[:, :-1], axis=0)
+    joint = np.linalg.lstsq(columns[:, :-1] / size, columns[:, -1], rcond=None)[0] / size
+    assert step == pytest.approx(joint[-1], rel=1e-4)
+
+
+def test_numerator_of_the_start_is_refitted():
+    data = spectral_data(make_record(CASE_2, snr_db=15, n=3000), 40.0, 8.0, Lowpass(25.0, 4))
+    theta = theta_of(CASE_2) * 1.05
+    columns, _ = columns_of(data, np.append(theta[:4], [0.0, 0.0]), 4)
+    expected = np.linalg.lstsq(columns[:, 4:6], columns[:, -1], rcond=None)[0]
+    refitted, _, _ = least_cost(*data, theta, 4, 0, 1e-9, 12)
+    np.testing.assert_allclose(refitted, np.append(theta[:4], expected), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("model", "regular", "tolerance"),
+    [(CASE_1, True, 1e-5), (CASE_1, False, 3e-4), (CASE_2, True, 1e-5), (CASE_2, False, 1e-3)],
+)
+def test_noise_free_records_give_the_true_model(model, regular, tolerance):
+    n = 4500 if model is CASE_2 and not regular else None
+    data = spectral_data(make_record(model, regular=regular, n=n), HIGHEST[model], 8.0)
+    theta, squared_error, step = least_cost(*data, disturbed(model), model.order, 50, 1e-6, 12)
+    np.testing.assert_allclose(theta, theta_of(model), rtol=tolerance)
+    assert abs(step) < 10 * tolerance
+    _, power = projected_moments(*data, np.append(1.0, theta[: model.order]), theta[model.order :])
+    assert squared_error < (10 * tolerance) ** 2 * power
+
+
+def test_estimate_is_that_of_the_time_domain():
+    # Same data, all frequencies: they differ by less than the estimate's own uncertainty (the time domain knows that
+    # the system starts at rest, the spectra do not).
+
+    for model, n in ((CASE_1, 4000), (CASE_2, 4500)):
+        record = make_record(model, regular=False, snr_db=15, replicate=2, n=n)
+        samples = filter_data(record, GREATEST)
+        truth = np.append(theta_of(model), 8.0)
+        direct = iterate(at_known_delay(samples, DEGREES[model]), truth, Steps(50, 1e-6, "guarded"))
+        theta, _, _ = least_cost(*spectral_data(record, np.inf, 8.0), truth[:-1], model.order, 50, 1e-6, 12)
+        variance = direct.equations.squared_error / samples.count
+        errors = np.sqrt(variance * np.diag(np.linalg.inv(direct.equations.hessian[:-1, :-1])))
+        assert np.all(np.abs(theta - direct.theta[:-1]) < errors)
+
+
+def test_initial_state_is_projected_out():
+    # A free response of the system, larger than the forced one, changes neither the estimate nor the cost.
+    record = make_record(CASE_1)
+    kick = HeldSignal([0.0, 10.0, 10.5], [0.0, 400.0, 0.0])
+    free = simulate(TransferFunction([1.0, 3.0], CASE_1.denominator), kick, record.t)
+    assert np.abs(free[record.t > 12]).max() > 3 * np.abs(record.y).max()
+    data = spectral_data(Record(record.t, record.y + free, record.input), 3.0, 8.0)
+    theta, squared_error, _ = least_cost(*data, disturbed(CASE_1), 2, 50, 1e-6, 12)
+    np.testing.assert_allclose(theta, theta_of(CASE_1), rtol=1e-4)
+    assert squared_error < 1e-8 * np.sum(np.abs(data[1]) ** 2)
+
+
+def test_record_cut_from_a_running_experiment():
+    # The input is known from the cut on: so is the delayed input in the window, and nothing else is needed.
+    record = make_record(CASE_1, regular=False)
+    later, edge = record.t > 60.0, record.input.t > 60.0
+    cut = Record(record.t[later], record.y[later], HeldSignal(record.input.t[edge], record.input.values[edge]))
+    theta, _, _ = least_cost(*spectral_data(cut, 3.0, 8.0), disturbed(CASE_1), 2, 50, 1e-6, 12)
+    np.testing.assert_allclose(theta, theta_of(CASE_1), rtol=5e-4)
+
+
+@pytest.mark.parametrize("model", [CASE_1, CASE_2])
+def test_units_do_not_matter(model):
+    # Time in units of 1/1024 s, output and input in other units.
+    frequencies, outputs, inputs, weights = spectral_data(make_record(model, snr_db=10), HIGHEST[model], 8.0)
+    n, m = model.order, model.numerator.size - 1
+    scale = np.concatenate((1024.0 ** -np.arange(1.0, n + 1), 1024.0 ** -np.arange(n - m, n + 1.0) * 8.0 / 0.25))
+    theta, squared_error, step = least_cost(frequencies, outputs, inputs, weights, disturbed(model), n, 50, 1e-9, 12)
+    scaled = frequencies / 1024, 8.0 * outputs, 0.25 * inputs, weights
+    other, its_error, its_step = least_cost(*scaled, disturbed(model) * scale, n, 50, 1e-9, 12)
+    np.testing.assert_allclose(other, theta * scale, rtol=1e-8)
+    assert its_error == pytest.approx(64 * squared_error, rel=1e-9)
+    assert its_step == pytest.approx(1024 * step, rel=1e-6)
+
+
+def test_with_fewer_bins_than_transient_coefficients_nothing_is_left():
+    # The mean and one frequency are three real equations; three coefficients of a transient explain them all.
+    t = 0.1 * np.arange(200)
+    y = np.random.default_rng(0).standard_normal(200)
+    spectra = record_spectra(Record(t, y, HeldSignal(t, np.sign(np.sin(t)))), 2.0, 0.36, 2.0)
+    assert spectra.frequencies.size == 2
+    for order in (3, 5):
+        a = np.poly(np.full(order, -1.0))
+        gram, power = projected_moments(
+            spectra.frequencies, spectra.outputs, spectra.inputs(1.0), np.ones(2), a, np.ones(1)
+        )
+        assert np.abs(gram).max() < 1e-12 * power
+
+
+def test_start_that_cannot_be_computed_has_no_cost():
+    data = spectral_data(make_record(CASE_1, n=1000), 3.0, 1.0)
+    on_a_bin = np.array([0.0, data[0][-1] ** 2, 1.0])
+    for start in (on_a_bin, theta_of(CASE_1) * np.nan, theta_of(CASE_1) * np.inf):
+        _, squared_error, step = least_cost(*data, start, 2, 50, 1e-9, 12)
+        assert squared_error == np.inf
+        assert np.isnan(step)
+
+
+# The costs of several filters -----------------------------------------------------------------------------------
+
+
+def costs_of(record, model=CASE_1, cutoffs=CUTOFFS):
+    lowpasses = [Lowpass(cutoff, 10) for cutoff in cutoffs]
     svf_cutoffs = np.full(len(cutoffs), SVF_CUTOFF[model])
-    more = {"start": LONGEST, "svf_cutoffs": svf_cutoffs, "steps": steps(**THOROUGH)}
-    return filtered_costs(record, lowpasses, DEGREES[model], LONGEST, **more)
-
-
-def started_at(model, factor=1.0):
-    """One start; the delay at its end is not used."""
-    return np.append(theta_of(model) * factor, 0.0)[None]
+    return filtered_costs(
+        record, lowpasses, DEGREES[model], GREATEST, start=GREATEST, svf_cutoffs=svf_cutoffs, steps=THOROUGH
+    )
 
 
 NONE = np.empty((0, 4))
 
 
 @pytest.mark.parametrize(("model", "cutoffs"), [(CASE_1, CUTOFFS), (CASE_2, [2.685, 26.85])])
-def test_least_cost_is_that_of_the_spectra(model, cutoffs):
-    # The problem written out at all frequencies, without the cut where a filter passes next to nothing.
+def test_least_cost_is_that_of_all_frequencies(model, cutoffs):
+    # Without the cut where a filter passes next to nothing.
     record = make_record(model, snr_db=15, regular=False, n=2500)
-    spectra = record_spectra(record, LONGEST, 1.5 * cutoffs[-1], LONGEST)
     costs = costs_of(record, model, cutoffs)
     for k, cutoff in enumerate(cutoffs):
-        weight = lowpass_weight(spectra.frequencies, Lowpass(cutoff, 10))
-        theta = spectral_refit_numerator(spectra, DEGREES[model], theta_of(model), 7.9, weight)
-        problem = spectral_at(spectra, DEGREES[model], 7.9, weight)
-        expected = iterate(problem, np.append(theta, 7.9), **THOROUGH)
-        found = costs.behind(k).minimise(7.9, started_at(model), False)
-        assert found.squared_error == pytest.approx(expected.equations.squared_error, rel=1e-5)
+        data = spectral_data(record, 1.5 * cutoffs[-1], 7.9, Lowpass(cutoff, 10))
+        _, expected, _ = least_cost(*data, theta_of(model), model.order, *costs.effort)
+        found = costs.behind(k).minimise(7.9, np.append(theta_of(model), 0.0)[None], False)
+        assert found.squared_error == pytest.approx(expected, rel=1e-5)
         assert found.delay == 7.9
-        sides = np.where(spectra.frequencies > 0, 2.0, 0.0)
-        assert costs.spreads[k] == pytest.approx(np.sum(sides * weight * np.abs(spectra.outputs) ** 2))
+        deviation = real_rows(data, [np.where(data[0] > 0, data[1], 0.0)])
+        assert costs.spreads[k] == pytest.approx(np.sum(deviation**2))
+
+
+@pytest.mark.parametrize("model", [CASE_1, CASE_2])
+def test_own_start_is_the_least_squares_solution(model):
+    # (jw)^n Y/F on -(jw)^(n-i) Y/F, (jw)^(m-j) U/F and (jw)^l/F, with real coefficients, by orthogonal decomposition.
+    record, cutoff = make_record(model, snr_db=15), HIGHEST[model] / 1.5
+    costs = costs_of(record, model, [cutoff])._replace(steps=Steps(0, 1e-9, "gauss_newton", 12))
+    data = spectral_data(record, HIGHEST[model], 7.9, Lowpass(cutoff, 10))
+    n, m, jw = model.order, model.numerator.size - 1, 1j * data[0]
+    f = np.poly(np.full(n, -SVF_CUTOFF[model]))
+    columns = [-(jw ** (n - i)) * data[1] for i in range(1, n + 1)]
+    columns += [jw ** (m - j) * data[2] for j in range(m + 1)]
+    columns += [jw**i for i in range(n)] + [jw**n * data[1]]
+    columns = real_rows(data, [column / np.polyval(f, jw) for column in columns])
+    size = np.linalg.norm(columns, axis=0)
+    solution = np.linalg.lstsq(columns[:, :-1] / size[:-1], columns[:, -1], rcond=None)[0] / size[:-1]
+    expected = reflect_unstable(np.append(1.0, solution[:n]))[1:]
+    found = costs.behind(0).minimise(7.9, np.empty((0, n + m + 2)), True)
+    np.testing.assert_allclose(found.theta[:n], expected, rtol=1e-4)
+
+
+def test_unstable_own_starts_are_reflected():
+    # A response that grows: the least-squares model is unstable, the start is its mirror image.
+    t = 0.05 * np.arange(400)
+    record = Record(t, 5 * np.exp(0.5 * t), HeldSignal(t, np.where(t < 1, 1.0, 0.0)))
+    steps = Steps(0, 1e-9, "gauss_newton", 12)
+    cutoffs = np.ones(1)
+    costs = filtered_costs(
+        record, [Lowpass(7.0, 10)], Structure(1, 0), 0.5, start=0.5, svf_cutoffs=cutoffs, steps=steps
+    )
+    assert costs.behind(0).minimise(0.25, np.empty((0, 3)), True).theta[0] == pytest.approx(0.5, rel=1e-2)
 
 
 def test_minimum_is_the_best_of_its_starts():
     cost = costs_of(make_record(snr_db=15, n=2000)).behind(2)
-    starts = np.vstack((started_at(CASE_1), started_at(CASE_1, 1e-3)))
+    starts = np.column_stack((theta_of(CASE_1) * np.array([[1.0], [1e-3]]), np.zeros(2)))
     alone = [cost.minimise(7.7, start[None], False).squared_error for start in starts]
     least_squares = cost.minimise(7.7, NONE, True).squared_error
     assert cost.minimise(7.7, starts, False).squared_error == min(alone)
@@ -63,7 +265,7 @@ def test_minimum_is_the_best_of_its_starts():
 
 def test_costs_behind_all_filters_are_handed_down_and_up():
     costs = costs_of(make_record(snr_db=5, n=2000))
-    thetas, squared_errors = minima_behind_all(costs, 6.5)
+    thetas, squared_errors = costs.minima_behind_all(6.5)
     down = [costs.behind(2).minimise(6.5, NONE, True)]
     for k in (1, 0):
         down.insert(0, costs.behind(k).minimise(6.5, down[0].theta[None], False))
@@ -79,18 +281,6 @@ def test_input_that_rests_while_it_counts_has_no_minimum():
     # All that the output could tell of the input lies before the samples that count.
     t = 0.05 * np.arange(1000)
     costs = costs_of(Record(t, np.sin(t), HeldSignal(t, np.where(t < t[-1], 0.0, 1.0))))
-    _, squared_errors = minima_behind_all(costs, 1.0)
+    _, squared_errors = costs.minima_behind_all(1.0)
     assert np.isinf(squared_errors).all()
     assert percents(squared_errors, costs.spreads).tolist() == [100.0] * 3
-
-
-@pytest.mark.parametrize("regular", [True, False])
-def test_minimum_is_where_the_delay_is(regular):
-    # Without noise: the least cost over a lattice lies within a twentieth of the filter's period of the true delay.
-    costs = costs_of(make_record(regular=regular), cutoffs=[0.5, 1.0, 2.02])
-    for k, cutoff in enumerate((0.5, 1.0, 2.02)):
-        delays = 8.0 + np.arange(-10, 11) * 0.02 * 2 * np.pi / cutoff
-        delays = delays[delays < LONGEST]
-        errors = np.array([costs.behind(k).minimise(d, started_at(CASE_1), False).squared_error for d in delays])
-        assert abs(delays[np.argmin(errors)] - 8.0) <= 0.061 * 2 * np.pi / cutoff
-        assert percents(errors.min(), costs.spreads[k]) < 1.0
