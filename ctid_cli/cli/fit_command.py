@@ -30,9 +30,9 @@ def fit(
     context: typer.Context,
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat), an experiment each.")],
     poles: Annotated[
-        int | None, typer.Option("--poles", help="Number of poles, 1 to 12; else by an order search.")
+        int | None, typer.Option("--poles", help="Poles, 1 to 12 (0 with --integrators); else by an order search.")
     ] = None,
-    zeros: Annotated[int | None, typer.Option("--zeros", help="Number of zeros, fewer than poles.")] = None,
+    zeros: Annotated[int | None, typer.Option("--zeros", help="Zeros, fewer than poles.")] = None,
     delay: Annotated[
         str | None, typer.Option("--delay", metavar="LOW:HIGH|VALUE", help="Range or value [time unit]; 0.")
     ] = None,
@@ -41,7 +41,7 @@ def fit(
         str | None, typer.Option("--terms", metavar="P/Z,P/Z,...", help="Poles/zeros of each submodel.")
     ] = None,
     integrators: Annotated[
-        int, typer.Option("--integrators", help="Further poles at the origin, of the first submodel.")
+        int, typer.Option("--integrators", help="Poles at the origin besides; of a sum, in its first submodel.")
     ] = 0,
     fix: Annotated[
         list[str] | None, typer.Option("--fix", metavar="NAME=VALUE", help="Hold a parameter; repeatable.")
@@ -54,7 +54,7 @@ def fit(
     ] = None,
     ignore_loop: Annotated[bool, typer.Option("--ignore-loop", help="Fit as if there were no loop.")] = False,
     initial_state: Annotated[InitialState, typer.Option("--initial-state", help="State before the record.")] = "rest",
-    offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output.")] = "none",
+    offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output (not input).")] = "none",
     loss: Annotated[LossKind, typer.Option("--loss", help="What large output errors count.")] = "squares",
     hold: Annotated[AskedHold, typer.Option("--hold", help="The input between its samples.")] = "auto",
     time: TimeColumn = None,

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from ctid_cli.models.additive import Term
     from ctid_cli.signals.measurement import Measurement
 
+#: More integrators are not told apart in records.
+MOST_INTEGRATORS = 3
 #: One transfer function, or a sum of submodels.
 ModelForm = Literal["fraction", "additive"]
 
@@ -41,7 +43,7 @@ class Asked:
     @property
     def iterated(self) -> bool:
         """Whether the estimator is that of submodels, which knows the delay and takes one record."""
-        return self.model == "additive" or self.integrators > 0 or self.loop
+        return self.model == "additive" or self.loop
 
 
 def estimator_of(asked: Asked) -> "Options":
@@ -60,7 +62,13 @@ def _fraction(asked: Asked) -> "Options":
 
     assert asked.poles is not None
     treatment: dict[str, Any] = {"initial_state": asked.initial_state, "offset": asked.offset, "loss": asked.loss}
-    return DelayProfile(asked.poles, asked.zeros or 0, asked.delay, **treatment, nested=True, fixed=_fixed(asked.fix))
+    return DelayProfile(
+        *(asked.poles, asked.zeros or 0, asked.delay),
+        **treatment,
+        nested=True,
+        fixed=_fixed(asked.fix),
+        integrators=asked.integrators,
+    )
 
 
 def _submodels(asked: Asked) -> "Options":
@@ -96,13 +104,23 @@ def _refuse_strangers(asked: Asked) -> None:
                 raise UsageError(f"{name} is for one transfer function; --terms has the degrees of a sum, drop {name}")
     elif asked.terms is not None:
         raise UsageError("--terms is for a sum of submodels; add --model additive, or give --poles and --zeros")
-    if asked.integrators < 0:
-        raise UsageError(f"--integrators must be 0 or more; got {asked.integrators}")
+    check_integrators(asked.integrators, asked.offset, "--initial-state" if asked.iterated else "--offset")
+
+
+def check_integrators(integrators: int, offset: Offset, instead: str = "--offset") -> None:
+    """Refuse numbers of integrators, and what they make of a mean; a constant is estimated by another option."""
+    if not 0 <= integrators <= MOST_INTEGRATORS:
+        raise UsageError(f"--integrators must be 0 to {MOST_INTEGRATORS}; got {integrators}")
+    if integrators and offset == "remove":
+        raise UsageError(
+            "--offset remove subtracts the mean of the output, which is no offset of a system that integrates; use "
+            f"{instead} estimate"
+        )
 
 
 def _refuse_unable(asked: Asked) -> None:
     """What refined instrumental variables at a known delay cannot do."""
-    what = "a record in a loop" if asked.loop else "a model with integrators or submodels"
+    what = "a record in a loop" if asked.loop else "a sum of submodels"
     low, high = asked.delay
     if low < high:
         why = "noise that comes back through the loop would move it" * asked.loop or "a known delay is needed"

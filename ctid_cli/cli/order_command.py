@@ -19,7 +19,7 @@ from ctid_cli.cli._common import (
     span,
     write_files,
 )
-from ctid_cli.cli.fit_structure import delay_bounds
+from ctid_cli.cli.fit_structure import check_integrators, delay_bounds
 from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import InitialState, Offset
 
@@ -34,7 +34,8 @@ def order(
         typer.Option("--delay", metavar="LOW:HIGH|VALUE", help="Range or value [time unit]; else as ctid check says."),
     ] = None,
     initial_state: Annotated[InitialState, typer.Option("--initial-state", help="State before the record.")] = "rest",
-    offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output.")] = "none",
+    integrators: Annotated[int, typer.Option("--integrators", help="Poles at the origin besides.")] = 0,
+    offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output (not input).")] = "none",
     hold: InputHold = "zoh",
     time: TimeColumn = None,
     input: InputColumn = None,
@@ -59,7 +60,8 @@ def order(
     from ctid_cli.reporting.order_report import order_object, order_text
     from ctid_cli.signals.measurement import read_measurement
 
-    ranges = _range("--poles", poles, 1), _range("--zeros", zeros, 0)
+    check_integrators(integrators, offset)
+    ranges = _range("--poles", poles, int(not integrators)), _range("--zeros", zeros, 0)
     bounds = None if delay is None else delay_bounds(delay)
     read = partial(read_measurement, time=time, input=input, output=output, hold=hold)
     measurements = [read(file, start=start, stop=stop) for file in files]
@@ -76,6 +78,7 @@ def order(
             initial_state=initial_state,
             offset=offset,
             validation=None if other is None else other.record,
+            integrators=integrators,
         )
     except ValueError as error:
         raise UsageError(str(error)) from None

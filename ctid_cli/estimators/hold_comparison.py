@@ -74,7 +74,9 @@ def _least(refinement: Refinement, fit: MeasuredFit, records: Sequence[Record]) 
     """Least sum of squared output errors near a fit, and its delay."""
     measured = MeasuredRecords(records, refinement.structure, refinement.measured.treatment)
     bounds = measured.treatment.delay_bounds
-    found = local_minimum(measured.problem, fit.model.poles, fit.model.delay, bounds, known=refinement.known)
+    found = local_minimum(
+        measured.problem, refinement.free_poles(fit.model), fit.model.delay, bounds, known=refinement.known
+    )
     return found.squared_error, found.point.delay.seconds
 
 

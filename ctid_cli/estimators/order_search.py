@@ -192,6 +192,7 @@ def search_orders(
     offset: Offset = "none",
     validation: Record | None = None,
     ends_early: bool = False,
+    integrators: int = 0,
 ) -> OrderSearch:
     r"""Fit a range of structures to the same records, judge them, and say which the records ask for.
 
@@ -211,6 +212,8 @@ def search_orders(
         Another record of the same system, on which all models are tried.
     ends_early : bool, default False
         Whether the search ends before the greatest number of poles when two further ones in a row were not worth it.
+    integrators : int, default 0
+        Poles at the origin besides, of all structures.
 
     Returns
     -------
@@ -231,7 +234,10 @@ def search_orders(
     residuals of the closest fit makes all residuals white, if they are not. A pole that runs to infinity leaves a
     smaller model, and its parameter counts all the same.
     """
-    search = _search(records, poles, zeros, delay_bounds, initial_state, offset, ends_early)
+    whole = DelayProfile(
+        *(poles[1], 0, delay_bounds), initial_state=initial_state, offset=offset, integrators=integrators
+    )
+    search = _search(records, poles, zeros, whole, ends_early)
     checked: Refinement | None = None
     if validation is not None:
         laid_out = laid_out_validation(search.options(poles[1], 0), validation)
@@ -255,7 +261,8 @@ def recommend_order(
 
     ``answer`` says whether the outputs answer to the inputs, where that is known already.
     """
-    search = _search(records, poles, zeros, delay_bounds, initial_state, offset, True)
+    whole = DelayProfile(poles[1], 0, delay_bounds, initial_state=initial_state, offset=offset)
+    search = _search(records, poles, zeros, whole, True)
     if answer is not None:
         search.answer = answer
     return search.result(search.ranked())
@@ -265,21 +272,19 @@ def _search(
     records: Record | Sequence[Record],
     poles: tuple[int, int],
     zeros: tuple[int, int],
-    delay_bounds: tuple[float, float],
-    initial_state: InitialState,
-    offset: Offset,
+    whole: DelayProfile,
     ends_early: bool,
 ) -> "_Search":
-    for name, (low, high), least in (("poles", poles, 1), ("zeros", zeros, 0)):
+    """The fits; ``whole`` says of the most poles how the records are treated."""
+    for name, (low, high), least in (("poles", poles, int(not whole.integrators)), ("zeros", zeros, 0)):
         if not least <= low <= high:
             raise OptionError(name, f"{name} must be a range from {least} on, the least number first; got {low}:{high}")
-    whole = DelayProfile(poles[1], 0, delay_bounds, initial_state=initial_state, offset=offset)
-    proper = whole.delay_bounds[0] < whole.delay_bounds[1]
-    if zeros[0] > poles[1] - proper:
+    most_zeros = whole.integrators - int(whole.delay_bounds[0] < whole.delay_bounds[1])
+    if zeros[0] > poles[1] + most_zeros:
         raise OptionError("zeros", f"no structure has at least {zeros[0]} zeros and at most {poles[1]} poles")
     search = _Search([records] if isinstance(records, Record) else list(records), whole)
     for n in range(poles[0], poles[1] + 1):
-        for m in range(zeros[0], min(zeros[1], n - proper) + 1):
+        for m in range(zeros[0], min(zeros[1], n + most_zeros) + 1):
             search.fit(n, m)
         if ends_early and search.found and n - search.ranked()[0].options.poles >= PATIENCE:
             break
@@ -303,7 +308,7 @@ class _Search:
 
     def _refinement(self, laid_out: Refinement, options: DelayProfile) -> Refinement:
         """Laid out records for a structure."""
-        structure = Structure(options.poles, options.zeros, delay=self.ladder.box.delay_free)
+        structure = Structure(options.order, options.zeros, delay=self.ladder.box.delay_free)
         problem = laid_out.problem._replace(zeros=options.zeros)
         return Refinement(laid_out.measured.with_structure(structure), problem=problem)
 

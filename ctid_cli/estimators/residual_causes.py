@@ -69,16 +69,21 @@ def another_delay(laid_out: LaidOut, fit: MeasuredFit, options: Options) -> Rich
         return None
     low, high = options.delay_bounds
     longest = max(float(np.ptp(data.t)) for data in laid_out.problem.records)
-    greatest = max(FARTHER * high, min(OF_RECORD * longest, 5.0 / float(np.abs(fit.model.poles).min())))
+    greatest = max(FARTHER * high, min(OF_RECORD * longest, 5.0 / _slowest(laid_out, fit)))
     if greatest >= 0.5 * longest:
         return None
     trials = [float(delay) for delay in np.linspace(0.0, greatest, DELAYS) if not low <= delay <= high]
     if options.zeros == options.poles or not trials:
         return None
-    near = laid_out.problem, fit.model.poles
+    near = laid_out.problem, laid_out.free_poles(fit.model)
     costs = [local_minimum(*near, delay, (0.0, greatest), known=laid_out.known) for delay in trials]
     best = min(costs, key=lambda local: local.squared_error)
     return Richer(options.poles, options.zeros, best.point.delay.seconds, _fall(best.squared_error, fit))
+
+
+def _slowest(laid_out: Refinement, fit: MeasuredFit) -> float:
+    """Least magnitude of a pole but the integrators [rad/s]; infinite where there is none."""
+    return float(np.abs(laid_out.free_poles(fit.model)).min(initial=np.inf))
 
 
 def clock_evidence(fit: MeasuredFit, records: Sequence[Record]) -> Clock:

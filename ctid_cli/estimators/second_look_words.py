@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple, TypeGuard
 
-from ctid_cli.estimators.delay_profile import MeasuredFit
+from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.estimators.hold_comparison import OtherHold
 from ctid_cli.estimators.identification_warnings import of_treatment
 from ctid_cli.estimators.judging import Options
@@ -324,19 +324,14 @@ def _of_integrator(look: SecondLook, options: Options, fit: MeasuredFit) -> str:
 
 def _with_integrator(look: SecondLook, options: Options, fit: MeasuredFit) -> str:
     """Options of ``ctid fit`` that change the model into one with an integrator; none where it would refuse them."""
-    if len(look.records) > 1 or options.initial_state == "periodic":
+    if options.initial_state == "periodic":
         return ""
-    integrators = _integrators(options) + 1
+    integrators = 1 + (options.integrators if isinstance(options, DelayProfile) else _integrators(options))
     if _is_sum(options):
         return f"--integrators {integrators} and one pole fewer in --terms"
     words = [f"--poles {fit.model.order - integrators} --integrators {integrators}"]
     words += [f"--zeros {options.zeros}"] * (options.zeros > 0)
-    # Models with integrators have a known delay, no other loss than squares, and names of their own.
-    low, high = options.delay_bounds
-    words += [f"--delay {fit.model.delay:.6g}"] * (low < high)
-    words += ["--loss squares"] * (options.loss != "squares")
-    # The free response of an integrator is an offset.
-    words += ["--offset none --initial-state estimate"] * (options.offset == "estimate")
+    words += ["--offset estimate"] * (options.offset == "remove")
     hold = look.records[0].examined.record.input.hold
     words += [f"--hold {hold}"] * (hold != "zoh")
     return " ".join(words) + " without --fix" * bool(options.fixed)

@@ -9,7 +9,7 @@ import numpy as np
 from ctid_cli.canonical import plain
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.optimum.box import Box
-from ctid_cli.estimators.delay_profile import MeasuredFit
+from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.estimators.identification import Identification, Validation
 from ctid_cli.estimators.judging import Options
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, SubmodelsFit
@@ -259,8 +259,10 @@ def asked_for(result: Identification, measurements: Sequence[Measurement], units
 
 def _structure(options: Options) -> str:
     """Poles and zeros, of each submodel if there are several."""
-    if not isinstance(options, MeasuredSubmodels) or not options.factored:
-        return f"{count(options.poles, 'pole')}, {count(options.zeros, 'zero')}"
+    if isinstance(options, DelayProfile) or not options.factored:
+        integrators = options.integrators if isinstance(options, DelayProfile) else 0
+        besides = f" and {count(integrators, 'integrator')}" * (integrators > 0)
+        return f"{count(options.poles, 'pole')}, {count(options.zeros, 'zero')}{besides}"
     parts = ", ".join(
         f"{term.poles}/{term.zeros}" + f" and {count(term.integrators, 'integrator')}" * (term.integrators > 0)
         for term in options.terms

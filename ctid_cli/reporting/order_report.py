@@ -81,7 +81,9 @@ def order_text(found: OrderSearch, measurements: Sequence[Measurement], units: U
 def spelled(each: FittedOrder) -> str:
     """A structure in words."""
     zeros = each.options.zeros
-    return f"{count(each.options.poles, 'pole')}, {count(zeros, 'zero') if zeros else 'no zero'}"
+    integrators = each.options.integrators
+    besides = f" and {count(integrators, 'integrator')}" * (integrators > 0)
+    return f"{count(each.options.poles, 'pole')}, {count(zeros, 'zero') if zeros else 'no zero'}{besides}"
 
 
 def _table(found: OrderSearch, units: Units) -> Table:

@@ -165,7 +165,7 @@ def _degrees(model: Any) -> tuple[int, int] | None:
     if hasattr(model, "terms"):
         return _fraction_degrees(model.terms)
     if hasattr(model, "zeros"):
-        return model.poles, model.zeros
+        return model.poles + getattr(model, "integrators", 0), model.zeros
     return None
 
 
