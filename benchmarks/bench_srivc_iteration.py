@@ -8,7 +8,7 @@ from ctid_cli.estimation.iteration import RULES, Steps, iterate
 from ctid_cli.estimation.sampled_problem import at_known_delay
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.excitation import Prbs
 from ctid_cli.signals.noise import WhiteNoise

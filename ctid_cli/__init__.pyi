@@ -38,18 +38,17 @@ from .estimators.order_search import search_orders as search_orders
 from .estimators.identification import Identification as Identification, identify as identify
 
 # Results
-from .inference.fit import Fit as Fit
-from .inference.fitted_model import FittedModel as FittedModel
-from .inference.bands import FrequencyBand as FrequencyBand, PoleBand as PoleBand, ResponseBand as ResponseBand
+from .inference.fit import Fit as Fit, FittedModel as FittedModel, Status as Status
+from .inference.model_responses import FrequencyBand as FrequencyBand, PoleBand as PoleBand
+from .inference.model_responses import ResponseBand as ResponseBand
 from .estimators.additive_srivc import AdditiveFit as AdditiveFit
 from .estimators.delay_profile import MeasuredFit as MeasuredFit
 from .estimators.measured_submodels import SubmodelsFit as SubmodelsFit
 from .estimators.useful_redundancy import RedundantFit as RedundantFit
-from .inference.status import Status as Status
-from .inference.diagnostics import fit_percent as fit_percent
+from .inference.criteria import fit_percent as fit_percent
 from .inference.frequency_response import FrequencyResponse as FrequencyResponse
 from .inference.frequency_response import estimate_frequency_response as estimate_frequency_response
-from .inference.finite_record import cramer_rao_bound as cramer_rao_bound
+from .inference.bounds import cramer_rao_bound as cramer_rao_bound
 
 # Results as text, as tables of pandas and as figures
 from .reporting.result_views import plot as plot, summary as summary, to_frame as to_frame

@@ -72,6 +72,19 @@ class Command(TyperCommand):
         return super().parse_args(ctx, args)
 
 
+class ComputingCommand(Command):
+    """A command that says so when it has to wait for compiled functions."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command."""
+        from numba.core import event
+
+        from ctid_cli.cli._compiling import CompilationNotice
+
+        with event.install_listener("numba:compile", CompilationNotice()):
+            return super().invoke(ctx)
+
+
 def duration(text: str) -> float:
     """A time such as ``90s``, ``30m`` or ``1h30m`` in seconds."""
     found = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+)s)?", text.strip())

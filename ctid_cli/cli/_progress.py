@@ -27,8 +27,6 @@ LINE_EVERY = 10.0
 BAR_AFTER = 1.0
 #: Seconds before a fit shows how long it takes.
 TIME_AFTER = 2.0
-#: Kernels that are ready sooner than this came from the cache [s].
-QUICK = 2.0
 
 
 class _Progress:
@@ -145,11 +143,6 @@ class Reporter(_Progress):
         match event:
             case events.PlanReady():
                 self._plan(event)
-            case events.KernelsCompiling():
-                self._say("preparing numerical kernels (compiled the first time, in a minute or more; then cached)")
-            case events.KernelsCompiled():
-                if event.seconds > QUICK:
-                    self._say(f"kernels ready after {seconds(event.seconds)}")
             case events.Warned():
                 self._say(f"warning: {event.text}")
             case events.EstimatesDone():

@@ -9,7 +9,7 @@ import typer
 from ctid_cli.cli._common import (
     AllowCode,
     AllowOutside,
-    Command,
+    ComputingCommand,
     Config,
     From,
     InputColumn,
@@ -72,7 +72,7 @@ def check(
         raise MismatchError(f"{file}: no model can be identified from this record as it is")
 
 
-@further.command("filters", cls=Command)
+@further.command("filters", cls=ComputingCommand)
 @guarded
 def check_filters(
     bandwidth: Annotated[float, typer.Option("--bandwidth", metavar="RAD/S", help="The system's last -3 dB crossing.")],
@@ -102,7 +102,7 @@ def check_filters(
     answer(as_json, lambda: filter_object(chosen, found), lambda: filter_text(chosen, found))
 
 
-@further.command("accuracy", cls=Command)
+@further.command("accuracy", cls=ComputingCommand)
 @guarded
 def check_accuracy(
     config: Config,
@@ -127,7 +127,7 @@ def check_accuracy(
     answer(as_json, lambda: content, lambda: accuracy_text(content))
 
 
-@further.command("pmu", cls=Command)
+@further.command("pmu", cls=ComputingCommand)
 @guarded
 def check_pmu(
     nominal: Annotated[int, typer.Option("--nominal", metavar="50|60", help="Nominal frequency [Hz].")] = 50,
@@ -165,7 +165,7 @@ def check_pmu(
         raise MismatchError("the measurement does not keep all limits of its class")
 
 
-class CheckCommand(Command):
+class CheckCommand(ComputingCommand):
     """``ctid check FILE``, which hands over if the first word names a further check: such a file is ``./filters``."""
 
     further = typer.main.get_group(further).commands

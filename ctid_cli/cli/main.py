@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 import ctid_cli
-from ctid_cli.cli._common import Command
+from ctid_cli.cli._common import Command, ComputingCommand
 from ctid_cli.cli.check_commands import CheckCommand, check
 from ctid_cli.cli.experiment_commands import run, schema, validate
 from ctid_cli.cli.fit_command import fit
@@ -52,9 +52,11 @@ def _root(
 
 
 app.command(cls=CheckCommand)(check)
+# What shows or moves stored results must not wait for Numba to be loaded.
+_STORED = (status, show, export, verify, repair, merge, init)
 _RESULTS = (status, table, figure, report, show, export, verify, repair)
 for _command in (fit, order, frf, track, init, run, merge, *_RESULTS, validate, schema):
-    app.command(cls=Command)(_command)
+    app.command(cls=Command if _command in _STORED else ComputingCommand)(_command)
 app.add_typer(model, name="model")
 app.add_typer(study, name="study")
 

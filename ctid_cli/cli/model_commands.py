@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ctid_cli.cli._common import (
-    Command,
+    ComputingCommand,
     From,
     InputColumn,
     Json,
@@ -50,7 +50,7 @@ def _root() -> None:
     """Use fitted models: responses with confidence bands, other records, other tools."""
 
 
-@model.command("simulate", cls=Command)
+@model.command("simulate", cls=ComputingCommand)
 @guarded
 def simulate_fit(
     file: FitFile,
@@ -80,7 +80,7 @@ def simulate_fit(
     _write_response("simulation", models, columns, drawing, level, as_json, out, [on])
 
 
-@model.command("step", cls=Command)
+@model.command("step", cls=ComputingCommand)
 @guarded
 def step(
     files: FitFiles,
@@ -106,7 +106,7 @@ def step(
     _write_response("step", models, response_columns(models, found), drawing, level, as_json, out)
 
 
-@model.command("bode", cls=Command)
+@model.command("bode", cls=ComputingCommand)
 @guarded
 def bode(
     files: FitFiles,
@@ -152,7 +152,7 @@ def bode(
     _write_response("bode", models, frequency_columns(models, found), drawing, level, as_json, out, records)
 
 
-@model.command("compare", cls=Command)
+@model.command("compare", cls=ComputingCommand)
 @guarded
 def compare_fits(
     files: FitFiles,
@@ -196,7 +196,7 @@ def compare_fits(
     )
 
 
-@model.command("residuals", cls=Command)
+@model.command("residuals", cls=ComputingCommand)
 @guarded
 def residuals(
     file: FitFile,
@@ -236,7 +236,7 @@ def residuals(
     )
 
 
-@model.command("export", cls=Command)
+@model.command("export", cls=ComputingCommand)
 @guarded
 def export_fit(
     file: FitFile,

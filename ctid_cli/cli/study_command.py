@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ctid_cli.cli._common import Fresh, Jobs, Out, Runs, guarded
+from ctid_cli.cli._common import ComputingCommand, Fresh, Jobs, Out, Runs, guarded
 from ctid_cli.cli.experiment_commands import run
 from ctid_cli.errors import MismatchError
 
@@ -42,7 +42,7 @@ def list_studies() -> None:
             typer.echo(f"  {name}  configs/{config}")
 
 
-@study.command("run")
+@study.command("run", cls=ComputingCommand)
 @guarded
 def run_study(
     names: Names = None,
@@ -58,7 +58,7 @@ def run_study(
         run([item.config(last_part(name)) for name in item.configs], jobs=jobs, runs=runs, out=out, fresh=fresh)
 
 
-@study.command("check")
+@study.command("check", cls=ComputingCommand)
 @guarded
 def check_study(
     names: Names = None,

@@ -13,8 +13,7 @@ from ctid_cli.estimation.common import diverged, history_entry, quality
 from ctid_cli.estimation.iteration import GUARDED, Equations, Iterated, Steps, iterate
 from ctid_cli.filtering.loop import loop_radius
 from ctid_cli.inference.covariance import white_noise_covariance
-from ctid_cli.inference.fit import IterationRecord
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import IterationRecord, Status
 from ctid_cli.inference.uncertainty import Covariance, Uncertainty, estimate_uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.controller import DiscreteController

@@ -15,8 +15,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.iteration import Equations, inadmissible
 from ctid_cli.estimation.stability import is_hurwitz, reflect_unstable
 from ctid_cli.filtering.filter_data import FilterData, plain_array
-from ctid_cli.filtering.submodels import LoopData
-from ctid_cli.filtering.submodels import OPEN_LOOP, InitialState, SubmodelFilter
+from ctid_cli.filtering.submodels import OPEN_LOOP, InitialState, LoopData, SubmodelFilter
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import unfactored

@@ -17,9 +17,8 @@ from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
-from ctid_cli.inference.diagnostics import percent_from_r_squared
-from ctid_cli.inference.fit import Fit, IterationRecord
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.criteria import percent_from_r_squared
+from ctid_cli.inference.fit import Fit, IterationRecord, Status
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty, estimate_uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
@@ -116,7 +115,7 @@ def _require_fraction(name: str, value: float) -> None:
 
 #: Checks of the options that several estimators share, by name; None stands for an option that was not given.
 CHECKS: Mapping[str, Callable[[str, Any], None]] = {
-    "poles": lambda name, value: require_integer(name, value, 1, 12),
+    "integrators": lambda name, value: require_integer(name, value, 0, 3),
     "zeros": lambda name, value: require_integer(name, value, 0),
     "delay": lambda name, value: require_not_negative(name, value, "s"),
     "svf_cutoff": lambda name, value: require_positive(name, value, "rad/s"),
@@ -142,7 +141,10 @@ def check_options(options: Any) -> None:
     choices = _choices(options.__class__)
     for item in fields(options):
         name, value = item.name, getattr(options, item.name)
-        if name in choices:
+        if name == "poles":
+            # A system may consist of integrators alone.
+            require_integer(name, value, int(not getattr(options, "integrators", 0)), 12)
+        elif name in choices:
             require_choice(name, value, choices[name])
         elif name in CHECKS and not (value is None and item.default is None):
             CHECKS[name](name, value)

@@ -1,4 +1,4 @@
-"""Compile every kernel once, so that no later process has to."""
+"""What a run calls is compiled before its worker processes begin, so that not each of them has to."""
 
 import time
 from collections.abc import Iterable
@@ -29,17 +29,19 @@ SHORT_WORK: dict[str, Any] = {
 }
 
 
-def compile_kernels(estimators: Iterable[Any] = ()) -> float:
-    """Compile the kernels that estimators need, or load them from the cache on disk, by short work of each.
+def compile_kernels(estimators: Iterable[Any], *, regular: bool = True, closed: bool = False) -> float:
+    """Compile what estimators need for one kind of record, or load it from the cache on disk; the seconds that it took.
 
     Numba keeps the compiled code beside the package, or in ``NUMBA_CACHE_DIR`` if that is set.
     """
     began = time.perf_counter()
     rng = np.random.default_rng(0)
     t = np.linspace(0.0, 49.75, 200)
+    if not regular:
+        t[1:] += rng.uniform(-0.1, 0.1, t.size - 1)
     held = HeldSignal(t, rng.choice([-1.0, 1.0], t.size))
     output = simulate(TransferFunction([2.0], [1.0, 2.0, 2.0], 0.4), held, t) + 0.1 * rng.standard_normal(t.size)
-    record = Record(t, output, held, loop=Loop(held.values, DiscreteController([0.1], [1.0])))
+    record = Record(t, output, held, loop=Loop(held.values, DiscreteController([0.1], [1.0])) if closed else None)
     for estimator in estimators:
         names = {item.name for item in fields(estimator)}
         # Not every structure can be estimated from this record: what was called before that is found is compiled.

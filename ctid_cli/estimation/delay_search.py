@@ -6,24 +6,14 @@ cost minimised over the coefficients has the gradient ``g = eps_tau' eps`` and t
 of, filtered or not, samples or spectra, is the business of the *cost*.
 """
 
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Iterable
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 
-from ctid_cli.arrays import Array
-from ctid_cli.estimation.iteration import (
-    CONVERGED,
-    INADMISSIBLE,
-    MAX_ITERATIONS,
-    SINGULAR,
-    Equations,
-    Steps,
-    admissible,
-    run,
-    solve_scaled,
-    with_best,
-)
+from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.estimation.iteration import Equations, Problem, Steps, iterate, solve_scaled, with_best
+from ctid_cli.inference.fit import Status
 
 #: The smallest delay step, as a fraction of the range of the delay.
 SMALLEST_STEP = 1e-5
@@ -47,6 +37,28 @@ class Minimum(NamedTuple):
     def delay(self) -> float:
         """The delay [s]."""
         return float(self.theta[-1])
+
+
+class Minima(NamedTuple):
+    """Least costs at several delays."""
+
+    #: ``(a_1 … a_n, b_0 … b_m, delay [s])``, shape (K, n + m + 2).
+    thetas: Array
+    #: Infinite where nothing could be computed, shape (K,).
+    squared_errors: Array
+
+    def lowest(self, most: int) -> list[Minimum]:
+        """The lowest local minima over rising delays, lowest first."""
+        places = lowest_minima(self.squared_errors, most).tolist()
+        return [Minimum(self.thetas[k], float(self.squared_errors[k])) for k in places]
+
+
+def lowest_minima(costs: Array, most: int) -> IndexArray:
+    """Where the lowest local minima of a profile are, lowest first."""
+    padded = np.concatenate(([np.inf], costs, [np.inf]))
+    lowest = (costs <= padded[:-2]) & (costs <= padded[2:]) & np.isfinite(costs)
+    indices = np.flatnonzero(lowest)
+    return indices[np.argsort(costs[indices], kind="stable")][:most]
 
 
 class DelayCost(Protocol):
@@ -79,17 +91,11 @@ class Descent(NamedTuple):
     minimum: Minimum
     #: Parameters with their squared errors in the last column, shape (K, n + m + 3); none without a start.
     path: Array
-    end: int
+    #: None where the cost could be computed nowhere.
+    end: Status | None
     iterations: int
 
 
-def minimise(cost: Any, delay: float, starts: Array, own: bool) -> Minimum:
-    """Least cost at a delay; compiled code is told by `calls` what to call."""
-    found: Minimum = cost.minimise(delay, starts, own)
-    return found
-
-
-@njit(cache=True, nogil=True)
 def delay_step(current: Equations, least_curvature: float) -> float:
     """Gauss-Newton step of the delay, the last parameter, with the coefficients projected out; NaN if undetermined."""
     hessian, gradient = current.hessian, current.instrument_error
@@ -105,49 +111,16 @@ def delay_step(current: Equations, least_curvature: float) -> float:
     return float(gradient[last] / curvature)
 
 
-@njit(cache=True, nogil=True)
-def best_of(problem: Any, starts: Array, poles: int, steps: Steps) -> Minimum:
+def best_of(problem: Problem, starts: Iterable[Array], poles: int, steps: Steps) -> Minimum:
     """Least cost from the denominators of several starts; the delay is the last parameter and held."""
-    free = starts.shape[1] - 1
-    best = Minimum(np.zeros(free + 1), np.inf, np.nan)
-    for k in range(starts.shape[0]):
+    best: Minimum | None = None
+    for start in starts:
         # The numerator of a start is refitted: only the denominator matters.
-        start = with_best(problem, admissible(problem, starts[k].copy()), poles, free)
-        theta, current, _, _, _ = run(problem, start, free, steps)
-        if current.squared_error < best.squared_error:
-            best = Minimum(theta, current.squared_error, delay_step(current, LEAST_CURVATURE))
-    return best
-
-
-@njit(cache=True, nogil=True)
-def _descend(cost: Any, delay: float, starts: Array, limits: Limits) -> Descent:
-    """Gauss-Newton on the delay, see `descend`."""
-    low, high = limits.low, limits.high
-    current = minimise(cost, delay, starts, starts.shape[0] == 0)
-    path = np.empty((limits.max_iterations + 1, current.theta.size + 1))
-    if not np.isfinite(current.squared_error):
-        return Descent(current, path[:0], INADMISSIBLE, 0)
-    path[0, :-1], path[0, -1] = current.theta, current.squared_error
-    for iteration in range(limits.max_iterations):
-        if not np.isfinite(current.step):
-            return Descent(current, path[: iteration + 1], SINGULAR, iteration)
-        before, step = current, min(max(current.step, -limits.largest_step), limits.largest_step)
-        start = before.theta.copy().reshape(1, -1)
-        while not current.squared_error < before.squared_error:
-            target = before.theta[-1] + step
-            if limits.reflect and not low <= target <= high:
-                target = 2.0 * (low if target < low else high) - target
-            while not low <= target <= high:
-                step *= 0.5
-                target = before.theta[-1] + step
-            if abs(step) <= limits.smallest_step:
-                return Descent(before, path[: iteration + 1], CONVERGED, iteration)
-            current = minimise(cost, target, start, False)
-            step *= 0.5
-        path[iteration + 1, :-1], path[iteration + 1, -1] = current.theta, current.squared_error
-        if 1.0 - current.squared_error / before.squared_error < limits.tolerance:
-            return Descent(current, path[: iteration + 2], CONVERGED, iteration + 1)
-    return Descent(current, path, MAX_ITERATIONS, limits.max_iterations)
+        theta = with_best(problem, problem.admissible(start.copy()), poles, start.size - 1)
+        end = iterate(problem, theta, steps)
+        if end is not None and (best is None or end.equations.squared_error < best.squared_error):
+            best = Minimum(end.theta, end.equations.squared_error, delay_step(end.equations, LEAST_CURVATURE))
+    return best or Minimum(np.zeros(problem.free + 1), np.inf)
 
 
 def descend(cost: DelayCost, delay: float, starts: Array, limits: Limits) -> Descent:
@@ -156,9 +129,39 @@ def descend(cost: DelayCost, delay: float, starts: Array, limits: Limits) -> Des
     A step is halved while it leaves the bounds (unless it is mirrored) or does not lower the cost, and the search ends
     where that makes it shorter than the shortest step.
     """
-    execute = _descend if isinstance(cost, tuple) else _descend.py_func
-    found: Descent = execute(cost, delay, starts, limits)
-    return found
+    current = cost.minimise(delay, starts, starts.shape[0] == 0)
+    if not np.isfinite(current.squared_error):
+        return Descent(current, np.empty((0, current.theta.size + 1)), None, 0)
+    path = [current]
+    end = Status.MAX_ITERATIONS
+    while end is Status.MAX_ITERATIONS and len(path) <= limits.max_iterations:
+        lower = _lower(cost, current, limits)
+        if isinstance(lower, Status):
+            end = lower
+        else:
+            path.append(lower)
+            if 1.0 - lower.squared_error / current.squared_error < limits.tolerance:
+                end = Status.CONVERGED
+            current = lower
+    rows = np.array([np.append(minimum.theta, minimum.squared_error) for minimum in path])
+    return Descent(current, rows, end, len(path) - 1)
+
+
+def _lower(cost: DelayCost, current: Minimum, limits: Limits) -> Minimum | Status:
+    """The minimum after one step of the delay, or why there is none."""
+    if not np.isfinite(current.step):
+        return Status.SINGULAR
+    step = min(max(current.step, -limits.largest_step), limits.largest_step)
+    while abs(step) > limits.smallest_step:
+        target = current.delay + step
+        if limits.reflect and not limits.low <= target <= limits.high:
+            target = 2.0 * (limits.low if target < limits.low else limits.high) - target
+        if limits.low <= target <= limits.high:
+            found = cost.minimise(target, current.theta[None], False)
+            if found.squared_error < current.squared_error:
+                return found
+        step *= 0.5
+    return Status.CONVERGED
 
 
 def bound_in_the_way(current: Equations, delay: float, bounds: tuple[float, float]) -> float | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.delay_search import Limits, descend
-from ctid_cli.estimation.filtered_costs import FilteredCosts, minima_behind_all, percents
+from ctid_cli.estimation.filtered_costs import FilteredCosts, percents
 from ctid_cli.estimation.redundancy import Path, RedundantMinimum, SearchStatus, Visit, minimise_redundantly
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.inference.fit import IterationRecord
@@ -79,7 +79,7 @@ class FilterSearch:
     def at(self, delay: float) -> Minima:
         """J0 and the minima of all filters at a point of the lattice."""
         if delay not in self._known:
-            thetas, squared_errors = minima_behind_all(self.costs, delay)
+            thetas, squared_errors = self.costs.minima_behind_all(delay)
             self._known[delay] = Minima(
                 float(percents(squared_errors, self.costs.spreads).mean()), thetas, squared_errors
             )

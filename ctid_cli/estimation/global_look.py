@@ -3,7 +3,8 @@
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.delay_grid import lowest_minima, quarter_periods
+from ctid_cli.estimation.delay_grid import quarter_periods
+from ctid_cli.estimation.delay_search import lowest_minima
 from ctid_cli.estimation.iteration import GUARDED, Steps, iterate, with_best
 from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.inference.fit import Fit

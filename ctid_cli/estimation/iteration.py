@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Status
 
 #: How steps are accepted where the solution is a minimum of the output-error cost, and in general.
 Variant = Literal["plain", "guarded"]

@@ -17,9 +17,9 @@ from ctid_cli.estimation.optimum.pilot import liveliest_parts
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.output_error import Layout
 from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
-from ctid_cli.inference.answer import output_bandwidth
-from ctid_cli.inference.faults import outliers
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.input_response import output_bandwidth
+from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.inference.signal_features import outliers
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, Offset, OutputHold
@@ -34,6 +34,8 @@ class Treatment(NamedTuple):
     hold_output: OutputHold
     #: Whether samples far from their neighbours are bridged while the search looks for starts.
     bridge: bool = False
+    #: Poles at the origin, counted among those of the structure.
+    integrators: int = 0
 
 
 class MeasuredRecords:
@@ -44,9 +46,10 @@ class MeasuredRecords:
             raise DataError("there is no record to estimate from")
         self.structure = structure
         self.treatment = treatment
-        self.layout = Layout(
-            structure, len(records), treatment.initial_state == "estimate", treatment.offset == "estimate"
-        )
+        free_state, integrators = treatment.initial_state == "estimate", treatment.integrators
+        # The free response of an integrator is a constant.
+        offset = treatment.offset == "estimate" and not (free_state and integrators)
+        self.layout = Layout(structure, len(records), free_state, offset, integrators)
         for record in records:
             self._check_input(record)
         removed = treatment.offset == "remove"
@@ -79,7 +82,8 @@ class MeasuredRecords:
     @property
     def plain(self) -> bool:
         """Whether there is but one record and nothing of its own to be estimated."""
-        from_rest = self.layout.own == 0 and self.treatment.initial_state != "periodic"
+        treatment = self.treatment
+        from_rest = self.layout.own == 0 and treatment.initial_state != "periodic" and not treatment.integrators
         return from_rest and len(self.data) == 1 and self.structure.zeros < self.structure.poles
 
     def _check_input(self, record: Record) -> None:
@@ -111,6 +115,7 @@ class MeasuredRecords:
             delays=self.treatment.delay_bounds,
             free_response=self.layout.initial_state,
             offset=self.layout.offset,
+            integrators=self.layout.integrators,
             periods=[_period(record) for record in self.records] if periodic else (),
         )
 

@@ -21,9 +21,8 @@ from ctid_cli.estimation import pole_relocation
 from ctid_cli.estimation.iteration import GUARDED, Steps, iterate, solve_scaled
 from ctid_cli.estimation.sampled_problem import at_known_delay, least_squares_start
 from ctid_cli.filtering.filter_data import FilterData, filter_data
-from ctid_cli.filtering.submodels import free_response, free_response_size
-from ctid_cli.filtering.submodels import SubmodelFilter
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.filtering.submodels import SubmodelFilter, free_response, free_response_size
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.signals.record import Record, named
 

@@ -15,7 +15,7 @@ from ctid_cli.estimation.optimum.box import ANYWHERE, point_of
 from ctid_cli.estimation.optimum.chain import Chain, chain_dynamics, numerators
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.triangle import Columns, rows_of
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 
 
@@ -27,6 +27,8 @@ class Layout:
     experiments: int = 1
     initial_state: bool = False
     offset: bool = False
+    #: Poles at the origin: that many of the last coefficients of the denominator are zero.
+    integrators: int = 0
 
     @property
     def own(self) -> int:
@@ -72,14 +74,17 @@ class Layout:
 def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) -> list[tuple[Array, Array]]:
     """Derivatives of the simulated output to the parameters, and the output error, at the used samples of each record.
 
-    The delay is that of theta where it is a parameter.
+    The delay is that of theta where it is a parameter. The last coefficients of the denominator are zero where the
+    problem has integrators.
     """
     structure, n, m = layout.structure, layout.structure.poles, layout.structure.zeros
     a, b = np.concatenate(([1.0], theta[:n])), theta[n : n + m + 1]
-    point = point_of(np.roots(a).astype(complex), theta[n + m + 1] if structure.delay else delay, ANYWHERE)
-    F, g = chain_dynamics(point.speed, point.damping)
+    stable = np.roots(a[: n + 1 - problem.integrators]).astype(complex)
+    point = point_of(stable, theta[n + m + 1] if structure.delay else delay, ANYWHERE)
+    sections = problem.sections(point.speed, point.damping)
+    F, g = chain_dynamics(*sections)
     # From the states to p^(n-1)/A ... 1/A. With n zeros B/A = b0 + B'/A, and p^n/A u = u - sum a_i p^(n-i)/A u.
-    powers = np.linalg.inv(numerators(point.speed, point.damping))
+    powers = np.linalg.inv(numerators(*sections))
     direct = b[0] if m == n else 0.0
     output = ((b - direct * a)[1:] if m == n else np.concatenate((np.zeros(n - 1 - m), b))) @ powers
     columns = Columns.of(n, second=True, free=layout.initial_state, offset=layout.offset)
@@ -88,7 +93,7 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) 
         first = layout.first(k)
         own = theta[first : first + layout.own]
         state = own[:n] if layout.initial_state else np.zeros(n)
-        form = Chain(point.speed, point.damping, F, g, F, g).driving(output, direct, state @ powers)
+        form = Chain(*sections, F, g, F, g).driving(output, direct, state @ powers)
         # Columns of the rows that are wanted, each a combination of the states, the input and what else stands there.
         wanted = np.zeros((columns.size, layout.size + 1))
         states, driven, now, measured = wanted[:n], wanted[n : 2 * n], wanted[columns.u], wanted[columns.u + 1]

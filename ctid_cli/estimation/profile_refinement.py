@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error
 from ctid_cli.estimation.optimum.box import box_of
@@ -13,8 +13,8 @@ from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.output_error import Layout, sensitivities
-from ctid_cli.inference.loss import Weighting
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.robust_loss import Weighting
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 
 #: Random starts, so many and so many for each pole.
@@ -68,6 +68,7 @@ class Refinement:
         A profile under an unknown initial state, an offset or a period has too few basins: smaller models help then.
         """
         (poles, zeros), records = (self.structure.poles, self.structure.zeros), self.problem.records
+        poles -= self.problem.integrators
         options = replace(
             self.measured.options,
             starts=starts,
@@ -100,7 +101,9 @@ class Refinement:
 
     def squared_error_at(self, model: TransferFunction, delay: float) -> float:
         """Least sum of squared output errors at a given delay, in the basin of a model."""
-        return local_minimum(self.problem, model.poles, delay, (delay, delay), known=self.known).squared_error
+        return local_minimum(
+            self.problem, self.free_poles(model), delay, (delay, delay), known=self.known
+        ).squared_error
 
     def squared_error_with(
         self, model: TransferFunction, *, initial_state: bool = False, offset: bool = False
@@ -112,7 +115,7 @@ class Refinement:
         problem, bounds = self.problem, self.measured.treatment.delay_bounds
         more = problem._replace(free_response=problem.free_response or initial_state, offset=problem.offset or offset)
         box = box_of(problem, bounds)
-        return local_minimum(more, model.poles, model.delay, bounds, box=box, known=self.known).squared_error
+        return local_minimum(more, self.free_poles(model), model.delay, bounds, box=box, known=self.known).squared_error
 
     def errors_of(self, model: TransferFunction) -> AppliedModel:
         """Errors of a given model on these records, each with its own best initial state and offset."""
@@ -127,8 +130,23 @@ class Refinement:
         slopes = tuple(psi for psi, _ in found)
         return AppliedModel(tuple(residuals), self.measured.used(), *self.own(layout, theta), slopes)
 
+    def free_poles(self, model: TransferFunction) -> ComplexArray:
+        """The poles of a model but its integrators."""
+        return np.roots(model.denominator[: model.denominator.size - self.problem.integrators]).astype(complex)
+
+    @property
+    def given(self) -> BoolArray:
+        """Which of the coefficients of the structure are known, those that integrators make zero among them."""
+        zeros = self.structure.zeros + 1
+        if self.known is NOTHING:
+            free = self.structure.poles - self.problem.integrators
+            of_a, of_b = np.zeros(free, dtype=bool), np.zeros(zeros, dtype=bool)
+        else:
+            of_a, of_b = np.isfinite(self.known.denominator), np.isfinite(self.known.numerator)
+        return np.concatenate((of_a, np.ones(self.problem.integrators, dtype=bool), of_b))
+
     def layout_of(self, poles: int, delay: bool) -> Layout:
-        """Which numbers stand where for so many poles."""
+        """Which numbers stand where for so many poles, integrators among them."""
         return replace(self.measured.layout, structure=Structure(poles, self.structure.zeros, delay))
 
     def own(self, layout: Layout, theta: Array) -> tuple[tuple[Array, ...], tuple[float, ...]]:

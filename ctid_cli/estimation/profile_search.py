@@ -6,15 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.delay_grid import lowest_minima, quarter_periods, scan, search_grid
-from ctid_cli.estimation.delay_search import Minimum, best_of
+from ctid_cli.estimation.delay_grid import quarter_periods, scan, search_grid
+from ctid_cli.estimation.delay_search import Minimum, best_of, lowest_minima
 from ctid_cli.estimation.filtered_costs import HIGHEST, filtered_costs
 from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.sampled_problem import CUTOFFS, at_known_delay, least_squares_starts
 from ctid_cli.filtering.lowpass import Lowpass
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.sensitivities import Structure
 
 #: Local minima of the profile that are refined.
 MINIMA = 3
@@ -67,17 +67,19 @@ class RecordsCost:
         self.measured = measured
         self.bandwidth = bandwidth
         self.cutoffs = cutoffs
-        self.coefficients = Structure(measured.structure.poles, measured.structure.zeros)
+        self.integrators = measured.treatment.integrators
+        self.coefficients = Structure(measured.structure.poles - self.integrators, measured.structure.zeros)
 
     def starts(self, delay: float) -> list[Array]:
         """Denominators of least-squares starts; the output's mean is left to the offset."""
         n, m = self.coefficients.poles, self.coefficients.zeros
-        strictly_proper = Structure(n, min(m, n - 1))
-        cutoffs = [cutoff * self.bandwidth for cutoff in self.cutoffs]
-        thetas = least_squares_starts(self.measured.centred, strictly_proper, delay, cutoffs)
-        found = [theta[:n] for theta in thetas]
+        cutoffs, found = [cutoff * self.bandwidth for cutoff in self.cutoffs], []
+        if not self.integrators:
+            strictly_proper = Structure(n, min(m, n - 1))
+            thetas = least_squares_starts(self.measured.centred, strictly_proper, delay, cutoffs)
+            found = [theta[:n] for theta in thetas]
         # Without any, a system of the right speed, whatever the data say: a start for Gauss-Newton.
-        found = found or [np.asarray(np.poly(np.full(n, -0.5 * self.bandwidth))[1:], dtype=float)]
+        found = found or [np.atleast_1d(np.poly(np.full(n, -0.5 * self.bandwidth)))[1:]]
         return [np.concatenate((a, np.zeros(m + 1), [delay])) for a in found]
 
     @property
@@ -115,7 +117,8 @@ def search_delay(records: MeasuredRecords, svf_cutoff: float | None, nested: boo
     treatment = measured.treatment
     # What filters see must be the answer to the input alone, or to one that is known from the start of the window on.
     at_rest = (treatment.initial_state == "rest" or part is not None) and treatment.offset != "estimate"
-    if at_rest and len(measured.records) == 1 and measured.structure.delay:
+    # With integrators they leave the mean out, and nothing is known at rest.
+    if (at_rest or treatment.integrators) and len(measured.records) == 1 and measured.structure.delay:
         yield _search_levels(cost)
     yield _search_samples(cost)
 
@@ -128,7 +131,7 @@ def _search_levels(cost: RecordsCost) -> Found:
     present = record.t[record.valid]
     # Two real equations for every frequency of the observed window that passes.
     equations = cutoffs * (present[-1] - max(present[0], record.input.t[0])) / np.pi
-    cutoffs = cutoffs[equations >= EQUATIONS_PER_PARAMETER * (cost.size + cost.coefficients.poles)]
+    cutoffs = cutoffs[equations >= EQUATIONS_PER_PARAMETER * (cost.size + measured.structure.poles)]
     # Near half the sampling frequency lines between the samples are no picture of the output.
     if not cutoffs.size or HIGHEST * bandwidth * float(np.median(np.diff(present))) > np.pi:
         return [], None
@@ -140,9 +143,9 @@ def _search_levels(cost: RecordsCost) -> Found:
         start=0.0 if measured.plain else bounds[1],
         svf_cutoffs=cutoffs,
         steps=LEVEL_EFFORT,
+        integrators=cost.integrators,
     )
-    levels = [(costs.behind(k), 0.5 * np.pi / cutoff) for k, cutoff in enumerate(cutoffs.tolist())]
-    delays, found, minima = search_grid(levels, bounds)
+    delays, found, minima = search_grid(costs, (0.5 * np.pi / cutoffs).tolist(), bounds)
     profile = Profile(delays, found, bandwidth, record.n_samples, float(cutoffs[0]))
     interval = measured.data[0].interval
     if interval > 0.0 and measured.plain:

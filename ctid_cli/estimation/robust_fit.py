@@ -18,7 +18,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.search import ROUNDING
 from ctid_cli.estimation.profile_refinement import Refinement
-from ctid_cli.inference.loss import Loss, RobustKind, scale_of
+from ctid_cli.inference.robust_loss import Loss, RobustKind, scale_of
 
 #: Most fits in one descent, and most of them after which the scale is taken anew.
 MOST_FITS, MOST_SCALES = 60, 20

@@ -11,8 +11,8 @@ from ctid_cli.estimation.iteration import Equations, inadmissible, solve_scaled,
 from ctid_cli.estimation.stability import reflect_unstable, with_stable_denominator
 from ctid_cli.filtering.bank import second_moments
 from ctid_cli.filtering.filter_data import FilterData
-from ctid_cli.inference.answer import output_bandwidth
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.input_response import output_bandwidth
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.signals.record import Record
 
 #: Cut-offs of the state-variable filter that are tried where none is given, as multiples of the output's bandwidth.

@@ -16,14 +16,13 @@ from ctid_cli.estimation.additive_estimate import SubmodelEstimate, estimate_sub
 from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_record
 from ctid_cli.estimation.fixed import Fixed, places_of
-from ctid_cli.estimation.iteration import RULES, StepRule, Steps
+from ctid_cli.estimation.iteration import StepRule, Steps
 from ctid_cli.estimation.modal_start import ModalStart, automatic_start
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.submodels import InitialState
 from ctid_cli.inference.derived import additive_derived
 from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.quantile import normal_quantile
-from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.inference.intervals import UncertainValue, normal_quantile
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Term, names_of
 from ctid_cli.models.factoring import unfactored
@@ -216,7 +215,7 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
 
     def _iterate(self, problem: AdditiveProblem, start: AdditiveModel) -> SubmodelEstimate:
         """Estimate from a start."""
-        steps = Steps(self.max_iterations, self.tolerance, RULES[self.variant])
+        steps = Steps(self.max_iterations, self.tolerance, self.variant)
         noise = self.covariance, self.bootstrap_draws
         if not problem.fixed:
             return estimate_submodels(problem, start.theta, steps, *noise)

@@ -19,14 +19,11 @@ from ctid_cli.estimation.output_error import Layout, sensitivities
 from ctid_cli.estimation.profile_refinement import Refinement
 from ctid_cli.estimation.profile_search import Profile, search_delay
 from ctid_cli.estimation.robust_fit import RobustFit, robust_fit
-from ctid_cli.inference.bootstrap import Progress
-from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.later import FilledLater
-from ctid_cli.inference.loss import Loss, Weighting, weighted
-from ctid_cli.inference.robust import nearly_regular
-from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.inference.status import Status
-from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty, estimate_uncertainty
+from ctid_cli.inference.covariance import nearly_regular
+from ctid_cli.inference.fit import DeferredFields, Fit, Status
+from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
+from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import InitialState, LossKind, Offset, OutputHold
@@ -40,7 +37,7 @@ class Starts(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MeasuredFit(FilledLater, Fit):
+class MeasuredFit(DeferredFields, Fit):
     """A fit with what belongs to the records.
 
     Parameters
@@ -89,7 +86,7 @@ class MeasuredFit(FilledLater, Fit):
         Names of the parameters that were fixed.
     """
 
-    later: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used")
+    deferred: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used")
 
     theta: Array = field(default_factory=lambda: np.zeros(0))
     initial_states: tuple[Array, ...] = ()
@@ -185,6 +182,10 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
     fixed : tuple of Fixed, optional
         Parameters that are known, by their names ``a1 ... an, b0 ... bm``. The estimate is the least output error of
         the admissible models that have them. A known delay is given in ``delay_bounds``.
+    integrators : int, default 0
+        Poles at the origin besides ``poles``, which may then be 0: the model is ``B/(p^l A)``, and the last l
+        coefficients of its denominator are known to be zero. With an estimated initial state the offset of the output
+        is part of it; an offset of the input is a ramp of the output, which no ``offset`` treats.
 
     Raises
     ------
@@ -226,29 +227,48 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
     covariance: Covariance = "auto"
     bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
     fixed: tuple[Fixed, ...] | None = field(default=None, metadata={"added_later": True})
+    integrators: int = field(default=0, metadata={"added_later": True})
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.integrators and self.offset == "remove":
+            raise OptionError(
+                "offset", "offset remove subtracts means, which an integrating output does not have; use estimate"
+            )
+        if self.integrators and self.initial_state == "periodic":
+            raise OptionError(
+                "initial_state", "initial_state periodic cannot be: no integrating system has a period; use estimate"
+            )
         known = places_of(self.fixed, Structure(self.poles, self.zeros).names)
         _check_stable(known, self.poles)
         low, high = bounds = checked_bounds(self.delay_bounds, known_allowed=True)
         object.__setattr__(self, "delay_bounds", bounds)
-        allowed = self.poles if low == high else self.poles - 1
+        allowed = self.order if low == high else self.order - 1
         if self.zeros > allowed:
             reason = "" if low == high else " while the delay is estimated"
-            given = f"got {self.zeros} zeros and {self.poles} poles"
+            given = f"got {self.zeros} zeros and {self.order} poles" + ", integrators included" * (self.integrators > 0)
             raise OptionError("zeros", f"zeros must be at most {allowed}{reason}: {given}")
+
+    @property
+    def order(self) -> int:
+        """Number of poles, integrators included."""
+        return self.poles + self.integrators
 
     def _lay_out(self, records: Record | Sequence[Record]) -> Refinement:
         low, high = self.delay_bounds
         measured = MeasuredRecords(
             [records] if isinstance(records, Record) else list(records),
-            Structure(self.poles, self.zeros, delay=low < high),
+            Structure(self.order, self.zeros, delay=low < high),
             Treatment(
-                self.delay_bounds, self.initial_state, self.offset, self.hold_output, bridge=self.loss != "squares"
+                self.delay_bounds,
+                self.initial_state,
+                self.offset,
+                self.hold_output,
+                bridge=self.loss != "squares",
+                integrators=self.integrators,
             ),
         )
-        known = places_of(self.fixed, measured.structure.names)
+        known = places_of(self.fixed, Structure(self.poles, self.zeros).names)
         return Refinement(measured, KnownCoefficients.of(self.poles, self.zeros, known) if known else NOTHING)
 
     def _estimate(self, refinement: Refinement, start: Start | None) -> MeasuredFit:
@@ -308,8 +328,8 @@ def fitted(
         box=found.box,
         weighting=samples.weighting,
         held_poles=tuple(found.held_poles.tolist()),
-        tangent=_tangent(layout, found, refinement.known),
-        known=tuple(np.array(layout.names[: refinement.known.size])[refinement.known.given].tolist()),
+        tangent=_tangent(layout, found, _given(layout, refinement)),
+        known=tuple(np.array(layout.names)[_given(layout, refinement)].tolist()),
         regular=all(nearly_regular(data.t) for data in refinement.problem.records),
         **values,
     )
@@ -352,16 +372,23 @@ def samples_at(
     return FittedSamples(errors, psi, used, weighted(losses, errors, layout.size))
 
 
-def _tangent(layout: Layout, found: Optimum, known: KnownCoefficients) -> Array:
-    """Directions along which no known parameter changes and neither a pole nor the delay leaves the admissible set."""
-    n, delay = layout.structure.poles, layout.structure.size - 1
+def _given(layout: Layout, refinement: Refinement) -> BoolArray:
+    """Which parameters are known."""
     fixed = np.zeros(layout.size, dtype=bool)
-    fixed[: known.size] = known.given
+    # Poles that have run to infinity are missing among the first coefficients.
+    given = refinement.given[refinement.structure.poles - layout.structure.poles :]
+    fixed[: given.size] = given
+    return fixed
+
+
+def _tangent(layout: Layout, found: Optimum, fixed: BoolArray) -> Array:
+    """Directions along which no known parameter changes and neither a pole nor the delay leaves the admissible set."""
+    n, delay, fixed = layout.structure.poles, layout.structure.size - 1, fixed.copy()
     if found.delay_at_bound:
         fixed[delay] = True
     if not found.held_poles.size:
         return np.eye(layout.size)[:, ~fixed]
-    moving = np.pad(found.pole_slopes, ((0, layout.size - n), (0, 0)))
+    moving = np.pad(found.pole_slopes, ((0, layout.size - len(found.pole_slopes)), (0, 0)))
     return np.column_stack((moving, np.eye(layout.size)[:, n:][:, ~fixed[n:]]))
 
 

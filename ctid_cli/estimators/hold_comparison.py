@@ -11,8 +11,8 @@ from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.profile_refinement import Refinement
 from ctid_cli.estimators.delay_profile import MeasuredFit
-from ctid_cli.inference.input_moves import input_moves
 from ctid_cli.inference.noise_model import fit_noise_model
+from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.record import Record, beginning
 from ctid_cli.signals.regularity import regular_interval

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -19,25 +19,17 @@ from ctid_cli.estimators.residual_causes import another_delay, another_order
 from ctid_cli.estimators.second_look import SecondLook, look_again
 from ctid_cli.estimators.second_look_words import of_second_look
 from ctid_cli.inference import criteria as criteria_of
-from ctid_cli.inference.answer_test import AnswerTest, answer_test
-from ctid_cli.inference.bootstrap import Progress
-from ctid_cli.inference.conditioning import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR
-from ctid_cli.inference.covariance import condition_number
-from ctid_cli.inference.delay_interval import CostOfDelay, DelayInterval
-from ctid_cli.inference.diagnostics import fit_percent, r_squared
-from ctid_cli.inference.fitted_model import FittedModel, responses
-from ctid_cli.inference.later import FilledLater
-from ctid_cli.inference.nonlinearity import UNSAFE, shifts_of_ends
-from ctid_cli.inference.parametric import Parametric
-from ctid_cli.inference.residuals import FEWEST_TESTED, ResidualTests, residual_tests
-from ctid_cli.inference.status import Status
-from ctid_cli.inference.uncertain_value import BIASED, UncertainValue
-from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty
+from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
+from ctid_cli.inference.criteria import fit_percent, r_squared
+from ctid_cli.inference.fit import DeferredFields, FittedModel, Status
+from ctid_cli.inference.intervals import BIASED, CostOfDelay, DelayInterval, UncertainValue
+from ctid_cli.inference.model_responses import Estimated
+from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
+from ctid_cli.inference.response_test import AnswerTest, response_test
+from ctid_cli.inference.sensitivities import Parametric
+from ctid_cli.inference.uncertainty import DRAWS, UNSAFE, Covariance, Progress, Uncertainty, shifts_of_ends
 from ctid_cli.signals.record import Record
 from ctid_cli.text import ShownAsTable
-
-if TYPE_CHECKING:
-    from ctid_cli.inference.responses import Estimated
 
 #: Confidence level of intervals and tests.
 LEVEL = 0.95
@@ -49,10 +41,10 @@ DRAWN_DELAYS, DRAWN_INTERVALS = 24, 2.5
 
 
 @dataclass(frozen=True, eq=False)
-class Validation(FilledLater):
+class Validation(DeferredFields):
     """The model on a record that it was not estimated from."""
 
-    later: ClassVar[tuple[str, ...]] = ("record", "applied")
+    deferred: ClassVar[tuple[str, ...]] = ("record", "applied")
 
     name: str
     record: Record = field(repr=False)
@@ -65,7 +57,7 @@ class Validation(FilledLater):
 
 
 @dataclass(frozen=True, eq=False)
-class Identification(FilledLater, FittedModel, ShownAsTable):
+class Identification(DeferredFields, FittedModel, ShownAsTable):
     """A fit, its uncertainty, and its diagnostics.
 
     Parameters
@@ -96,7 +88,7 @@ class Identification(FilledLater, FittedModel, ShownAsTable):
         What it was estimated from.
     """
 
-    later: ClassVar[tuple[str, ...]] = ("records",)
+    deferred: ClassVar[tuple[str, ...]] = ("records",)
 
     options: Options
     fit: MeasuredFit | SubmodelsFit
@@ -121,11 +113,10 @@ class Identification(FilledLater, FittedModel, ShownAsTable):
         assert self.fit.law is not None
         return self.fit.law
 
-    def _estimated(self) -> "Estimated":
+    def _estimated(self) -> Estimated:
         """The model with what its reported errors and intervals are from."""
-        return responses.with_uncertainty(
-            self.fit.parametrised, self.fit.parameter_names, self.uncertainty, defined=self._determined
-        )
+        law = self.uncertainty if self._determined else self.uncertainty.undefined
+        return Estimated.of(self.fit.parametrised, self.fit.parameter_names, law)
 
     @property
     def _determined(self) -> bool:
@@ -192,7 +183,7 @@ def identify(
     residuals = np.concatenate(fit.residuals)
     output = np.concatenate([record.y[use] for record, use in zip(records, fit.used, strict=True)])
     answering = judging.answering(options, prepared.laid_out)
-    answer = answer_test(answering, fit.used, options.delay_bounds, options.initial_state)
+    answer = response_test(answering, fit.used, options.delay_bounds, options.initial_state)
     squared_error = float(residuals @ residuals) if fit.weighting is None else fit.cost * fit.count
     tests = tests_of(options, linear, records, answer)
     # What the data determine can be told even where no standard error can be given.

@@ -8,12 +8,11 @@ from ctid_cli.arrays import Array
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.judging import Options
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
-from ctid_cli.inference.answer_test import AnswerTest
-from ctid_cli.inference.conditioning import describe_conditioning
-from ctid_cli.inference.covariance import condition_number
-from ctid_cli.inference.delay_interval import DelayInterval
-from ctid_cli.inference.residuals import ResidualTests
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.covariance import condition_number, describe_conditioning
+from ctid_cli.inference.fit import Status
+from ctid_cli.inference.intervals import DelayInterval
+from ctid_cli.inference.residual_tests import ResidualTests
+from ctid_cli.inference.response_test import AnswerTest
 from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.text import listed
 

@@ -11,7 +11,7 @@ from ctid_cli.estimators.delay_profile import DelayProfile, FittedSamples, Measu
 from ctid_cli.estimators.hold_comparison import OtherHold, best_other_hold, decisive, otherwise_held
 from ctid_cli.estimators.measured_submodels import LaidOutSubmodels, MeasuredSubmodels, SubmodelsFit
 from ctid_cli.inference.derived import additive_derived, derived_parameters
-from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.inference.intervals import UncertainValue
 from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record

@@ -19,9 +19,8 @@ from ctid_cli.estimation.profile_refinement import AppliedModel
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels, in_one_order
 from ctid_cli.estimators.delay_profile import FittedSamples, MeasuredFit
 from ctid_cli.filtering.filter_data import used_samples
-from ctid_cli.filtering.submodels import free_response
-from ctid_cli.filtering.submodels import OPEN_LOOP
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.filtering.submodels import OPEN_LOOP, free_response
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian

@@ -15,17 +15,17 @@ from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit, fitted
 from ctid_cli.estimators.identification import tests_of, validated
 from ctid_cli.estimators.judging import laid_out_validation
 from ctid_cli.inference import criteria as criteria_of
-from ctid_cli.inference.answer_test import AnswerTest, answer_test
-from ctid_cli.inference.diagnostics import fit_percent
-from ctid_cli.inference.noise_model import NoiseModel
-from ctid_cli.inference.order_criterion import (
+from ctid_cli.inference.criteria import (
     cross_validated_errors,
+    fit_percent,
     innovations_count,
     shared_noise,
     squared_innovations,
 )
-from ctid_cli.inference.residuals import ResidualTests
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.noise_model import NoiseModel
+from ctid_cli.inference.residual_tests import ResidualTests
+from ctid_cli.inference.response_test import AnswerTest, response_test
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import InitialState, Offset
 
@@ -365,7 +365,7 @@ class _Search:
     def answer(self) -> AnswerTest:
         """Whether there is anything to model."""
         measured, treatment = self.measured, self.measured.treatment
-        return answer_test(measured.records, measured.used(), treatment.delay_bounds, treatment.initial_state)
+        return response_test(measured.records, measured.used(), treatment.delay_bounds, treatment.initial_state)
 
     def result(self, orders: Sequence[FittedOrder]) -> OrderSearch:
         """All of them."""

@@ -22,8 +22,7 @@ from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.estimators.td_srivc import SrivcCost, TdSrivc
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.filtering.lowpass import Lowpass
-from ctid_cli.inference.fit import Fit, IterationRecord
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Fit, IterationRecord, Status
 from ctid_cli.signals.record import Record
 
 

@@ -9,13 +9,18 @@ from ctid_cli.arrays import Array
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.hold_comparison import OtherHold
 from ctid_cli.estimators.residual_causes import Clock, Richer, clock_evidence
-from ctid_cli.inference import faults
-from ctid_cli.inference.beside import SideBySide, constant, rest_of
-from ctid_cli.inference.input_dependence import InputDependence, input_dependence
 from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.inference.record_check import SIGNIFICANT, Examined, examine
-from ctid_cli.inference.residuals import dependence
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.residual_tests import (
+    InputDependence,
+    SideBySide,
+    constant,
+    dependence,
+    input_dependence,
+    rest_of,
+)
+from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.inference.signal_features import growth_time, residual_outliers, stood_still
 from ctid_cli.models.factoring import pole_jacobian
 from ctid_cli.signals.record import Record
 
@@ -80,12 +85,12 @@ def look_again(
 def _look(record: Record, fit: MeasuredFit, k: int) -> RecordLook:
     e, psi, use = fit.residuals[k], fit.sensitivities[k], fit.used[k]
     t, y = record.t[use], record.y[use]
-    found, off = faults.residual_outliers(e)
+    found, off = residual_outliers(e)
     return RecordLook(
         examine(record),
         np.column_stack((t[found], np.abs(off))),
-        t[faults.stood_still(y)],
-        faults.growth_time(t, y, record.input.at(t)),
+        t[stood_still(y)],
+        growth_time(t, y, record.input.at(t)),
         _drift(e, psi, t),
         input_dependence(e, y - e, psi, t, record, fit.model.delay),
     )

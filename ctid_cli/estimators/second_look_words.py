@@ -9,7 +9,7 @@ from ctid_cli.estimators.identification_warnings import of_treatment
 from ctid_cli.estimators.judging import Options
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.estimators.second_look import RecordLook, SecondLook
-from ctid_cli.inference.residuals import ResidualTests
+from ctid_cli.inference.residual_tests import ResidualTests
 from ctid_cli.signals.treatment import Hold
 
 #: Chances of a test statistic like this without feedback, and without missing dynamics.

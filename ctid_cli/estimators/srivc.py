@@ -10,13 +10,12 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.additive_estimate import estimate_submodels
 from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, check_record, finish, history_of
-from ctid_cli.estimation.iteration import RULES, StepRule, Steps, iterate
+from ctid_cli.estimation.iteration import StepRule, Steps, iterate
 from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, cutoffs_of, least_squares_starts
 from ctid_cli.estimation.stability import with_stable_denominator
 from ctid_cli.filtering.filter_data import filter_data
-from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Fit, Status
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
@@ -156,7 +155,7 @@ class Srivc(Estimator[Iteration, Fit]):
     def _from(self, problem: SampledProblem | AdditiveProblem, theta: Array, covariance: Covariance) -> Fit:
         """Iterate from one start."""
         structure = Structure(self.poles, self.zeros)
-        steps = Steps(self.max_iterations, self.tolerance, RULES[self.step_rule])
+        steps = Steps(self.max_iterations, self.tolerance, self.step_rule)
         if isinstance(problem, AdditiveProblem):
             return self._as_submodel(problem, theta, structure, steps, covariance)
         result = iterate(problem, theta, steps)

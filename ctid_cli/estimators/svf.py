@@ -7,9 +7,8 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Estimator, Start, check_proper, check_record, finish, history_entry
 from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, cutoffs_of, least_squares_start
 from ctid_cli.filtering.filter_data import filter_data
-from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Fit, Status
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import OutputHold
 

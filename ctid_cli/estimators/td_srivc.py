@@ -34,13 +34,12 @@ from ctid_cli.estimation.delay_search import (
     descend,
 )
 from ctid_cli.estimation.global_look import lower_elsewhere
-from ctid_cli.estimation.iteration import ENDS, GUARDED, INADMISSIBLE, RULES, Iterated, Steps, Variant, iterate
+from ctid_cli.estimation.iteration import GUARDED, Iterated, Steps, Variant, iterate
 from ctid_cli.estimation.sampled_problem import SampledProblem, cutoffs_around, least_squares_starts
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
-from ctid_cli.inference.answer import output_bandwidth
-from ctid_cli.inference.fit import Fit, IterationRecord
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Fit, IterationRecord, Status
+from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import OutputHold
@@ -151,7 +150,7 @@ class TdSrivc(Estimator["Searches", Fit]):
         starts = cutoffs_around(searches.bandwidth) if self.svf_cutoff is None else (self.svf_cutoff,)
         none = np.empty((0, searches.first.free))
         found = self._descend(searches.first, delay, none, "search", history, starts)
-        if found.end == INADMISSIBLE:
+        if found.end is None:
             raise DataError(Status.SINGULAR.value)
         end = self._finish if self.lowpass is None else self._refine
         fit = end(searches.last, found, history)
@@ -163,7 +162,7 @@ class TdSrivc(Estimator["Searches", Fit]):
     def _refine(self, problem: SampledProblem, found: Descent, history: list[IterationRecord]) -> Fit:
         """Go on from a delay and coefficients that a search on filtered data has found."""
         refined = self._descend(problem, found.minimum.delay, found.minimum.theta[None], "refine", history)
-        if refined.end != INADMISSIBLE:
+        if refined.end is not None:
             found = refined._replace(iterations=found.iterations + refined.iterations)
         return self._finish(problem, found, history)
 
@@ -186,7 +185,7 @@ class TdSrivc(Estimator["Searches", Fit]):
 
     def _finish(self, problem: SampledProblem, found: Descent, history: list[IterationRecord]) -> Fit:
         """Polish with joint iterations on coefficients and delay, mind the bounds, and report."""
-        theta, status, iterations = found.minimum.theta, ENDS[found.end], found.iterations
+        theta, status, iterations = found.minimum.theta, found.end or Status.DIVERGED, found.iterations
         if self.variant == "guarded":
             # From the right basin they converge in a few steps.
             polished = self._iterated(problem, theta)
@@ -248,7 +247,7 @@ class SrivcCost:
         problem, refit = self.problem, self.options.variant == "guarded"
         cutoffs = self.svf_cutoffs if own else ()
         tried = [*least_squares_starts(problem.data, problem.structure, delay, cutoffs, refit), *starts]
-        steps = Steps(INNER_ITERATIONS, self.tolerance, RULES[self.options.variant])
+        steps = Steps(INNER_ITERATIONS, self.tolerance, self.options.variant)
         ends = (iterate(problem, np.append(start[:-1], delay), steps) for start in tried)
         best = min((end for end in ends if end is not None), key=lambda end: end.equations.squared_error, default=None)
         if best is None:

@@ -13,16 +13,15 @@ from ctid_cli.estimation.delay_grid import scan
 from ctid_cli.estimation.delay_search import Descent, Minimum
 from ctid_cli.estimation.filter_search import LARGEST_STEP, LATTICE, FilterPath, FilterSearch
 from ctid_cli.estimation.filtered_costs import filtered_costs
-from ctid_cli.estimation.iteration import CONVERGED, GAUSS_NEWTON, Steps, Variant
+from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps, Variant
 from ctid_cli.estimation.redundancy import RedundantMinimum, Visit
 from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.estimators.printed_redundancy import PrintedSearch, printed_search
 from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.filter_set import FilterSet
-from ctid_cli.inference.answer import output_bandwidth
-from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Fit, Status
+from ctid_cli.inference.input_response import output_bandwidth
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import OutputHold
@@ -256,7 +255,7 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
             starts = np.vstack((here.thetas[-1:], starts))
         if not np.isfinite(found.squared_errors[least]):
             raise DataError(Status.SINGULAR.value)
-        ends = [Descent(Minimum(theta, np.nan), np.empty((0, 1)), CONVERGED, 0) for theta in starts]
+        ends = [Descent(Minimum(theta, np.nan), np.empty((0, 1)), Status.CONVERGED, 0) for theta in starts]
         return min((self.refinement._refine(laid_out.unfiltered, end, []) for end in ends), key=lambda fit: fit.cost)
 
 

@@ -14,13 +14,12 @@ By Parseval the mean square of v over the window is ``|V(0)|^2 + 2 sum_k |V(w_k)
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.exponential import place
 from ctid_cli.filtering.filter_data import plain_array
 from ctid_cli.filtering.lowpass import Lowpass
+from ctid_cli.filtering.spectral_kernels import partial_sums, window_spectrum
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
@@ -58,7 +57,7 @@ class RecordSpectra:
         self.damping: Array = damping[self._first :]
         joined = _held_spectrum(output, start, end - start, 0.0, count)
         #: Spectrum of the output [output unit], shape (K,).
-        self.outputs: ComplexArray = window_spectrum(joined, 0.0, 1.0 / damping[1:])[self._first :]
+        self.outputs: ComplexArray = joined.at(0.0, 1.0 / damping[1:])[self._first :]
         #: The input, laid out for its spectrum at any delay.
         self.input = _held_spectrum(record.input, start, end - start, greatest_delay, count)
 
@@ -71,8 +70,7 @@ class RecordSpectra:
         """Spectrum of the delayed input over the window."""
         if not 0.0 <= delay <= self.greatest_delay:
             raise ValueError(f"the delay must lie between 0 and {self.greatest_delay:g} s, not {delay:g} s")
-        ones = np.ones(self.frequencies.size - 1 + self._first)
-        return np.asarray(window_spectrum(self.input, delay, ones)[self._first :])
+        return self.input.at(delay, np.ones(self.frequencies.size - 1 + self._first))[self._first :]
 
 
 def record_spectra(
@@ -140,6 +138,13 @@ class HeldSpectrum(NamedTuple):
     sums: Array
     duration: float
 
+    def at(self, delay: float, gain: Array) -> ComplexArray:
+        """Spectrum at zero frequency and at as many above it as there are gains, of the signal later by a delay [s].
+
+        The gain multiplies what happens inside the window, as opposed to its ends.
+        """
+        return np.asarray(window_spectrum(*self, delay, gain))
+
 
 def _held_spectrum(
     signal: HeldSignal, start: float, duration: float, greatest_delay: float, count: int
@@ -161,118 +166,5 @@ def _held_spectrum(
     late = int(np.searchsorted(times, duration - greatest_delay))
     stretch = max(SHORTEST_STRETCH, (early + times.size - late) // STRETCHES)
     marks = np.union1d(np.arange(0, early + 1, stretch), np.arange(late, times.size + 1, stretch)).astype(np.int64)
-    sums = _partial_sums(times, jumps, marks, 2 * np.pi / duration, count)
+    sums = partial_sums(times, jumps, marks, 2 * np.pi / duration, count)
     return HeldSpectrum(times, values, slopes, jumps, integral, foh, marks, sums, duration)
-
-
-@njit(cache=True, nogil=True)
-def _phases(angle: float, count: int, re: Array, im: Array) -> None:
-    """Real and imaginary parts of ``exp(-j k angle)``, k = 1 … count, by doubling: vector operations throughout."""
-    power_re, power_im = np.cos(angle), -np.sin(angle)
-    re[0], im[0] = power_re, power_im
-    done = 1
-    while done < count:
-        for i in range(min(done, count - done)):
-            re[done + i] = power_re * re[i] - power_im * im[i]
-            im[done + i] = power_re * im[i] + power_im * re[i]
-        power_re, power_im = power_re * power_re - power_im * power_im, 2.0 * power_re * power_im
-        done *= 2
-
-
-@njit(cache=True, nogil=True)
-def _add_jumps(times: Array, jumps: Array, first: int, last: int, base: float, phases: Array, total: Array) -> None:
-    """Add ``sum jump_i exp(-j k base t_i)`` over the breaks ``first … last - 1`` to ``total``."""
-    count = total.shape[1]
-    phase_re, phase_im = phases[0], phases[1]
-    total_re, total_im = total[0], total[1]
-    for i in range(first, last):
-        _phases(base * times[i], count, phase_re, phase_im)
-        for k in range(count):
-            total_re[k] += jumps[i] * phase_re[k]
-            total_im[k] += jumps[i] * phase_im[k]
-
-
-@njit(cache=True, nogil=True)
-def _partial_sums(times: Array, jumps: Array, marks: IntArray, base: float, count: int) -> Array:
-    """Sums over the first ``marks[r]`` breaks, shape (marks, 2, count)."""
-    sums = np.zeros((marks.size, 2, count))
-    phases, total = np.zeros((2, count)), np.zeros((2, count))
-    done = 0
-    for r in range(marks.size):
-        _add_jumps(times, jumps, done, marks[r], base, phases, total)
-        done = marks[r]
-        place(sums[r], 0, 0, total)
-    return sums
-
-
-@njit(cache=True, nogil=True)
-def _last_at(grid: Array | IntArray, value: float) -> int:
-    """Index of the last entry not above ``value``; 0 if there is none."""
-    low, high = 0, grid.size
-    while high - low > 1:
-        middle = (low + high) // 2
-        if grid[middle] <= value:
-            low = middle
-        else:
-            high = middle
-    return low
-
-
-@njit(cache=True, nogil=True)
-def window_spectrum(held: HeldSpectrum, delay: float, gain: Array) -> ComplexArray:
-    """Spectrum at zero frequency and at as many above it as there are gains, of the signal later by ``delay``.
-
-    The gain multiplies what happens inside the window, as opposed to its ends.
-
-    With a and b the ends of the window on the undelayed signal's clock, value v and slope r there, and D the sum of
-    ``jump exp(-jw t)`` over the breaks between them,
-
-    ``T V = (v(a) e_a - v(b))/jw + (r(a) e_a - r(b))/(jw)^2 + gain exp(-jw delay) D/(jw)^i``,
-
-    i = 1 for a constant hold (whose slopes are zero) and 2 for a linear one. ``e_a`` is 1 unless a precedes the first
-    break, where the signal begins with a jump.
-    """
-    times, values, slopes, jumps, integral, foh, marks, sums, duration = held
-    count = gain.size
-    spectrum = np.zeros(count + 1, np.complex128)
-    # a and b; before its first break the signal is zero.
-    begin, end = max(-delay, times[0]), duration - delay
-    if end <= begin:
-        return spectrum
-    base = 2.0 * np.pi / duration
-    # v, r and the integral of v at both ends, from the last break before each.
-    left, right = _last_at(times, begin), _last_at(times, end)
-    before, after = begin - times[left], end - times[right]
-    value_left, value_right = values[left] + slopes[left] * before, values[right] + slopes[right] * after
-    total_left = integral[left] + before * (values[left] + 0.5 * slopes[left] * before)
-    total_right = integral[right] + after * (values[right] + 0.5 * slopes[right] * after)
-    spectrum[0] = (total_right - total_left) / duration
-    if count == 0:
-        return spectrum
-    phases = np.zeros((2, count))
-    # D: kept sums up to the nearest marks, completed break by break.
-    row, upper = _last_at(marks, left + 1), _last_at(marks, right + 1)
-    total, early = sums[upper, :, :count].copy(), sums[row, :, :count].copy()
-    _add_jumps(times, jumps, marks[upper], right + 1, base, phases, total)
-    _add_jumps(times, jumps, marks[row], left + 1, base, phases, early)
-    _phases(base * delay, count, phases[0], phases[1])
-    # e_a, and the equation above.
-    starts = np.zeros((2, count))
-    if begin > -delay:
-        _phases(base * (delay + begin), count, starts[0], starts[1])
-    else:
-        for k in range(count):
-            starts[0, k] = 1.0
-    for k in range(count):
-        jw = 1j * (base * (k + 1))
-        start = complex(starts[0, k], starts[1, k])
-        inside = complex(total[0, k] - early[0, k], total[1, k] - early[1, k])
-        inside *= gain[k] * complex(phases[0, k], phases[1, k])
-        value = value_left * start - value_right
-        slope = slopes[left] * start - slopes[right]
-        if foh:
-            slope += inside
-        else:
-            value += inside
-        spectrum[k + 1] = (value + slope / jw) / jw / duration
-    return spectrum

@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.frequency.decoding import flag_uncertain
 from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.frequency_kernels import flag_uncertain
 from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES, series_of
 from ctid_cli.frequency.tracking import FrequencyEstimate
 from ctid_cli.signals.checks import require_positive

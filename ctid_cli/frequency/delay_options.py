@@ -1,19 +1,23 @@
 """Options that all estimators on the delay regression share, and what they mean at a sampling interval."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from math import gcd
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
-from ctid_cli.frequency.consistency import second_lag
+from ctid_cli.frequency.frequency_kernels import DelayClock
 from ctid_cli.frequency.inputs import require_bounds
 from ctid_cli.frequency.prefilter import impulse_response
 from ctid_cli.frequency.regression import delay_table, whole_delay
 from ctid_cli.frequency.tracking import OnlineEstimator
 from ctid_cli.signals.checks import require_not_negative, require_positive
 
+#: The second delay is near this fraction of the first, as far from every simple ratio as can be.
+GOLDEN_FRACTION = (np.sqrt(5.0) - 1.0) / 2.0
+#: A number without a common divisor lies within this distance of any place, for all delays that are allowed.
+SEARCHED = 100
 #: Verdicts are given, and rows at the second delay looked at, so many times in a delay h, but at most so many samples
 #: apart.
 VERDICTS_PER_DELAY = 64
@@ -24,26 +28,6 @@ NOTEWORTHY_ROUNDING = 0.01
 #: or too much alike to show that they disagree.
 ROWS_PER_TONE = 4
 STARTING_SPAN = 0.25
-
-
-class DelayClock(NamedTuple):
-    """The delay regression at a sampling interval, as the kernels take it."""
-
-    #: Coefficients of the regression, shape (n + 1, 2 n + 1).
-    table: Array
-    #: Sampling interval [s].
-    interval: float
-    #: The delay h in sampling intervals, and in seconds.
-    lag: int
-    delay: float
-    #: A second delay, at which the frequencies are checked.
-    second_lag: int
-    second_delay: float
-    #: Cosines of the highest and of the lowest frequency times h [-].
-    bottom: float
-    top: float
-    #: Samples from one verdict to the next.
-    every: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,3 +100,12 @@ class DelayRegression(OnlineEstimator):
             raise OptionError("h", f"with h = {delay:g} s, {seen}, but {asked}")
         require_bounds(self.lowest_frequency, highest)
         return min(highest, unique)
+
+
+def second_lag(lag: int) -> int:
+    """Second delay for a given first one."""
+    if lag == 1:
+        return 0
+    wanted = GOLDEN_FRACTION * lag
+    near = range(max(1, round(wanted) - SEARCHED), min(lag, round(wanted) + SEARCHED + 1))
+    return min((m for m in near if gcd(m, lag) == 1), key=lambda m: abs(m - wanted))

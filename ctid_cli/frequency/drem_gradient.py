@@ -2,44 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal
 
 import numpy as np
-from numba import njit
 
-from ctid_cli.arrays import Array
-from ctid_cli.frequency.mixing import MIXING_ROUNDING, MixingOptions, back_end
+from ctid_cli.frequency.frequency_kernels import Gains, Gradient
+from ctid_cli.frequency.mixing import MixingOptions
 from ctid_cli.frequency.regression import theta_of
 from ctid_cli.frequency.tracking import Recursion
 from ctid_cli.signals.checks import require_integer, require_positive
 
 #: The residuals that show how far an estimate can be trusted are remembered over so many times n h.
 RECENT_SPANS = 2
-
-
-class Gains(NamedTuple):
-    """Settings of the gradient."""
-
-    #: ``gamma_k`` times the sampling interval, shape (n,).
-    gains: Array
-    #: ``theta(0)``, shape (n,).
-    initial: Array
-    #: Whether the part of the initial value is taken out.
-    finite_time: bool
-    #: Number of the largest gain.
-    fastest: int
-    #: What the recent sums keep from one sample to the next.
-    keep: float
-
-
-class Gradient(NamedTuple):
-    """State of the gradient."""
-
-    #: z and q, ``theta = z + (1 - q) theta(0)``, shape (2, n).
-    sums: Array
-    #: Recent sums of the squares of ``Psi_k - Delta theta_k``, of Delta and of its rounding, and of the squared weights
-    #: with which the rows enter q, shape (n + 3,).
-    recent: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,55 +101,7 @@ class DremGradient(MixingOptions):
             clock,
             Gradient(np.zeros((2, n)), np.zeros(n + 3)),
             theta,
-            tuning=Gains(gains, theta, self._finite_time, int(np.argmax(gains)), keep),
+            gains=Gains(gains, theta, self._finite_time, int(np.argmax(gains)), keep),
             normalisation=float(self.epsilon) ** (n if self.power == "literal" else int(self.power)),
             past=np.nan if self.gated else 0.0,
         )
-
-
-@njit(cache=True, nogil=True)
-def absorb_gradient(
-    scale: float, count: int, tuning: Gains, back: Gradient, theta: Array, mixed: Array
-) -> tuple[float, int]:
-    """Exact solution of ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)`` over one interval, Delta and Psi held."""
-    n = theta.size
-    sums, recent = back
-    gains, initial = tuning.gains, tuning.initial
-    if np.isnan(scale):
-        return recent[n], count
-    delta = mixed[n]
-    recent[n] = tuning.keep * recent[n] + delta * delta
-    recent[n + 1] = tuning.keep * recent[n + 1] + (MIXING_ROUNDING * scale) ** 2
-    x, m, gain = 0.0, 0.0, 0.0
-    for i in range(n):
-        if count > 1:
-            # The residual of what was known before this sample: theta moves only below.
-            recent[i] = tuning.keep * recent[i] + (mixed[i] - delta * theta[i]) ** 2
-        if i == 0 or gains[i] != gains[i - 1]:
-            # m = 1 - exp(-x), the share of the new row; gain = gamma m/x without 0/0 where Delta vanishes.
-            x = gains[i] * delta * delta
-            m = -np.expm1(-x)
-            gain = gains[i] * (m / x if x > 1e-8 else 1.0 - 0.5 * x)
-        if i == tuning.fastest:
-            recent[n + 2] = (1.0 - m) ** 2 * recent[n + 2] + m * m
-        # The part of the rows and that of the initial value are kept apart, so that no difference cancels.
-        sums[0, i] += gain * delta * mixed[i] - m * sums[0, i]
-        sums[1, i] += m * (1.0 - sums[1, i])
-        z, q = sums[0, i], sums[1, i]
-        theta[i] = z / q if tuning.finite_time and q > 0.0 else z + (1.0 - q) * initial[i]
-    return recent[n], count
-
-
-@njit(cache=True, nogil=True)
-def weigh_gradient(tuning: Gains, back: Gradient, theta: Array, errors: Array) -> tuple[float, float]:
-    """Errors of theta that the recent residuals show, rounding of Delta relative to Delta, rows that carry weight."""
-    n = theta.size
-    recent, q = back.recent, back.sums[1, tuning.fastest]
-    for i in range(n):
-        errors[i] = np.sqrt(recent[i] / recent[n])
-    # (sum w)^2/sum w^2 for the weights w with which the rows enter the fastest parameter.
-    remembered = q * q / recent[n + 2] if recent[n + 2] > 0.0 else 0.0
-    return np.sqrt(recent[n + 1] / recent[n]), remembered
-
-
-back_end(Gradient, absorb_gradient, weigh_gradient)

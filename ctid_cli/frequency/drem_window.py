@@ -1,30 +1,14 @@
 """Frequencies from the mixed regressions (DREM) of a sliding window: finite time after every change of the signal."""
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
-from numba import njit
 
-from ctid_cli.arrays import Array, IntArray
-from ctid_cli.frequency.mixing import MIXING_ROUNDING, MixingOptions, back_end
+from ctid_cli.frequency.frequency_kernels import SlidingWindow
+from ctid_cli.frequency.mixing import MixingOptions
 from ctid_cli.frequency.regression import whole_delay
 from ctid_cli.frequency.tracking import Recursion
-
-#: A scatter of the scalar regressions below this fraction of their square is rounding.
-SCATTER_ROUNDING = 1e-14
-
-
-class Window(NamedTuple):
-    """State of the sliding sums; an entry is ``[Delta Psi, Psi^2, Delta^2, rounding^2, 1]``, of the size 2 n + 3."""
-
-    #: Entries after the place of the next one, each summed with all that follow it; before the place, plain ones.
-    entries: Array
-    #: Sum of the plain entries.
-    newer: Array
-    #: Sum of the window.
-    sums: Array
-    place: IntArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,69 +66,5 @@ class DremWindow(MixingOptions):
         length = whole_delay("memory", self.memory, interval)
         self._require_samples(self.memory, length, interval)
         size = 2 * n + 3
-        back = Window(np.zeros((length, size)), np.zeros(size), np.zeros(size), np.zeros(1, np.int64))
+        back = SlidingWindow(np.zeros((length, size)), np.zeros(size), np.zeros(size), np.zeros(1, np.int64))
         return self._mixed(clock, back, np.full(n, np.nan), most_rows=length)
-
-
-@njit(cache=True, nogil=True, forceinline=True)
-def slide(window: Array, newer: Array, place: int, sums: Array) -> int:
-    """Sum a sliding window after a new entry at ``place``; the place of the next entry.
-
-    Nothing is ever subtracted, so no rounding error of an entry outlives it.
-    """
-    length, width = window.shape
-    for i in range(width):
-        newer[i] += window[place, i]
-        sums[i] = newer[i]
-    if place + 1 < length:
-        # The next place holds the sum of all older entries that are still in the window.
-        for i in range(width):
-            sums[i] += window[place + 1, i]
-        return place + 1
-    # The window is full of plain entries: sum them backwards, and begin anew.
-    for j in range(length - 2, -1, -1):
-        for i in range(width):
-            window[j, i] += window[j + 1, i]
-    newer[:] = 0.0
-    return 0
-
-
-@njit(cache=True, nogil=True)
-def absorb_window(
-    scale: float, count: int, tuning: None, back: Window, theta: Array, mixed: Array
-) -> tuple[float, float]:
-    """Least squares on each scalar regression, ``theta_k = sum Delta Psi_k/sum Delta^2`` over the window."""
-    n = theta.size
-    entries, newer, sums, place = back
-    here = place[0]
-    if np.isnan(scale):
-        for i in range(sums.size):
-            entries[here, i] = 0.0
-    else:
-        # [Delta Psi, Psi^2, Delta^2, rounding^2, 1]; a missing sample leaves a zero entry, which weighs nothing.
-        for i in range(n):
-            entries[here, i] = mixed[n] * mixed[i]
-            entries[here, n + i] = mixed[i] * mixed[i]
-        entries[here, 2 * n] = mixed[n] * mixed[n]
-        entries[here, 2 * n + 1] = (MIXING_ROUNDING * scale) ** 2
-        entries[here, 2 * n + 2] = 1.0
-    place[0] = slide(entries, newer, here, sums)
-    # While Delta vanishes there is no estimate, not an old one: the window has forgotten it.
-    for i in range(n):
-        theta[i] = sums[i] / sums[2 * n] if sums[2 * n] > 0.0 else np.nan
-    return sums[2 * n], sums[2 * n + 2]
-
-
-@njit(cache=True, nogil=True)
-def weigh_window(tuning: None, back: Window, theta: Array, errors: Array) -> tuple[float, float]:
-    """Scatter of the scalar regressions of the window, rounding of Delta relative to Delta, rows in the window."""
-    n, sums = theta.size, back.sums
-    for i in range(n):
-        # Mean of (Psi - Delta theta)^2 over that of Delta^2; as a difference it is known up to rounding only.
-        square = sums[n + i] / sums[2 * n]
-        scatter = square - theta[i] * theta[i]
-        errors[i] = np.sqrt(scatter) if scatter > SCATTER_ROUNDING * square else 0.0
-    return np.sqrt(sums[2 * n + 1] / sums[2 * n]), sums[2 * n + 2]
-
-
-back_end(Window, absorb_window, weigh_window)

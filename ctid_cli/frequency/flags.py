@@ -2,10 +2,6 @@
 
 from enum import IntFlag
 
-#: Frequencies are called certain while the error that the misfit of the equations can make stays below this fraction of
-#: the frequency itself and of the distance to its neighbours.
-CERTAIN_FRACTION = 0.1
-
 
 class Flag(IntFlag):
     """Reasons for which an estimate is marked invalid; an estimate is valid exactly if it has none.
@@ -61,6 +57,3 @@ MEANINGS: dict[Flag, str] = {
     Flag.ABSENT: "The tone is not there, or not beyond doubt, at this instant.",
     Flag.UNCONFIRMED: "No window around this instant in which nothing changes shows such a tone.",
 }
-
-# The bits as plain integers, as compiled code wants them.
-STARTING, GAP, CHANGED, UNDETERMINED, UNCERTAIN, COMPLEX_ROOTS, OUT_OF_BOUNDS, INCONSISTENT = map(int, list(Flag)[:8])

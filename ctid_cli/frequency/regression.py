@@ -12,7 +12,6 @@ adjugate of the regressor matrix: ``Psi_k = Delta theta_k`` with one determinant
 from math import comb
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, IntArray
@@ -80,63 +79,3 @@ def minor_plan(tones: int) -> IntArray:
             sign = -1 if (len(columns) - 1 - place) % 2 else 1
             steps.append((pattern, len(columns) - 1, column, pattern & ~(1 << column), sign))
     return np.array(steps, np.int64)
-
-
-@njit(cache=True, nogil=True)
-def following(place: int, size: int) -> int:
-    """The next place of a ring."""
-    return place + 1 if place + 1 < size else 0
-
-
-@njit(cache=True, nogil=True)
-def form_row(history: Array, newest: int, lag: int, table: Array, row: Array) -> bool:
-    """Regression row ``[phi psi]`` at the newest sample of a ring; whether no sample of it is missing."""
-    count, width = table.shape
-    row[:count] = 0.0
-    place = newest
-    complete = True
-    # One delayed sample after the other, from y(t) to y(t - 2 n h).
-    for j in range(width):
-        value = history[place]
-        complete = complete and np.isfinite(value)
-        for k in range(count):
-            row[k] += table[k, j] * value
-        # The ring holds 2 n lags and one sample: one step beyond its start at most.
-        place -= lag
-        if place < 0:
-            place += history.size
-    return complete
-
-
-@njit(cache=True, nogil=True)
-def mix_rows(
-    rows: Array, newest: int, first: int, spacing: int, plan: IntArray, matrix: Array, minors: Array, mixed: Array
-) -> float:
-    """``[adj(Phi) Psi_f, det Phi]`` of the rows ``first`` to ``first + n - 1`` spacings ago; returns their scale."""
-    n = matrix.shape[0]
-    size = rows.shape[0]
-    place = newest - first * spacing
-    # Hadamard: no minor exceeds the product of the lengths of the rows, nor does its rounding by much.
-    scale = 1.0
-    for i in range(n):
-        if place < 0:
-            place += size
-        square = 0.0
-        for k in range(n + 1):
-            value = rows[place, k]
-            matrix[i, k] = value
-            square += value * value
-        scale *= np.sqrt(square)
-        place -= spacing
-    # Laplace expansion along the last row: every minor of the first rows is computed once, and finite though singular.
-    minors[:] = 0.0
-    minors[0] = 1.0
-    for step in range(plan.shape[0]):
-        minors[plan[step, 0]] += plan[step, 4] * matrix[plan[step, 1], plan[step, 2]] * minors[plan[step, 3]]
-    everything = minors.size - 1
-    for k in range(n):
-        # Column psi moves from the last place to place k: n - 1 - k exchanges.
-        sign = -1.0 if (n - 1 - k) % 2 else 1.0
-        mixed[k] = sign * minors[everything - (1 << k)]
-    mixed[n] = minors[everything - (1 << n)]
-    return scale

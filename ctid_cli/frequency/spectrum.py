@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numba import njit
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.processors import in_threads
@@ -15,9 +14,8 @@ PADDING = 4
 SHORTEST_SEGMENT = 64
 LONGEST_SEGMENT = 2**18
 MOST_SAMPLES = 2**21
-#: Points of spectra that are made at once, and of them those whose values are gathered for medians.
+#: Points of spectra that are made at once.
 TOGETHER = 2**17
-GATHERED = 32
 #: A segment with a larger fraction of missing samples is left out, or with the second one if no segment had fewer.
 MOST_MISSING = (0.1, 0.5)
 #: A peak must stand so many times (in amplitude) above the median of the bins around it, so many on each side, and
@@ -104,23 +102,7 @@ def median_spectrum(
         # The mean of a segment, with the weights of the window. (Threads of a linear algebra would be in the way.)
         tapered -= tapered.sum(axis=1, keepdims=True) * window
         spectra[done : done + together] = 2.0 * np.abs(np.fft.rfft(tapered, PADDING * size))
-    return _medians(spectra) if begins.size else None
-
-
-@njit(cache=True, nogil=True)
-def _medians(spectra: Array) -> Array:
-    """Median of each column."""
-    rows, columns = spectra.shape
-    # Rows of spectra are far apart in memory.
-    out, gathered = np.empty(columns), np.empty((GATHERED, rows))
-    for first in range(0, columns, GATHERED):
-        count = min(GATHERED, columns - first)
-        for row in range(rows):
-            for k in range(count):
-                gathered[k, row] = spectra[row, first + k]
-        for k in range(count):
-            out[first + k] = np.median(gathered[k])
-    return out
+    return np.median(spectra, axis=0) if begins.size else None
 
 
 def significant(spectrum: Array) -> tuple[Array, Array]:

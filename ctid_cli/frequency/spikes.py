@@ -1,7 +1,6 @@
 """Samples that no sum of a few tones can have: so far above all others around them that they are taken as missing."""
 
 import numpy as np
-from numba import njit
 
 from ctid_cli.arrays import Array, BoolArray
 
@@ -19,26 +18,11 @@ def find_spikes(samples: Array) -> BoolArray:
     if not there.any():
         return there
     size = np.where(there, np.abs(samples - np.median(samples[there])), 0.0)
-    spikes = np.zeros(size.size, np.bool_)
-    _mark_spikes(size, spikes)
+    # The largest of so many samples in a row; zeros stand for those beyond the ends.
+    largest = np.lib.stride_tricks.sliding_window_view(np.pad(size, WIDTH + AROUND), AROUND).max(axis=1)
+    around = np.maximum(largest[: size.size], largest[-size.size :])
+    spikes = (around > 0.0) & (size > TIMES * around)
     return spikes if spikes.mean() <= MOST else np.zeros_like(spikes)
-
-
-@njit(cache=True, nogil=True)
-def _mark_spikes(size: Array, spikes: BoolArray) -> None:
-    """Mark what is so much larger than all around it, where that is not all zero."""
-    for k in range(size.size):
-        found = True
-        positive = False
-        # From the sample outwards: nearly always one of the first is large enough.
-        for away in range(WIDTH + 1, WIDTH + AROUND + 1):
-            for i in (k - away, k + away):
-                if 0 <= i < size.size:
-                    positive |= size[i] > 0.0
-                    found &= size[k] > TIMES * size[i]
-            if not found:
-                break
-        spikes[k] = found and positive
 
 
 def spikes_told(spikes: BoolArray) -> list[str]:

@@ -25,14 +25,15 @@ COVERED = 3.0
 
 
 @njit(cache=True, nogil=True)
-def find_combs(omega: Array, error: Array, gap: Array, low: Array, high: Array) -> None:
+def find_combs(omega: Array, order: IndexArray, error: Array, gap: Array, low: Array, high: Array) -> None:
     """Distances and bands of the combs of all windows, shape (R, n); lines that something disturbs are lines too.
 
     Amplitude or frequency that changes periodically makes lines at equal distances, each of them as steady as a tone.
+    ``order`` sorts the frequencies of each window.
     """
     gaps = np.empty(omega.shape[1])
     for row in range(omega.shape[0]):
-        lines = np.argsort(omega[row])
+        lines = order[row]
         count = 0
         while count < lines.size and not math.isnan(error[row, lines[count]]):
             count += 1

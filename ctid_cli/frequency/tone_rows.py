@@ -148,7 +148,7 @@ def _readings(tones: ToneRows, length: int, places: Array) -> Readings:
     row, window = row[near], window[near]
     sound = _sound(tones, length)
     gap, low_end, high_end = np.zeros((3, *tones.omega.shape))
-    find_combs(tones.omega, tones.omega_error, gap, low_end, high_end)
+    find_combs(tones.omega, np.argsort(tones.omega, axis=1), tones.omega_error, gap, low_end, high_end)
     pair, tone = np.nonzero(sound[window])
     row, window = row[pair], window[pair]
 

@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
-from ctid_cli.frequency.tone_equations import NUMBERS
-from ctid_cli.frequency.tone_fit import Windows, fit_windows, windows_at
+from ctid_cli.frequency.frequency_kernels import NUMBERS, ToneWindows, fit_windows
 from ctid_cli.frequency.tone_tests import Line, find_changes, strongest_line
 from ctid_cli.frequency.whitening import Left, whiten
 from ctid_cli.processors import in_threads
@@ -72,12 +71,24 @@ def tones_of_windows(
     return ToneRows(**{name: np.concatenate([getattr(block, name) for block in blocks]) for name in ToneRows._fields})
 
 
+def windows_at(first: IndexArray, most_tones: int) -> ToneWindows:
+    """ToneWindows without a tone yet."""
+    rows = first.size
+    return ToneWindows(
+        first=np.ascontiguousarray(first, dtype=np.int64),
+        used=np.zeros(rows, np.int64),
+        numbers=np.zeros((rows, most_tones, NUMBERS)),
+        variances=np.zeros((rows, most_tones, NUMBERS)),
+        converged=np.zeros(rows, np.bool_),
+    )
+
+
 def nearest(middles: Array, places: Array) -> IndexArray:
     """Which of some middles, ascending, is the nearest to each place."""
     return np.asarray(np.searchsorted(0.5 * (middles[1:] + middles[:-1]), places))
 
 
-def _begun(windows: Windows, length: int, shorter: ToneRows) -> None:
+def _begun(windows: ToneWindows, length: int, shorter: ToneRows) -> None:
     """Put into windows the tones of the shorter windows nearest to their middles, where nothing is wrong with them."""
     half = 0.5 * (length - 1)
     middle = np.asarray(windows.first + half, dtype=np.float64)
@@ -123,7 +134,7 @@ def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: T
     return _rows(windows, tests, length)
 
 
-def _join(windows: Windows, rows: IndexArray, turns: Array) -> BoolArray:
+def _join(windows: ToneWindows, rows: IndexArray, turns: Array) -> BoolArray:
     """Add a line to each of some windows, and tell where: where it is one, there is room, and no tone is beside it."""
     most = windows.numbers.shape[1]
     apart = np.abs(windows.numbers[rows, :, 3] - turns[:, None])
@@ -157,7 +168,7 @@ class _Tests(NamedTuple):
         return self
 
 
-def _tested(residuals: Array, windows: Windows, rows: IndexArray) -> _Tests:
+def _tested(residuals: Array, windows: ToneWindows, rows: IndexArray) -> _Tests:
     """Tests of what is left of some windows, which lose it on the way."""
     left = whiten(residuals, NUMBERS * windows.used[rows] + 1)
     change, cube = (np.full((rows.size, windows.numbers.shape[1]), np.nan) for _ in range(2))
@@ -166,7 +177,7 @@ def _tested(residuals: Array, windows: Windows, rows: IndexArray) -> _Tests:
     return _Tests(left._replace(white=np.empty((rows.size, 0))), line, change, cube)
 
 
-def _rows(windows: Windows, tests: _Tests, length: int) -> ToneRows:
+def _rows(windows: ToneWindows, tests: _Tests, length: int) -> ToneRows:
     half = 0.5 * (length - 1)
     most = windows.numbers.shape[1]
     empty = np.arange(most) >= windows.used[:, None]

@@ -53,7 +53,8 @@ def strongest_line(left: Left) -> Line:
     least = SURELY * sure * (LEAST_CHANCE ** (-1.0 / sure) - 1.0)
     place, height, top = np.empty(rows, np.int64), np.empty(rows), np.empty(rows)
     others = np.full((rows, FURTHER), -1)
-    _find_lines(ordinates, floor.medians, floor.hop, least, place, height, top, others)
+    medians = np.maximum(floor.medians, SMALLEST_FLOOR)
+    _find_lines(ordinates, medians, floor.hop, PADDING, least, place, height, top, others)
     one = (1.0 + height / sure) ** -sure
     chance = -np.expm1(INDEPENDENT * length * np.log1p(-np.minimum(one, 1.0 - 1e-16)))
     turn = 2.0 * np.pi / (PADDING * length)
@@ -72,6 +73,7 @@ def _find_lines(
     ordinates: Array,
     medians: Array,
     hop: int,
+    padding: int,
     least: float,
     place: IndexArray,
     height: Array,
@@ -90,12 +92,12 @@ def _find_lines(
             own, next_ = medians[row, first // hop], medians[row, first // hop + 1]
             for j in range(min(hop, size - first)):
                 floor = own + ramp[j] * (next_ - own)
-                ratio[first + j] = ordinates[row, first + j] / max(floor, SMALLEST_FLOOR)
-        ratio[:PADDING] = 0.0
+                ratio[first + j] = ordinates[row, first + j] / floor
+        ratio[:padding] = 0.0
         best = np.argmax(ratio)
         place[row], height[row], top[row] = best, ratio[best], ordinates[row].max()
         for k in range(others.shape[1]):
-            ratio[max(0, best - LOBES * PADDING + 1) : best + LOBES * PADDING] = 0.0
+            ratio[max(0, best - LOBES * padding + 1) : best + LOBES * padding] = 0.0
             best = np.argmax(ratio)
             if ratio[best] <= least or ordinates[row, best] <= SIDE_LOBE * top[row]:
                 break

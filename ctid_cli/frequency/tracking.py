@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.frequency_kernels import Output
 from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES, series_of
 from ctid_cli.frequency.prefilter import convolve, fast_convolve
 from ctid_cli.signals.checks import require_integer, require_positive
@@ -88,17 +89,6 @@ class FrequencyTrack(ShownAsTable):
     def final(self) -> FrequencyEstimate:
         """The last estimate."""
         return self[-1]
-
-
-class Output(NamedTuple):
-    """Where a kernel puts its rows, one for each sample."""
-
-    #: Frequencies [rad/s], shape (N, n).
-    omega: Array
-    #: What may be wrong with them [rad/s], shape (N, n).
-    uncertainty: Array
-    #: Shape (N,).
-    flags: NDArray[np.uint16]
 
 
 class Recursion(NamedTuple):

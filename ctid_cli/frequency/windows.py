@@ -8,7 +8,8 @@ from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.amplitudes import fit_sinusoids
 from ctid_cli.frequency.esprit import Esprit
-from ctid_cli.frequency.flags import CERTAIN_FRACTION, Flag
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.frequency_kernels import CERTAIN_FRACTION
 from ctid_cli.frequency.tracking import FrequencyEstimate
 
 #: An estimate within this fraction of an expected frequency is probably the one of that tone.

@@ -1,8 +1,13 @@
-"""Asymptotic covariance of an output-error estimate with white residuals."""
+"""Covariance of output-error estimates in white and in coloured noise, and what an ill-conditioned one means."""
+
+import re
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from ctid_cli.arrays import Array
+from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model, fit_residual_noise
+from ctid_cli.text import listed
 
 #: Beyond this condition number the inverse holds no correct digit: NaN says so, a tidy number would not.
 LARGEST_CONDITION = 1e14
@@ -45,3 +50,151 @@ def condition_number(hessian: Array) -> float:
     scale = 1.0 / np.sqrt(diagonal)
     values = np.linalg.eigvalsh(hessian * np.outer(scale, scale))
     return float(values[-1] / values[0]) if values[0] > 0 else float("inf")
+
+
+#: A clock of which 95 % of the intervals are this close to their median counts as regular for the noise.
+NEARLY_REGULAR = 0.05
+
+
+def nearly_regular(times: Array) -> bool:
+    """Whether lags counted in samples are lags in time, up to jitter."""
+    intervals = np.diff(times)
+    middle = float(np.median(intervals))
+    return bool(np.mean(np.abs(intervals - middle) <= NEARLY_REGULAR * middle) >= 0.95)
+
+
+def robust_covariance(psi: Sequence[Array], residuals: Sequence[Array], *, regular: bool) -> tuple[Array, NoiseModel]:
+    r"""Covariance ``M^-1 Sigma M^-1`` of an unweighted output-error estimate under coloured noise, and that noise.
+
+    With noise v independent of the input (open loop) and ``M = sum psi psi'``,
+
+    .. math:: \Sigma = \operatorname{cov} \sum_t \psi_t v_t
+              = \sum_\tau R_v(\tau) \sum_t \psi_{t+\tau} \psi_t'.
+
+    The noise is an autoregression by restricted maximum likelihood (:func:`fit_residual_noise`), common to all
+    experiments.
+
+    *Regular clock*: ``R_v`` is that of this autoregression. White residuals give ``s^2 M^-1``. With missing samples
+    lags count the samples that are left: those of a stationary noise at random places, or around a few long gaps, are
+    nearly stationary again.
+
+    *Irregular clock*: a heteroskedasticity and autocorrelation consistent Sigma of ``psi eps`` in the order of the
+    samples: each column is whitened by an autoregression whose order Akaike's criterion chooses, and the covariance of
+    the whitened columns is divided by the autoregressions' gains, times ``N/(N - p)``. It does not ask the noise to be
+    stationary from sample to sample, at the price of precision: standard errors are more often too large than too
+    small, after steps by up to a half. The autoregression then only tells how much the samples are worth.
+
+    With feedback from the output to the input the noise is not independent of psi, and neither form holds.
+    """
+    size, count = psi[0].shape[1], sum(block.size for block in residuals)
+    found = unit_inverse(sum((block.T @ block for block in psi), np.zeros((size, size)))) if count > size else None
+    if found is None:
+        return np.full((size, size), np.nan), fit_noise_model(residuals, max_order=0)
+    inverse, scale = found
+    scaled = [block * scale for block in psi]
+    noise = fit_residual_noise(scaled, residuals)
+    if regular:
+        sigma = sum((noise.covariance_of(block) for block in scaled), np.zeros((size, size)))
+        return sandwich(inverse, scale, sigma), noise
+    sigma = _long_run_covariance([block * error[:, None] for block, error in zip(scaled, residuals, strict=True)])
+    return sandwich(inverse, scale, sigma, 1.0 - size / count), noise
+
+
+def _long_run_covariance(scores: Sequence[Array]) -> Array:
+    """Covariance of the sum of the rows of independent blocks, an autoregression for every column."""
+    models = [fit_noise_model([block[:, j] for block in scores]) for j in range(scores[0].shape[1])]
+    start = max(model.order for model in models)
+    white = [np.column_stack([m.innovations(block[:, j]) for j, m in enumerate(models)])[start:] for block in scores]
+    used = sum(block.shape[0] for block in white)
+    if used == 0:
+        return np.full((len(models), len(models)), np.nan)
+    gain = np.array([model.coefficients.sum() for model in models])
+    total = sum((block.T @ block for block in white), np.zeros((len(models), len(models))))
+    return np.asarray(total / np.outer(gain, gain) * sum(block.shape[0] for block in scores) / used)
+
+
+#: A coefficient or delay whose standard error exceeds its magnitude by this factor is called undetermined.
+LARGE_STANDARD_ERROR = 10.0
+#: Beyond this (multiple) correlation, estimates are called hard to tell apart.
+CLOSE_TO_ONE = 0.999
+#: Beyond this condition number of the scaled matrix ``sum psi psi'`` half the digits are lost: nearly singular.
+NEARLY_SINGULAR = 1e8
+
+
+def describe_conditioning(
+    covariance: Array, estimates: Array, names: Sequence[str], condition_number: float, hessian: Array
+) -> list[str]:
+    """Sentences on parameters that the data do not determine, none if all is well.
+
+    Three rules. A standard error is not defined, or the condition number exceeds 1e8: the parameters with more than a
+    tenth of the singular direction (unit diagonal) are named. A standard error exceeds ten times the magnitude of a
+    coefficient or of the delay; initial states and offsets may well be zero and are not looked at. Two estimates have
+    a correlation beyond 0.999, or one has such a multiple correlation with several others.
+    """
+    variances = np.diag(covariance)
+    defined = bool(np.isfinite(covariance).all() and (variances > 0).all())
+    sentences: list[str] = []
+    singular = not condition_number <= NEARLY_SINGULAR
+    if singular or not defined:
+        group = [names[i] for i in _singular_direction(hessian)]
+        what = listed(group) if 0 < len(group) < len(names) else "all the parameters together"
+        number = f"condition number {condition_number:.1e}" if np.isfinite(condition_number) else "singular equations"
+        start = f"These data do not determine {what} one by one ({number})"
+        if len(group) == 1:
+            start = f"{what} has no effect that these data show ({number})"
+        end = "their standard errors are not reliable" if defined else "no standard errors can be given"
+        sentences.append(f"{start}; {end}. {_advice(group, names)}")
+    if defined:
+        errors = np.sqrt(variances)
+        sentences += _large_errors(estimates, errors, names)
+        # Of singular equations the correlations would say the same again.
+        sentences += [] if singular else _correlated(covariance / np.outer(errors, errors), names)
+    return sentences
+
+
+def _large_errors(theta: Array, errors: Array, names: Sequence[str]) -> Iterator[str]:
+    for name, value, error in zip(names, theta, errors, strict=True):
+        if re.fullmatch(r"[ab]\d+|delay", name) and error > LARGE_STANDARD_ERROR * abs(value):
+            times = f"{error / abs(value):.2g} times its value" if value else "its value being zero"
+            start = f"{name} = {value:.3g} has a standard error of {error:.3g}, {times}"
+            yield f"{start}: these data do not determine it, not even its sign; a simpler model may do."
+
+
+def _correlated(correlation: Array, names: Sequence[str]) -> Iterator[str]:
+    def told(group: Sequence[int], how: str, combinations: str) -> str:
+        several = [names[i] for i in group]
+        start = f"{listed(several)} can hardly be told apart by these data ({how}): only"
+        return f"{start} {combinations} well determined. {_advice(several, names)}"
+
+    size = len(names)
+    pairs = [(j, i) for i in range(size) for j in range(i) if abs(correlation[i, j]) > CLOSE_TO_ONE]
+    for pair in pairs:
+        yield told(pair, f"correlation {correlation[pair]:.5f}", "a combination of them is")
+    with np.errstate(invalid="ignore", divide="ignore"):
+        multiple = np.sqrt(1.0 - 1.0 / np.diag(np.linalg.inv(correlation)))
+    paired = {index for pair in pairs for index in pair}
+    group = [i for i in range(size) if multiple[i] > CLOSE_TO_ONE and i not in paired]
+    if len(group) > 1:
+        yield told(group, f"multiple correlations above {CLOSE_TO_ONE}", "combinations of them are")
+
+
+def _singular_direction(hessian: Array) -> list[int]:
+    """Parameters with more than a tenth of the direction that changes the output least; none if unknown."""
+    diagonal = np.diag(hessian)
+    if not np.isfinite(hessian).all():
+        return []
+    if (diagonal <= 0).any():
+        return np.flatnonzero(diagonal <= 0).tolist()
+    scale = 1.0 / np.sqrt(diagonal)
+    direction = np.linalg.eigh(hessian * np.outer(scale, scale))[1][:, 0]
+    return np.flatnonzero(np.abs(direction) > 0.1).tolist()
+
+
+def _advice(group: Sequence[str], names: Sequence[str]) -> str:
+    numerator = [name for name in group if re.fullmatch(r"b\d+", name)]
+    zeros = sum(bool(re.fullmatch(r"b\d+", name)) for name in names) - 1
+    if "delay" in group and numerator and zeros > 0:
+        return "A zero and a delay have nearly the same effect here: fix the delay, or use fewer zeros."
+    if "delay" in group and numerator:
+        return "The input hardly shows when the response begins: fix the delay, or use an input with sharper changes."
+    return "Use fewer poles or zeros, or an input that excites the system at more frequencies."

@@ -1,10 +1,51 @@
-"""Criteria for choosing between models fitted to the same samples."""
+"""Fit of a simulated output, and criteria for choosing between models fitted to the same samples."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
+from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
+from ctid_cli.inference.residual_tests import all_white, orthonormal
+
+
+def fit_percent(y: ArrayLike, x: ArrayLike) -> float:
+    """Fit of a simulated output: ``100 (1 - ||y - x|| / ||y - mean y||)``.
+
+    Parameters
+    ----------
+    y : array_like, shape (N,)
+        Measured output; NaN marks a missing sample and is left out.
+    x : array_like, shape (N,)
+        Simulated output.
+
+    Returns
+    -------
+    float
+        Fit [%]: 100 is perfect, 0 no better than the mean; NaN where the measured output is constant.
+
+    Examples
+    --------
+    >>> fit_percent([0.0, 1.0, 2.0], [0.0, 1.0, 2.0])
+    100.0
+    """
+    return percent_from_r_squared(r_squared(y, x))
+
+
+def percent_from_r_squared(r2: float) -> float:
+    """Fit that belongs to a coefficient of determination: ``100 (1 - sqrt(1 - R^2))``."""
+    return 100.0 * (1.0 - float(np.sqrt(max(1.0 - r2, 0.0))))
+
+
+def r_squared(y: ArrayLike, x: ArrayLike) -> float:
+    """Coefficient of determination of a simulated output: ``1 - ||y - x||^2 / ||y - mean y||^2``."""
+    measured = np.asarray(y, dtype=float)
+    error = measured - np.asarray(x, dtype=float)
+    valid = np.isfinite(measured)
+    spread = float(np.sum((measured[valid] - measured[valid].mean()) ** 2)) if valid.any() else 0.0
+    return 1.0 - float(np.sum(error[valid] ** 2)) / spread if spread > 0 else float("nan")
 
 
 @dataclass(frozen=True)
@@ -72,3 +113,62 @@ def young_information_criterion(residuals: Array, output: Array, estimates: Arra
     with np.errstate(divide="ignore", invalid="ignore"):
         normalised = np.mean(variances / estimates**2)
         return float(np.log(np.var(residuals) / output_variance) + np.log(normalised))
+
+
+#: Directions of the sensitivities with less than this share of the greatest singular value are none.
+RANK = 1e-9
+#: Parts of each record that are left out in turn.
+BLOCKS = 10
+#: A block that gives a larger share of what is known of a direction has it for itself.
+OWN = 0.9
+
+
+def shared_noise(residuals: Sequence[Array]) -> NoiseModel:
+    """Noise behind the residuals of the closest fit: white, unless they are seen not to be."""
+    return fit_noise_model(residuals, max_order=0 if all_white(residuals) else None)
+
+
+def squared_innovations(residuals: Sequence[Array], psi: Sequence[Array], noise: NoiseModel) -> float:
+    r"""V of a fit; the first samples of each record, without those before them, are left out.
+
+    Criteria that count parameters take residuals as independent. Coloured noise is made white first, by one
+    autoregressive model for all fits, so that their criteria remain comparable: with c(q) that model and e, psi the
+    residuals and sensitivities of a fit,
+
+    .. math:: V = \min_x \| c(q) (e - \psi x) \|^2
+
+    is the squared innovation of the fit by generalised least squares, one Gauss-Newton step from that by least squares.
+    """
+    order = noise.order
+    errors = np.concatenate([noise.innovations(e)[order:] for e in residuals])
+    left = float(errors @ errors)
+    if order and psi[0].shape[1]:
+        columns = np.concatenate([np.column_stack([noise.innovations(c)[order:] for c in block.T]) for block in psi])
+        along = (columns @ orthonormal(columns, RANK)).T @ errors
+        left -= float(along @ along)
+    return left
+
+
+def innovations_count(residuals: Sequence[Array], noise: NoiseModel) -> int:
+    """Number of samples in V."""
+    return sum(max(e.size - noise.order, 0) for e in residuals)
+
+
+def cross_validated_errors(residuals: Sequence[Array], psi: Sequence[Array]) -> tuple[Array, ...]:
+    """Output errors of each tenth of each record with the parameters of the fit to all the rest, linearised.
+
+    Without block B, ``e_B + Q_B (I - Q_B'Q_B)^-1 Q_B' e_B``, Q an orthonormal basis of the sensitivities. Directions
+    that hardly anything but the block itself determines, such as the state before it, are taken from it.
+    """
+    stacked = np.concatenate(psi)
+    basis = stacked @ orthonormal(stacked, RANK)
+    splits = np.cumsum([e.size for e in residuals])[:-1]
+    found = []
+    for e, q in zip(residuals, np.split(basis, splits), strict=True):
+        parts = []
+        for rows in np.array_split(np.arange(e.size), BLOCKS):
+            own, directions = np.linalg.eigh(q[rows].T @ q[rows])
+            told = q[rows] @ directions[:, own < OWN]
+            parts.append(e[rows] + told @ ((told.T @ e[rows]) / (1.0 - own[own < OWN])))
+        found.append(np.concatenate(parts))
+    return tuple(found)

@@ -1,14 +1,13 @@
 """Poles, time constants, frequencies, damping and gain of estimated models, with their standard errors."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
-from ctid_cli.inference.quantile import normal_quantile
-from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.inference.intervals import UncertainValue, normal_quantile
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import pole_jacobian
 from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
@@ -18,7 +17,6 @@ GAIN_UNIT = "output unit/input unit"
 HELD = "A pole is held at a bound of the admissible models, where the record does not determine it."
 #: A quantity that changes by less than this fraction where a free pole changes by its own size is held [-].
 UNMOVED = 1e-6
-
 #: Standard errors to each side of a quantity with a given gradient by the leading parameters.
 Quantile = Callable[[Array], float]
 
@@ -40,9 +38,9 @@ def derived_parameters(
     from the *other* poles: they are regular where the pair meets on the real axis. What does not change along the
     tangent, the directions in which the coefficients were free, is held and has no standard error.
     """
-    n, poles = model.order, model.poles
+    n = model.order
     rows = _Rows(covariance, quantile, tangent)
-    rows.add_poles(poles, pole_jacobian(model.denominator, poles))
+    rows.add_poles(*pole_slopes(model.denominator, range(n - 1, -1, -1)))
     gradient = np.zeros(covariance.shape[0])
     last = float(model.denominator[-1])
     reason = ""
@@ -84,7 +82,7 @@ def _of_submodel(submodel: Submodel, covariance: Array, quantile: Quantile) -> l
     """All quantities of one submodel; covariance of its own parameters."""
     n = submodel.term().poles
     falling = submodel.denominator
-    poles, jacobian = submodel_poles(submodel)
+    poles, jacobian = pole_slopes(falling, range(1, n + 1))
     rows = _Rows(covariance, quantile)
     rows.add_poles(poles, jacobian, number_lone=False)
     if n == 2 and falling[0] > 0 and not poles.imag.any():
@@ -100,13 +98,12 @@ def _of_submodel(submodel: Submodel, covariance: Array, quantile: Quantile) -> l
     return rows.found
 
 
-def submodel_poles(submodel: Submodel) -> tuple[ComplexArray, ComplexArray]:
-    """Poles of a submodel but its integrators, and their derivatives by a_1 … a_n."""
-    falling = submodel.denominator
-    poles = sorted_roots(falling)
-    # A = a_n times the monic polynomial, whose derivatives run from p^(n-1) down to 1; here they run from p to p^n.
+def pole_slopes(denominator: Array, powers: Sequence[int]) -> tuple[ComplexArray, ComplexArray]:
+    """Poles, and their derivatives ``-p^k/A'(p)`` by the coefficients of these powers."""
+    poles = sorted_roots(denominator)
     with np.errstate(invalid="ignore"):
-        return poles, poles[:, None] * pole_jacobian(falling / falling[0], poles)[:, ::-1] / falling[0]
+        by_constant = pole_jacobian(denominator / denominator[0], poles)[:, -1:] / denominator[0]
+        return poles, by_constant * poles[:, None] ** np.asarray(powers, dtype=int)
 
 
 class _Rows:

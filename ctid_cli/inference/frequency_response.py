@@ -9,18 +9,25 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.spectra import record_spectra
-from ctid_cli.inference.answer import analyse_answer
-from ctid_cli.inference.input_moves import input_moves
-from ctid_cli.inference.local_polynomial import local_polynomial
-from ctid_cli.inference.periodic_response import find_period, from_periods
-from ctid_cli.inference.response_lines import ResponseLines, hold_factor, images
-from ctid_cli.inference.welch_response import welch
+from ctid_cli.inference.input_response import analyse_response
+from ctid_cli.inference.signal_features import input_moves
+from ctid_cli.inference.spectral_methods import (
+    ResponseLines,
+    find_period,
+    from_periods,
+    hold_factor,
+    images,
+    local_polynomial,
+    welch,
+)
 from ctid_cli.signals.checks import require_choice, require_integer
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.regularity import REGULARITY
 from ctid_cli.signals.treatment import ResponseMethod
 
+#: How a response was estimated.
+Estimate = Literal["periodic", "local-polynomial", "welch"]
 #: Up to this share of missing outputs is bridged by straight lines.
 MOST_MISSING = 0.05
 #: A change of the input belongs to a sample that is no further away than this fraction of the interval.
@@ -76,7 +83,7 @@ class FrequencyResponse:
     coherence: Array
     distortion: Array | None
     bias: Array
-    method: Literal["periodic", "local-polynomial", "welch"]
+    method: Estimate
     hold: Hold
     notes: tuple[str, ...]
     told: BoolArray
@@ -278,7 +285,7 @@ def estimate_frequency_response(
     for record in every:
         if input_moves(record).kind == "constant":
             raise DataError(f"{named(record)}the input is constant: it excites no frequency")
-    first, hold = every[0], every[0].input.hold
+    first = every[0]
     odd = next((sentence for record in every if (sentence := _not_on_one_clock(record))), None)
     if odd is not None:
         return _on_any_clock(every, odd, method, points, half_width, time_unit)
@@ -291,8 +298,8 @@ def estimate_frequency_response(
     if len(every) > 1:
         _require_alike(every, period)
     if period is not None and method in ("auto", "periodic"):
-        return _finished(from_periods(signals, period, interval), "periodic", hold, interval, first, time_unit)
-    # A long delay turns the phase fast: the output is advanced to where it begins to answer.
+        return _finished(from_periods(signals, period, interval), "periodic", first, time_unit)
+    # A long delay turns the phase fast: the output is advanced to where it begins to respond.
     u, y = signals[0]
     shift = min(int(_begins(first) / interval), u.size // 2)
     u, y = u[: u.size - shift], y[shift:]
@@ -300,10 +307,9 @@ def estimate_frequency_response(
         inputs, outputs = (np.fft.rfft(x - x.mean())[1 : (x.size + 1) // 2] / x.size for x in (u, y))
         lines = local_polynomial(inputs, outputs, 2 * np.pi / (u.size * interval), points, half_width, time_unit)
         if lines.frequencies.size >= FEWEST or method == "local-polynomial":
-            return _finished(_later(lines, shift * interval), "local-polynomial", hold, interval, first, time_unit)
-    return _finished(
-        _later(welch(u, y, interval, segment, time_unit), shift * interval), "welch", hold, interval, first, time_unit
-    )
+            return _finished(_delayed(lines, shift * interval), "local-polynomial", first, time_unit)
+    lines = welch(u, y, interval, segment, time_unit)
+    return _finished(_delayed(lines, shift * interval), "welch", first, time_unit)
 
 
 def _on_any_clock(
@@ -320,7 +326,7 @@ def _on_any_clock(
     late = min(_begins(record), 0.5 * record.duration)
     spectra = record_spectra(record, late, np.inf, late, keep_mean=False)
     base = 2 * np.pi / spectra.duration
-    found = _later(local_polynomial(spectra.inputs(late), spectra.outputs, base, points, half_width, time_unit), late)
+    found = _delayed(local_polynomial(spectra.inputs(late), spectra.outputs, base, points, half_width, time_unit), late)
     note = (
         f"Since {reason}, the spectrum of the output is that of straight lines between its samples, corrected for what "
         f"they damp; towards {np.pi / float(np.median(np.diff(record.t))):.3g} rad/{time_unit} that is rough."
@@ -334,12 +340,12 @@ def _on_any_clock(
 
 
 def _begins(record: Record) -> float:
-    """Time before which the output does not answer [s]."""
-    hint = analyse_answer(record).delay
+    """Time before which the output does not respond [s]."""
+    hint = analyse_response(record).delay
     return hint.early if hint is not None else 0.0
 
 
-def _later(lines: ResponseLines, delay: float) -> ResponseLines:
+def _delayed(lines: ResponseLines, delay: float) -> ResponseLines:
     return lines._replace(response=lines.response * np.exp(-1j * lines.frequencies * delay))
 
 
@@ -351,16 +357,10 @@ def _require_some(lines: ResponseLines, record: Record) -> None:
         )
 
 
-def _finished(
-    lines: ResponseLines,
-    method: Literal["periodic", "local-polynomial", "welch"],
-    hold: Hold,
-    interval: float,
-    record: Record,
-    time_unit: str,
-) -> FrequencyResponse:
+def _finished(lines: ResponseLines, method: Estimate, record: Record, time_unit: str) -> FrequencyResponse:
     """The response to the input as it was between its samples."""
     _require_some(lines, record)
+    hold, interval = record.input.hold, float(record.interval or 0.0)
     factor = hold_factor(hold, lines.frequencies, interval)
     power = np.abs(factor) ** 2
     distortion = None if lines.distortion is None else lines.distortion / power

@@ -1,13 +1,56 @@
-"""Autoregressive model of stationary output noise, from residuals on a regular clock."""
+r"""Autoregressive models of stationary output noise, from residuals on a regular clock: Yule and Walker's, and REML.
 
-from collections.abc import Sequence
+Yule and Walker's equations take residuals as the noise itself. A fit takes from the residuals whatever its
+sensitivities explain. On a short record of slow noise that is much of the noise's power at low frequency, and the
+autocovariances of the residuals are too small. REML maximises the likelihood of what is left, whatever the parameters
+[1]_: with V the covariance matrix of the noise over its innovation variance,
+
+.. math:: \min\; (N - p) \ln s^2 + \ln|V| + \ln|\Psi'V^{-1}\Psi|,\qquad
+          s^2 = \min_x (e - \Psi x)' V^{-1} (e - \Psi x) / (N - p).
+
+References
+----------
+.. [1] H. D. Patterson and R. Thompson, "Recovery of inter-block information when block sizes are unequal",
+   *Biometrika* 58 (1971) 545-554. doi:10.1093/biomet/58.3.545
+"""
+
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numba import njit
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.beside import Rows, row_blocks
+
+#: Orders up to this are tried in turn, until the criterion has risen so often.
+ORDERS, RISES = 8, 3
+#: Greatest partial correlation.
+INSIDE = 0.9999
+#: Fisher's steps end where they promise less than this of the criterion, or after so many.
+PROMISE, STEPS = 1e-10, 60
+#: Residuals of which the sensitivities leave less than this fraction are rounding.
+NO_NOISE = 1e-12
+#: The greatest order is that of the samples over this, and half of the shortest experiment.
+SAMPLES_PER_ORDER = 10
+#: Rows of a block: a few dozen columns of them stay in the processor's cache.
+ROWS = 4096
+
+
+class Rows(Protocol):
+    """Columns that are made, or looked up, a block of rows at a time."""
+
+    def __len__(self) -> int:
+        """Number of rows."""
+
+    def __getitem__(self, rows: slice, /) -> Array:
+        """Some rows, shape (count, columns)."""
+
+
+def row_blocks(count: int) -> Iterator[slice]:
+    """Slices that cover so many rows."""
+    return (slice(first, min(first + ROWS, count)) for first in range(0, count, ROWS))
+
 
 #: Share of the energy of a noise that is rounding.
 ROUNDING = 1e-17
@@ -119,3 +162,151 @@ def fit_noise_model(blocks: Sequence[Array], max_order: int | None = None) -> No
         if criterion < best_criterion:
             best, best_criterion = NoiseModel(coefficients, covariances[: order + 1], variance), criterion
     return best
+
+
+class _Likelihood(NamedTuple):
+    """The criterion at one model, with what Fisher's scoring needs, and the innovation variance."""
+
+    criterion: float
+    #: By the partial correlations, shape (r,), and the expected second derivatives, shape (r, r).
+    gradient: Array
+    information: Array
+    variance: float
+
+
+def levinson(partial: Array) -> tuple[Array, Array, Array]:
+    """Coefficients ``(1, c_1 ... c_r)``, their slopes by the partial correlations, and autocovariances over s^2.
+
+    Shapes (r + 1,), (r, r + 1) and (r + 1,).
+    """
+    r = partial.size
+    c, slopes, covariances = np.eye(1, r + 1)[0], np.zeros((r, r + 1)), np.zeros(r + 1)
+    covariances[0] = variance = 1.0 / np.prod(1.0 - partial**2)
+    for k, value in enumerate(partial):
+        # The model of order k predicts the next autocovariance, but for the partial correlation.
+        covariances[k + 1] = -value * variance - c[1 : k + 1] @ covariances[k:0:-1]
+        variance *= 1.0 - value * value
+        # c of order k + 1 is c of order k plus the partial correlation times the same backwards; so are its slopes.
+        backwards = c[k + 1 :: -1].copy()
+        slopes[:k, : k + 2] += value * slopes[:k, k + 1 :: -1]
+        slopes[k, : k + 2] = backwards
+        c[: k + 2] += value * backwards
+    return c, slopes, covariances
+
+
+def restricted_likelihood(products: Array, count: int, blocks: int, partial: Array) -> _Likelihood:
+    """The criterion from products of the columns (Q, e) at pairs of lags, shape (lags, lags, p + 1, p + 1).
+
+    ``v'V^-1 v = sum_ij c_i c_j D_ij`` with ``D_ij = sum_t v(t + i) v(t + j)`` over ``0 <= t < n - i - j``: exactly, the
+    first samples included (Box and Jenkins, *Time Series Analysis*, appendix A7.4).
+    """
+    p, r = products.shape[2] - 1, partial.size
+    left = count - p
+    c, slopes, covariances = levinson(partial)
+    products = products[: r + 1, : r + 1]
+    # Cholesky's factor of (Q, e)' V^-1 (Q, e): its last diagonal entry is what the sensitivities do not explain.
+    factor = np.linalg.cholesky(np.tensordot(np.outer(c, c), products))
+    squared = factor[p, p] ** 2
+    # d criterion = sum W d(gram): with L the factor, its inverse's last row is the residual's combination.
+    inverse = np.linalg.inv(factor)
+    weight = inverse[:p].T @ inverse[:p] + left * np.outer(inverse[p], inverse[p])
+    gradient = slopes @ (2.0 * np.tensordot(products, weight) @ c)
+    # |V| = prod (1 - partial_k^2)^-k for each experiment.
+    orders, one = np.arange(1, r + 1), 1.0 - partial**2
+    criterion = left * np.log(squared / left) + 2.0 * np.log(np.diag(factor)[:p]).sum()
+    criterion -= blocks * (orders @ np.log(one))
+    gradient += 2.0 * blocks * orders * partial / one
+    # The coefficients have the information of a regression on the samples before, N R(i - j) / s^2, twice in -2 ln L.
+    toeplitz = 2.0 * left * covariances[np.abs(np.subtract.outer(orders, orders))]
+    steps = slopes[:, 1:]
+    return _Likelihood(float(criterion), gradient, steps @ toeplitz @ steps.T, float(squared / left))
+
+
+def fit_residual_noise(psi: Sequence[Array], residuals: Sequence[Array]) -> NoiseModel:
+    """REML model of the noise behind the residuals of a fit with sensitivities psi, of full rank.
+
+    The order is that of the least AICc among those up to 8, until it has risen three times, and the one that Akaike's
+    criterion chooses for the Yule-Walker model: the noise may have a memory much longer than its first lags show.
+    """
+    stacked, errors = np.concatenate(psi), np.concatenate(residuals)
+    orthonormal = np.linalg.qr(stacked / np.linalg.norm(stacked, axis=0))[0]
+    # What the sensitivities explain tells nothing; away from an optimum it may be most.
+    left = errors - orthonormal @ (orthonormal.T @ errors)
+    power = float(left @ left)
+    if not power > NO_NOISE**2 * float(errors @ errors):
+        return fit_noise_model(residuals, max_order=0)
+    columns = np.column_stack((orthonormal, left / np.sqrt(power)))
+    blocks = np.split(columns, np.cumsum([len(block) for block in psi])[:-1])
+    most = min(len(errors) // SAMPLES_PER_ORDER, min(len(block) for block in blocks) // 2)
+    guess = _partial(fit_noise_model([block[:, -1] for block in blocks]).coefficients)[:most]
+    products = _products(blocks, min(most, max(ORDERS, guess.size)))
+    (count, size), number = columns.shape, len(blocks)
+
+    def at(partial: Array) -> _Likelihood:
+        try:
+            likelihood: _Likelihood = restricted_likelihood(products, count, number, partial)
+        except np.linalg.LinAlgError:
+            # Residuals without noise, which so slow a model would explain altogether.
+            r = partial.size
+            return _Likelihood(np.inf, np.zeros(r), np.eye(r), np.nan)
+        return likelihood
+
+    def penalised(partial: Array) -> float:
+        k = partial.size + 1
+        return float(at(partial).criterion + 2 * k + 2 * k * (k + 1) / max(count - size - k, 1))
+
+    best = partial = np.zeros(0)
+    least, rises = penalised(best), 0
+    for _ in range(min(most, ORDERS)):
+        partial = _scored(at, np.append(partial, 0.0))
+        value = penalised(partial)
+        best, least, rises = (partial, value, 0) if value < least else (best, least, rises + 1)
+        if rises == RISES:
+            break
+    if guess.size > ORDERS and penalised(far := _scored(at, guess)) < least:
+        best = far
+    c, _, covariances = levinson(best)
+    variance = at(best).variance * power
+    return NoiseModel(c, covariances * variance, variance)
+
+
+def _scored(at: Callable[[Array], _Likelihood], start: Array) -> Array:
+    """Partial correlations of the least criterion nearby, by Fisher's scoring in their inverse hyperbolic tangents."""
+    z = np.arctanh(np.clip(start, -INSIDE, INSIDE))
+    here = at(np.tanh(z))
+    for _ in range(STEPS):
+        slope = 1.0 - np.tanh(z) ** 2
+        gradient = slope * here.gradient
+        step = -np.linalg.solve(here.information * np.outer(slope, slope), gradient)
+        promise = -float(step @ gradient)
+        step /= max(1.0, float(np.abs(step).max()))
+        while promise > PROMISE:
+            moved = np.clip(z + step, -np.arctanh(INSIDE), np.arctanh(INSIDE))
+            there = at(np.tanh(moved))
+            if there.criterion < here.criterion:
+                break
+            step, promise = 0.5 * step, 0.5 * promise
+        else:
+            break
+        z, here = moved, there
+    return np.asarray(np.tanh(z))
+
+
+def _products(blocks: Sequence[Array], order: int) -> Array:
+    """D of all pairs of lags."""
+    size = blocks[0].shape[1]
+    products = np.zeros((order + 1, order + 1, size, size))
+    for i in range(order + 1):
+        for j in range(i + 1):
+            products[i, j] = sum(block[i : len(block) - j].T @ block[j : len(block) - i] for block in blocks)
+            products[j, i] = products[i, j].T
+    return products
+
+
+def _partial(coefficients: Array) -> Array:
+    """Partial correlations of given coefficients: Levinson's recursion backwards."""
+    c, found = coefficients, []
+    while c.size > 1:
+        found.append(float(c[-1]))
+        c = ((c - c[-1] * c[::-1]) / (1.0 - c[-1] ** 2))[:-1]
+    return np.array(found[::-1])

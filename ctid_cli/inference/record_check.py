@@ -7,13 +7,13 @@ from typing import Any, Literal
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.answer import Answer, DelayHint, analyse_answer, regular_grid
-from ctid_cli.inference.faults import outliers, quantum, saturated
-from ctid_cli.inference.input_moves import InputMoves, input_moves
+from ctid_cli.inference.input_response import DelayHint, InputResponse, analyse_response, regular_grid
+from ctid_cli.inference.signal_features import InputMoves, input_moves, outliers, quantum, saturated
 from ctid_cli.signals.record import Record
 
 Level = Literal["ok", "note", "warning", "problem"]
-
+#: Whether the output moves before it can respond to what happens in the record.
+Start = Literal["flat", "moving", "unknown"]
 #: From the best to the worst.
 LEVELS: tuple[Level, ...] = ("ok", "note", "warning", "problem")
 #: An interval longer than this many median intervals is a gap.
@@ -101,14 +101,14 @@ class RecordReport:
     explained: float
     #: The same as a signal-to-noise ratio [dB].
     snr_db: float
-    #: Frequency below which 95 % of the answer to the input lies [rad/s].
+    #: Frequency below which 95 % of the response to the input lies [rad/s].
     output_bandwidth: float
-    #: Highest frequency at which the answer is seen [rad/s].
+    #: Highest frequency at which the response is seen [rad/s].
     visible_up_to: float
-    #: The output begins to answer between these times after a change of the input [s].
+    #: The output begins to respond between these times after a change of the input [s].
     delay_early: float
     delay_late: float
-    starts: Literal["flat", "moving", "unknown"]
+    starts: Start
     #: Range to search for the delay [s].
     suggested_delay: tuple[float, float] | None
     suggested_offset: Literal["none", "remove", "estimate"]
@@ -130,14 +130,14 @@ class Examined:
 
     record: Record
     moves: InputMoves
-    answer: Answer
+    answer: InputResponse
     report: RecordReport
 
 
 def examine(record: Record) -> Examined:
     """Numbers of a record; an input that excites fewer than four parameters shows no delay."""
     moves = input_moves(record)
-    answer = analyse_answer(record, moves)
+    answer = analyse_response(record, moves)
     order = _excitation_order(record, moves, answer)
     if order < ENOUGH_ORDER and moves.kind != "steps":
         # A sine that comes later and one that is filtered look the same.
@@ -201,7 +201,7 @@ def _range(signal: str, x: Array) -> dict[str, Any]:
     return {f"{signal}_{name}": float(value) for name, value in values.items()}
 
 
-def _excitation_order(record: Record, moves: InputMoves, answer: Answer) -> int:
+def _excitation_order(record: Record, moves: InputMoves, answer: InputResponse) -> int:
     """Rank of the autocovariance of the input, at most 50; directions 40 dB below the strongest do not count."""
     grid = regular_grid(record)
     u = record.input.at(record.t[0] + grid.interval * (np.arange(grid.u.size) + 1e-6))
@@ -239,8 +239,10 @@ def _trend(t: Array, y: Array) -> tuple[float, float, float]:
     return slope, math.sqrt(inflated / float(time @ time)), math.sqrt(inflated / y.size)
 
 
-def _start(record: Record, answer: Answer, deviation: float, explained: float) -> Literal["flat", "moving", "unknown"]:
-    """Whether the output moves before it can answer to what happens in the record."""
+def _start(
+    record: Record, answer: InputResponse, deviation: float, explained: float
+) -> Literal["flat", "moving", "unknown"]:
+    """Whether the output moves before it can respond to what happens in the record."""
     t, y = record.t[record.valid], record.y[record.valid]
     if answer.delay is None or deviation == 0.0 or not (explained > 0 or math.isnan(answer.explained)):
         return "unknown"

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.errors import BiasedError, DataError, UsageError
-from ctid_cli.inference.quantile import normal_quantile
+from ctid_cli.inference.intervals import normal_quantile
 from ctid_cli.reporting.expected_accuracy import expected_accuracy
 from ctid_cli.reporting.layout import Report, Table, count, number
 from ctid_cli.reporting.results import Results

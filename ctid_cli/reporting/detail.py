@@ -8,7 +8,7 @@ from typing import Any
 
 from ctid_cli.canonical import plain
 from ctid_cli.errors import MismatchError
-from ctid_cli.inference.uncertain_value import BIASED, NORMAL, UncertainValue
+from ctid_cli.inference.intervals import BIASED, NORMAL, UncertainValue
 from ctid_cli.kinds import KINDS
 from ctid_cli.reporting.estimate import as_object, parameter_object, parameter_table, parameters
 from ctid_cli.reporting.layout import Table, delay_label, number, seconds

@@ -7,7 +7,7 @@ from math import nan
 from typing import Any
 
 from ctid_cli.canonical import plain
-from ctid_cli.inference.uncertain_value import NORMAL, UncertainValue
+from ctid_cli.inference.intervals import NORMAL, UncertainValue
 from ctid_cli.reporting.layout import Table, number
 from ctid_cli.signals.sampled_signal import SECONDS
 

@@ -2,18 +2,21 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ctid_cli.arrays import Array
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import BiasedError, DataError
-from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.inference.accuracy import ParameterAccuracy
-from ctid_cli.inference.asymptotic import limiting_accuracy, output_variance, require_uncorrelated_input
-from ctid_cli.inference.finite_record import finite_record_covariance, sensitivities
+from ctid_cli.inference.bounds import (
+    EstimatedForm,
+    ExpectedAccuracy,
+    Instruments,
+    accuracy_of_long_records,
+    accuracy_of_records,
+    require_uncorrelated_input,
+)
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import factored, unfactored
@@ -21,7 +24,6 @@ from ctid_cli.models.relay import Relay
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.running.cells import Plan
 from ctid_cli.signals.excitation import Gaussian
-from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.noise import Noise
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.send_on_delta import SendOnDelta
@@ -36,25 +38,6 @@ MOST_SETS, SET_SAMPLES = 10, 20_000
 SAME_DELAY = 1e-6
 #: A coefficient of partial fractions below this fraction of the others, or of its standard error, is zero in truth.
 ROUNDING = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class ExpectedAccuracy:
-    """What theory says of one estimator on one kind of data."""
-
-    parameters: ParameterAccuracy
-    limit: bool
-    formula: str
-
-
-@dataclass(frozen=True, eq=False)
-class _Estimated:
-    """The true system in the form in which an estimator has it."""
-
-    model: AdditiveModel | TransferFunction
-    zeros: int | None
-    delay_from: float | None  # samples before this time [s] are not used; None where the delay is known
-    instruments: str
 
 
 def expected_accuracy(
@@ -91,7 +74,7 @@ def why_biased(source: SimulatedSource, estimator: Any) -> str:
     return ""
 
 
-def _unbiased(source: SimulatedSource, estimator: Any) -> _Estimated:
+def _unbiased(source: SimulatedSource, estimator: Any) -> EstimatedForm:
     """The system as the estimator has it, or why it is biased."""
     system, loop, sampling, noise = source.system, source.loop, source.sampling, source.noise
     if isinstance(system, OwnSystem) or isinstance(estimator, OwnEstimation) or isinstance(noise, OwnNoise):
@@ -104,7 +87,7 @@ def _unbiased(source: SimulatedSource, estimator: Any) -> _Estimated:
     return estimated
 
 
-def _estimated(system: AdditiveModel | TransferFunction, estimator: Any) -> _Estimated:
+def _estimated(system: AdditiveModel | TransferFunction, estimator: Any) -> EstimatedForm:
     """The system as the estimator has it, or why it cannot hold the system."""
     if estimator.kind == "svf":
         raise BiasedError("svf is least squares, the start of other estimators")
@@ -115,9 +98,9 @@ def _estimated(system: AdditiveModel | TransferFunction, estimator: Any) -> _Est
         sought = f"sought from {low:g} to {high:g} s" if bounds else f"taken as {low:g} s"
         raise BiasedError(f"the delay is {sought} and the true one is {system.delay:g} s")
     delay_from = high if low < high else None
-    instruments = getattr(estimator, "instruments", "open_loop")
+    instruments: Instruments = getattr(estimator, "instruments", "open_loop")
     if hasattr(estimator, "terms"):
-        return _Estimated(_in_terms(system, estimator.terms), None, delay_from, instruments)
+        return EstimatedForm(_in_terms(system, estimator.terms), None, delay_from, instruments)
     if estimator.zeros >= estimator.poles:
         raise DataError("the model has as many zeros as poles, and theory is given here for fewer zeros only")
     fraction = unfactored(system) if isinstance(system, AdditiveModel) else system
@@ -127,7 +110,7 @@ def _estimated(system: AdditiveModel | TransferFunction, estimator: Any) -> _Est
         raise BiasedError(f"the model has {has}: it cannot hold the system")
     if estimator.poles > fraction.order:
         raise DataError(f"the model has {has}: no data determine the poles in excess")
-    return _Estimated(fraction, estimator.zeros, delay_from, instruments)
+    return EstimatedForm(fraction, estimator.zeros, delay_from, instruments)
 
 
 def _in_terms(system: AdditiveModel | TransferFunction, terms: tuple[Term, ...]) -> AdditiveModel:
@@ -166,7 +149,7 @@ def _without_rounding(submodel: Submodel) -> Submodel:
     return Submodel(numerator, submodel.denominator, submodel.integrators)
 
 
-def _why_no_limit(source: SimulatedSource, estimated: _Estimated) -> str:
+def _why_no_limit(source: SimulatedSource, estimated: EstimatedForm) -> str:
     """Why the limit for long records is not taken, in a clause; empty where it is."""
     sampling, (name, signal) = source.sampling, _driving(source)
     if estimated.delay_from is not None:
@@ -189,73 +172,17 @@ def _driving(source: SimulatedSource) -> tuple[str, Any]:
     return ("input", source.excitation) if source.loop is None else ("reference", source.loop.reference)
 
 
-def _of_long_records(source: Any, estimated: _Estimated) -> ExpectedAccuracy:
-    sampling, noise, loop, (name, signal) = source.sampling, source.noise, source.loop, _driving(source)
-    options: dict[str, Any] = {}
-    if loop is None:
-        # A level relative to the output counts from its mean square.
-        power = output_variance(estimated.model, sampling.interval, signal.standard_deviation)
-        variance = noise.innovation_variance_of(np.sqrt([power]))
-    else:
-        variance = noise.innovation_variance_of()
-        options = {"controller": loop.controller, "enters": loop.enters, "instruments": estimated.instruments}
-    parameters = limiting_accuracy(
-        estimated.model,
-        sampling.interval,
-        standard_deviation=signal.standard_deviation,
-        innovation_variance=variance,
-        noise_filter=noise.filter,
-        samples=sampling.samples,
-        zeros=estimated.zeros,
-        **options,
-    )
-    product, matrices = "sigma^2 M^-1", "M = E psi psi'"
-    if noise.coloured:
-        product = "M^-1 Sigma M^-1"
-        matrices += ", Sigma = sigma_e^2 cov(H psi), H the filter and sigma_e^2 the innovation variance of the noise"
-    formula = f"the limit for long records, {product} / N with {matrices}, psi {_sensitivities(source, estimated)}; "
-    formula += f"by discrete Lyapunov equations, as the {name} is white Gaussian noise"
-    return ExpectedAccuracy(parameters, True, formula)
+def _of_long_records(source: Any, estimated: EstimatedForm) -> ExpectedAccuracy:
+    clock, loop, (_, signal) = source.sampling, source.loop, _driving(source)
+    options = {} if loop is None else {"controller": loop.controller, "enters": loop.enters}
+    deviation = signal.standard_deviation
+    return accuracy_of_long_records(estimated, clock.interval, clock.samples, source.noise, deviation, **options)
 
 
-def _of_records(source: Any, estimated: _Estimated, why: str) -> ExpectedAccuracy:
+def _of_records(source: Any, estimated: EstimatedForm, why_no_limit: str) -> ExpectedAccuracy:
     sets = max(1, min(MOST_SETS, SET_SAMPLES // source.sampling.samples))
-    covariance = np.mean([_record_covariance(source, estimated, replicate) for replicate in range(sets)], axis=0)
-    if not np.isfinite(covariance).all():
-        raise DataError("the data would not determine the parameters, even without noise")
-    parameters = ParameterAccuracy.of(estimated.model, covariance, estimated.zeros, estimated.delay_from is not None)
-    # Instruments other than the input itself are not the best there are, nor is least squares where there are outliers.
-    best = estimated.instruments == "open_loop" and source.noise.gaussian
-    start = f"{'the Cramér-Rao bound ' if best else ''}sigma^2 (psi' psi)^-1"
-    if source.noise.coloured:
-        start = "(psi' psi)^-1 psi' R psi (psi' psi)^-1, R the covariance matrix of the noise"
-    where = "in the first data set" if sets == 1 else f"averaged over the first {sets} data sets"
-    formula = f"{start}, psi {_sensitivities(source, estimated)}, {where}, as {why}"
-    return ExpectedAccuracy(parameters, False, formula)
-
-
-def _record_covariance(source: Any, estimated: _Estimated, replicate: int) -> Array:
-    """Covariance of an estimate from one data set; NaN where it does not determine the parameters."""
-    record = source.dataset(replicate).record
-    signal = record.input
-    if estimated.instruments == "closed_loop":
-        reference, controller, enters = record.loop.reference, source.loop.controller, source.loop.enters
-        loop = simulate_loop(source.system, controller, reference, 0.0, record.interval, enters)
-        signal = HeldSignal(record.t, loop.u)
-    sought = estimated.delay_from is not None
-    psi = sensitivities(estimated.model, signal, record.t, estimated.zeros, estimate_delay=sought)
-    # Nothing is learnt from outputs that are missing; the others keep their distances.
-    psi = psi * record.valid[:, None]
-    if estimated.delay_from is not None:
-        psi = psi[record.t >= record.input.t[0] + estimated.delay_from]
-    lags = np.arange(psi.shape[0] if source.noise.coloured else 1)
-    return finite_record_covariance(psi, source.noise.autocovariance(lags, record.noise_free))
-
-
-def _sensitivities(source: SimulatedSource, estimated: _Estimated) -> str:
-    """What psi are, in words."""
-    where = "noise-free loop" if estimated.instruments == "closed_loop" else "loop, noise included"
-    return "the sensitivities of the output to the parameters" + ("" if source.loop is None else f" in the {where}")
+    records = [source.dataset(replicate).record for replicate in range(sets)]
+    return accuracy_of_records(estimated, source.system, records, source.noise, why_no_limit)
 
 
 def long_record_variances(plan: Plan) -> dict[tuple[int, int], dict[str, float]]:

@@ -8,8 +8,8 @@ import numpy as np
 
 from ctid_cli.arrays import ComplexArray
 from ctid_cli.estimators.identification import DelayCosts, Identification, Validation
-from ctid_cli.inference.bands import FrequencyBand, PoleBand, ResponseBand
 from ctid_cli.inference.frequency_response import FrequencyResponse
+from ctid_cli.inference.model_responses import FrequencyBand, PoleBand, ResponseBand
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.figures.style import BAND, DARK, MARK, MIDDLE, Drawing, plain
 from ctid_cli.reporting.frf_plot import decibels, draw_points, name_axes

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.hold_comparison import MOST, best_other_hold
-from ctid_cli.inference.input_moves import input_moves
 from ctid_cli.inference.record_check import RecordReport
+from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.reporting.layout import count
 from ctid_cli.reporting.order_proposal import proposed_delay
 from ctid_cli.signals.record import Record, beginning

@@ -13,8 +13,8 @@ from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.identification import Identification, Validation
 from ctid_cli.estimators.judging import Options
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, SubmodelsFit
-from ctid_cli.inference.status import Status
-from ctid_cli.inference.uncertain_value import BIASED, UncertainValue
+from ctid_cli.inference.fit import Status
+from ctid_cli.inference.intervals import BIASED, UncertainValue
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
 from ctid_cli.reporting.layout import Report, Table, count, number, picked

@@ -7,8 +7,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimators.delay_profile import MeasuredFit
-from ctid_cli.inference.diagnostics import percent_from_r_squared
-from ctid_cli.inference.loss import Weighting
+from ctid_cli.inference.criteria import percent_from_r_squared
+from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.layout import count, number
 from ctid_cli.signals.record import Record

@@ -19,8 +19,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
+from ctid_cli.inference.fit import Status
 from ctid_cli.inference.monte_carlo import MEASURES, Measure, Measured, requested
-from ctid_cli.inference.status import Status
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.model_measures import distance_of, distances, pole_estimates, system_of
 from ctid_cli.reporting.parameter_errors import ParameterEstimates, estimates_by_group, least_variances

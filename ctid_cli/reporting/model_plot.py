@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctid_cli.estimators.model_comparison import ModelOnRecord
-from ctid_cli.inference.bands import FrequencyBand, ResponseBand
 from ctid_cli.inference.frequency_response import FrequencyResponse
+from ctid_cli.inference.model_responses import FrequencyBand, ResponseBand
 from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, outline, plain
 from ctid_cli.reporting.fit_drawings import draw_bode, draw_response
 from ctid_cli.reporting.frf_plot import decibels, draw_points, name_axes

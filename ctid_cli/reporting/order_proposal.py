@@ -8,8 +8,8 @@ import numpy as np
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.optimum.pilot import liveliest
 from ctid_cli.estimators.order_search import recommend_order
-from ctid_cli.inference.answer_test import AnswerTest
 from ctid_cli.inference.record_check import RecordReport
+from ctid_cli.inference.response_test import AnswerTest
 from ctid_cli.reporting.order_report import spelled
 from ctid_cli.reporting.record_findings import check_record_quality
 from ctid_cli.signals.held import HeldSignal

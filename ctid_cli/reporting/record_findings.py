@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctid_cli.inference import record_check
-from ctid_cli.inference.answer_test import AnswerTest, answer_test
 from ctid_cli.inference.record_check import Examined, Finding, Level, RecordReport
+from ctid_cli.inference.response_test import AnswerTest, response_test
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from ctid_cli.text import listed
@@ -38,7 +38,7 @@ def check_record_quality(
     # Where the record begins, the system is taken to be in equilibrium.
     signal = record.input
     moved = HeldSignal(signal.t, signal.values - signal.at(record.t[:1]), signal.hold)
-    test = answer_test([replace(record, input=moved)], [record.valid], (low, high))
+    test = response_test([replace(record, input=moved)], [record.valid], (low, high))
     findings = _Words(found, found.report, test, time_unit, input_unit, output_unit).findings()
     worst_first = sorted(findings, key=lambda finding: -record_check.LEVELS.index(finding.level))
     return replace(found.report, answer_p_value=test.p_value, findings=tuple(worst_first))

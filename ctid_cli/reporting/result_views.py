@@ -13,7 +13,7 @@ from ctid_cli.frequency.synchrophasor import SynchrophasorTrack
 from ctid_cli.frequency.synchrophasor_check import SynchrophasorCheck
 from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.inference.intervals import UncertainValue
 from ctid_cli.reporting import identification_plot, track_plot
 from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
 from ctid_cli.reporting.figures.style import Picture, require_kind

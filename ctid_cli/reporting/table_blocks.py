@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from ctid_cli.inference.uncertain_value import UncertainValue
+from ctid_cli.inference.intervals import UncertainValue
 from ctid_cli.reporting.estimate import parameters
 from ctid_cli.reporting.layout import Table, delay_label, number, percent, seconds, with_error
 from ctid_cli.reporting.percentages import Row, measures_of, pooled_rows, settings_of, time_of

@@ -417,13 +417,19 @@ def _check_first_records(todo: Todo) -> None:
 
 def _compile_kernels(plan: Plan) -> float:
     from ctid_cli.estimation.compilation import compile_kernels
+    from ctid_cli.signals.sampling import RegularSampling
     from ctid_cli.simulation.frequency_runs import FrequencyEstimation, SignalSource
     from ctid_cli.simulation.own_components import OwnEstimation
 
     source = plan.data_cells[0].source
     if not isinstance(source, SignalSource):
-        ours = (cell.estimator for cell in plan.estimators if not isinstance(cell.estimator, OwnEstimation))
-        return compile_kernels(ours)
+        ours = [cell.estimator for cell in plan.estimators if not isinstance(cell.estimator, OwnEstimation)]
+        clocks = [
+            (getattr(cell.source, "sampling", None), getattr(cell.source, "loop", None)) for cell in plan.data_cells
+        ]
+        # A clock that is not known before the data are read is taken as regular.
+        kinds = {(isinstance(clock, RegularSampling | None), loop is not None) for clock, loop in clocks}
+        return sum(compile_kernels(ours, regular=regular, closed=closed) for regular, closed in sorted(kinds))
     begun = time.perf_counter()
     for cell in plan.estimators:
         if isinstance(cell.estimator, FrequencyEstimation):

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ctid_cli.errors import DataError
-from ctid_cli.inference.quantile import normal_quantile
+from ctid_cli.inference.intervals import normal_quantile
 from ctid_cli.models.additive import Term
 from ctid_cli.models.factoring import factored, factored_jacobian
 

@@ -271,7 +271,7 @@ def _simulated(system: TransferFunction | AdditiveModel | OwnSystem, applied: He
 
 def _fit_percent(model: Any, record: Record | None, output: str) -> float | None:
     """Fit of a model to an output of a record [%], where there are all three."""
-    from ctid_cli.inference.diagnostics import fit_percent
+    from ctid_cli.inference.criteria import fit_percent
 
     wanted: Array | None = getattr(record, output, None)
     if model is None or record is None or wanted is None:

@@ -15,9 +15,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.inference.diagnostics import fit_percent
-from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.criteria import fit_percent
+from ctid_cli.inference.fit import Fit, Status
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.own_code import reason
 from ctid_cli.signals.excitation import Excitation

@@ -14,8 +14,7 @@ from pydantic_core import ErrorDetails
 
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import Problem, UsageError
-from ctid_cli.inference.monte_carlo import requested
-from ctid_cli.inference.precision import AT_LEAST, block_ends
+from ctid_cli.inference.monte_carlo import AT_LEAST, block_ends, requested
 from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.signals.recorder import Recorder
 from ctid_cli.simulation.dataset import MeasuredSource, located

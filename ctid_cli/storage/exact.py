@@ -14,7 +14,7 @@ from typing import Any, Literal, NoReturn, Union, get_args, get_origin, get_type
 import numpy as np
 
 from ctid_cli.errors import DataError
-from ctid_cli.inference.later import FilledLater
+from ctid_cli.inference.fit import DeferredFields
 
 #: Numbers that JSON does not have.
 _NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
@@ -96,7 +96,7 @@ def _instance(content: Any, kind: type, place: str) -> Any:
     if not isinstance(content, Mapping) or set(content) != {"type", *hints} or content["type"] != kind.__name__:
         _refuse(place)
     values = {name: decoded(content[name], hint, f"{place}.{name}") for name, hint in hints.items()}
-    late = dict.fromkeys(kind.later, ()) if issubclass(kind, FilledLater) else {}
+    late = dict.fromkeys(kind.deferred, ()) if issubclass(kind, DeferredFields) else {}
     return kind(**values, **late)
 
 
@@ -113,7 +113,7 @@ def _plain(content: Any, hint: Any, place: str) -> Any:
 @cache
 def _hints(kind: type) -> dict[str, Any]:
     """The fields that are written, with their annotations."""
-    late = kind.later if issubclass(kind, FilledLater) else ()
+    late = kind.deferred if issubclass(kind, DeferredFields) else ()
     hints = get_type_hints(kind)
     return {each.name: hints[each.name] for each in dataclasses.fields(kind) if each.init and each.name not in late}
 

@@ -17,7 +17,7 @@ import numpy as np
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.estimators import judging
 from ctid_cli.estimators.identification import Identification
-from ctid_cli.inference.loss import Weighting
+from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.measurement import ROLES, Measurement, read_measurement
@@ -142,7 +142,7 @@ class StoredFit:
 
     def _weights(self) -> dict[str, Any]:
         weighting = self._samples()["weighting"]
-        return {name: getattr(weighting, name) for name in Weighting.later}
+        return {name: getattr(weighting, name) for name in Weighting.deferred}
 
     def _applied(self) -> dict[str, Any]:
         assert self.validation is not None

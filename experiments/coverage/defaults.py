@@ -14,10 +14,10 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.canonical import plain
 from ctid_cli.estimators.delay_profile import DelayProfile
-from ctid_cli.inference.finite_record import finite_record_covariance, sensitivities
+from ctid_cli.inference.bounds import finite_record_covariance
 from ctid_cli.inference.monte_carlo import QUANTILE, Sample, covered, wilson_interval
-from ctid_cli.inference.nonlinearity import UNSAFE, shifts_of_ends
-from ctid_cli.inference.parametric import Parametric
+from ctid_cli.inference.sensitivities import Parametric, sensitivities
+from ctid_cli.inference.uncertainty import UNSAFE, shifts_of_ends
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction

@@ -6,8 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from ctid_cli.inference.asymptotic import limiting_accuracy
-from ctid_cli.inference.finite_record import cramer_rao_bound
+from ctid_cli.inference.bounds import cramer_rao_bound, limiting_accuracy
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction

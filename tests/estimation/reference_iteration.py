@@ -6,7 +6,7 @@ import numpy as np
 
 from ctid_cli.estimation.iteration import HALVINGS, NEGLIGIBLE_FALL, ROUNDING, SLOW_STEPS, SUFFICIENT_FALL
 from ctid_cli.estimation.stability import is_hurwitz
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Status
 
 
 @dataclass

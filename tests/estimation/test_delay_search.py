@@ -13,8 +13,8 @@ from ctid_cli.estimation.delay_search import Limits, Minimum, bound_in_the_way, 
 from ctid_cli.estimation.iteration import ENDS, INADMISSIBLE, Equations
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import filter_data
-from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Status
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 from tests.estimation.adapters import CoefficientProblem, DelayProblem, delay_step, iterate
 from tests.estimators.records import CASE_1, CASE_2, make_record, theta_of

@@ -6,7 +6,7 @@ import pytest
 from ctid_cli.estimation.filtered_costs import filtered_costs, minima_behind_all, percents
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.spectra import lowpass_weight, record_spectra
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from tests.estimation.adapters import iterate, spectral_at, spectral_refit_numerator, steps

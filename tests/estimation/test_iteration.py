@@ -6,8 +6,8 @@ import pytest
 from ctid_cli.estimation.iteration import PATIENCE, RELAXATIONS, Equations, relative_change
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import filter_data
-from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Status
+from ctid_cli.inference.sensitivities import Structure
 from tests.estimation.adapters import CoefficientProblem, DelayProblem, iterate
 from tests.estimators.records import CASE_1, CASE_2, make_record, theta_of
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from ctid_cli.estimation.stability import is_hurwitz, reflect_unstable
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import filter_data
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.sensitivities import Structure
 from tests.estimation.adapters import CoefficientProblem, DelayProblem, least_squares_start, refit_numerator
 from tests.estimators.records import CASE_1, CASE_2, make_record, theta_of
 

@@ -8,7 +8,7 @@ from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.filtering.spectra import lowpass_weight, record_spectra
-from ctid_cli.inference.sensitivity import Structure
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record

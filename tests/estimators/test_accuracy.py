@@ -5,8 +5,8 @@ import pytest
 
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimators.td_srivc import TdSrivc
-from ctid_cli.inference.finite_record import cramer_rao_bound
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.bounds import cramer_rao_bound
+from ctid_cli.inference.fit import Status
 from tests.estimators.records import CASE_1, make_record
 
 RUNS = 200

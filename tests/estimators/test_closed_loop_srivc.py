@@ -13,7 +13,7 @@ from ctid_cli.estimators.additive_srivc import AdditiveSrivc
 from ctid_cli.estimators.srivc import Srivc
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.loop import loop_radius, simulate_loop
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Status
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import factored, factored_jacobian, unfactored

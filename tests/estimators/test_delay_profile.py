@@ -13,9 +13,9 @@ from ctid_cli.estimation.output_error import Layout, sensitivities
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.diagnostics import r_squared
-from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.criteria import r_squared
+from ctid_cli.inference.fit import Status
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record

@@ -10,10 +10,9 @@ from ctid_cli.estimation.optimum.box import LIMITS
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import identify
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.quantile import student_quantile
-from ctid_cli.inference.robust import robust_covariance
-from ctid_cli.inference.status import Status
-from ctid_cli.inference.uncertain_value import BIASED
+from ctid_cli.inference.covariance import robust_covariance
+from ctid_cli.inference.fit import Status
+from ctid_cli.inference.intervals import BIASED, student_quantile
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record

@@ -7,8 +7,8 @@ from scipy.stats import chi2
 
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.loss import BEND, END
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Status
+from ctid_cli.inference.robust_loss import BEND, END
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record

@@ -5,7 +5,7 @@ import pytest
 
 from ctid_cli import DelayProfile, HeldSignal, Record, TransferFunction, search_orders, simulate
 from ctid_cli.errors import OptionError
-from ctid_cli.inference.order_criterion import cross_validated_errors, shared_noise, squared_innovations
+from ctid_cli.inference.criteria import cross_validated_errors, shared_noise, squared_innovations
 
 INTERVAL, SAMPLES = 0.1, 600
 

@@ -8,8 +8,8 @@ from ctid_cli.estimation.common import Start
 from ctid_cli.estimators.srivc import Srivc
 from ctid_cli.estimators.svf import Svf
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.diagnostics import fit_percent, r_squared
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.criteria import fit_percent, r_squared
+from ctid_cli.inference.fit import Status
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record

@@ -8,8 +8,8 @@ from ctid_cli.estimators.srivc import Srivc
 from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.finite_record import cramer_rao_bound
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.bounds import cramer_rao_bound
+from ctid_cli.inference.fit import Status
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record

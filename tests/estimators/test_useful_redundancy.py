@@ -15,7 +15,7 @@ from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.spectra import window_spectrum
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Status
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record

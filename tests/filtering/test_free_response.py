@@ -82,6 +82,6 @@ def test_repeated_poles_are_the_limit_of_separate_ones():
     theta, free = np.array([2.0, 1.0, 1.0]), np.ones(2)
     x, by_theta, by_free = free_response(theta, free, [Term(2, 0)], ELAPSED)
     np.testing.assert_allclose(x, np.exp(-ELAPSED), atol=1e-13)
-    near, near_theta, near_free = free_response(theta + [1e-4, 0, 0], free, [Term(2, 0)], ELAPSED)
+    near, near_theta, near_free = free_response(theta + np.array([1e-4, 0, 0]), free, [Term(2, 0)], ELAPSED)
     for one, other in ((x, near), (by_theta, near_theta), (by_free, near_free)):
         np.testing.assert_allclose(one, other, atol=1e-3)

@@ -7,12 +7,11 @@ from hypothesis import strategies as st
 
 from ctid_cli.filtering.bank import MOST_MODAL_INTEGRATORS
 from ctid_cli.filtering.filter_data import filter_data
-from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.filtering.kernels import BLOCK
+from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.filtering.sampled import simulate_additive
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.filtering.submodels import LoopData
-from ctid_cli.filtering.submodels import OPEN_LOOP, SubmodelFilter
+from ctid_cli.filtering.submodels import OPEN_LOOP, LoopData, SubmodelFilter
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction

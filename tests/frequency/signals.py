@@ -3,12 +3,12 @@
 import numpy as np
 
 from ctid_cli.frequency.adaptive_observer import AdaptiveObserver
-from ctid_cli.frequency.decoding import decode, decoding_memory
 from ctid_cli.frequency.drem_finite_time import DremFiniteTime
 from ctid_cli.frequency.drem_gradient import DremGradient
 from ctid_cli.frequency.drem_window import DremWindow
 from ctid_cli.frequency.filter_regression import FilterRegression
 from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.frequency_kernels import decode, decoding_memory
 from ctid_cli.frequency.regression import delay_table
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 

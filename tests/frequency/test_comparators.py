@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ctid_cli.frequency.adaptive_observer import AdaptiveObserver, observer_slope, place_poles
+from ctid_cli.frequency.adaptive_observer import AdaptiveObserver
 from ctid_cli.frequency.filter_regression import FilterRegression, derivative_rows
 from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.frequency_kernels import observer_slope, place_poles
 from tests.frequency.signals import INTERVAL, OMEGA, tones
 
 

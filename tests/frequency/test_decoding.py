@@ -5,7 +5,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from ctid_cli.frequency.decoding import (
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.frequency_kernels import (
     cosine_sensitivities,
     flag_uncertain,
     propagate,
@@ -13,7 +14,6 @@ from ctid_cli.frequency.decoding import (
     root_real_parts,
     still_doubtful,
 )
-from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.regression import theta_of
 from tests.frequency.signals import frequencies_of
 

@@ -5,8 +5,9 @@ import pytest
 
 from ctid_cli.frequency.drem_finite_time import DremFiniteTime
 from ctid_cli.frequency.drem_gradient import DremGradient
-from ctid_cli.frequency.drem_window import DremWindow, slide
+from ctid_cli.frequency.drem_window import DremWindow
 from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.frequency_kernels import slide
 from ctid_cli.frequency.regression import theta_of
 from tests.frequency.signals import INTERVAL, OMEGA, frequencies_of, regression_rows, tones
 

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.frequency.consistency import check_consistency, second_lag
+from ctid_cli.frequency.delay_options import second_lag
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.moments import (
+from ctid_cli.frequency.frequency_kernels import (
     accumulate_row,
+    check_consistency,
     factorise,
     least_squares,
     moment_uncertainty,

@@ -6,15 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.polynomial import polynomial
 
-from ctid_cli.frequency.regression import (
-    delay_table,
-    determinant_from_tones,
-    form_row,
-    minor_plan,
-    mix_rows,
-    theta_of,
-    whole_delay,
-)
+from ctid_cli.frequency.frequency_kernels import form_row, mix_rows
+from ctid_cli.frequency.regression import delay_table, determinant_from_tones, minor_plan, theta_of, whole_delay
 from tests.frequency.signals import AMPLITUDES, OMEGA, regression_rows, tones
 
 INTERVAL = 0.002

@@ -10,7 +10,7 @@ def combs_of(omega, error=1e-5):
     """Distances and bands that are found in one window."""
     row = np.array([omega], dtype=float)
     gap, low, high = np.zeros((3, *row.shape))
-    find_combs(row, np.where(np.isnan(row), np.nan, error), gap, low, high)
+    find_combs(row, np.argsort(row, axis=1), np.where(np.isnan(row), np.nan, error), gap, low, high)
     return gap[0], low[0], high[0]
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from ctid_cli.frequency.tone_fit import fit_windows, windows_at
-from ctid_cli.frequency.tone_search import tones_of_windows
+from ctid_cli.frequency.frequency_kernels import fit_windows
+from ctid_cli.frequency.tone_search import tones_of_windows, windows_at
 from ctid_cli.frequency.tone_tests import strongest_line
 from ctid_cli.frequency.whitening import running_floor, whiten
 

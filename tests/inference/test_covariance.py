@@ -1,11 +1,19 @@
-"""Covariances and condition numbers from the Gauss-Newton matrix."""
+"""Covariances of white and coloured noise, against exact ones and by coverage; sentences on ill-conditioned ones."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.linalg import block_diag, toeplitz
+from scipy.signal import lfilter
 
-from ctid_cli.inference.covariance import condition_number, white_noise_covariance
+from ctid_cli.inference.covariance import (
+    condition_number,
+    describe_conditioning,
+    robust_covariance,
+    white_noise_covariance,
+)
+from ctid_cli.inference.noise_model import fit_residual_noise
 
 
 def sensitivities(seed, scales):
@@ -48,3 +56,155 @@ def test_singular_matrices_have_no_covariance(hessian):
 def test_no_degrees_of_freedom_no_covariance():
     assert np.isnan(white_noise_covariance(np.eye(3), 1.0, 3)).all()
     assert white_noise_covariance(np.eye(3), 1.0, 4)[0, 0] == 1.0
+
+
+def regressors(count, seed=0, pole=0.95):
+    """Sensitivities of a first-order system with a delay to its pole, gain and delay."""
+    u = np.repeat(np.random.default_rng(seed).choice([-1.0, 1.0], count // 10 + 1), 10)[:count]
+    x = lfilter([1 - pole], [1, -pole], u)
+    return np.column_stack([lfilter([1 - pole], [1, -pole], x), x, np.append(0, np.diff(x)) / (1 - pole)])
+
+
+def noise(rng, count, numerator=(1.0, 0.8), denominator=(1.0, -1.5, 0.7)):
+    return lfilter(numerator, denominator, rng.standard_normal(count + 300))[300:]
+
+
+def largest_relative_error(covariance, expected):
+    deviations = np.sqrt(np.diag(expected))
+    return np.abs((covariance - expected) / np.outer(deviations, deviations)).max()
+
+
+def covariance_of(psi, residuals, regular=True):
+    return robust_covariance(psi, residuals, regular=regular)[0]
+
+
+def test_is_the_double_sum_over_all_pairs_of_samples():
+    psi, v = regressors(200), noise(np.random.default_rng(1), 200)
+    R = toeplitz(fit_residual_noise([psi], [v]).autocovariance(200))
+    M = np.linalg.inv(psi.T @ psi)
+    assert largest_relative_error(covariance_of([psi], [v]), M @ psi.T @ R @ psi @ M) < 1e-9
+
+
+def test_white_residuals_give_the_white_formula():
+    psi = regressors(200)
+    v = np.random.default_rng(4).standard_normal(200)
+    v -= psi @ np.linalg.lstsq(psi, v)[0]
+    assert fit_residual_noise([psi], [v]).order == 0  # then it is exact, N - p included
+    expected = white_noise_covariance(psi.T @ psi, v @ v, 200)
+    assert largest_relative_error(covariance_of([psi], [v], True), expected) < 1e-12
+    psi, v = regressors(20_000), np.random.default_rng(5).standard_normal(20_000)
+    expected = white_noise_covariance(psi.T @ psi, v @ v, 20_000)
+    assert largest_relative_error(covariance_of([psi], [v], False), expected) < 0.1
+
+
+@pytest.mark.parametrize(("regular", "lowest", "highest"), [(True, 0.93, 0.97), (False, 0.92, 0.985)])
+def test_intervals_cover_under_coloured_noise(regular, lowest, highest):
+    rng = np.random.default_rng(6)
+    psi = regressors(1000)
+    solve = np.linalg.pinv(psi)
+    robust, white = np.zeros(3), np.zeros(3)
+    for _ in range(400):
+        v = noise(rng, 1000)
+        error = solve @ v
+        residuals = v - psi @ error
+        robust += np.abs(error) < 1.96 * np.sqrt(np.diag(covariance_of([psi], [residuals], regular)))
+        covariance = white_noise_covariance(psi.T @ psi, residuals @ residuals, 1000)
+        white += np.abs(error) < 1.96 * np.sqrt(np.diag(covariance))
+    # of 400 runs: two binomial standard deviations are 0.022
+    assert (robust / 400 > lowest - 0.022).all()
+    assert (robust / 400 < highest + 0.022).all()
+    assert (white / 400 < 0.85).all()
+
+
+@pytest.mark.parametrize("regular", [True, False])
+def test_covariance_follows_the_units(regular):
+    psi, v = regressors(500), noise(np.random.default_rng(8), 500)
+    units = np.array([1e-6, 1.0, 1e6])
+    rescaled = covariance_of([1e3 * psi * units], [1e3 * v], regular)
+    expected = covariance_of([psi], [v], regular) / np.outer(units, units)
+    assert largest_relative_error(rescaled, expected) < 1e-9
+
+
+def test_experiments_are_independent_of_each_other():
+    psi = [regressors(150, 1), regressors(90, 2)]
+    v = [noise(np.random.default_rng(1), 150), noise(np.random.default_rng(2), 90)]
+    r = fit_residual_noise(psi, v).autocovariance(150)
+    stacked = np.vstack(psi)
+    M = np.linalg.inv(stacked.T @ stacked)
+    sigma = stacked.T @ block_diag(toeplitz(r), toeplitz(r[:90])) @ stacked
+    expected = M @ sigma @ M
+    assert largest_relative_error(covariance_of(psi, v, True), expected) < 1e-9
+
+
+@pytest.mark.parametrize("regular", [True, False])
+def test_undefined_where_the_data_say_nothing(regular):
+    v = np.random.default_rng(0).standard_normal(50)
+    assert np.isnan(covariance_of([np.ones((50, 2))], [v], regular)).all()
+    assert np.isnan(covariance_of([np.eye(50)[:, :2] * 0], [v], regular)).all()
+    assert np.isnan(covariance_of([np.eye(2)], [v[:2]], regular)).all()
+
+
+NAMES = ("a1", "b0", "delay")
+
+
+def described(C, theta, names, number, hessian=None):
+    C = np.asarray(C)
+    H = hessian if hessian is not None else np.linalg.inv(C) if np.isfinite(C).all() else np.full(C.shape, np.nan)
+    return describe_conditioning(C, np.asarray(theta), names, number, np.asarray(H))
+
+
+def covariance(errors, pairs=()):
+    correlation = np.eye(len(errors))
+    for i, j, value in pairs:
+        correlation[i, j] = correlation[j, i] = value
+    return correlation * np.outer(errors, errors)
+
+
+def test_nothing_is_said_of_a_sound_covariance():
+    assert described(covariance([0.1, 0.1, 0.1], [(0, 1, 0.998)]), [1.0, 2.0, 3.0], NAMES, 1e4) == []
+
+
+def test_a_standard_error_of_many_times_the_value():
+    (sentence,) = described(covariance([0.1, 25.0, 0.1]), [1.0, -2.0, 3.0], NAMES, 10.0)
+    assert sentence.startswith("b0 = -2 has a standard error of 25, 12 times its value")
+    assert described(covariance([0.1, 19.0, 0.1]), [1.0, -2.0, 3.0], NAMES, 10.0) == []
+    # an initial state or an offset may be zero
+    assert described(covariance([0.1, 0.1]), [1.0, 0.0], ("a1", "offset"), 10.0) == []
+
+
+def test_two_parameters_that_cannot_be_told_apart():
+    C = covariance([0.1, 0.1, 0.1], [(1, 2, -0.9995)])
+    (sentence,) = described(C, [1.0, 2.0, 3.0], NAMES, 4000.0)
+    assert "b0 and delay can hardly be told apart by these data (correlation -0.99950)" in sentence
+    assert "sharper changes" in sentence  # without a zero it is not the zero
+    C = covariance([0.1] * 5, [(2, 4, 0.9995)])
+    (sentence,) = described(C, [1.0, 2.0, 3.0, 4.0, 5.0], ("a1", "a2", "b0", "b1", "delay"), 4000.0)
+    assert "A zero and a delay have nearly the same effect here" in sentence
+    assert "use fewer zeros" in sentence
+
+
+def test_three_parameters_that_cannot_be_told_apart_together():
+    # each pair 0.6 to 0.8, but the third is nearly the sum of the others
+    rng = np.random.default_rng(1)
+    x = rng.standard_normal((1000, 3))
+    x[:, 2] = x[:, 0] + x[:, 1] + 0.01 * x[:, 2]
+    C = np.cov(x.T)
+    (sentence,) = described(C, [5.0, 5.0, 5.0], ("a1", "a2", "b0"), 1e5)
+    assert sentence.startswith("a1, a2 and b0 can hardly be told apart by these data (multiple correlations")
+
+
+def test_a_singular_matrix_names_its_direction():
+    H = np.array([[4.0, 0.0, 0.0], [0.0, 1.0, 2.0], [0.0, 2.0, 4.0]])
+    undefined = np.full((3, 3), np.nan)
+    (sentence,) = described(undefined, [1.0, 2.0, 3.0], NAMES, np.inf, hessian=H)
+    assert "do not determine b0 and delay one by one (singular equations); no standard errors can be given" in sentence
+    (sentence,) = described(undefined, [1.0, 2.0, 3.0], NAMES, np.inf)
+    assert "all the parameters together" in sentence
+    (sentence,) = described(undefined, [1.0, 2.0, 3.0], NAMES, np.inf, hessian=np.diag([1.0, 1.0, 0.0]))
+    assert sentence.startswith("delay has no effect that these data show")
+
+
+def test_nearly_singular_is_said_once():
+    C = covariance([0.1, 0.1, 0.1], [(1, 2, 1 - 1e-9)])
+    (sentence,) = described(C, [1.0, 2.0, 3.0], NAMES, 2e9)
+    assert "b0 and delay one by one (condition number 2.0e+09); their standard errors are not reliable" in sentence

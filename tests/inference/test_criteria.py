@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from ctid_cli.inference.criteria import information_criteria, r_t_squared, young_information_criterion
-from ctid_cli.inference.diagnostics import r_squared
+from ctid_cli.inference.criteria import information_criteria, r_squared, r_t_squared, young_information_criterion
 
 
 def test_information_criteria_by_hand():
@@ -15,13 +14,6 @@ def test_information_criteria_by_hand():
     assert criteria.bic == pytest.approx(-6.0517018598809 + 3 * 2.995732273554, rel=1e-9)
     assert criteria.fpe == pytest.approx(0.7389056098931 * 23 / 17, rel=1e-9)
     assert (criteria.count, criteria.parameters) == (20, 3)
-
-
-def test_aicc_estimates_the_expected_discrepancy_of_regression():
-    # Hurvich and Tsai: N ln V + N (1 + p/N) / (1 - (p + 2)/N), which differs by N + 2, common to all models.
-    for p in (1, 4, 9):
-        criteria = information_criteria(30.0, 30, p)
-        assert criteria.aicc == pytest.approx(30 * (1 + p / 30) / (1 - (p + 2) / 30) - 32, rel=1e-12)
 
 
 def test_criteria_of_a_perfect_fit_and_of_too_few_samples():

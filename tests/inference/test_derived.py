@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.inference.derived import derived_parameters
-from ctid_cli.models.factoring import pole_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 
 FOURTH = TransferFunction([-6400.0, 1600.0], [1.0, 5.0, 408.0, 416.0, 1600.0])
@@ -15,21 +14,6 @@ MIXED = TransferFunction([3.0], np.poly([-0.2, -5.0, -1 + 2j, -1 - 2j]).real)
 
 def by_name(model, covariance, **options):
     return {row.name: row for row in derived_parameters(model, np.asarray(covariance), **options)}
-
-
-@pytest.mark.parametrize("model", [FOURTH, MIXED])
-def test_pole_jacobian_is_that_of_central_differences(model):
-    poles = model.poles
-    jacobian = pole_jacobian(model.denominator, poles)
-    for i in range(1, model.order + 1):
-        step = 1e-6 * abs(model.denominator[i])
-        moved = []
-        for sign in (1, -1):
-            a = model.denominator.copy()
-            a[i] += sign * step
-            roots = np.roots(a)
-            moved.append(roots[np.argmin(np.abs(roots[None, :] - poles[:, None]), axis=1)])
-        np.testing.assert_allclose(jacobian[:, i - 1], (moved[0] - moved[1]) / (2 * step), rtol=1e-6)
 
 
 @pytest.mark.parametrize("model", [FOURTH, MIXED])
@@ -66,28 +50,6 @@ def test_second_order_in_closed_form(damping, frequency):
     assert rows["damping_1"].estimate == pytest.approx(damping, rel=1e-9)
     assert rows["damping_1"].standard_error == pytest.approx(damping * 1e-3 * np.sqrt(1.25), rel=1e-6)
     assert rows["pole_1_real"].standard_error == pytest.approx(0.5e-3 * a1, rel=1e-6)
-
-
-def test_first_order_by_hand():
-    rows = by_name(TransferFunction([3.0], [1.0, 0.5]), [[0.0004, 0.001], [0.001, 0.01]])
-    assert list(rows) == ["pole_1", "time_constant_1", "static_gain"]
-    assert (rows["pole_1"].estimate, rows["pole_1"].unit) == (-0.5, "rad/s")
-    assert rows["time_constant_1"].estimate == 2.0
-    assert rows["time_constant_1"].standard_error == pytest.approx(0.02 / 0.25)
-    assert rows["time_constant_1"].low == pytest.approx(2.0 - 1.959964 * 0.08, rel=1e-6)
-    assert rows["time_constant_1"].unit == "s"
-    gain = rows["static_gain"]
-    # gradient (-b/a^2, 1/a) = (-12, 2)
-    assert (gain.estimate, gain.unit) == (6.0, "output unit/input unit")
-    assert gain.standard_error == pytest.approx(np.sqrt(144 * 0.0004 - 2 * 24 * 0.001 + 4 * 0.01))
-    narrow = by_name(TransferFunction([3.0], [1.0, 0.5]), np.diag([0.0004, 0.01]), quantile=lambda _: 0.7)["pole_1"]
-    assert narrow.high - narrow.low == pytest.approx(2 * 0.7 * 0.02, rel=1e-9)
-
-
-def test_a_numerator_with_a_vanished_leading_coefficient_keeps_its_covariance():
-    covariance = np.diag([0.01, 0.02, 0.03]) ** 2
-    rows = by_name(TransferFunction([0.0, 3.0], [1.0, 0.5]), covariance)
-    assert rows["static_gain"].standard_error == pytest.approx(np.hypot(12 * 0.01, 2 * 0.03))
 
 
 def test_near_repeated_poles_are_undetermined():

@@ -9,10 +9,9 @@ from ctid_cli.estimators.additive_srivc import AdditiveFit
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.useful_redundancy import RedundantFit
 from ctid_cli.frequency.tracking import FrequencyTrack
-from ctid_cli.inference.diagnostics import fit_percent, r_squared
-from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.sensitivity import Structure
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.criteria import fit_percent, r_squared
+from ctid_cli.inference.fit import Fit, Status
+from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
@@ -52,11 +51,6 @@ def test_coefficient_that_vanished_keeps_its_name():
     assert fit.parameters == {"a1": 2.0, "a2": 3.0, "b0": 0.0, "b1": 6.0}
 
 
-def test_undefined_standard_errors_are_nan_without_a_warning():
-    fit = make_fit(TransferFunction([1.0], [1.0, 2.0]), ("a1", "b0"), np.diag([-1.0, np.nan]))
-    assert all(np.isnan(error) for error in fit.standard_errors.values())
-
-
 @pytest.mark.parametrize(("poles", "zeros"), [(1, 0), (3, 1), (4, 3)])
 @pytest.mark.parametrize("delay", [True, False])
 def test_structure_counts_and_names_its_parameters(poles, zeros, delay):
@@ -75,12 +69,6 @@ def test_measures_of_fit_follow_their_definitions(y, seed):
     assert r_squared(y, x) == pytest.approx(1 - ratio**2, rel=1e-9, abs=1e-9)
     with_gap, beside = np.append(y, np.nan), np.append(x, 1e6)
     assert fit_percent(with_gap, beside) == fit_percent(y, x)
-
-
-@given(VALUES)
-def test_ends_of_the_scale(y):
-    assert fit_percent(y, y) == 100.0
-    assert fit_percent(y, np.full(len(y), np.mean(y))) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_constant_or_missing_output_has_no_fit():

@@ -5,8 +5,7 @@ import pytest
 
 from ctid_cli import DataError, HeldSignal, Record, TransferFunction, simulate
 from ctid_cli.inference.frequency_response import FrequencyResponse, estimate_frequency_response
-from ctid_cli.inference.periodic_response import find_period
-from ctid_cli.inference.response_lines import hold_factor
+from ctid_cli.inference.spectral_methods import find_period, hold_factor
 
 INTERVAL, PERIOD = 0.1, 256
 MODEL = TransferFunction([2.0, 1.0], [1.0, 1.0, 3.0], delay=0.37)
@@ -153,15 +152,6 @@ def test_the_phase_is_followed_where_it_is_known():
     assert any("No phase at" in note for note in found.notes)
 
 
-def test_local_polynomials_follow_a_long_delay():
-    model = TransferFunction([1.0], [0.5, 1.0], delay=20.03)
-    found = estimate_frequency_response(random_record(3, noise=0.05, model=model, warm_up=600))
-    low = found.frequencies < 3.0
-    true = sampled_response(model, found.frequencies)
-    assert np.median(np.abs(found.response - true)[low] / np.abs(true)[low]) < 0.05
-    assert np.mean((np.abs(found.response - true) <= found.radius())[low]) > 0.85
-
-
 def test_any_clock_covers():
     shares = []
     for seed in range(6):
@@ -176,18 +166,6 @@ def test_any_clock_covers():
         shares.append(np.mean((np.abs(found.response - exact(MODEL, found.frequencies)) <= found.radius())[inside]))
         assert any("the clock is irregular" in note for note in found.notes)
     assert 0.88 < np.mean(shares) < 0.985
-
-
-def test_bands_of_gain_and_phase():
-    found = estimate_frequency_response(random_record(1))
-    low, high = found.gain_band()
-    gain, half = np.abs(found.response), found.phase_band()
-    assert (low <= gain).all()
-    assert (gain <= high).all()
-    assert ((low > 0) == (gain > found.radius())).all()
-    known = found.phase_known()
-    assert np.sin(half[known]) == pytest.approx((high - low)[known] / 2 / gain[known])
-    assert (found.radius(0.99) > found.radius(0.9)).all()
 
 
 def test_welch_averages():
@@ -207,23 +185,6 @@ def test_the_period_of_an_input():
     assert find_period(np.sin(2 * np.pi * np.arange(400) / 100)) == 100
     assert find_period(rng.standard_normal(500)) is None
     assert find_period(np.linspace(0.0, 1.0, 500)) is None
-
-
-def test_a_response_moves_and_scales_with_its_record():
-    record = random_record(2)
-    found = estimate_frequency_response(record)
-    moved = Record(record.t + 100.0, 3.0 * record.y + 7.0, HeldSignal(record.input.t + 100.0, record.input.values))
-    again = estimate_frequency_response(moved)
-    assert again.response == pytest.approx(3.0 * found.response, rel=1e-6)
-    assert again.variance == pytest.approx(9.0 * found.variance, rel=1e-6)
-
-
-def test_a_hold_is_divided_out():
-    record = random_record(2)
-    straight = Record(record.t, record.y, HeldSignal(record.t, record.input.values, "foh"))
-    zoh, foh = (estimate_frequency_response(each) for each in (record, straight))
-    factor = hold_factor("zoh", zoh.frequencies, INTERVAL) / hold_factor("foh", zoh.frequencies, INTERVAL)
-    assert foh.response == pytest.approx(zoh.response * factor, rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -6,22 +6,18 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from ctid_cli.canonical import plain
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc
 from ctid_cli.estimators.delay_profile import DelayProfile
-from ctid_cli.estimators.identification import identify
 from ctid_cli.estimators.srivc import Srivc
 from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.quantile import student_quantile
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Status
+from ctid_cli.inference.intervals import student_quantile
 from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.reporting.estimate import parameters
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
-from ctid_cli.simulation.dataset import DataSet
 
 DELAY = 0.25
 ESTIMATORS = {
@@ -87,16 +83,3 @@ def test_a_fit_that_ignores_a_loop_has_no_errors_where_residuals_are_coloured(na
     assert np.isnan([*found.standard_errors.values()]).all()
     assert fitted(name, 0.9, "robust", feedback=True).standard_errors == fitted(name, 0.9, "robust").standard_errors
     assert fitted(name, 0.0, "auto", feedback=True).standard_errors == fitted(name, 0.0, "auto").standard_errors
-
-
-@pytest.mark.parametrize("kind", ["auto", "bootstrap"])
-@pytest.mark.parametrize("colour", [0.0, 0.9])
-def test_what_is_stored_of_an_estimate_is_what_a_fit_prints(kind, colour):
-    options = ESTIMATORS["delay_profile"](covariance=kind, bootstrap_draws=50)
-    stored = DataSet(record(colour)).result_of(options.fit(record(colour)), None, None)
-    printed = identify(ESTIMATORS["delay_profile"](), [record(colour)], None, kind, 50)
-    assert stored["covariance"] == printed.uncertainty.kind
-    assert printed.delay_interval is None
-    assert {item.name: (item.estimate, item.low, item.high) for item in printed.estimates} == {
-        item.name: (item.estimate, item.low, item.high) for item in parameters(plain(stored), (0.0, 1.0))
-    }

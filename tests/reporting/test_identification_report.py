@@ -13,7 +13,7 @@ from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import identify
 from ctid_cli.estimators.identification_warnings import of_status
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.status import Status
+from ctid_cli.inference.fit import Status
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.identification_plot import identification_drawing

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.inference.asymptotic import limiting_accuracy
+from ctid_cli.inference.bounds import limiting_accuracy
 from ctid_cli.inference.monte_carlo import wilson_interval
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.reporting.expected_accuracy import long_record_variances

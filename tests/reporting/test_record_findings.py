@@ -7,8 +7,8 @@ import pytest
 from scipy.signal import lfilter
 
 from ctid_cli import HeldSignal, Record, TransferFunction, simulate
-from ctid_cli.inference.answer import output_bandwidth
-from ctid_cli.inference.input_moves import input_moves
+from ctid_cli.inference.input_response import output_bandwidth
+from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.reporting.record_findings import check_record_quality
 from ctid_cli.signals.excitation import Prbs
 

@@ -11,9 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ctid_cli.inference import precision
-from ctid_cli.inference.monte_carlo import Sample, root_mean_square, wilson_interval
-from ctid_cli.inference.precision import AT_LEAST, GROWTH, Replications, Until, block_ends, decide
+from ctid_cli.inference import monte_carlo
+from ctid_cli.inference.monte_carlo import (
+    AT_LEAST,
+    GROWTH,
+    Replications,
+    Sample,
+    Until,
+    block_ends,
+    decide,
+    root_mean_square,
+    wilson_interval,
+)
 from ctid_cli.running import events
 from ctid_cli.running.cell_precision import cell_precisions
 from ctid_cli.running.engine import RunSummary, preview, run_experiment
@@ -121,7 +130,7 @@ FEW = 20
 @pytest.fixture(scope="module")
 def small_blocks() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(precision, "AT_LEAST", FEW)
+        patch.setattr(monte_carlo, "AT_LEAST", FEW)
         yield
 
 

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from ctid_cli.inference.bootstrap import BootstrapT
-from ctid_cli.inference.quantile import normal_quantile
-from ctid_cli.inference.uncertainty import Uncertainty
+from ctid_cli.inference.intervals import normal_quantile
+from ctid_cli.inference.uncertainty import BootstrapT, Uncertainty
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import factored, factored_jacobian, unfactored
 from ctid_cli.models.transfer_function import TransferFunction

@@ -31,6 +31,9 @@ class SearchOptions:
     delays: tuple[float, float] = (0.0, 0.0)
     free_response: bool = False
     offset: bool = False
+    #: Poles at the origin, besides those that are searched. With free responses these hold the offset, too; no record
+    #: may repeat itself.
+    integrators: int = 0
     #: Period [s] of each record that repeats for ever, 0 for another; by default none repeats.
     periods: Sequence[float] = ()
     #: Denominators and delays [s] that other estimators have found.
@@ -46,19 +49,16 @@ class SearchOptions:
     seed: int = 0
     #: Coefficients that are known.
     known: KnownCoefficients = NOTHING
-    #: Poles at 0 besides. With free responses these hold the offset, too; no record may repeat itself.
-    integrators: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
     """The least output error that was found."""
 
-    #: Coefficients in descending powers, the denominator monic and without the integrators.
+    #: Coefficients in descending powers, the denominator monic.
     numerator: Array
     denominator: Array
     delay: float
-    integrators: int
     #: Of each record, coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers, and offset;
     #: zeros without them.
     free_responses: Array
@@ -81,6 +81,8 @@ class Optimum:
     agree: int
     evaluations: int
     box: Box = field(repr=False)
+    #: Poles at the origin, which the denominator does not have.
+    integrators: int = 0
 
     @property
     def model(self) -> TransferFunction:
@@ -161,7 +163,8 @@ def _from_part(problem: Problem, part: Problem, box: Box, poles: int, options: S
 def least(nest: Nest, poles: int, zeros: int, fewer_poles: bool) -> Optimum:
     """The least squared error that a nest knows of a structure."""
     # With a pole at infinity a model of one pole less, whatever its zeros, is in the closure of the structure.
-    fewest = max(zeros + int(nest.box.delay_free) - nest.problem.integrators, 1) if fewer_poles else poles
+    integrators = nest.problem.integrators
+    fewest = max(zeros + int(nest.box.delay_free) - integrators, int(not integrators)) if fewer_poles else poles
     found = [nest.settled(n, zeros) for n in range(poles, fewest - 1, -1)] or [nest.settled(poles, zeros)]
     errors = [judged.local.squared_error for judged in found]
     # Such a pole costs nothing: a smaller model must be worse by more than rounding to lose.
@@ -176,9 +179,10 @@ def problem_of(records: Sequence[FilterData], zeros: int, options: SearchOptions
     """The records and what is eliminated with them."""
     periods = tuple(options.periods) or (0.0,) * len(records)
     data = tuple(_one_period(*pair) if pair[1] else pair[0] for pair in zip(records, periods, strict=True))
-    if options.integrators and any(periods):
+    integrators = options.integrators
+    if integrators and any(periods):
         raise ValueError("what an integrator makes of a periodic input need not repeat itself")
-    return Problem(data, zeros, options.free_response, options.offset, periods, integrators=options.integrators)
+    return Problem(data, zeros, options.free_response, options.offset, periods, integrators=integrators)
 
 
 def _one_period(data: FilterData, period: float) -> FilterData:
@@ -194,11 +198,11 @@ def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Opt
     """The model in coefficients of polynomials."""
     point, projected = best.local.point, best.local.projected
     a, known, n = point.denominator, nest.known, point.poles.size
-    over, integrators = numerators(*nest.problem.sections(point.speed, point.damping)), nest.problem.integrators
+    over = numerators(*nest.problem.sections(point.speed, point.damping))
     held = best.held[:n]
     b = projected.output @ over
     if projected.direct:
-        b = np.append(0.0, b) + projected.direct * np.append(a, np.zeros(integrators))
+        b = np.concatenate(([0.0], b)) + projected.direct * np.append(a, np.zeros(nest.problem.integrators))
     slopes = point.denominator_slopes()[:, ~held]
     if known is not NOTHING:
         # The same up to rounding.
@@ -211,7 +215,6 @@ def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Opt
         numerator=np.trim_zeros(b, "f") if b.any() else np.zeros(1),
         denominator=a,
         delay=point.delay.seconds,
-        integrators=integrators,
         free_responses=projected.free @ over,
         offsets=projected.offset,
         squared_error=best.local.squared_error,
@@ -226,4 +229,5 @@ def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Opt
         agree=agree,
         evaluations=nest.evaluations,
         box=nest.box,
+        integrators=nest.problem.integrators,
     )

@@ -353,4 +353,4 @@ def at_bounds(point: Point, box: Box) -> tuple[BoolArray, BoolArray]:
         slack = TOUCH * (edges[1] - edges[0])
         at_low.append(point.delay.seconds <= edges[0] + slack)
         at_high.append(point.delay.seconds >= edges[1] - slack)
-    return np.array(at_low), np.array(at_high)
+    return np.array(at_low, dtype=bool), np.array(at_high, dtype=bool)

@@ -101,7 +101,7 @@ def polynomial_slopes(speed: Array, damping: Array) -> Array:
         own = [[w]] if zeta < 0 else [[2 * zeta * w, 2 * w * w], [2 * zeta * w, 0.0]]
         columns += [np.convolve(others, slope) for slope in own]
     n = len(columns)
-    return np.column_stack([np.pad(column, (n - column.size, 0)) for column in columns])
+    return np.array([np.pad(column, (n - column.size, 0)) for column in columns]).reshape(n, n).T
 
 
 def numerators(speed: Array, damping: Array) -> Array:

@@ -253,7 +253,7 @@ def slopes(
         # dx/dtau = -x'(t - tau).
         of_z, of_u = form.rate(output)
         psi[:, :, n] = -(rows[:, :, : columns.n] @ of_z + of_u * rows[:, :, columns.u])
-    psi = psi.reshape(-1, n + delay_free)
+    psi = psi.reshape(span.residual.size, n + delay_free)
     # (I - P): what the eliminated coefficients would follow is no effect of the poles.
     psi -= span.left @ (span.left.T @ psi)
     residual = span.residual

@@ -197,7 +197,7 @@ class Descent:
             ways = self._freedom(here, scale)
             scaled, slope = ways.reduced(here.gradient, here.curvature)
             promise = _promise(scaled, slope)[0] if slope.size else 0.0
-            arrived = promise <= near * max(here.squared_error, self.floor)
+            arrived = not scale.size or promise <= near * max(here.squared_error, self.floor)
             fallen = sum(falls) if self.box.cell == 0.0 else np.inf
             if arrived or _hopeless(taken, here.squared_error, promise, fallen, lowest):
                 break
@@ -422,7 +422,7 @@ def _alike(here: Local, other: Local, box: Box) -> bool:
         return False
     away = np.concatenate((here.point.speed / other.point.speed - 1, here.point.damping / other.point.damping - 1))
     later = (here.point.delay.seconds - other.point.delay.seconds) / box.quarter
-    return bool(np.abs(away).max() < CLOSE and abs(later) < CLOSE)
+    return bool(np.abs(away).max(initial=0.0) < CLOSE and abs(later) < CLOSE)
 
 
 def _hopeless(taken: int, squared_error: float, promise: float, fallen: float, lowest: float) -> bool:
@@ -434,7 +434,7 @@ def _hopeless(taken: int, squared_error: float, promise: float, fallen: float, l
 def _newton_step(values: Array, vectors: Array, gradient: Array) -> Array:
     """``-H^-1 g`` with the eigenvalues of H made positive; along a negative one a step of one at least."""
     along = vectors.T @ gradient
-    flat = FLAT * max(float(np.abs(values).max()), 1e-300)
+    flat = FLAT * max(float(np.abs(values).max(initial=0.0)), 1e-300)
     parts = -along / np.maximum(np.abs(values), flat)
     if values[0] < -flat:
         parts[0] = -np.copysign(max(abs(parts[0]), 1.0), along[0])
@@ -445,13 +445,13 @@ def _newton_step(values: Array, vectors: Array, gradient: Array) -> Array:
 def _lengths(here: Local) -> Array:
     """Lengths of the columns of the Jacobian; what has no effect at all gets the least that can be told from none."""
     lengths: Array = np.sqrt(np.maximum(np.diag(here.curvature), 0.0))
-    return np.maximum(lengths, max(1e-9 * float(lengths.max()), 1e-150))
+    return np.maximum(lengths, max(1e-9 * float(lengths.max(initial=0.0)), 1e-150))
 
 
 def _promise(curvature: Array, gradient: Array) -> tuple[float, Array, Array]:
     """``g'H^-1 g`` over the directions that curve, with the eigenvalues and vectors of H."""
     values, vectors = np.linalg.eigh(curvature)
-    curved = values > FLAT * max(float(np.abs(values).max()), 1e-300)
+    curved = values > FLAT * max(float(np.abs(values).max(initial=0.0)), 1e-300)
     along = (vectors.T @ gradient)[curved]
     return float(np.sum(along**2 / values[curved])), values, vectors
 

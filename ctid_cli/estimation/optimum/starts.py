@@ -165,7 +165,7 @@ class Nest:
         Beside a fast pole each cell has a smooth cost of its own, and a minimum in one says nothing of the next.
         """
         low, high = self.box.delays
-        if point.delay.cell < 0 or point.speed[0] * self.box.cell < FAST:
+        if point.delay.cell < 0 or not point.speed.size or point.speed[0] * self.box.cell < FAST:
             return []
         own, width = point.delay.cell, self.box.cell
         cells.add(own)
@@ -181,6 +181,10 @@ class Nest:
     def _from_below(self, poles: int, zeros: int) -> list[Point]:
         """Starts from smaller models, and along the delay."""
         effort = self.effort
+        if poles == 0:
+            return self._along_delay(
+                zeros, [point_of(np.zeros(0, dtype=complex), 0.5 * sum(self.box.delays), self.box)]
+            )
         contained = [self._spine(poles).point] if effort.spine else []
         others: list[Point] = []
         if poles == 2 or (poles == 1 and not effort.spine):
@@ -191,7 +195,7 @@ class Nest:
             # Contained in this structure whatever the added pole is, as is the one before.
             grown = self._grown(poles - 1, zeros - 1, zeros, 1)
             contained, others = contained + grown[:1], grown[1:]
-        most_zeros = int(effort.spine or not self.box.delay_free)
+        most_zeros = int(effort.spine or not self.box.delay_free) + self.problem.integrators
         for n, m in ((poles - 1, zeros), (poles - 2, zeros - 2), (poles - 2, zeros)):
             if n > 0 and 0 <= m < n + most_zeros:
                 others += self._grown(n, m, zeros, poles - n)

@@ -1,0 +1,345 @@
+"""Accuracy that theory gives: Cramér-Rao bounds of a record, and the limit for long records."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctid_cli.arrays import Array
+from ctid_cli.errors import BiasedError, DataError
+from ctid_cli.filtering.loop import loop_radius, simulate_loop
+from ctid_cli.filtering.sampled import sampled_model
+from ctid_cli.inference.covariance import sandwich, unit_inverse
+from ctid_cli.inference.sensitivities import Structure, sensitivities
+from ctid_cli.models.additive import AdditiveModel, Term
+from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.factoring import factored, factored_jacobian
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.noise import Noise
+from ctid_cli.signals.record import Enters, Record
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterAccuracy:
+    """Parameters of the true system and the covariance of their estimates."""
+
+    model: AdditiveModel | TransferFunction
+    names: tuple[str, ...]
+    #: Their true values, shape (p,).
+    values: Array
+    #: Covariance of their estimates, shape (p, p).
+    covariance: Array
+
+    @classmethod
+    def of(
+        cls, model: AdditiveModel | TransferFunction, covariance: Array, zeros: int | None = None, delay: bool = False
+    ) -> ParameterAccuracy:
+        """Accuracy of the parameters of a model, or of a fraction with more zeros or with its delay estimated too."""
+        if isinstance(model, AdditiveModel):
+            return cls(model, model.names, model.theta, covariance)
+        own = model.numerator.size - 1
+        m = own if zeros is None else zeros
+        parts = [model.denominator[1:], np.zeros(m - own), model.numerator, np.full(int(delay), model.delay)]
+        return cls(model, Structure(model.order, m, delay).names, np.concatenate(parts), covariance)
+
+    @property
+    def standard_errors(self) -> Array:
+        """Square roots of the variances, in the units of the parameters, shape (p,)."""
+        errors: Array = np.sqrt(np.diag(self.covariance))
+        return errors
+
+    def factored(self, terms: Sequence[Term] | None = None) -> ParameterAccuracy:
+        """Accuracy of the submodels into which an estimated transfer function is factored, by the delta method."""
+        if isinstance(self.model, AdditiveModel):
+            return self
+        additive = factored(self.model, terms)
+        # The delay is the same in both forms.
+        own = len(self.names) - int(self.names[-1] == "delay")
+        size, delays = additive.theta.size, len(self.names) - own
+        jacobian = np.zeros((size + delays, len(self.names)))
+        jacobian[:size, :own] = factored_jacobian(self.model, additive, own - self.model.order)
+        jacobian[size:, own:] = np.eye(delays)
+        names, values = additive.names + self.names[own:], np.concatenate([additive.theta, self.values[own:]])
+        return ParameterAccuracy(additive, names, values, jacobian @ self.covariance @ jacobian.T)
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedForm:
+    """The true system in the form in which an estimator has it."""
+
+    model: AdditiveModel | TransferFunction
+    #: Degree of the numerator of a fraction; None for that of the model.
+    zeros: int | None
+    #: Samples before this time [s] are not used; None where the delay is known.
+    delay_from: float | None
+    instruments: Instruments
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedAccuracy:
+    """What theory says of one estimator on one kind of data."""
+
+    parameters: ParameterAccuracy
+    #: Whether it is the limit for long records.
+    limit: bool
+    #: How it was computed, in words.
+    formula: str
+
+
+def accuracy_of_long_records(
+    form: EstimatedForm,
+    interval: float,
+    samples: int,
+    noise: Noise,
+    deviation: float,
+    controller: DiscreteController | None = None,
+    enters: Enters = "controller",
+) -> ExpectedAccuracy:
+    """Limit for long records, with white Gaussian noise of a deviation as the input, or as the reference of a loop."""
+    # A level relative to the output counts from its mean square; a loop has none.
+    power = [] if controller else [np.sqrt([output_variance(form.model, interval, deviation)])]
+    parameters = limiting_accuracy(
+        form.model,
+        interval,
+        controller,
+        standard_deviation=deviation,
+        innovation_variance=noise.innovation_variance_of(*power),
+        noise_filter=noise.filter,
+        samples=samples,
+        enters=enters,
+        instruments=form.instruments if controller else "closed_loop",
+        zeros=form.zeros,
+    )
+    product, matrices = "sigma^2 M^-1", "M = E psi psi'"
+    if noise.coloured:
+        product = "M^-1 Sigma M^-1"
+        matrices += ", Sigma = sigma_e^2 cov(H psi), H the filter and sigma_e^2 the innovation variance of the noise"
+    formula = (
+        f"the limit for long records, {product} / N with {matrices}, psi {_psi_in_words(form, controller)}; summed "
+    )
+    formula += f"over responses to a pulse, as the {'reference' if controller else 'input'} is white Gaussian noise"
+    return ExpectedAccuracy(parameters, True, formula)
+
+
+def accuracy_of_records(
+    form: EstimatedForm,
+    system: AdditiveModel | TransferFunction,
+    records: Sequence[Record],
+    noise: Noise,
+    why_no_limit: str,
+) -> ExpectedAccuracy:
+    """Accuracy on simulated records of a system, averaged over them."""
+    covariance = np.mean([_record_covariance(form, system, record, noise) for record in records], axis=0)
+    if not np.isfinite(covariance).all():
+        raise DataError("the data would not determine the parameters, even without noise")
+    parameters = ParameterAccuracy.of(form.model, covariance, form.zeros, form.delay_from is not None)
+    # Instruments other than the input itself are not the best there are, nor is least squares where there are outliers.
+    best = form.instruments == "open_loop" and noise.gaussian
+    start = f"{'the Cramér-Rao bound ' if best else ''}sigma^2 (psi' psi)^-1"
+    if noise.coloured:
+        start = "(psi' psi)^-1 psi' R psi (psi' psi)^-1, R the covariance matrix of the noise"
+    sets = len(records)
+    where = "in the first data set" if sets == 1 else f"averaged over the first {sets} data sets"
+    formula = f"{start}, psi {_psi_in_words(form, records[0].loop)}, {where}, as {why_no_limit}"
+    return ExpectedAccuracy(parameters, False, formula)
+
+
+def _record_covariance(
+    form: EstimatedForm, system: AdditiveModel | TransferFunction, record: Record, noise: Noise
+) -> Array:
+    """Covariance of an estimate from one data set; NaN where it does not determine the parameters."""
+    signal = record.input
+    if form.instruments == "closed_loop" and record.loop is not None:
+        loop, interval = record.loop, record.interval or 0.0
+        u = simulate_loop(system, loop.controller, loop.reference, 0.0, interval, loop.enters).u
+        signal = HeldSignal(record.t, u)
+    psi = sensitivities(form.model, signal, record.t, form.zeros, estimate_delay=form.delay_from is not None)
+    # Nothing is learnt from outputs that are missing; the others keep their distances.
+    psi = psi * record.valid[:, None]
+    if form.delay_from is not None:
+        psi = psi[record.t >= record.input.t[0] + form.delay_from]
+    lags = np.arange(psi.shape[0] if noise.coloured else 1)
+    return finite_record_covariance(psi, noise.autocovariance(lags, record.noise_free))
+
+
+def _psi_in_words(form: EstimatedForm, loop: object | None) -> str:
+    where = "noise-free loop" if form.instruments == "closed_loop" else "loop, noise included"
+    return "the sensitivities of the output to the parameters" + ("" if loop is None else f" in the {where}")
+
+
+def finite_record_covariance(psi: Array, autocovariances: ArrayLike) -> Array:
+    r"""Covariance of an unweighted output-error estimate from one record with noise of known autocovariances.
+
+    With ``M = psi' psi`` and the covariance matrix R of the noise, ``M^-1 psi' R psi M^-1``, to first order in the
+    noise: ``sigma^2 M^-1`` for white noise. Unlike the limit of long records it knows the start from rest, which counts
+    as long as the memory of the system or of its loop is not short against the record.
+    """
+    from scipy.linalg import matmul_toeplitz
+
+    lags = np.atleast_1d(np.asarray(autocovariances, dtype=float))
+    count, size = psi.shape
+    found = unit_inverse(psi.T @ psi) if count >= size else None
+    if found is None:
+        return np.full((size, size), np.nan)
+    inverse, scale = found
+    scaled = psi * scale
+    first_column = np.zeros(count)
+    first_column[: lags.size] = lags[:count]
+    coloured = lags[0] * scaled if lags.size == 1 else matmul_toeplitz(first_column, scaled)
+    return sandwich(inverse, scale, scaled.T @ coloured)
+
+
+def cramer_rao_bound(
+    model: TransferFunction,
+    record: Record,
+    noise_standard_deviation: float,
+    start: float = 0.0,
+    estimate_delay: bool = True,
+) -> Array:
+    """Cramér-Rao bound for white Gaussian output noise.
+
+    Parameters
+    ----------
+    model : TransferFunction
+        The true, strictly proper system.
+    record : Record
+        Instants and input; its outputs are not used, but missing ones count as missing.
+    noise_standard_deviation : float
+        Standard deviation of the noise [output unit].
+    start : float, default 0.0
+        Samples earlier than this after the first input break [s] are not used.
+    estimate_delay : bool, default True
+        Whether the delay is unknown too.
+
+    Returns
+    -------
+    ndarray, shape (p, p)
+        Lower bound of the covariance of ``(a_1 … a_n, b_0 … b_m[, delay])``.
+
+    Notes
+    -----
+    ``sigma^2 (sum psi psi')^-1`` with the exact sensitivities psi of the simulated output at these instants.
+    """
+    psi = sensitivities(model, record.input, record.t, estimate_delay=estimate_delay)
+    slack = 1e-9 * (record.interval or 0.0)
+    used = record.valid & (record.t >= record.input.t[0] + start - slack)
+    return finite_record_covariance(psi[used], noise_standard_deviation**2)
+
+
+#: What the estimator's instruments are made from: the input, or the noise-free input of the loop.
+Instruments = Literal["open_loop", "closed_loop"]
+#: A controller that does nothing.
+OPEN = DiscreteController([0.0], [1.0])
+#: Amplitude at which the response to a pulse counts as died away: its square is below rounding.
+FORGOTTEN = 1e-12
+#: Longest response to a pulse that is summed [samples], and the least magnitude of a pole that its length allows for.
+LONGEST_MEMORY, DEADBEAT = 1_000_000, 0.1
+#: Noise that is white: its filter has the numerator and the denominator 1.
+WHITE: tuple[Sequence[float], Sequence[float]] = ((1.0,), (1.0,))
+
+
+def limiting_accuracy(
+    model: AdditiveModel | TransferFunction,
+    interval: float,
+    controller: DiscreteController | None = None,
+    *,
+    standard_deviation: float,
+    innovation_variance: float,
+    noise_filter: tuple[ArrayLike, ArrayLike] = WHITE,
+    samples: int,
+    enters: Enters = "controller",
+    instruments: Instruments = "closed_loop",
+    zeros: int | None = None,
+) -> ParameterAccuracy:
+    r"""Accuracy for white noise held between the samples as the input, or as the reference of a closed loop.
+
+    With the sensitivities ``psi = dx/d theta`` and ``M = E psi psi'`` the estimates of SRIVC and of its additive form
+    approach [1]_
+
+    .. math:: \operatorname{cov} \sqrt N\,\hat\theta = M^{-1} \Sigma M^{-1}, \qquad
+              \Sigma = \sum_\tau R_v(\tau)\, E\,\psi(t+\tau)\psi(t)' = \sigma_e^2 \operatorname{cov} H(q)\psi,
+
+    which for white noise is ``sigma^2 M^-1``, the Cramér-Rao bound. Both covariances are sums over the exact responses
+    to one pulse, which solve the discrete Lyapunov equations of the sampled system.
+
+    In a closed loop psi are driven by its noise-free input, ``S r``. With the input itself, ``u = S (r - v)`` for a
+    reference that enters at the controller, and white noise, psi has the part of the noise too: feedback then is a
+    second reference, and the variances are somewhat smaller [1]_. That needs a sample of delay around the loop.
+    """
+    from scipy.signal import lfilter  # slow to import
+
+    # Without a controller what drives the loop is the input, and no noise comes back.
+    if controller is None:
+        controller, enters = OPEN, "input"
+    count = _memory(model, interval, controller, noise_filter)
+    pulse, times = np.zeros(count), np.asarray(interval * np.arange(count), dtype=float)
+    pulse[0] = 1.0
+    inputs: list[Array] = [standard_deviation * simulate_loop(model, controller, pulse, 0.0, interval, enters).u]
+    # What drives the instruments besides the reference: the noise, where they come from the input itself.
+    if instruments == "open_loop":
+        gain = float(np.ravel(noise_filter[0])[0] / np.ravel(noise_filter[1])[0])
+        noise = math.sqrt(innovation_variance) * gain * pulse
+        inputs.append(simulate_loop(model, controller, np.zeros(count), noise, interval, enters).u)
+    responses = [sensitivities(model, HeldSignal(times, u), times, zeros) for u in inputs]
+    found = unit_inverse(_moments(responses))
+    if found is None:
+        wrong = "the parameters are not determined, even by endless data"
+        raise DataError(f"{wrong}: some have no effect of their own, as where a pole cancels a zero or a gain is zero")
+    inverse, scale = found
+    filtered = [lfilter(*noise_filter, psi * scale, axis=0) for psi in responses]
+    covariance = sandwich(inverse, scale, innovation_variance * _moments(filtered), samples)
+    return ParameterAccuracy.of(model, covariance, zeros)
+
+
+def require_uncorrelated_input(
+    model: AdditiveModel | TransferFunction,
+    interval: float,
+    controller: DiscreteController,
+    noise_filter: tuple[ArrayLike, ArrayLike],
+) -> None:
+    """Refuse instruments made from the input of a loop if they are correlated with the noise at the same sample."""
+    why = "the noise is coloured" if any(np.size(part) > 1 for part in noise_filter) else ""
+    if not why and sampled_model(model, interval).state_space()[3].any() and controller.direct != 0.0:
+        why = "model and controller both react at once"
+    if why:
+        raise BiasedError(f"{why}, so that the input is correlated with the noise (closed_loop instruments are not)")
+
+
+def output_variance(model: AdditiveModel | TransferFunction, interval: float, input_deviation: float) -> float:
+    """Variance of the noise-free output of a stable model, for white noise held between the samples as the input."""
+    pulse = np.zeros(_memory(model, interval, OPEN, WHITE))
+    pulse[0] = input_deviation
+    x = simulate_loop(model, OPEN, pulse, 0.0, interval, "input").x
+    return float(x @ x)
+
+
+def _memory(
+    model: AdditiveModel | TransferFunction,
+    interval: float,
+    controller: DiscreteController,
+    noise_filter: tuple[ArrayLike, ArrayLike],
+) -> int:
+    """Samples after which the responses to one pulse have died away."""
+    # Integrators of a submodel are in the loop only, the poles that its sensitivities repeat outside of it too.
+    denominators = [s.denominator for s in model.submodels] if isinstance(model, AdditiveModel) else [model.denominator]
+    own = np.exp(interval * np.concatenate([np.roots(part) for part in denominators]).real).max(initial=0.0)
+    radius = max(loop_radius(model, controller, interval), float(own))
+    if radius >= 1.0:
+        wrong = "the system, or its loop, is not stable: there is no limit for long records"
+        raise DataError(f"{wrong}; its sampled poles reach the magnitude {radius:.6g}, and must stay below 1")
+    slowest = max(radius, float(np.abs(np.roots(np.ravel(noise_filter[1]))).max(initial=0.0)), DEADBEAT)
+    count = math.ceil(math.log(FORGOTTEN) / math.log(slowest) + model.delay / interval) + controller.order
+    if count > LONGEST_MEMORY:
+        raise DataError(f"the system forgets too slowly for a limit of long records: it takes {count} samples")
+    return count
+
+
+def _moments(responses: Sequence[Array]) -> Array:
+    """Covariance of outputs driven by independent white noises, from the responses to one pulse of each."""
+    return np.asarray(np.sum([response.T @ response for response in responses], axis=0))

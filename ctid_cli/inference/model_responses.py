@@ -1,0 +1,350 @@
+r"""Responses of an estimated model with confidence bands, from the joint covariance of its parameters.
+
+Linearised, a quantity g has the variance ``(dg/dtheta) C (dg/dtheta)'`` with exact derivatives, and its interval
+reaches as many standard errors to both sides as those of the parameters do. Sampled, parameters are drawn from the
+normal distribution with covariance C, or Student's t where C itself is uncertain, and the interval lies between
+quantiles of what the drawn models give: it need not be symmetric, and knows what a linearisation does not, such as
+what an uncertain delay does to the first instants of a step response.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.errors import DataError, UsageError
+from ctid_cli.inference.derived import indistinct
+from ctid_cli.inference.sensitivities import Model, Parametric
+from ctid_cli.inference.uncertainty import Uncertainty
+from ctid_cli.signals.checks import require_increasing
+from ctid_cli.signals.held import HeldSignal
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseBand:
+    """A response over time with its pointwise confidence band.
+
+    Parameters
+    ----------
+    t : ndarray, shape (N,)
+        Instants [s].
+    value : ndarray, shape (N,)
+        Response of the estimate [output unit]; of an impulse response per second.
+    standard_error : ndarray, shape (N,)
+        Standard error of each value; NaN where it is not defined.
+    lower, upper : ndarray, shape (N,)
+        Ends of the interval of each instant; a band that holds the whole curve is wider.
+    level : float
+        Confidence level of each interval [-].
+    """
+
+    t: Array = field(repr=False)
+    value: Array = field(repr=False)
+    standard_error: Array = field(repr=False)
+    lower: Array = field(repr=False)
+    upper: Array = field(repr=False)
+    level: float
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyBand:
+    """A frequency response with pointwise confidence bands of gain and phase.
+
+    Parameters
+    ----------
+    frequencies : ndarray, shape (N,)
+        Angular frequencies [rad/s].
+    value : ndarray of complex, shape (N,)
+        ``G(j w)`` of the estimate, delay included [output unit/input unit].
+    covariance : ndarray, shape (N, 2, 2)
+        Covariance of real and imaginary part: ellipses of a Nyquist plot.
+    gain : ndarray, shape (N,)
+        ``|G|`` [output unit/input unit].
+    gain_error, gain_lower, gain_upper : ndarray, shape (N,)
+        Its standard error and the ends of its interval, never below zero.
+    phase : ndarray, shape (N,)
+        Phase [rad], continuous over the frequency.
+    phase_error, phase_lower, phase_upper : ndarray, shape (N,)
+        Its standard error and the ends of its interval [rad].
+    level : float
+        Confidence level of each interval [-].
+    """
+
+    frequencies: Array = field(repr=False)
+    value: ComplexArray = field(repr=False)
+    covariance: Array = field(repr=False)
+    gain: Array = field(repr=False)
+    gain_error: Array = field(repr=False)
+    gain_lower: Array = field(repr=False)
+    gain_upper: Array = field(repr=False)
+    phase: Array = field(repr=False)
+    phase_error: Array = field(repr=False)
+    phase_lower: Array = field(repr=False)
+    phase_upper: Array = field(repr=False)
+    level: float
+
+
+@dataclass(frozen=True, eq=False)
+class PoleBand:
+    """Poles with their uncertainty.
+
+    Parameters
+    ----------
+    value : ndarray of complex, shape (n,)
+        Poles of the estimate [rad/s].
+    covariance : ndarray, shape (n, 2, 2)
+        Covariance of real and imaginary part [rad^2/s^2]; NaN of a pole that the data cannot tell from another.
+    standard_error : ndarray, shape (n,)
+        ``sqrt(var Re p + var Im p)`` [rad/s].
+    lower, upper : ndarray of complex, shape (n,)
+        Ends of the intervals of real and imaginary part, each by itself [rad/s].
+    reach : ndarray, shape (n,)
+        Axes of the ellipse that holds a complex pole with probability ``level``, over those of the covariance [-].
+    level : float
+        Confidence level [-].
+    """
+
+    value: ComplexArray
+    covariance: Array = field(repr=False)
+    standard_error: Array
+    lower: ComplexArray = field(repr=False)
+    upper: ComplexArray = field(repr=False)
+    reach: Array = field(repr=False)
+    level: float
+
+
+class SystemWithDelay(NamedTuple):
+    """A model as an object of another library."""
+
+    system: Any
+    #: Delay that is not part of the object [s].
+    delay: float
+
+
+#: Whether bands come from a linearisation or from drawn parameters.
+Bands = Literal["linearised", "sampled"]
+#: Parameters that are drawn, and the seed: one fit always gets one band.
+DRAWS, SEED = 1000, 20261122
+#: Points of a curve for which nobody gave any.
+POINTS = 400
+STEP = HeldSignal(np.zeros(1), np.ones(1))
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """A model with the joint law of the parameters of its fit."""
+
+    parametric: Parametric
+    law: Uncertainty
+
+    @classmethod
+    def of(cls, model: Model, names: tuple[str, ...], law: Uncertainty) -> Estimated:
+        """Join a model, the names of all parameters of its fit, and their law."""
+        return cls(Parametric(model, names), law)
+
+    @cached_property
+    def reported(self) -> Array:
+        """Covariance of all parameters; NaN where it is not defined or a parameter is held, shape (p, p)."""
+        return self.law.covariance
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance that takes held parameters as known."""
+        held = np.isnan(np.diag(self.reported))
+        if held.all():
+            return self.reported
+        return np.where(held[:, None] | held, 0.0, self.reported)
+
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Of the t distribution that parameters are drawn from [-]; infinite for the normal one."""
+        return self.law.degrees_of_freedom if self.law.bootstrap is None else np.inf
+
+    def intervals(self, slopes: Array, level: float) -> tuple[Array, Array]:
+        """Standard errors of quantities from their gradients, shape (N, p), and half the widths of their intervals."""
+        with np.errstate(invalid="ignore"):
+            variances = np.maximum(np.einsum("ni,ij,nj->n", slopes, self.covariance, slopes), 0.0)
+        errors = np.asarray(np.sqrt(variances))
+        return errors, self.law.reach(slopes, level) * errors
+
+    def of_parts(self, slopes: ComplexArray) -> Array:
+        """Covariances of real and imaginary parts from their gradients, shape (N, 2, 2)."""
+        parts = np.stack((slopes.real, slopes.imag), axis=1)
+        return np.asarray(np.einsum("nki,ij,nlj->nkl", parts, self.covariance, parts))
+
+    @property
+    def linear_only(self) -> bool:
+        """Whether there is no covariance to draw parameters with."""
+        return not np.isfinite(self.covariance).all()
+
+    def draws(self) -> Iterator[Parametric]:
+        """Models with drawn parameters; those that are none are left out."""
+        mine, _ = self.parametric.free
+        values, vectors = np.linalg.eigh(self.covariance[np.ix_(mine, mine)])
+        rng = np.random.default_rng(SEED)
+        normal = rng.standard_normal((DRAWS, mine.size))
+        if np.isfinite(self.degrees_of_freedom):
+            normal /= np.sqrt(rng.chisquare(self.degrees_of_freedom, DRAWS) / self.degrees_of_freedom)[:, None]
+        for change in normal @ (vectors * np.sqrt(np.maximum(values, 0.0))).T:
+            with suppress(DataError):
+                yield self.parametric.at(change)
+
+
+def simulated(
+    found: Estimated, signal: HeldSignal, times: ArrayLike | None, level: float, bands: Bands
+) -> ResponseBand:
+    """Output from rest."""
+    return _over_time(found, found.parametric, signal, _instants(signal.t if times is None else times), level, bands)
+
+
+def step_response(found: Estimated, times: ArrayLike | None, level: float, bands: Bands) -> ResponseBand:
+    """Output for a step of size one at time zero."""
+    return _over_time(found, found.parametric, STEP, _response_times(found, times), level, bands)
+
+
+def impulse_response(found: Estimated, times: ArrayLike | None, level: float, bands: Bands) -> ResponseBand:
+    """Derivative of the step response."""
+    return _over_time(found, found.parametric.derivative, STEP, _response_times(found, times), level, bands)
+
+
+def frequency_response(found: Estimated, frequencies: ArrayLike | None, level: float, bands: Bands) -> FrequencyBand:
+    """Gain and phase: the parts of ``d ln G = dG/G`` are the relative change of the gain and that of the phase."""
+    _check(level, bands)
+    model = found.parametric.model
+    w = _grid(found.parametric) if frequencies is None else _checked_frequencies(frequencies)
+    value, phase = model.frequency_response(w), _phase(found.parametric, w)
+    gain = np.abs(value)
+    slopes = found.parametric.frequency_slopes(w)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        relative = slopes / value[:, None]
+    gain_error, wide = found.intervals(relative.real, level)
+    phase_error, turn = found.intervals(relative.imag, level)
+    if bands == "linearised" or found.linear_only:
+        lower, upper, low_phase, high_phase = gain * np.exp(-wide), gain * np.exp(wide), phase - turn, phase + turn
+    else:
+        drawn = np.array([one.model.frequency_response(w) for one in found.draws()])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            turned = np.angle(drawn / value)
+        lower, upper = _quantiles(np.abs(drawn), level)
+        low_phase, high_phase = (phase + end for end in _quantiles(turned, level))
+    covariance = found.of_parts(slopes)
+    return FrequencyBand(
+        w, value, covariance, gain, gain * gain_error, lower, upper, phase, phase_error, low_phase, high_phase, level
+    )
+
+
+def poles(found: Estimated, level: float) -> PoleBand:
+    """Poles by the delta method."""
+    _check(level, "linearised")
+    value, slopes = found.parametric.poles()
+    slopes[~np.isfinite(slopes).all(axis=1)] = np.nan
+    covariance = found.of_parts(slopes)
+    for k in range(value.size):
+        others = np.arange(value.size) != k
+        if indistinct(value, k, slopes[k], others, found.covariance, lambda row: found.law.quantile(row, level)):
+            covariance[k] = np.nan
+    with np.errstate(invalid="ignore"):
+        errors = np.sqrt(np.maximum(np.einsum("nkk->nk", covariance), 0.0))
+    half = found.law.reach(slopes.real, level) * errors[:, 0] + 1j * found.law.reach(slopes.imag, level) * errors[:, 1]
+    reach = np.full(value.size, _ellipse(level, found.degrees_of_freedom))
+    return PoleBand(value, covariance, np.hypot(*errors.T), value - half, value + half, reach, level)
+
+
+# --- how ------------------------------------------------------------------------------------------
+
+
+def _over_time(
+    found: Estimated, model: Parametric, signal: HeldSignal, t: Array, level: float, bands: Bands
+) -> ResponseBand:
+    _check(level, bands)
+    value, slopes = model.simulated(signal, t), model.output_slopes(signal, t)
+    errors, half = found.intervals(slopes, level)
+    if bands == "linearised" or found.linear_only:
+        lower, upper = value - half, value + half
+    else:
+        behind = (one.derivative if model.differentiated else one for one in found.draws())
+        lower, upper = _quantiles(np.array([one.simulated(signal, t) for one in behind]), level)
+    return ResponseBand(t, value, errors, lower, upper, level)
+
+
+def _quantiles(drawn: Array, level: float) -> tuple[Array, Array]:
+    """Ends of the middle part of what was drawn; what overflows lies beyond both."""
+    low, high = np.nanquantile(drawn, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+    return low, high
+
+
+def _ellipse(level: float, degrees_of_freedom: float) -> float:
+    """Radius of the region of two numbers with unit covariance that holds both with a probability."""
+    if not np.isfinite(degrees_of_freedom):
+        return float(np.sqrt(-2.0 * np.log1p(-level)))
+    # Of Hotelling's T^2 of two numbers: 2 F(2, d), whose quantile has a closed form.
+    d = degrees_of_freedom
+    return float(np.sqrt(d * ((1.0 - level) ** (-2.0 / d) - 1.0)))
+
+
+def _check(level: float, bands: str) -> None:
+    if not 0.0 < level < 1.0:
+        raise UsageError(f"the level of a confidence band lies between 0 and 1, such as 0.95; got {level:g}")
+    if bands not in get_args(Bands):
+        raise UsageError(f"bands are {' or '.join(map(repr, get_args(Bands)))}; got {bands!r}")
+
+
+def _instants(times: ArrayLike) -> Array:
+    t = np.atleast_1d(np.array(times, dtype=float))
+    if t.ndim != 1 or not np.isfinite(t).all():
+        raise DataError("the instants of a response must be a list of finite numbers")
+    require_increasing("instants", t)
+    return t
+
+
+def _response_times(found: Estimated, times: ArrayLike | None) -> Array:
+    """Instants that are asked for, or until the slowest mode has settled."""
+    if times is not None:
+        return _instants(times)
+    model = found.parametric.model
+    decay = np.abs(found.parametric.poles()[0].real)
+    speeds = np.abs(found.parametric.poles()[0])
+    decay, speeds = decay[decay > 1e-9 * speeds.max(initial=0.0)], speeds[speeds > 0]
+    longest = 5.0 / float(decay.min()) if decay.size else 0.0
+    if speeds.size:
+        # A mode that hardly decays is shown for thirty periods, and one that is much slower than all others in part.
+        longest = min(longest or np.inf, 60.0 * np.pi / float(speeds.min()))
+    return np.linspace(0.0, model.delay + (longest or 10.0 * (model.delay or 1.0)), POINTS)
+
+
+def _grid(parametric: Parametric) -> Array:
+    """Frequencies from well below to well above all corners."""
+    model = parametric.fraction
+    corners = np.abs(np.concatenate((model.poles, model.zeros)))
+    corners = corners[corners > 0]
+    if not corners.size:
+        corners = np.ones(1)
+    return np.geomspace(0.05 * float(corners.min()), 20.0 * float(corners.max()), POINTS)
+
+
+def _checked_frequencies(frequencies: ArrayLike) -> Array:
+    w = np.atleast_1d(np.array(frequencies, dtype=float))
+    if w.ndim != 1 or not np.isfinite(w).all() or (w < 0).any():
+        raise DataError("frequencies must be a list of finite numbers of rad/s, none below zero")
+    return w
+
+
+def _phase(parametric: Parametric, w: Array) -> Array:
+    """Phase [rad], continuous over frequency: that of the value, on the branch of the sum over poles and zeros."""
+    model, s = parametric.fraction, np.asarray(1j * w, dtype=complex)
+    with np.errstate(invalid="ignore"):
+        undelayed = parametric.model.frequency_response(w) * np.exp(s * model.delay)
+    wrapped = np.arctan2(undelayed.imag, undelayed.real)
+    branch = np.full(w.size, 0.0 if model.numerator[0] >= 0 else np.pi)
+    for corners, sign in ((model.zeros, 1.0), (model.poles, -1.0)):
+        away = s[:, None] - corners
+        branch += sign * np.sum(np.arctan2(away.imag, away.real), axis=1)
+    phase: Array = wrapped + 2.0 * np.pi * np.round((branch - wrapped) / (2.0 * np.pi)) - w * model.delay
+    return phase

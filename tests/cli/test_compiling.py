@@ -1,0 +1,93 @@
+"""Who waits for compiled functions is told so: once, on stderr, and only where there is something to wait for."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import typer
+
+from ctid_cli.cli import _compiling
+from ctid_cli.cli._common import ComputingCommand
+from ctid_cli.cli._compiling import ANNOUNCEMENT, CompilationNotice
+from ctid_cli.cli.main import app
+
+#: Commands that show, move or describe files, and need not load Numba.
+STORED = {"status", "show", "export", "verify", "repair", "merge", "init", "study list", "study publish"}
+
+
+class Clock:
+    """A clock and timers that go as the test says: each compilation takes six seconds."""
+
+    def __init__(self):
+        self.now = 0.0
+        self.waits = []
+
+    def __call__(self, wait, action):
+        self.waits.append(wait)
+        if wait < 6.0:
+            action()
+        return self
+
+    def start(self):
+        self.now += 6.0
+
+    def cancel(self):
+        pass
+
+    join = cancel
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(_compiling.threading, "Timer", clock)
+    monkeypatch.setattr(_compiling.time, "monotonic", lambda: clock.now)
+    return clock
+
+
+@pytest.mark.parametrize(
+    ("silent", "waits", "times"), [(2.0, [2.0], 1), (10.0, [10.0, 4.0], 1), (99.0, [99.0, 93.0, 87.0], 0)]
+)
+def test_one_sentence_when_compilation_takes_long_in_all(silent, waits, times, clock, monkeypatch, capsys):
+    monkeypatch.setattr(_compiling, "SILENT", silent)
+    notice = CompilationNotice()
+    for _ in range(3):
+        # A function that calls another one is compiled once that is.
+        notice.on_start(None)
+        notice.on_start(None)
+        notice.on_end(None)
+        notice.on_end(None)
+    assert clock.waits == waits
+    assert capsys.readouterr() == ("", times * f"{ANNOUNCEMENT}\n")
+
+
+def test_a_command_tells_it_in_a_pipe_and_with_a_filled_cache_never(tmp_path):
+    """Real compilation, announced at once: JSON stays JSON, and what is loaded from disk is no compilation."""
+    t = 0.001 * np.arange(2000)
+    np.savetxt(
+        tmp_path / "mains.csv", np.column_stack((t, np.cos(100 * np.pi * t))), header="t,u", delimiter=",", comments=""
+    )
+    program = "from ctid_cli.cli import _compiling, main; _compiling.SILENT = 0.0; main.main()"
+    command = [sys.executable, "-c", program, "track", "mains.csv", "--pmu", "50", "--json"]
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    told = []
+    for _ in range(2):
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+        json.loads(done.stdout)
+        told.append(done.stderr.count(ANNOUNCEMENT))
+    assert told == [1, 0]
+
+
+def test_every_command_that_computes_tells_it():
+    def commands(group, prefix=""):
+        for name, command in group.commands.items():
+            if hasattr(command, "commands"):
+                yield from commands(command, f"{name} ")
+            else:
+                yield prefix + name, command
+
+    quiet = {name for name, command in commands(typer.main.get_group(app)) if not isinstance(command, ComputingCommand)}
+    assert quiet == STORED

@@ -1,0 +1,155 @@
+"""Whether outputs answer to their inputs: how often noise passes for an answer, and how often an answer is missed."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import binom
+
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.inference import response_test as module
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
+
+FIRST_ORDER = TransferFunction([0.1], [1.0, 0.1], 5.0)
+#: Denominators of autoregressive noise: white, of first order, resonant, and a near random walk.
+COLOURS = ([1.0], [1.0, -0.5], [1.0, -0.8], [1.0, -0.95], np.real(np.poly(0.9 * np.exp([0.4j, -0.4j]))), [1.0, -0.998])
+
+
+def noise(rng, n, colour=(1.0,)):
+    e = lfilter([1.0], colour, rng.standard_normal(n + 2000))[2000:]
+    return e / e.std()
+
+
+def inputs(rng, n):
+    """A fast and a slow random binary input, steps, a sine and filtered noise."""
+    k = np.arange(n)
+    yield np.repeat(rng.choice([-1.0, 1.0], n // 2 + 1), 2)[:n]
+    yield np.repeat(rng.choice([-1.0, 1.0], n // 10 + 1), 10)[:n]
+    yield 1.0 * (k >= n // 10) - 1.5 * (k >= n // 2)
+    yield np.sin(0.1 * k)
+    yield lfilter([1.0], [1.0, -0.9], rng.standard_normal(n))
+
+
+def record_of(u, y, t=None):
+    return Record.from_arrays(np.arange(float(len(u))) if t is None else t, u, y)
+
+
+def outcome(*records, delays=(0.0, 10.0), **options):
+    return module.response_test(records, [record.valid for record in records], delays, **options)
+
+
+def answering(rng, n=400, share=0.36, colour=(1.0,), model=FIRST_ORDER):
+    """A record of which the model explains a share of the output's variance."""
+    u = next(inputs(rng, n))
+    x = simulate(model, HeldSignal(np.arange(float(n)), u), np.arange(float(n)))
+    return record_of(u, np.sqrt(share) * x / x.std() + np.sqrt(1 - share) * noise(rng, n, colour))
+
+
+def test_noise_seldom_passes_for_an_answer():
+    rng = np.random.default_rng(41)
+    found = [
+        outcome(record_of(u, noise(rng, 120, colour))).seen
+        for _ in range(4)
+        for colour in COLOURS
+        for u in inputs(rng, 120)
+    ]
+    # A test of level 5 % stays below in 999 of 1,000 such samples.
+    assert sum(found) <= binom.ppf(0.999, len(found), 0.05)
+    # One that never gives a false alarm would not know its level.
+    assert sum(found) >= 1
+
+
+@pytest.mark.parametrize("colour", [COLOURS[0], COLOURS[2]])
+def test_an_answer_that_fits_20_percent_is_seen(colour):
+    rng = np.random.default_rng(42)
+    found = [outcome(answering(rng, 500, colour=colour)).seen for _ in range(12)]
+    # With a power of 95 % two are missed, or fewer, in 98 of 100 such samples.
+    assert sum(found) >= 10
+
+
+def test_one_step_in_noise_is_seen():
+    """The output of a step looks like slow noise; what the answer leaves of it does not."""
+    rng = np.random.default_rng(52)
+    t = np.arange(300.0)
+    u = 1.0 * (t >= 100)
+    x = simulate(FIRST_ORDER, HeldSignal(t, u), t) / 0.47
+    assert all(outcome(record_of(u, 0.94 * x + 0.33 * noise(rng, 300, COLOURS[2]))).seen for _ in range(6))
+
+
+@pytest.mark.parametrize("initial_state", ["rest", "estimate"])
+def test_the_share_is_that_of_least_squares(initial_state):
+    rng = np.random.default_rng(43)
+    record = answering(rng, 100)
+    t, y, best = record.t, record.y - record.y.mean(), 0.0
+    for pole in module._poles(1.0, 99.0):
+        denominator = np.real(np.poly([pole, pole.conjugate()] if np.imag(pole) else [pole]))
+        beside = [np.ones(100)]
+        if initial_state == "estimate" and pole:
+            beside += [np.exp(pole * t).real] + [np.exp(pole * t).imag] * bool(np.imag(pole))
+        left = y - np.column_stack(beside) @ np.linalg.lstsq(np.column_stack(beside), y, rcond=None)[0]
+        columns = np.column_stack([*beside, simulate(TransferFunction([1.0], denominator, 4.0), record.input, t)])
+        rest = y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
+        best = max(best, 1 - float(rest @ rest) / float(left @ left))
+    found = outcome(record, delays=(4.0, 4.0), initial_state=initial_state)
+    assert found.explained == pytest.approx(best, rel=1e-6)
+
+
+def test_a_clock_with_holes_and_an_irregular_one():
+    rng = np.random.default_rng(46)
+    record = answering(rng)
+    y = np.where(rng.random(400) < 0.3, np.nan, record.y)
+    assert outcome(record_of(record.input.values, y)).seen
+    t = np.cumsum(rng.uniform(0.2, 1.8, 400))
+    x = simulate(FIRST_ORDER, record.input, t)
+    assert outcome(Record(t, x / x.std() + noise(rng, 400), record.input)).seen
+
+
+def test_a_long_record_is_averaged_and_a_fast_answer_is_still_seen():
+    rng = np.random.default_rng(47)
+    u = rng.choice([-1.0, 1.0], 9000)
+    assert outcome(record_of(u, np.append(0.0, u[:-1]) + noise(rng, 9000))).seen
+    assert not outcome(record_of(u, noise(rng, 9000))).seen
+
+
+@pytest.mark.parametrize("model", [([1.0], [1.0, 0.0]), ([1.0], [1.0, 0.005, 0.25]), ([-0.1, 0.01], [1.0, 0.2, 0.01])])
+def test_without_noise_an_answer_is_always_seen(model):
+    """Integrating, hardly damped, and with a zero in the right half plane."""
+    rng = np.random.default_rng(48)
+    t = np.arange(300.0)
+    for u in inputs(rng, 300):
+        assert outcome(record_of(u, simulate(TransferFunction(*model), HeldSignal(t, u), t))).seen
+
+
+def test_free_responses_and_steady_states():
+    rng = np.random.default_rng(49)
+    t = np.arange(100.0)
+    # Most of the answer to a pulse at the end comes at the beginning of the next period.
+    u = 1.0 * (t >= 92)
+    twice = simulate(FIRST_ORDER, HeldSignal(np.arange(200.0), np.append(u, u)), np.arange(200.0))
+    steady = record_of(u, twice[100:] + 0.01 * noise(rng, 100))
+    assert outcome(steady).explained < 0.5
+    assert outcome(steady, initial_state="periodic").explained > 0.95
+    # A free response is none to the input, however large.
+    falling = record_of(next(inputs(rng, 100)), 50.0 * np.exp(-t / 12.0) + noise(rng, 100))
+    assert not outcome(falling, initial_state="estimate").seen
+
+
+def test_outliers_hide_no_answer():
+    rng = np.random.default_rng(50)
+    record = answering(rng, share=0.9)
+    y = record.y.copy()
+    y[rng.choice(400, 15, replace=False)] += 50.0 * rng.choice([-1.0, 1.0], 15)
+    assert outcome(record_of(record.input.values, y)).seen
+
+
+def test_what_cannot_be_tested_is_not_denied():
+    rng = np.random.default_rng(51)
+    held = record_of(np.ones(100), noise(rng, 100))
+    # From rest a constant input is a step.
+    assert np.isfinite(outcome(held).p_value)
+    still = Record(held.t, held.y, HeldSignal(held.t - 1e6, np.zeros(100)))
+    for found in (outcome(still), outcome(answering(rng, 7))):
+        assert np.isnan(found.p_value)
+        assert found.seen
+    assert outcome(record_of(next(inputs(rng, 100)), np.full(100, 3.0))).p_value == 1.0

@@ -1,0 +1,103 @@
+"""Sensitivities against differences of the simulated output, and covariances of records of given length."""
+
+import numpy as np
+import pytest
+from scipy.linalg import toeplitz
+
+from ctid_cli.filtering.sampled import simulate_additive
+from ctid_cli.inference.bounds import finite_record_covariance, limiting_accuracy
+from ctid_cli.inference.sensitivities import sensitivities
+from ctid_cli.models.additive import AdditiveModel, Submodel
+from ctid_cli.models.factoring import unfactored, unfactored_jacobian
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.noise import ArmaNoise
+
+MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([0.1, 1.0], [0.025, 0.01, 1.0])], 0.13)
+BODY = AdditiveModel([Submodel([0.2, 0.4], [0.3, 1.0], integrators=1), Submodel([0.1], [0.01, 0.1, 1.0])])
+FREE_BODY = AdditiveModel([Submodel([0.4], [1.0], integrators=2), Submodel([2.0, 0.5], [0.4, 1.0])])
+GAIN = AdditiveModel([Submodel([2.0], [1.0]), Submodel([0.5], [0.4, 1.0])], 0.02)
+
+
+def held(hold="zoh"):
+    rng = np.random.default_rng(3)
+    return HeldSignal(np.arange(0.0, 20.0, 0.25), rng.standard_normal(80), hold)
+
+
+def clock(regular):
+    return 0.05 * np.arange(400) if regular else np.cumsum(np.random.default_rng(1).uniform(0.01, 0.09, 400))
+
+
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize("model", [MODES, BODY, FREE_BODY, GAIN], ids=["modes", "1 integrator", "2", "gain"])
+def test_sensitivities_are_differences_of_the_output(model, regular, hold):
+    signal, times = held(hold), clock(regular)
+    psi = sensitivities(model, signal, times)
+    assert psi.shape == (400, len(model.names))
+    for k, value in enumerate(model.theta):
+        step = 1e-5 * abs(value)
+        moved = []
+        for sign in (1, -1):
+            theta = model.theta.copy()
+            theta[k] += sign * step
+            moved.append(simulate_additive(AdditiveModel.from_theta(theta, model.terms, model.delay), signal, times))
+        expected = (moved[0] - moved[1]) / (2 * step)
+        np.testing.assert_allclose(psi[:, k], expected, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize("zeros", [None, 3])
+def test_the_two_forms_obey_the_chain_rule(zeros, regular):
+    signal, times = held(), clock(regular)
+    model = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])], 0.13)
+    psi = sensitivities(unfactored(model), signal, times, zeros)
+    jacobian = unfactored_jacobian(model)
+    assert np.abs(jacobian[4]).max() == 0.0  # there is no b of degree 3 in the sum
+    chained = psi @ (np.delete(jacobian, 4, axis=0) if zeros is None else jacobian)
+    expected = sensitivities(model, signal, times)
+    assert (np.abs(chained - expected).max(axis=0) < 1e-9 * np.abs(expected).max(axis=0)).all()
+
+
+def test_covariance_is_the_double_sum_over_all_pairs_of_samples():
+    psi = sensitivities(MODES, held(), clock(True))
+    noise = ArmaNoise(numerator=(1.0, 0.5), denominator=(1.0, -0.85), innovation_variance=0.02)
+    autocovariances = noise.autocovariance(np.arange(400))
+    inverse = np.linalg.inv(psi.T @ psi)
+    expected = inverse @ psi.T @ toeplitz(autocovariances) @ psi @ inverse
+    deviations = np.sqrt(np.diag(expected))
+    covariance = finite_record_covariance(psi, autocovariances)
+    assert np.abs((covariance - expected) / np.outer(deviations, deviations)).max() < 1e-9
+    # Lags beyond the record do not count, and those not given are zero.
+    np.testing.assert_allclose(finite_record_covariance(psi, noise.autocovariance(np.arange(900))), covariance)
+    padded = np.append([0.3, 0.1], np.zeros(398))
+    np.testing.assert_allclose(
+        finite_record_covariance(psi, [0.3, 0.1]), finite_record_covariance(psi, padded), rtol=1e-9
+    )
+
+
+def test_long_records_approach_the_limit():
+    count = 20_000
+    times = 0.05 * np.arange(count)
+    signal = HeldSignal(times, 2.0 * np.random.default_rng(0).standard_normal(count))
+    noise = ArmaNoise(numerator=(1.0, 0.5), denominator=(1.0, -0.85), innovation_variance=0.02)
+    limit = limiting_accuracy(
+        MODES,
+        0.05,
+        standard_deviation=2.0,
+        innovation_variance=0.02,
+        noise_filter=noise.filter,
+        samples=count,
+    )
+    psi = sensitivities(MODES, signal, times)
+    covariance = finite_record_covariance(psi, noise.autocovariance(np.arange(2000)))
+    ratios = np.sqrt(np.diag(covariance)) / limit.standard_errors
+    # The least damped mode has the time constant 5 s: some hundred independent stretches.
+    assert np.abs(ratios - 1).max() < 0.1
+    white = np.sqrt(np.diag(finite_record_covariance(psi, 0.02)))
+    assert np.abs(white / limit.standard_errors - 1).min() > 0.3
+
+
+def test_covariance_is_undefined_where_the_data_say_nothing():
+    assert np.isnan(finite_record_covariance(np.ones((50, 2)), 1.0)).all()
+    assert np.isnan(finite_record_covariance(np.zeros((50, 2)), [1.0, 0.5])).all()
+    assert np.isnan(finite_record_covariance(np.ones((1, 2)), 1.0)).all()
