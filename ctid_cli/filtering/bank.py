@@ -140,6 +140,7 @@ def _run(
         measured = NOTHING if own else data.u
         kernels.regular_pass(*modes, states, clock, driving, measured, output, data.use, layout, gram, rows, simulated)
     else:
+        assert not isinstance(delay, tuple)
         breaks = data.tu, data.u, data.input_foh
         kernels.irregular_pass(
             *modes, states, (data.t, delay, data.slack), breaks, output, data.use, layout, gram, rows, simulated
