@@ -135,15 +135,15 @@ def _run(
     output = data.y, data.y_foh
     if data.interval > 0.0:
         clock = (data.interval, *_place(delay, data.interval))
-        own = instruments is None
-        driving = (data.u if own else instruments, bool(data.input_foh and own))
-        measured = NOTHING if own else data.u
+        if instruments is None:
+            driving, measured = (data.u, bool(data.input_foh)), NOTHING
+        else:
+            driving, measured = (instruments, False), data.u
         kernels.regular_pass(*modes, states, clock, driving, measured, output, data.use, layout, gram, rows, simulated)
     else:
-        breaks = data.tu, data.u, data.input_foh
-        kernels.irregular_pass(
-            *modes, states, (data.t, delay, data.slack), breaks, output, data.use, layout, gram, rows, simulated
-        )
+        assert not isinstance(delay, tuple)
+        instants, breaks = (data.t, float(delay), data.slack), (data.tu, data.u, data.input_foh)
+        kernels.irregular_pass(*modes, states, instants, breaks, output, data.use, layout, gram, rows, simulated)
 
 
 def _place(delay: Place, interval: float) -> tuple[int, float]:
@@ -217,7 +217,7 @@ def double_chain(a: Array, b: Array, integrators: int) -> DoubleChain:
     single, entry, powers = chain(roots)
     powers = powers * (w0 ** np.arange(-order, 0.0))[:, None]
     output = b[::-1] @ powers[: b.size]
-    dynamics = np.kron(np.eye(2), single)
+    dynamics: Array = np.kron(np.eye(2), single)
     dynamics[order:, :order] = np.outer(entry, output)
     return DoubleChain(w0, dynamics, np.concatenate((entry, np.zeros(order))), powers, output)
 

@@ -92,7 +92,7 @@ def simulate_loop(
     _require_solvable(plant, discrete)
     A, B, C, D = discrete.state_space()
     law = plain_array(A), plain_array(B[:, 0]), plain_array(C[0]), float(D[0, 0])
-    u, x = kernels.loop_signals(tuple(plant), law, r, v, float(enters == "controller"))
+    u, x = kernels.loop_signals((*plant,), law, r, v, float(enters == "controller"))
     if not (np.isfinite(u).all() and np.isfinite(x).all()):
         raise DataError(
             "the signals of the closed loop are not finite; check reference, noise and stability: its largest pole has "

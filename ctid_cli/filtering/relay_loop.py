@@ -26,7 +26,7 @@ def simulate_relay(
     if plant.shift == 0 and plant.direct != 0.0:
         raise DataError("a relay needs a model that does not act at once: give it a delay, or fewer zeros than poles")
     before = float(enters == "controller")
-    u, x = kernels.relay_signals(tuple(plant), reference, noise, before, relay.amplitude, relay.hysteresis, relay.bias)
+    u, x = kernels.relay_signals((*plant,), reference, noise, before, relay.amplitude, relay.hysteresis, relay.bias)
     if not np.isfinite(x).all():
         raise DataError("the signals of the loop with the relay are not finite; check the system and the reference")
     return LoopSignals(u, x)

@@ -18,7 +18,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.filtering import kernels
 from ctid_cli.filtering.bank import (
@@ -247,7 +247,7 @@ class SubmodelFilter:
         v = kernels.loop_input(modes.poles, modes.residues, float(modes.direct.sum()), clock, *self.loop)
         return modal_pass(data, modes, delay, rows=rows, leading=leading, instruments=v)
 
-    def _in_steady_state(self, data: FilterData, modes: Modes) -> tuple[FilterData, float, Array]:
+    def _in_steady_state(self, data: FilterData, modes: Modes) -> tuple[FilterData, float, ComplexArray]:
         """Return the record with its input late by whole intervals, the delay left, and states that come back."""
         count, interval = data.y.size, data.interval
         period = interval * count

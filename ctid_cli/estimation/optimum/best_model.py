@@ -31,6 +31,9 @@ class SearchOptions:
     delays: tuple[float, float] = (0.0, 0.0)
     free_response: bool = False
     offset: bool = False
+    #: Poles at the origin, besides those that are searched. With free responses these hold the offset, too; no record
+    #: may repeat itself.
+    integrators: int = 0
     #: Period [s] of each record that repeats for ever, 0 for another; by default none repeats.
     periods: Sequence[float] = ()
     #: Denominators and delays [s] that other estimators have found.
@@ -46,19 +49,16 @@ class SearchOptions:
     seed: int = 0
     #: Coefficients that are known.
     known: KnownCoefficients = NOTHING
-    #: Poles at 0 besides. With free responses these hold the offset, too; no record may repeat itself.
-    integrators: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
     """The least output error that was found."""
 
-    #: Coefficients in descending powers, the denominator monic and without the integrators.
+    #: Coefficients in descending powers, the denominator monic.
     numerator: Array
     denominator: Array
     delay: float
-    integrators: int
     #: Of each record, coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers, and offset;
     #: zeros without them.
     free_responses: Array
@@ -81,6 +81,8 @@ class Optimum:
     agree: int
     evaluations: int
     box: Box = field(repr=False)
+    #: Poles at the origin, which the denominator does not have.
+    integrators: int = 0
 
     @property
     def model(self) -> TransferFunction:
@@ -178,6 +180,8 @@ def problem_of(records: Sequence[FilterData], zeros: int, options: SearchOptions
     periods = tuple(options.periods) or (0.0,) * len(records)
     data = tuple(_one_period(*pair) if pair[1] else pair[0] for pair in zip(records, periods, strict=True))
     integrators = options.integrators
+    if integrators and any(periods):
+        raise ValueError("what an integrator makes of a periodic input need not repeat itself")
     return Problem(data, zeros, options.free_response, options.offset, periods, integrators=integrators)
 
 
@@ -211,7 +215,6 @@ def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Opt
         numerator=np.trim_zeros(b, "f") if b.any() else np.zeros(1),
         denominator=a,
         delay=point.delay.seconds,
-        integrators=nest.problem.integrators,
         free_responses=projected.free @ over,
         offsets=projected.offset,
         squared_error=best.local.squared_error,
@@ -226,4 +229,5 @@ def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Opt
         agree=agree,
         evaluations=nest.evaluations,
         box=nest.box,
+        integrators=nest.problem.integrators,
     )

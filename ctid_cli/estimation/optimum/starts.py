@@ -43,8 +43,8 @@ class Effort(NamedTuple):
     #: peak of the noise.
     alone: int
     denser: int
-    #: Whether a pole and a zero are also added at a time, from a single pole on, and models as fast as their input are
-    #: starts, too.
+    #: Whether a pole and a zero are also added at a time, from a single pole on, and whether models with as many zeros
+    #: as poles are starts although the delay is free.
     spine: bool
     #: Up to so many poles the whole range of the delay is looked at.
     along_delay: float
