@@ -16,7 +16,7 @@ from ctid_cli.filtering.loop import loop_radius, simulate_loop
 from ctid_cli.inference.fit import Status
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
-from ctid_cli.models.factoring import factored, factored_jacobian
+from ctid_cli.models.factoring import factored
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Loop, Record
 from tests.estimators.additive_records import (
@@ -31,13 +31,10 @@ from tests.estimators.additive_records import (
     modes,
     open_record,
 )
-from tests.estimators.records import assert_same_model
 
 TWO = (MODE, MODE)
 #: PD control of what integrates.
 PD = DiscreteController.from_pid(0.5, 0.0, 2.0)
-DRIVE = AdditiveModel([Submodel([0.5], [0.4, 1.0], 1), Submodel([0.05], [0.02, 0.02, 1.0])])
-RIGID = AdditiveModel([Submodel([0.3], [1.0], 2), Submodel([0.02], [0.02, 0.02, 1.0])])
 DELAYED = AdditiveModel(TWO_MODES.submodels, 0.12)
 BIPROPER = AdditiveModel([TWO_MODES.submodels[0], Submodel([0.3, 0.5], [0.1, 1.0])])
 
@@ -127,40 +124,6 @@ def test_estimate_with_closed_loop_instruments_solves_the_equations_of_clsrivc()
     assert np.abs(direct.model.numerator / b - 1).max() > 1e-4
 
 
-@pytest.mark.parametrize("covariance", ["white", "sandwich"])
-@pytest.mark.parametrize(
-    "system", [modes([0.25, 0.25, 3.0]), AdditiveModel([Submodel([0.3, 2.0], [0.1, 0.3, 1.0], 0)], 0.12)]
-)
-def test_one_submodel_is_srivc_with_closed_loop_instruments(system, covariance):
-    record = loop_record(system, 2000, 0.05, 4)
-    start = Start(model=disturbed(system, 2))
-    options = {"instruments": "closed_loop", "covariance": covariance, "tolerance": 1e-12, "delay": system.delay}
-    one = AdditiveSrivc(terms=system.terms, **options).fit(record, start)
-    term = system.terms[0]
-    two = Srivc(term.poles, term.zeros, **options).fit(record, start)
-    assert one.status is two.status is Status.CONVERGED
-    assert_same_model(one.model, two.model, 1e-10)
-    assert (one.count, one.iterations) == (two.count, two.iterations)
-    # The covariance of the anti-monic form is that of the monic one by the delta method.
-    jacobian = factored_jacobian(two.model, factored(two.model, system.terms))
-    if term.zeros:
-        converted = jacobian @ two.covariance @ jacobian.T
-        size = np.sqrt(np.diag(one.covariance))
-        np.testing.assert_allclose(converted / np.outer(size, size), one.covariance / np.outer(size, size), atol=1e-7)
-    theta = two.parameters
-    a2 = 1 / theta["a2"]
-    gradient = np.array([0.0, -(a2**2), 0.0] + [0.0] * term.zeros)
-    assert one.covariance[1, 1] == pytest.approx(gradient @ two.covariance @ gradient, rel=1e-8)
-
-
-@pytest.mark.parametrize("system", [TWO_MODES, DELAYED], ids=["no delay", "delay"])
-def test_hold_of_the_output_does_not_move_the_estimate(system):
-    record = loop_record(system, 3000, 0.1, 6)
-    one, two = (fitted(record, (system, 1), tolerance=1e-12, hold_output=hold) for hold in ("foh", "zoh"))
-    assert one.status is two.status is Status.CONVERGED
-    np.testing.assert_allclose(one.additive.theta, two.additive.theta, rtol=1e-8)
-
-
 @pytest.mark.parametrize("enters", ["controller", "input"])
 @pytest.mark.parametrize("system", [TWO_MODES, DELAYED, BIPROPER], ids=["modes", "delay", "biproper"])
 def test_noise_free_loop_returns_the_true_model(system, enters):
@@ -169,33 +132,6 @@ def test_noise_free_loop_returns_the_true_model(system, enters):
         fit = fitted(record, (system, 1, 0.02), instruments=instruments, tolerance=1e-11)
         assert fit.status is Status.CONVERGED
         assert_parameters(fit, system, 1e-7)
-
-
-@pytest.mark.parametrize("system", [DRIVE, RIGID], ids=["integrator and pole", "rigid body"])
-def test_integrators_in_a_loop(system):
-    fit = fitted(loop_record(system, 2000, 0.01, 1, controller=PD), (system, 1))
-    assert fit.status is Status.CONVERGED
-    assert fit.iterations <= 15
-    assert np.abs(deviations(fit, system)).max() < 4
-    assert fit.loop_radius < 1
-
-
-@pytest.mark.parametrize("system", [TWO_MODES, DELAYED])
-def test_record_of_a_loop_in_motion_is_fitted_exactly(system):
-    whole = loop_record(system, 1300, 0.0, 10)
-    cut = slice(100, None)
-    record = Record(
-        whole.t[cut],
-        whole.y[cut],
-        HeldSignal(whole.t[cut], whole.input.values[cut]),
-        loop=Loop(whole.loop.reference[cut], PID),
-    )
-    start = disturbed(system, 1, 0.02)
-    fit = fitted(record, start, initial_state="estimated", tolerance=1e-11)
-    assert fit.status is Status.CONVERGED
-    assert_parameters(fit, system, 1e-6)
-    at_rest = fitted(record, start, tolerance=1e-11)
-    assert np.abs(at_rest.additive.theta / system.theta - 1).max() > 1e-3
 
 
 def test_every_record_of_the_loop_converges():
@@ -239,19 +175,6 @@ def test_coloured_noise_in_a_loop_biases_direct_instruments_only():
     assert (np.abs(direct.mean(axis=0))[[3, 5]] > 2.5).all()
     # So do they scatter by one deviation: the mean square of 72 lies within 0.5 and 1.7.
     assert 0.5 < np.mean((closed - closed.mean(axis=0)) ** 2) * 12 / 11 < 1.7
-
-
-def test_standard_errors_are_those_of_repeated_loops():
-    # 80 observed to stated standard deviations: their ratio lies within 0.7 and 1.35 with 99.9 % confidence.
-    system = modes([0.25, 0.25, 3.0, 0.02, 0.025, 1.0])
-    estimates, stated = [], []
-    for seed in range(80):
-        fit = fitted(loop_record(system, 3000, 0.1, 400 + seed), system)
-        assert fit.status is Status.CONVERGED
-        estimates.append(fit.additive.theta)
-        stated.append(np.diag(fit.covariance))
-    ratio = np.sqrt(np.mean(stated, axis=0)) / np.std(estimates, axis=0, ddof=1)
-    assert ((ratio > 0.7) & (ratio < 1.35)).all()
 
 
 ESTIMATORS = [
