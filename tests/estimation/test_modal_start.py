@@ -1,48 +1,29 @@
 """Starts for sums of submodels, from the record alone."""
 
-import math
-
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimation import modal_start
 from ctid_cli.estimation.common import Start
-from ctid_cli.estimation.modal_start import _arrangements, _criterion, _NumeratorFit, automatic_start
+from ctid_cli.estimation.modal_start import automatic_start
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc
-from ctid_cli.filtering.filter_data import filter_data
-from ctid_cli.filtering.sampled import simulate_additive
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from tests.estimators.additive_records import (
-    BEAM,
     FOUR_MODES,
     MODE,
     TWO_MODES,
     assert_parameters,
+    beam_record,
+    coloured_record,
     loop_record,
     open_record,
 )
 
 MODE_1 = Submodel([3.0], [0.25, 0.25, 1.0])
 MODE_2 = Submodel([1.0], [0.025, 0.01, 1.0])
-
-
-def beam_record(noise, seed, *, period=1):
-    """Two seconds of a multisine up to 500 Hz on a beam with a delay of four samples; from rest in its first period."""
-    rng = np.random.default_rng(seed)
-    n, rate = 8192, 4096.0
-    spectrum = np.zeros(n // 2 + 1, complex)
-    spectrum[1:1001] = np.exp(2j * np.pi * rng.uniform(size=1000))
-    u = np.fft.irfft(spectrum, n)
-    u /= u.std()
-    t = np.arange(n * period) / rate
-    system = AdditiveModel(BEAM.submodels, 4 / rate)
-    x = simulate_additive(system, HeldSignal(t, np.tile(u, period)), t)[-n:]
-    y = x + noise * np.sqrt(np.mean(x**2)) * rng.standard_normal(n)
-    return Record(t[:n], y, HeldSignal(t[:n], u)), system
 
 
 def assert_in_basin(record, system, **options):
@@ -59,24 +40,9 @@ def assert_in_basin(record, system, **options):
     return start
 
 
-def coloured_record(seed):
-    """Four modes with the published noise, strong where the first two are."""
-    rng = np.random.default_rng(seed)
-    t = 0.05 * np.arange(2000)
-    u = HeldSignal(t, rng.standard_normal(2000))
-    v = lfilter([1.0, 0.5], [1.0, -0.85], np.sqrt(0.02) * rng.standard_normal(2200))[200:]
-    return Record(t, simulate_additive(FOUR_MODES, u, t) + v, u)
-
-
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_four_modes_in_coloured_noise(seed):
     assert_in_basin(coloured_record(seed), FOUR_MODES)
-
-
-def test_spectra_alone_would_do_in_coloured_noise(monkeypatch):
-    monkeypatch.setattr(modal_start, "_transfer_function_poles", lambda *_: None)
-    start = assert_in_basin(coloured_record(1), FOUR_MODES)
-    assert "weighted by local noise levels" in start.method
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -85,12 +51,13 @@ def test_two_modes_in_closed_loop(seed):
 
 
 def test_beam_from_rest():
-    start = assert_in_basin(*beam_record(1e-3, 0))
+    record, system, _ = beam_record(0, noise=1e-3)
+    start = assert_in_basin(record, system)
     assert "free response" not in start.method
 
 
 def test_beam_that_still_rings():
-    record, system = beam_record(1e-5, 1, period=3)
+    record, system, _ = beam_record(1, periods=3)
     start = automatic_start(record, system.terms, system.delay)
     assert start.method.endswith("a free response was fitted along with the numerators.")
     # Damping shows little in two seconds of modes that ring for half a minute.
@@ -169,14 +136,10 @@ def test_terms_keep_their_order_and_equal_ones_rise_in_frequency():
     system = AdditiveModel([Submodel([2.0], [0.02, 1.0]), MODE_2, MODE_1])
     start = automatic_start(open_record(system, 2000, 0.05, 8, interval=0.02), system.terms)
     assert start.model.terms == (Term(1, 0), MODE, MODE)
-    assert_parameters_close(start.model, AdditiveModel([Submodel([2.0], [0.02, 1.0]), MODE_1, MODE_2]))
+    expected = AdditiveModel([Submodel([2.0], [0.02, 1.0]), MODE_1, MODE_2])
+    np.testing.assert_allclose(start.model.theta, expected.theta, rtol=0.1)
     turned = automatic_start(open_record(system, 2000, 0.05, 8, interval=0.02), system.terms[::-1])
-    assert_parameters_close(turned.model.sorted(), start.model.sorted(), 1e-6)
-
-
-def assert_parameters_close(model, expected, tolerance=0.1):
-    assert model.terms == expected.terms
-    np.testing.assert_allclose(model.theta, expected.theta, rtol=tolerance)
+    np.testing.assert_allclose(turned.model.sorted().theta, start.model.sorted().theta, rtol=1e-6)
 
 
 def test_units_do_not_matter():
@@ -201,76 +164,21 @@ def test_gain_alone_is_plain_least_squares():
     np.testing.assert_allclose(gain, u @ record.y / (u @ u), rtol=1e-10)
 
 
-def test_errors_are_sentences():
+def test_errors_are_sentences(monkeypatch):
     record = open_record(TWO_MODES, 200, 0.1, 12)
     seven = Record(record.t[:7], record.y[:7], record.input, name="bench")
     with pytest.raises(DataError, match="bench: no start was found: 7 samples"):
         automatic_start(seven, TWO_MODES.terms)
-
-
-def test_no_way_finds_anything(monkeypatch):
     monkeypatch.setattr(modal_start.pole_relocation, "spectral_lines", lambda *_, **__: None)
     monkeypatch.setattr(modal_start, "_transfer_function_poles", lambda *_, **__: None)
     with pytest.raises(DataError, match="no modes of the structure asked for"):
-        automatic_start(open_record(TWO_MODES, 200, 0.1, 13), TWO_MODES.terms)
+        automatic_start(record, TWO_MODES.terms)
 
 
-def test_pairs_and_real_poles_are_shared_out():
-    pair, slow, middle, fast = -1 + 5j, -0.1 + 0j, -1 + 0j, -10 + 0j
-    assert list(_arrangements([pair, slow], (Term(1, 0), MODE))) == [[[slow], [pair]]]
-    # Of three real poles any one may be the single one; the others are a term's two poles.
-    three = list(_arrangements([slow, middle, fast], (MODE, Term(1, 0))))
-    assert [[slow, middle], [fast]] in three
-    assert [[slow, fast], [middle]] in three
-    assert [[middle, fast], [slow]] in three
-    # A pair without room becomes two real poles about its magnitude.
-    ((one,), (two,)) = next(_arrangements([pair], (Term(1, 0), Term(1, 0))))
-    assert one.imag == two.imag == 0
-    assert abs(one) < abs(two)
-    np.testing.assert_allclose(abs(one * two), abs(pair) ** 2)
-    # The wrong number of poles fits no term.
-    assert list(_arrangements([pair, slow], (MODE,))) == []
-    assert list(_arrangements([pair], (MODE, Term(1, 0)))) == []
-
-
-@pytest.mark.parametrize("others", [[], [Submodel([0.5], [1.0], 2)], [Submodel([0.7], [1.0])]])
-def test_spare_poles_are_those_that_explain_least(others):
-    system = AdditiveModel([MODE_1, MODE_2, *others])
-    record = open_record(system, 1000, 0.01, 15)
-    fitter = _NumeratorFit(filter_data(record), system.terms, 0.0)
-    first, second = (complex(mode.poles[0].real, abs(mode.poles[0].imag)) for mode in (MODE_1, MODE_2))
-    assert fitter.reduced([-0.5 + 4j, first, -3 + 0j, second], 4) == [first, second]
-    # Of two pairs for three poles the better damped one, here the first, becomes a real pole.
-    assert fitter.reduced([first, second], 3) == [complex(-abs(first)), second]
-
-
-def test_different_structures_are_tried_in_every_order():
-    pairs = [complex(-1, k) for k in (1, 2, 3)]
-    terms = (MODE, Term(2, 1), MODE)
-    found = [[poles[0] for poles in groups] for groups in _arrangements(pairs, terms)]
-    one, two, three = pairs
-    assert sorted(found, key=str) == sorted([[one, two, three], [one, three, two], [two, one, three]], key=str)
-    many = (MODE, Term(2, 1), Term(2, 2), MODE)
-    orders = list(_arrangements([*pairs, -1 + 4j], many))
-    assert len(orders) == math.factorial(4) // 2
-    assert all(groups[0][0].imag < groups[3][0].imag for groups in orders)
-
-
-def test_criterion_is_a_likelihood_with_a_level_for_each_band():
-    error = np.random.default_rng(14).standard_normal(400)
-    power = np.abs(np.fft.rfft(error)) ** 2
-    bands = np.split(power, 16 * np.arange(1, 12))
-    expected = 2 * sum(band.size * np.log(band.mean()) for band in bands)
-    np.testing.assert_allclose(_criterion(error), expected, rtol=1e-12)
-    np.testing.assert_allclose(_criterion(10 * error) - _criterion(error), 4 * power.size * np.log(10), rtol=1e-12)
-    assert np.isfinite(_criterion(np.zeros(50)))
-
-
-@pytest.mark.parametrize("shift", [-3.0, 1e4])
 @pytest.mark.parametrize("initial_state", ["rest", "estimated"])
-def test_when_the_clock_began_does_not_matter(shift, initial_state):
+def test_when_the_clock_began_does_not_matter(initial_state):
     record = coloured_record(1)
-    later = Record(record.t + shift, record.y, HeldSignal(record.input.t + shift, record.input.values))
+    later = Record(record.t + 1e4, record.y, HeldSignal(record.input.t + 1e4, record.input.values))
     options = AdditiveSrivc(terms=FOUR_MODES.terms, initial_state=initial_state)
     fits = []
     for one in (record, later):

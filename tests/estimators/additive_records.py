@@ -41,6 +41,33 @@ def open_record(system, n, noise, seed, *, interval=INTERVAL, hold="zoh", times=
     return Record(t, x + noise * rng.standard_normal(n), u, noise_free=x)
 
 
+def coloured_record(seed, n=2000):
+    """Four modes with the published noise, strong where the first two are."""
+    rng = np.random.default_rng(seed)
+    t = INTERVAL * np.arange(n)
+    u = HeldSignal(t, rng.standard_normal(n))
+    v = lfilter([1.0, 0.5], [1.0, -0.85], np.sqrt(0.02) * rng.standard_normal(n + 200))[200:]
+    return Record(t, simulate_additive(FOUR_MODES, u, t) + v, u)
+
+
+def beam_record(seed, noise=1e-5, periods=1):
+    """Two seconds of a multisine up to 500 Hz on a beam with a delay of four samples, its system and its noise.
+
+    From rest in its first period.
+    """
+    rng = np.random.default_rng(seed)
+    n, rate = 8192, 4096.0
+    spectrum = np.zeros(n // 2 + 1, complex)
+    spectrum[1:1001] = np.exp(2j * np.pi * rng.uniform(size=1000))
+    u = np.fft.irfft(spectrum, n)
+    u /= u.std()
+    t = np.arange(n * periods) / rate
+    system = AdditiveModel(BEAM.submodels, 4 / rate)
+    x = simulate_additive(system, HeldSignal(t, np.tile(u, periods)), t)[-n:]
+    sigma = noise * np.sqrt(np.mean(x**2))
+    return Record(t[:n], x + sigma * rng.standard_normal(n), HeldSignal(t[:n], u)), system, sigma
+
+
 def loop_record(
     system, n, noise, seed, *, controller=PID, interval=INTERVAL, enters="controller", filter=([1.0], [1.0])
 ):

@@ -1,56 +1,84 @@
-"""Monte Carlo statistics against theory."""
+"""Monte Carlo statistics of the estimators of a delay, against theory and a local search beside the truth."""
 
 import numpy as np
 import pytest
 
 from ctid_cli.estimation.common import Start
+from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.td_srivc import TdSrivc
+from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
 from ctid_cli.inference.bounds import cramer_rao_bound
 from ctid_cli.inference.fit import Status
 from tests.estimators.records import CASE_1, make_record
 
-RUNS = 200
+BOUNDS = (0.0, 15.0)
+TRUTH = np.array([2.8, 4.0, 8.0, 8.0])
+LOCAL = TdSrivc(2, 0, BOUNDS)
+#: Data sets; estimator and where it starts; one of the same cost that need not search; and the time from which samples
+#: count [s].
+SEARCHES = {
+    "td_srivc": (200, LOCAL, 7.0, LOCAL, 15.0),
+    "useful_redundancy": (
+        120,
+        UsefulRedundancy(2, 0, delay_bounds=BOUNDS, bandwidth=2.02, svf_cutoff=1.0),
+        0.0,
+        LOCAL,
+        15.0,
+    ),
+    # At rest the input before the record is known to be zero, and every sample counts.
+    "delay_profile": (200, DelayProfile(2, 0, BOUNDS), 0.0, DelayProfile(2, 0, delay_bounds=(7.9, 8.1)), 0.0),
+}
 
 
-@pytest.fixture(scope="module")
-def monte_carlo():
-    """Estimates, reported standard errors and bounds of the second-order benchmark, 15 dB."""
-    estimator = TdSrivc(poles=2, zeros=0, delay_bounds=(0, 15))
+def record_of(replicate):
+    return make_record(CASE_1, seed=20170331, replicate=replicate, snr_db=15)
+
+
+@pytest.fixture(scope="module", params=SEARCHES)
+def monte_carlo(request):
+    """Estimates, standard errors and bounds of the second-order benchmark at 15 dB."""
+    runs, estimator, start, _, begin = SEARCHES[request.param]
     estimates, errors, bounds = [], [], []
-    for replicate in range(RUNS):
-        record = make_record(CASE_1, seed=20170331, replicate=replicate, snr_db=15)
-        fit = estimator.fit(record, Start(delay=7.0))
+    for replicate in range(runs):
+        record = record_of(replicate)
+        fit = estimator.fit(record, Start(start))
         assert fit.status is Status.CONVERGED
         estimates.append(list(fit.parameters.values()))
         errors.append(list(fit.standard_errors.values()))
         noise = np.sqrt(np.mean(record.noise_free**2) / 10**1.5)
-        bounds.append(np.diag(cramer_rao_bound(CASE_1, record, noise, start=15.0)))
-    return np.array(estimates), np.array(errors), np.sqrt(np.mean(bounds, axis=0)), np.sqrt(bounds)
+        bounds.append(np.diag(cramer_rao_bound(CASE_1, record, noise, start=begin)))
+    return request.param, np.array(estimates), np.array(errors), np.sqrt(bounds)
 
 
 def test_deviations_reach_the_cramer_rao_bound(monte_carlo):
-    # The deviation of 200 runs is itself known to 5 % (one standard error): 15 % is three of them.
-    estimates, _, bound, _ = monte_carlo
-    np.testing.assert_allclose(estimates.std(axis=0, ddof=1), bound, rtol=0.15)
+    # The deviation of 120 to 200 runs is itself known to 6.5 to 5 % (one standard error). Not one run is in a local
+    # minimum: five standard deviations, of which no sample of a normal distribution falls short.
+    _, estimates, _, bounds = monte_carlo
+    np.testing.assert_allclose(estimates.std(axis=0, ddof=1), np.sqrt(np.mean(bounds**2, axis=0)), rtol=0.15)
+    assert (np.abs(estimates - TRUTH) < 5 * bounds).all()
 
 
 def test_reported_standard_errors_are_the_bound(monte_carlo):
     # On average, and of each data set.
-    _, errors, bound, bounds = monte_carlo
-    np.testing.assert_allclose(errors.mean(axis=0), bound, rtol=0.02)
+    _, _, errors, bounds = monte_carlo
+    np.testing.assert_allclose(errors.mean(axis=0), np.sqrt(np.mean(bounds**2, axis=0)), rtol=0.02)
     np.testing.assert_allclose(errors, bounds, rtol=0.1)
 
 
-def test_estimates_are_unbiased(monte_carlo):
-    # |bias| below 3.3 standard errors of the mean: 99.9 % of the time for each parameter.
-    estimates, _, _, _ = monte_carlo
-    truth = [2.8, 4.0, 8.0, 8.0]
-    standard_error = estimates.std(axis=0, ddof=1) / np.sqrt(RUNS)
-    assert (np.abs(estimates.mean(axis=0) - truth) < 3.3 * standard_error).all()
+def test_estimates_are_unbiased_and_intervals_cover(monte_carlo):
+    # |bias| below 3.3 standard errors of the mean: 99.9 % of the time for each parameter. 95 % of the intervals of two
+    # standard errors hold the truth; 120 of them leave 88 to 100 %.
+    _, estimates, errors, _ = monte_carlo
+    standard_error = estimates.std(axis=0, ddof=1) / np.sqrt(len(estimates))
+    assert (np.abs(estimates.mean(axis=0) - TRUTH) < 3.3 * standard_error).all()
+    covered = (np.abs(estimates - TRUTH) < 1.96 * errors).mean(axis=0)
+    assert ((covered > 0.88) & (covered < 1.0)).all()
 
 
-def test_confidence_intervals_cover(monte_carlo):
-    # 95 % of the intervals of two standard errors hold the truth; 200 of them leave 90 to 99 %.
-    estimates, errors, _, _ = monte_carlo
-    covered = np.abs(estimates - [2.8, 4.0, 8.0, 8.0]) < 1.96 * errors
-    assert ((covered.mean(axis=0) > 0.90) & (covered.mean(axis=0) < 0.99)).all()
+def test_estimates_are_those_of_a_search_beside_the_truth(monte_carlo):
+    # By far less than a standard deviation: both end in the same minimum.
+    name, estimates, _, bounds = monte_carlo
+    local = SEARCHES[name][3]
+    for replicate in range(0, len(estimates), 8):
+        expected = list(local.fit(record_of(replicate), Start(8.0)).parameters.values())
+        assert (np.abs(estimates[replicate] - expected) < 1e-3 * bounds[replicate]).all()

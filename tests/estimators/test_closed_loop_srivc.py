@@ -14,12 +14,11 @@ from ctid_cli.estimators.srivc import Srivc
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.loop import loop_radius, simulate_loop
 from ctid_cli.inference.fit import Status
-from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
-from ctid_cli.models.factoring import factored, factored_jacobian, unfactored
+from ctid_cli.models.factoring import factored
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Loop, Record
-from tests.estimation.adapters import iterate
 from tests.estimators.additive_records import (
     INTERVAL,
     MODE,
@@ -32,13 +31,10 @@ from tests.estimators.additive_records import (
     modes,
     open_record,
 )
-from tests.estimators.records import assert_same_model
 
 TWO = (MODE, MODE)
 #: PD control of what integrates.
 PD = DiscreteController.from_pid(0.5, 0.0, 2.0)
-DRIVE = AdditiveModel([Submodel([0.5], [0.4, 1.0], 1), Submodel([0.05], [0.02, 0.02, 1.0])])
-RIGID = AdditiveModel([Submodel([0.3], [1.0], 2), Submodel([0.02], [0.02, 0.02, 1.0])])
 DELAYED = AdditiveModel(TWO_MODES.submodels, 0.12)
 BIPROPER = AdditiveModel([TWO_MODES.submodels[0], Submodel([0.3, 0.5], [0.1, 1.0])])
 
@@ -55,15 +51,6 @@ def reference_record():
     u, x = simulate_loop(TWO_MODES, PID, r, v, INTERVAL)
     t = INTERVAL * np.arange(3000)
     return Record(t, x + v, HeldSignal(t, u), noise_free=x, loop=Loop(r, PID))
-
-
-def test_reference_record():
-    record = reference_record()
-    u = record.input.values
-    first = [-0.0185404823, -0.0333535724, -0.0183051125, -0.0047443714]
-    np.testing.assert_allclose(u[:4], first, atol=1e-10)
-    assert np.sum(u**2) == pytest.approx(4.521475672, rel=1e-9)
-    assert np.sum(record.noise_free**2) == pytest.approx(81.84333235, rel=1e-9)
 
 
 @pytest.mark.parametrize("variant", ["plain", "relaxed"])
@@ -137,74 +124,6 @@ def test_estimate_with_closed_loop_instruments_solves_the_equations_of_clsrivc()
     assert np.abs(direct.model.numerator / b - 1).max() > 1e-4
 
 
-@pytest.mark.parametrize("covariance", ["white", "sandwich"])
-@pytest.mark.parametrize(
-    "system", [modes([0.25, 0.25, 3.0]), AdditiveModel([Submodel([0.3, 2.0], [0.1, 0.3, 1.0], 0)], 0.12)]
-)
-def test_one_submodel_is_srivc_with_closed_loop_instruments(system, covariance):
-    record = loop_record(system, 2000, 0.05, 4)
-    start = Start(model=disturbed(system, 2))
-    options = {"instruments": "closed_loop", "covariance": covariance, "tolerance": 1e-12, "delay": system.delay}
-    one = AdditiveSrivc(terms=system.terms, **options).fit(record, start)
-    term = system.terms[0]
-    two = Srivc(term.poles, term.zeros, **options).fit(record, start)
-    assert one.status is two.status is Status.CONVERGED
-    assert_same_model(one.model, two.model, 1e-10)
-    assert (one.count, one.iterations) == (two.count, two.iterations)
-    # The covariance of the anti-monic form is that of the monic one by the delta method.
-    jacobian = factored_jacobian(two.model, factored(two.model, system.terms))
-    if term.zeros:
-        converted = jacobian @ two.covariance @ jacobian.T
-        size = np.sqrt(np.diag(one.covariance))
-        np.testing.assert_allclose(converted / np.outer(size, size), one.covariance / np.outer(size, size), atol=1e-7)
-    theta = two.parameters
-    a2 = 1 / theta["a2"]
-    gradient = np.array([0.0, -(a2**2), 0.0] + [0.0] * term.zeros)
-    assert one.covariance[1, 1] == pytest.approx(gradient @ two.covariance @ gradient, rel=1e-8)
-
-
-@pytest.mark.parametrize("hold", ["foh", "zoh", "gauss-newton"])
-@pytest.mark.parametrize("system", [TWO_MODES, DELAYED], ids=["no delay", "delay"])
-def test_hold_of_the_output_does_not_move_the_estimate(system, hold):
-    record = loop_record(system, 3000, 0.1, 6)
-    expected = fitted(record, (system, 1), tolerance=1e-12)
-    assert expected.status is Status.CONVERGED
-    if hold != "gauss-newton":
-        fit = fitted(record, (system, 1), tolerance=1e-12, hold_output=hold)
-        np.testing.assert_allclose(fit.additive.theta, expected.additive.theta, rtol=1e-8)
-        return
-    problem = AdditiveProblem(
-        filter_data(record, system.delay), system.terms, system.delay, loop_data(record, "closed_loop")
-    )
-
-    class Newton:
-        def equations(self, theta):
-            found = problem.equations(theta)
-            return found._replace(instrument_regressor=found.hessian)
-
-        def admissible(self, theta):
-            return problem.admissible(theta)
-
-    found = iterate(Newton(), disturbed(system, 1, 0.01).theta, max_iterations=200, tolerance=1e-12, variant="relaxed")
-    assert found.status is Status.CONVERGED
-    np.testing.assert_allclose(found.theta, expected.additive.theta, rtol=1e-8)
-
-
-def test_no_controller_is_open_loop():
-    # u = r - 0 y: instruments of the loop are those of the input.
-    plain = open_record(TWO_MODES, 2000, 0.2, 7)
-    looped = Record(
-        plain.t, plain.y, plain.input, loop=Loop(plain.input.values, DiscreteController([0.0], [1.0]), "input")
-    )
-    one = fitted(plain, (TWO_MODES, 1), instruments="open_loop")
-    two = fitted(looped, (TWO_MODES, 1))
-    np.testing.assert_allclose(two.additive.theta, one.additive.theta, rtol=1e-11)
-    np.testing.assert_allclose(two.covariance, one.covariance, rtol=1e-9)
-    assert one.iterations == two.iterations
-    assert two.loop_radius < 1
-    assert np.isnan(one.loop_radius)
-
-
 @pytest.mark.parametrize("enters", ["controller", "input"])
 @pytest.mark.parametrize("system", [TWO_MODES, DELAYED, BIPROPER], ids=["modes", "delay", "biproper"])
 def test_noise_free_loop_returns_the_true_model(system, enters):
@@ -213,45 +132,6 @@ def test_noise_free_loop_returns_the_true_model(system, enters):
         fit = fitted(record, (system, 1, 0.02), instruments=instruments, tolerance=1e-11)
         assert fit.status is Status.CONVERGED
         assert_parameters(fit, system, 1e-7)
-
-
-@pytest.mark.parametrize("enters", ["controller", "input"])
-def test_where_the_reference_enters_matters(enters):
-    # Both estimates are within their errors of the truth, and a wrong statement would not simulate the loop.
-    record = loop_record(TWO_MODES, 4000, 0.1, 9, enters=enters)
-    fit = fitted(record, (TWO_MODES, 1))
-    assert fit.status is Status.CONVERGED
-    assert np.abs(deviations(fit, TWO_MODES)).max() < 4
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize("system", [DRIVE, RIGID], ids=["integrator and pole", "rigid body"])
-def test_integrators_in_a_loop(system, seed):
-    record = loop_record(system, 2000, 0.01, seed, controller=PD)
-    assert loop_radius(system, PD, INTERVAL) < 1
-    fit = fitted(record, (system, seed))
-    assert fit.status is Status.CONVERGED
-    assert fit.iterations <= 15
-    assert np.abs(deviations(fit, system)).max() < 4
-    assert fit.loop_radius < 1
-
-
-@pytest.mark.parametrize("system", [TWO_MODES, DELAYED])
-def test_record_of_a_loop_in_motion_is_fitted_exactly(system):
-    whole = loop_record(system, 1300, 0.0, 10)
-    cut = slice(100, None)
-    record = Record(
-        whole.t[cut],
-        whole.y[cut],
-        HeldSignal(whole.t[cut], whole.input.values[cut]),
-        loop=Loop(whole.loop.reference[cut], PID),
-    )
-    start = disturbed(system, 1, 0.02)
-    fit = fitted(record, start, initial_state="estimated", tolerance=1e-11)
-    assert fit.status is Status.CONVERGED
-    assert_parameters(fit, system, 1e-6)
-    at_rest = fitted(record, start, tolerance=1e-11)
-    assert np.abs(at_rest.additive.theta / system.theta - 1).max() > 1e-3
 
 
 def test_every_record_of_the_loop_converges():
@@ -265,11 +145,10 @@ def test_every_record_of_the_loop_converges():
         np.testing.assert_allclose(fits[0].additive.theta, fits[1].additive.theta, rtol=1e-5)
 
 
-@pytest.mark.parametrize("seed", [150])
-def test_relaxed_steps_end_a_cycle_of_full_ones(seed):
+def test_relaxed_steps_end_a_cycle_of_full_ones():
     # A short record on which full steps never settle.
-    record = loop_record(TWO_MODES, 500, 0.1, seed)
-    start = disturbed(TWO_MODES, 1000 + seed)
+    record = loop_record(TWO_MODES, 500, 0.1, 150)
+    start = disturbed(TWO_MODES, 1150)
     assert fitted(record, start, variant="plain").status is Status.MAX_ITERATIONS
     fit = fitted(record, start, variant="relaxed")
     assert fit.status is Status.CONVERGED
@@ -296,30 +175,6 @@ def test_coloured_noise_in_a_loop_biases_direct_instruments_only():
     assert (np.abs(direct.mean(axis=0))[[3, 5]] > 2.5).all()
     # So do they scatter by one deviation: the mean square of 72 lies within 0.5 and 1.7.
     assert 0.5 < np.mean((closed - closed.mean(axis=0)) ** 2) * 12 / 11 < 1.7
-
-
-def test_standard_errors_are_those_of_repeated_loops():
-    # 80 observed to stated standard deviations: their ratio lies within 0.7 and 1.35 with 99.9 % confidence.
-    system = modes([0.25, 0.25, 3.0, 0.02, 0.025, 1.0])
-    estimates, stated = [], []
-    for seed in range(80):
-        fit = fitted(loop_record(system, 3000, 0.1, 400 + seed), system)
-        assert fit.status is Status.CONVERGED
-        estimates.append(fit.additive.theta)
-        stated.append(np.diag(fit.covariance))
-    ratio = np.sqrt(np.mean(stated, axis=0)) / np.std(estimates, axis=0, ddof=1)
-    assert ((ratio > 0.7) & (ratio < 1.35)).all()
-
-
-def test_masked_samples_and_delay():
-    record = loop_record(DELAYED, 4000, 0.1, 12)
-    y = record.y.copy()
-    y[np.random.default_rng(1).choice(4000, 400, replace=False)] = np.nan
-    fit = fitted(replace(record, y=y), (DELAYED, 1))
-    assert fit.status is Status.CONVERGED
-    assert fit.count < 3601
-    assert np.abs(deviations(fit, DELAYED)).max() < 4
-    assert fit.loop_radius == pytest.approx(loop_radius(fit.additive, PID, INTERVAL))
 
 
 ESTIMATORS = [
@@ -383,15 +238,6 @@ def test_loop_without_a_solution_is_refused():
     assert BIPROPER.submodels[1].transfer_function().numerator[0] == pytest.approx(3.0)
     with pytest.raises(DataError, match="the loop has no solution"):
         AdditiveSrivc(terms=BIPROPER.terms, instruments="closed_loop").fit(looped, Start(model=BIPROPER))
-
-
-def test_unstable_estimate_of_an_open_loop_record_says_so():
-    # Instruments of the input need no loop, and none is looked at.
-    record = loop_record(TWO_MODES, 1000, 0.1, 3)
-    fit = fitted(record, (TWO_MODES, 1), instruments="open_loop")
-    assert np.isnan(fit.loop_radius)
-    assert unfactored(fit.additive).order == 4
-    assert fit.additive.terms == (Term(2, 0), Term(2, 0))
 
 
 @pytest.mark.parametrize("enters", ["controller", "input"])

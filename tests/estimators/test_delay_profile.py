@@ -13,7 +13,6 @@ from ctid_cli.estimation.output_error import Layout, sensitivities
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference.criteria import r_squared
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction
@@ -153,22 +152,15 @@ def test_one_experiment_twice_gives_the_same_model_and_half_the_variance():
 # --- the search ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("replicate", range(3))
+@pytest.mark.parametrize("replicate", range(2))
 @pytest.mark.parametrize("regular", [True, False])
-def test_finds_the_delay_of_case_1_in_heavy_noise(regular, replicate):
-    record = make_record(snr_db=5, regular=regular, replicate=replicate)
-    fit = DelayProfile(2, 0, (0, 15)).fit(record)
+@pytest.mark.parametrize("model", [CASE_1, CASE_2])
+def test_finds_the_delay_in_heavy_noise(model, regular, replicate):
+    record = make_record(model, snr_db=5, regular=regular, replicate=replicate)
+    fit = DelayProfile(model.order, model.numerator.size - 1, (0, 15)).fit(record)
     assert fit.status is Status.CONVERGED
     assert abs(fit.model.delay - 8.0) < 0.08
     # At least as low as the cost of the truth.
-    assert fit.cost <= np.mean((record.y - record.noise_free) ** 2)
-
-
-@pytest.mark.parametrize("replicate", range(2))
-def test_finds_the_delay_of_case_2_in_heavy_noise(replicate):
-    record = make_record(CASE_2, snr_db=5, replicate=replicate)
-    fit = DelayProfile(4, 1, (0, 15)).fit(record)
-    assert abs(fit.model.delay - 8.0) < 0.08
     assert fit.cost <= np.mean((record.y - record.noise_free) ** 2)
 
 
@@ -181,17 +173,6 @@ def test_the_profile_is_lowest_next_to_the_estimate(treated):
     spacing = np.diff(profile.delays).max()
     assert spacing <= 0.5 * np.pi / (profile.cutoff or profile.bandwidth) * (1 + 1e-12)
     assert abs(profile.delays[np.argmin(profile.costs)] - fit.model.delay) <= 1.5 * spacing
-
-
-@pytest.mark.parametrize(("model", "poles", "zeros"), [(CASE_1, 2, 0), (CASE_2, 4, 1)])
-@pytest.mark.parametrize("regular", [True, False])
-def test_the_search_finds_what_one_beside_the_truth_finds(model, poles, zeros, regular):
-    record = make_record(model, seed=7, snr_db=5, regular=regular)
-    near = DelayProfile(poles, zeros, (7.9, 8.1)).fit(record)
-    fit = DelayProfile(poles, zeros, (0, 15)).fit(record)
-    assert fit.status is Status.CONVERGED
-    assert fit.cost <= near.cost * (1 + 1e-9)
-    assert fit.model.delay == pytest.approx(near.model.delay, abs=1e-5)
 
 
 def test_records_too_short_for_filters_are_searched_on_every_sample():
@@ -222,46 +203,23 @@ def fitted(irregular=False):
 
 
 @pytest.mark.parametrize("irregular", [False, True])
-@pytest.mark.parametrize("factor", [1 / 86400, 1e6, 1e3], ids=["days", "microseconds", "milliseconds"])
-def test_the_unit_of_time_does_not_matter(factor, irregular):
+@pytest.mark.parametrize(
+    ("factor", "gain_u", "gain_y"),
+    [(1 / 86400, 1e6, 1.0), (1e6, 1e-6, 1e6), (1e3, 1.0, 1e-6)],
+    ids=["days", "us", "ms"],
+)
+def test_units_and_the_origin_of_time_do_not_matter(factor, gain_u, gain_y, irregular):
     record, fit = fitted(irregular)
-    scaled = Record(record.t * factor, record.y, HeldSignal(record.input.t * factor, record.input.values))
-    other = replace(OPTIONS, delay_bounds=(0, 1.5 * factor)).fit(scaled).model
-    powers = factor ** np.arange(3)
-    back = TransferFunction(other.numerator * factor**2, other.denominator * powers, other.delay / factor)
-    assert_same_model(back, fit.model, 1e-8)
-
-
-@pytest.mark.parametrize(("gain_u", "gain_y"), [(1e6, 1.0), (1e-6, 1e6), (1.0, 1e-6), (1e6, 1e6)])
-def test_the_units_of_input_and_output_do_not_matter(gain_u, gain_y):
-    record, fit = fitted()
-    scaled = Record(record.t, record.y * gain_y, HeldSignal(record.input.t, record.input.values * gain_u))
-    other = OPTIONS.fit(scaled)
-    back = TransferFunction(other.model.numerator * gain_u / gain_y, other.model.denominator, other.model.delay)
+    t, held = record.t + 1024.0, HeldSignal((record.input.t + 1024.0) * factor, record.input.values * gain_u)
+    other = replace(OPTIONS, delay_bounds=(0, 1.5 * factor)).fit(Record(t * factor, record.y * gain_y, held))
+    numerator, denominator = other.model.numerator, other.model.denominator * factor ** np.arange(3)
+    back = TransferFunction(numerator * factor**2 * gain_u / gain_y, denominator, other.model.delay / factor)
     assert_same_model(back, fit.model, 1e-8)
     assert other.offsets[0] == pytest.approx(fit.offsets[0] * gain_y, rel=1e-7)
-    assert other.standard_errors["a1"] == pytest.approx(fit.standard_errors["a1"], rel=1e-5)
-
-
-def test_a_shift_of_the_clock_does_not_matter():
-    record, fit = fitted()
-    later = Record(record.t + 1024.0, record.y, HeldSignal(record.input.t + 1024.0, record.input.values))
-    assert_same_model(OPTIONS.fit(later).model, fit.model, 1e-8)
+    assert other.standard_errors["a1"] * factor == pytest.approx(fit.standard_errors["a1"], rel=1e-5)
 
 
 # --- a given model on other records ----------------------------------------------------------------
-
-
-def test_errors_of_a_model_from_rest_are_those_of_its_simulation():
-    record, other = record_of(noise=0.1), record_of(noise=0.1, seed=1, irregular=True)
-    options = DelayProfile(2, 0, (0, 3))
-    fit = options.fit(record)
-    applied = options.prepare(other).laid_out.errors_of(fit.model)
-    expected = other.y - simulate(fit.model, other.input, other.t)
-    np.testing.assert_allclose(applied.residuals[0], expected, atol=1e-9)
-    again = options.prepare(record).laid_out.errors_of(fit.model)
-    np.testing.assert_allclose(again.residuals[0], fit.residuals[0], atol=1e-9)
-    assert r_squared(record.y, record.y - again.residuals[0]) == pytest.approx(fit.r2)
 
 
 @pytest.mark.parametrize("initial_state", ["estimate", "periodic"])
@@ -318,16 +276,11 @@ def test_a_constant_input():
     assert fit.model.dc_gain == pytest.approx(2 / 3)
 
 
-def test_a_range_beyond_the_record_and_no_record():
+def test_a_range_beyond_the_record_or_no_record_is_refused():
     with pytest.raises(DataError, match="not shorter than the record"):
         DelayProfile(2, 0, (0, 100)).fit(record_of())
     with pytest.raises(DataError, match="no record"):
         DelayProfile(2, 0, (0, 1)).fit([])
-
-
-def test_case_1_without_noise_is_exact():
-    fit = DelayProfile(2, 0, (0, 15)).fit(make_record(CASE_1, n=1500))
-    assert_same_model(fit.model, CASE_1, 1e-7)
 
 
 @pytest.mark.parametrize("offset", ["remove", "estimate"])

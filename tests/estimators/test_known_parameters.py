@@ -66,15 +66,6 @@ def test_known_coefficients_beside_an_estimated_offset():
     assert fit.parameters["offset"] == pytest.approx(expected["offset"], rel=1e-4)
 
 
-def test_knowing_what_is_estimated_changes_nothing_but_the_other_errors():
-    record = record_of()
-    free = DelayProfile(2, 1, (0.0, 2.0)).fit(record)
-    known = DelayProfile(2, 1, (0.0, 2.0), fixed=(Fixed("a1", free.parameters["a1"]),)).fit(record)
-    assert known.cost == pytest.approx(free.cost, rel=1e-9)
-    assert known.parameters == pytest.approx(free.parameters, rel=1e-4)
-    assert known.standard_errors["a2"] < free.standard_errors["a2"]
-
-
 def test_outliers_do_not_move_a_fit_with_a_known_coefficient():
     record = record_of()
     plain = DelayProfile(2, 1, (0.0, 2.0), fixed=(Fixed("a1", 1.2),)).fit(record)

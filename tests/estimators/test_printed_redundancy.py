@@ -8,13 +8,13 @@ import pytest
 from ctid_cli.errors import OptionError
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.redundancy import SearchStatus
+from ctid_cli.estimation.stability import with_stable_denominator
 from ctid_cli.estimators.td_srivc import INNER_ITERATIONS
 from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
-from tests.estimation.reference_iteration import stable
 from tests.estimators.records import make_record
 
 BOUNDS, FILTERS, BETA, BANDWIDTH, SVF_CUTOFF = (0.0, 15.0), 2, 3.0, 2.02, 1.0
@@ -53,12 +53,12 @@ class Transcription:
         """Algorithm I: coefficients, squared error and Gauss-Newton step of the delay, (26) and (27)."""
         if theta is None:
             highest, phi, *_ = self.signals(record, np.poly([-SVF_CUTOFF] * 2), 1.0, delay)
-            theta = stable(np.linalg.solve(phi @ phi.T, phi @ highest), 2)
+            theta = with_stable_denominator(np.linalg.solve(phi @ phi.T, phi @ highest), 2)
         for _ in range(INNER_ITERATIONS):
             highest, phi, psi, *_ = self.signals(record, np.append(1.0, theta[:2]), theta[2], delay)
             found = np.linalg.solve(psi @ phi.T, psi @ highest)
             change, power = psi.T @ (found - theta), np.sum((theta[2] * psi[2]) ** 2)
-            theta = stable(found, 2)
+            theta = with_stable_denominator(found, 2)
             if change @ change <= TOLERANCE**2 * power:
                 break
         _, _, psi, error, slope = self.signals(record, np.append(1.0, theta[:2]), theta[2], delay)

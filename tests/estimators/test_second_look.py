@@ -1,4 +1,7 @@
-"""What ``identify`` says of faults that are planted in a record, and that it says nothing where there are none."""
+"""What ``identify`` says of faults that are planted in a record, and that it says nothing where there are none.
+
+What was tried for bad residuals is what a fit with it gives.
+"""
 
 import numpy as np
 import pytest
@@ -7,6 +10,7 @@ from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.hold_comparison import best_other_hold
 from ctid_cli.estimators.identification import identify
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
+from ctid_cli.estimators.residual_causes import another_delay, another_order, clock_evidence
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
@@ -14,17 +18,22 @@ from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
 SYSTEM = TransferFunction([2.0], [1.0, 0.8, 2.0], 0.0)
-KNOWN = DelayProfile(2, 0, (0, 0))
+LATE = TransferFunction([2.0], [1.0, 0.8, 2.0], 2.5)
+KNOWN, SEARCHED = DelayProfile(2, 0, (0, 0)), DelayProfile(2, 0, (0, 1))
+FIRST_ORDER = DelayProfile(1, 0, (0, 0))
 NOISE = 0.1
 
 
-def record_of(model=SYSTEM, *, seed=0, n=1000, interval=0.2, hold="zoh", read_as=None, bias=0.0):
-    """A record of steps of random length, or of a random walk that is followed along straight lines."""
-    rng = np.random.default_rng(seed)
+def record_of(model=SYSTEM, *, seed=0, interval=0.2, hold="zoh", read_as=None, late=0.0):
+    """A record of steps of random length, or of a random walk that is followed along straight lines.
+
+    Samples are taken ``late`` after their time stamps.
+    """
+    rng, n = np.random.default_rng(seed), 1000
     t = interval * np.arange(n)
     u = np.repeat(rng.choice([-1.0, 1.0], n), rng.integers(3, 12, n))[:n] if hold == "zoh" else rng.standard_normal(n)
-    y = simulate(model, HeldSignal(t, u + bias, hold), t) + NOISE * rng.standard_normal(n)
-    return Record(t, y, HeldSignal(t, u + bias, read_as or hold))
+    y = simulate(model, HeldSignal(t, u, hold), np.sort(np.maximum(t + late, 0.0))) + NOISE * rng.standard_normal(n)
+    return Record(t, y, HeldSignal(t, u, read_as or hold))
 
 
 def changed(record, y):
@@ -43,6 +52,10 @@ def stopped(record, first, last):
     return changed(record, y)
 
 
+def jittered(seed):
+    return record_of(seed=seed, late=0.1 * np.random.default_rng(1000 + seed).standard_normal(1000))
+
+
 def looped(gain=0.8, n=1000):
     """A record in the loop of a proportional controller."""
     rng = np.random.default_rng(5)
@@ -58,7 +71,6 @@ def looped(gain=0.8, n=1000):
 
 CLEAN = record_of()
 FEW = 40 + 61 * np.arange(15)
-FIRST_ORDER = DelayProfile(1, 0, (0, 0))
 FAULTS = {
     "15 outliers": (spoilt(CLEAN, FEW, 50 * NOISE), KNOWN, "15 output samples are outliers (t = 8, 20.2, 32.4, ...)"),
     "one outlier": (spoilt(CLEAN, [500], -20 * NOISE), KNOWN, "1 output sample is an outlier (t = 100)"),
@@ -81,7 +93,11 @@ FAULTS = {
         MeasuredSubmodels((Term(1, 0, 1),)),
         "try --poles 2)",
     ),
-    "a delay that is not searched": (record_of(TransferFunction([2.0], [1.0, 0.8, 2.0], 4.0)), KNOWN, "--delay 0:"),
+    "a delay that is not searched": (record_of(LATE), KNOWN, "--delay 0:"),
+    "a delay outside the range": (record_of(LATE), SEARCHED, "try --delay 0:"),
+    "an offset": (changed(CLEAN, CLEAN.y + 0.3), KNOWN, "use --offset estimate"),
+    "jitter": (jittered(51), KNOWN, "as if the clock were wrong"),
+    "a clock that wanders": (record_of(late=0.2 + 0.2 * np.sin(0.04 * CLEAN.t)), SEARCHED, "clock were wrong"),
 }
 
 
@@ -96,6 +112,39 @@ def test_a_planted_fault_is_named_first_and_once(fault):
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
 def test_a_clean_record_needs_no_words(hold):
     assert identify(KNOWN, [record_of(seed=3, hold=hold)]).warnings == ()
+
+
+def test_coloured_noise_is_told_from_all_causes():
+    """Nothing is to be mended: every cause is in the sentence of those that were ruled out."""
+    rng, noise = np.random.default_rng(7), np.zeros(1000)
+    for k in range(1, 1000):
+        noise[k] = 0.8 * noise[k - 1] + 0.05 * rng.standard_normal()
+    clean = record_of(seed=53)
+    first, *others = identify(KNOWN, [changed(clean, clean.y + noise)]).warnings
+    for cause in ("ruled out", "one more pole", "another delay", "hold", "an offset", "drift", "feedback", "clock"):
+        assert cause in first
+    assert len(others) == 1
+
+
+def test_another_order_and_another_delay_are_what_fits_with_them_find():
+    prepared = FIRST_ORDER.prepare([CLEAN])
+    fit = prepared.fit()
+    richer = another_order(prepared.laid_out, fit, FIRST_ORDER)
+    assert (richer.poles, richer.zeros) == (2, 0)
+    assert richer.fall == pytest.approx(1 - KNOWN.fit([CLEAN]).cost / fit.cost, abs=1e-4)
+    record = record_of(LATE, seed=55)
+    prepared = KNOWN.prepare([record])
+    fit = prepared.fit()
+    elsewhere = another_delay(prepared.laid_out, fit, KNOWN)
+    wide = DelayProfile(2, 0, (0.0, 5.0)).fit([record])
+    assert elsewhere.delay == pytest.approx(wide.model.delay, abs=1e-3)
+    assert elsewhere.fall == pytest.approx(1 - wide.cost / fit.cost, abs=1e-4)
+
+
+def test_the_size_of_the_jitter_is_told():
+    record = jittered(56)
+    assert clock_evidence(KNOWN.fit([record]), [record]).jitter == pytest.approx(0.1, rel=0.35)
+    assert clock_evidence(KNOWN.fit([CLEAN]), [CLEAN]).share == 0.0
 
 
 def test_gaps_are_named():

@@ -7,16 +7,14 @@ import pytest
 
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.filter_search import LATTICE
-from ctid_cli.estimation.filtered_costs import minima_behind_all, percents
+from ctid_cli.estimation.filtered_costs import percents
 from ctid_cli.estimation.redundancy import SearchStatus
-from ctid_cli.estimation.spectral_problem import SpectralProblem
 from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.filtering.lowpass import Lowpass
-from ctid_cli.filtering.spectra import window_spectrum
+from ctid_cli.filtering.spectral_kernels import projected_moments
 from ctid_cli.inference.fit import Status
-from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from tests.estimators.records import CASE_1, CASE_2, SVF_CUTOFF, assert_same_model, make_record
@@ -29,7 +27,7 @@ FILTERS = {CASE_1: 10, CASE_2: 15}
 def member_costs(prepared, delay):
     """Costs of all filters at a delay, each with its own coefficients."""
     costs = prepared.laid_out.filtered.costs
-    return percents(minima_behind_all(costs, delay)[1], costs.spreads)
+    return percents(costs.minima_behind_all(delay)[1], costs.spreads)
 
 
 def reference_cost(prepared, delay):
@@ -59,20 +57,14 @@ def prepared():
 
 def same(one, two):
     """Whether two fits agree bit for bit, with their searches."""
-    return (
-        one.parameters == two.parameters
-        and one.history == two.history
-        and one.search == two.search
-        and one.covariance.tolist() == two.covariance.tolist()
-        and [(p.round, p.filter, p.delays.tolist(), p.costs.tolist(), p.coefficients.tolist()) for p in one.paths]
-        == [(p.round, p.filter, p.delays.tolist(), p.costs.tolist(), p.coefficients.tolist()) for p in two.paths]
-    )
+    paths = [[(p.round, p.filter, p.delays.tolist(), p.costs.tolist()) for p in fit.paths] for fit in (one, two)]
+    return (one.parameters, one.history, one.search, paths[0]) == (two.parameters, two.history, two.search, paths[1])
 
 
 # To the truth -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("start", [0.0, 3.0, 9.0])
+@pytest.mark.parametrize("start", [0.0, 9.0])
 @pytest.mark.parametrize("regular", [True, False])
 @pytest.mark.parametrize("model", [CASE_1, CASE_2])
 def test_noise_free_data_return_the_true_model_and_delay(model, regular, start):
@@ -83,23 +75,16 @@ def test_noise_free_data_return_the_true_model_and_delay(model, regular, start):
     assert_same_model(fit.model, model, 1e-6)
 
 
-@pytest.mark.parametrize("start", [0.0, 3.0, 9.0, 15.0, None])
-@pytest.mark.parametrize("snr_db", [5, 15])
-def test_every_start_leads_to_the_same_estimate(start, snr_db):
+@pytest.mark.parametrize("start", [0.0, 3.0, 15.0, None])
+def test_every_start_leads_to_the_same_estimate(start):
     # That of the plain search from right beside the true delay.
-    record = make_record(snr_db=snr_db, regular=False)
+    record = make_record(snr_db=5, regular=False)
     fit = UsefulRedundancy(**options()).fit(record, None if start is None else Start(start))
     near = TdSrivc(2, 0, BOUNDS).fit(record, Start(8.1))
     assert_same_model(fit.model, near.model, 1e-6)
     assert fit.cost == pytest.approx(near.cost, rel=1e-9)
     np.testing.assert_allclose(list(fit.standard_errors.values()), list(near.standard_errors.values()), rtol=1e-4)
     assert fit.count == near.count
-
-
-def test_delay_off_the_sampling_grid():
-    truth = TransferFunction(CASE_1.numerator, CASE_1.denominator, 7.98765)
-    record = make_record(truth, n=3000, clock_period=0.5)
-    assert_same_model(UsefulRedundancy(**options()).fit(record, Start(2.0)).model, truth, 1e-6)
 
 
 # Data sets on which the plain search from the same start ends in a local minimum, with every one of these filters.
@@ -151,33 +136,23 @@ def test_all_costs_have_their_minimum_at_the_true_delay(model):
     assert mean[np.abs(delays - 8.0) > 2.5].min() > 10 * mean.min()
 
 
-def test_reference_cost_is_the_mean_of_the_members_on_a_lattice(prepared):
+def test_reference_cost_is_the_mean_of_the_members_on_a_lattice_within_the_bounds():
+    prepared = UsefulRedundancy(**options(delay_bounds=(1.0, 9.0))).prepare(make_record(snr_db=5, n=2000))
     step = LATTICE * 2 * np.pi / BANDWIDTH[CASE_1]
-    for place in (3, 20, 40):
+    for place in (4, 20):
         mean = member_costs(prepared, place * step).mean()
         for part in (-0.49, 0.0, 0.3, 0.49):
             assert reference_cost(prepared, (place + part) * step) == pytest.approx(mean, rel=1e-9)
         assert abs(reference_cost(prepared, (place + 0.51) * step) - mean) > 1e-3 * mean
-    assert member_costs(prepared, 8.0).shape == (10,)
-
-
-def test_lattice_points_beyond_a_bound_are_moved_onto_it():
-    prepared = UsefulRedundancy(**options(delay_bounds=(1.0, 9.0))).prepare(make_record(snr_db=15))
-    for bound in (1.0, 9.0):
-        assert reference_cost(prepared, bound) > 0
-    step = LATTICE * prepared.laid_out.filtered.period
-    # The lattice points next to both bounds lie outside of them.
+    # The lattice points next to both bounds lie outside of them, and are moved onto them.
     assert round(1.0 / step) * step < 1.0
-    assert reference_cost(prepared, 1.0) == member_costs(prepared, 1.0).mean()
     assert round(9.0 / step) * step > 9.0
-    assert reference_cost(prepared, 9.0) == member_costs(prepared, 9.0).mean()
+    for bound in (1.0, 9.0):
+        assert reference_cost(prepared, bound) == member_costs(prepared, bound).mean()
 
 
 def test_members_are_those_of_the_filter_set(prepared):
-    expected = FilterSet(BANDWIDTH[CASE_1], 10, 10.0, 10)
-    assert prepared.laid_out.filtered.filters == expected
-    assert prepared.laid_out.filtered.costs.reach.size == 10
-    assert prepared.laid_out.filtered.period == pytest.approx(2 * np.pi / BANDWIDTH[CASE_1])
+    assert prepared.laid_out.filtered.filters == FilterSet(BANDWIDTH[CASE_1], 10, 10.0, 10)
     other = UsefulRedundancy(**options(filters=4, beta=3.0, order=5)).prepare(make_record(snr_db=15, n=2000))
     filters = other.laid_out.filtered.filters
     np.testing.assert_allclose(filters.cutoffs, BANDWIDTH[CASE_1] / np.array([3, 7 / 3, 5 / 3, 1]))
@@ -200,16 +175,14 @@ def test_starts_do_not_influence_one_another():
             assert same(prepared.fit(Start(start)), alone[start])
 
 
-@pytest.mark.parametrize(("model", "replicate", "start"), [(CASE_1, 2, 3.0), (CASE_2, 1, 0.0)])
-def test_search_tells_how_it_went(model, replicate, start):
-    record = make_record(model, snr_db=5, seed=5, replicate=replicate, n=4000)
-    estimator = UsefulRedundancy(**options(model))
-    prepared = estimator.prepare(record)
-    fit = prepared.fit(Start(start))
+def test_search_tells_how_it_went():
+    estimator = UsefulRedundancy(**options(CASE_2))
+    prepared = estimator.prepare(make_record(CASE_2, snr_db=5, seed=5, replicate=1, n=4000))
+    fit = prepared.fit(Start(0.0))
     search, trajectory, on_lattice = fit.search, fit.search.trajectory, prepared.laid_out.filtered.on_lattice
     assert search.status.succeeded
     # The first incumbent is the start, and every next one is better.
-    assert (trajectory[0].point, trajectory[0].round, trajectory[0].path) == (on_lattice(start), 0, -1)
+    assert (trajectory[0].point, trajectory[0].round, trajectory[0].path) == (0.0, 0, -1)
     costs = [visit.cost for visit in trajectory]
     assert all(after < before for before, after in pairwise(costs))
     assert [visit.cost for visit in search.visits] == [reference_cost(prepared, v.point) for v in search.visits]
@@ -222,7 +195,7 @@ def test_search_tells_how_it_went(model, replicate, start):
         candidates = [visit for visit in search.visits if visit.round == number]
         assert [path.filter for path in followed] == [visit.path for visit in candidates]
         assert [on_lattice(path.delays[-1]) for path in followed] == [visit.point for visit in candidates]
-        assert set(range(FILTERS[model])) == {path.filter for path in followed}
+        assert set(range(FILTERS[CASE_2])) == {path.filter for path in followed}
         assert {path.delays[0] for path in followed} == {incumbents[number]}
     # On a path the cost of its own filter falls, and the delay stays within the bounds.
     for path in fit.paths:
@@ -231,10 +204,7 @@ def test_search_tells_how_it_went(model, replicate, start):
         assert (path.delays >= 0).all()
         assert (path.delays <= 15).all()
         assert path.delays.size <= estimator.max_iterations + 1
-    # Switches are the incumbents that another filter led to than the one before.
-    on_paths = trajectory[1:]
     assert fit.switches == search.switches
-    assert list(fit.switches) == [now for before, now in pairwise(on_paths) if now.path != before.path]
 
 
 def test_some_search_does_switch():
@@ -260,13 +230,13 @@ def test_history_leads_from_incumbent_to_incumbent(prepared):
         assert block[0].delay == before.point
         assert block[-1].delay == pytest.approx(after.point, abs=0.5 * LATTICE * prepared.laid_out.filtered.period)
         costs = prepared.laid_out.filtered.costs
-        weight, ones = costs.weights[after.path], np.ones(costs.frequencies.size - 1)
+        weight = costs.weights[after.path]
         for entry in block:
-            inputs = window_spectrum(costs.input, entry.delay, ones)
-            problem = SpectralProblem(costs.frequencies, costs.outputs, inputs, weight, 2, 0)
-            theta = np.array([*entry.denominator[1:], *entry.numerator, entry.delay])
+            inputs = costs.inputs(entry.delay, costs.frequencies.size)
+            a, b = np.array(entry.denominator), np.array(entry.numerator)
+            gram, _ = projected_moments(costs.frequencies, costs.outputs, inputs, weight, a, b)
             # What lies beyond 1e-6 of the greatest weight is left out.
-            assert entry.cost == pytest.approx(problem.equations(theta).squared_error, rel=1e-4)
+            assert entry.cost == pytest.approx(gram[-1, -1], rel=1e-4)
         assert (np.diff([entry.cost for entry in block]) < 0).all()
     stages = list(dict.fromkeys(entry.stage for entry in fit.history if entry not in steps))
     assert stages == ["refine", "joint"]
@@ -294,20 +264,17 @@ def test_coarse_tolerance_settles_early():
 
 def test_without_a_start_the_middle_of_the_bounds_is_taken(prepared):
     assert same(prepared.fit(), prepared.fit(Start(7.5)))
-    assert same(prepared.fit(Start()), prepared.fit(Start(7.5)))
 
 
 # Bounds -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("bound", [0, 1])
+@pytest.mark.parametrize("bound", [3.0, 11.0])
 def test_start_on_a_bound_is_a_start(bound):
-    record = make_record(snr_db=15)
-    for bounds in ((0.0, 15.0), (3.0, 11.0)):
-        fit = UsefulRedundancy(**options(delay_bounds=bounds)).fit(record, Start(bounds[bound]))
-        assert fit.search.trajectory[0].point == pytest.approx(bounds[bound], abs=0.05 * 2 * np.pi / 2.02)
-        assert abs(fit.model.delay - 8.0) < 0.01
-        assert all((path.delays >= bounds[0]).all() and (path.delays <= bounds[1]).all() for path in fit.paths)
+    fit = UsefulRedundancy(**options(delay_bounds=(3.0, 11.0))).fit(make_record(snr_db=15), Start(bound))
+    assert fit.search.trajectory[0].point == pytest.approx(bound, abs=0.05 * 2 * np.pi / 2.02)
+    assert abs(fit.model.delay - 8.0) < 0.01
+    assert all((path.delays >= 3.0).all() and (path.delays <= 11.0).all() for path in fit.paths)
 
 
 @pytest.mark.parametrize("bounds", [(0.0, 7.8), (8.2, 15.0)])
@@ -320,43 +287,22 @@ def test_true_delay_beyond_a_bound_ends_at_the_bound(bounds):
 # Units ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seconds", [1e-3, 3600.0])
-def test_unit_of_time_does_not_matter(seconds):
+@pytest.mark.parametrize(("seconds", "gain_u", "gain_y"), [(1e-3, 1e6, -1e-3), (3600.0, -1e-9, 1e9)])
+def test_units_do_not_matter(seconds, gain_u, gain_y):
     # Milliseconds for seconds, or hours: the same search and the same estimate.
     record = make_record(snr_db=5, seed=5, replicate=2, n=1500)
-    held = HeldSignal(record.input.t * seconds, record.input.values)
-    scaled = Record(record.t * seconds, record.y, held)
+    held = HeldSignal(record.input.t * seconds, gain_u * record.input.values)
+    scaled = Record(record.t * seconds, gain_y * record.y, held)
     more = {"bandwidth": 2.02 / seconds, "svf_cutoff": 1.0 / seconds, "delay_bounds": (0.0, 15.0 * seconds)}
     one = UsefulRedundancy(**options()).fit(record, Start(3.0))
     two = UsefulRedundancy(**options(**more)).fit(scaled, Start(3.0 * seconds))
-    factors = {"a1": 1 / seconds, "a2": seconds**-2, "b0": seconds**-2, "delay": seconds}
+    factors = {"a1": 1 / seconds, "a2": seconds**-2, "b0": seconds**-2 * gain_y / gain_u, "delay": seconds}
     for name, value in one.parameters.items():
         assert two.parameters[name] == pytest.approx(factors[name] * value, rel=1e-6)
-    assert [v.path for v in two.search.trajectory] == [v.path for v in one.search.trajectory]
-    for before, after in zip(one.search.trajectory, two.search.trajectory, strict=True):
-        assert after.point == pytest.approx(before.point * seconds, rel=1e-4)
-        assert after.cost == pytest.approx(before.cost, rel=1e-4)
-
-
-@pytest.mark.parametrize(("gain_u", "gain_y"), [(1e6, -1e-3), (-1e-9, 1e9)])
-def test_units_of_the_signals_do_not_matter(gain_u, gain_y):
-    record = make_record(snr_db=5, seed=5, replicate=2, n=1500)
-    scaled = Record(record.t, gain_y * record.y, HeldSignal(record.input.t, gain_u * record.input.values))
-    one, two = (UsefulRedundancy(**options()).fit(r, Start(3.0)) for r in (record, scaled))
-    for name, value in one.parameters.items():
-        factor = gain_y / gain_u if name == "b0" else 1.0
-        assert two.parameters[name] == pytest.approx(factor * value, rel=1e-6)
     assert two.cost == pytest.approx(gain_y**2 * one.cost, rel=1e-6)
     assert [v.path for v in two.search.trajectory] == [v.path for v in one.search.trajectory]
     for before, after in zip(one.search.trajectory, two.search.trajectory, strict=True):
-        assert (after.point, after.cost) == pytest.approx((before.point, before.cost), rel=1e-4)
-
-
-def test_origin_of_time_does_not_matter():
-    record = make_record(snr_db=15, n=2500)
-    moved = Record(record.t + 1000.0, record.y, HeldSignal(record.input.t + 1000.0, record.input.values))
-    one, two = (UsefulRedundancy(**options()).fit(r, Start(1.0)) for r in (record, moved))
-    assert_same_model(two.model, one.model, 1e-6)
+        assert (after.point, after.cost) == pytest.approx((before.point * seconds, before.cost), rel=1e-4)
 
 
 # Records and models of other kinds --------------------------------------------------------------------
@@ -372,14 +318,6 @@ def test_missing_outputs_are_estimated_around():
     fit = UsefulRedundancy(**options()).fit(masked, Start(1.0))
     assert_same_model(fit.model, TdSrivc(2, 0, BOUNDS).fit(masked, Start(8.1)).model, 1e-6)
     assert fit.count == int((np.isfinite(y) & (record.t >= 15 - 1e-9)).sum())
-
-
-def test_repeated_poles():
-    # A model on the border between real and complex poles.
-    truth = TransferFunction([4.0], [1.0, 4.0, 4.0], 8.0)
-    record = make_record(truth, n=3000)
-    fit = UsefulRedundancy(2, 0, BOUNDS, bandwidth=1.3).fit(record, Start(1.0))
-    assert_same_model(fit.model, truth, 1e-6)
 
 
 @pytest.mark.parametrize(("poles", "zeros"), [(2, 1), (3, 0), (3, 1)])
@@ -399,25 +337,13 @@ def test_more_coefficients_than_the_system_has(poles, zeros):
     ("more", "message"),
     [
         ({"bandwidth": 0.0}, r"bandwidth must be a positive number \[rad/s\], not 0.0"),
-        ({"bandwidth": -2.0}, r"bandwidth must be a positive number \[rad/s\], not -2.0"),
-        ({"bandwidth": np.nan}, "bandwidth must be a positive number"),
         ({"bandwidth": "2"}, "bandwidth must be a positive number"),
         ({"filters": 1}, "must be an integer of at least 2, not 1"),
-        ({"filters": 2.5}, "must be an integer of at least 2, not 2.5"),
         ({"beta": 1.5}, r"beta, .*, must be between 1.7170 .* and 10, not 1.5"),
-        ({"beta": 10.5}, r"beta, .*, must be between 1.7170 .* and 10, not 10.5"),
-        ({"beta": np.nan}, "beta, .*, not nan"),
-        ({"order": 0}, "order must be an integer from 1 to 20, not 0"),
         ({"order": 21}, "order must be an integer from 1 to 20, not 21"),
         ({"max_rounds": 0}, "max_rounds must be an integer of at least 1, not 0"),
-        ({"max_rounds": 1.5}, "max_rounds must be an integer of at least 1, not 1.5"),
     ],
 )
 def test_impossible_options_are_refused(more, message):
     with pytest.raises(ValueError, match=message):
         UsefulRedundancy(**options(**more))
-
-
-def test_bounds_become_numbers():
-    assert UsefulRedundancy(2, 0, [0, "15"]).delay_bounds == (0.0, 15.0)
-    assert UsefulRedundancy(2, 0, np.array([0, 15])).delay_bounds == (0.0, 15.0)

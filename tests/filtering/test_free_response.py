@@ -66,11 +66,6 @@ def test_sensitivities_are_differences(terms, theta):
             assert not by_theta[:, k].any()
 
 
-@pytest.mark.parametrize(("terms", "size"), [([Term(2, 0)], 2), ([Term(1, 1), Term(2, 0, 2)], 5), ([Term(0, 0)], 0)])
-def test_as_many_parameters_as_states(terms, size):
-    assert free_response_size(terms) == size
-
-
 def test_gain_has_no_free_response():
     x, by_theta, by_free = free_response(np.array([3.0]), np.zeros(0), [Term(0, 0)], ELAPSED)
     assert not x.any()

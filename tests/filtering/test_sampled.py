@@ -3,8 +3,6 @@
 import control
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.sampled import sampled_model, simulate_additive
@@ -83,17 +81,6 @@ def test_states_of_the_submodels_do_not_mix():
     assert not transition[blocks == 0].any()
     poles = np.exp(INTERVAL * FOUR_MODES.poles)
     np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(transition)), np.sort_complex(poles), rtol=1e-12)
-
-
-@given(st.floats(1e-3, 1e3), st.floats(0.0, 3.0), st.sampled_from(sorted(MODELS)))
-def test_unit_of_time_does_not_matter(unit, delay, name):
-    u = np.random.default_rng(2).standard_normal(30)
-    scaled = []
-    for g in parts(MODELS[name]):
-        b, a = (c * unit ** np.arange(c.size - 1.0, -1.0, -1.0) for c in (g.numerator, g.denominator))
-        scaled.append(response(sampled_model(TransferFunction(b, a, unit * delay), unit).state_space(), u))
-    expected = response(sampled_model(with_delay(MODELS[name], delay), 1.0).state_space(), u)
-    assert np.abs(sum(scaled) - expected).max() <= 1e-10 * max(np.abs(expected).max(), 1e-300)
 
 
 @pytest.mark.parametrize("regular", [True, False])

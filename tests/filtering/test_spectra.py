@@ -98,25 +98,6 @@ def test_smooth_outputs_keep_their_spectrum(regular, bound):
     assert error < 0.2 * as_lines
 
 
-def test_straight_line_is_its_own_interpolation():
-    t = clock(True, 400)
-    spectra = record_spectra(Record.from_arrays(t, np.ones(t.size), 3 - 2 * t), 1.0, 20.0, 1.0)
-    # int (c - 2 s) exp(-jws) ds/T = 2/(jw) at the window's own frequencies
-    np.testing.assert_allclose(spectra.outputs[1:], 2 / (1j * spectra.frequencies[1:]), rtol=1e-9)
-
-
-def test_power_of_the_bins_is_the_mean_square():
-    # Parseval, for waves at the window's own frequencies.
-    t = clock(True, 401)
-    base = 2 * np.pi / 20.0
-    y = 1.5 + np.sin(2 * base * t) - 0.5 * np.cos(7 * base * t)
-    spectra = record_spectra(Record.from_arrays(t, np.ones(t.size), y), 0.0, 10 * base, 0.0)
-    power = np.abs(spectra.outputs) ** 2
-    assert power[0] + 2 * power[1:].sum() == pytest.approx(1.5**2 + 0.5 + 0.125, rel=1e-4)
-    assert spectra.outputs[2] == pytest.approx(-0.5j, abs=1e-4)
-    assert spectra.outputs[7] == pytest.approx(-0.25, abs=1e-4)
-
-
 def test_missing_samples_are_left_out():
     # As if the record had been sampled without them; masked ends shorten the window.
     record = noisy_record("foh")
@@ -130,21 +111,6 @@ def test_missing_samples_are_left_out():
     assert masked.window == thinned.window == (record.t[100], record.t[789])
     np.testing.assert_allclose(masked.outputs, thinned.outputs, rtol=0, atol=1e-10)
     assert np.array_equal(masked.inputs(1.2), thinned.inputs(1.2))
-
-
-def test_origin_and_unit_of_time_do_not_matter():
-    record = noisy_record(regular=False)
-    spectra = record_spectra(record, 9.0, 6.0, 9.0)
-    u = record.input
-    moved = record_spectra(Record(record.t - 300, record.y, HeldSignal(u.t - 300, u.values)), 9.0, 6.0, 9.0)
-    np.testing.assert_allclose(moved.outputs, spectra.outputs, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(moved.inputs(4.7), spectra.inputs(4.7), rtol=0, atol=1e-11)
-    faster = record_spectra(
-        Record(record.t / 1024, record.y, HeldSignal(u.t / 1024, u.values)), 9 / 1024, 6.0 * 1024, 9 / 1024
-    )
-    np.testing.assert_allclose(faster.frequencies, 1024 * spectra.frequencies, rtol=1e-12)
-    np.testing.assert_allclose(faster.outputs, spectra.outputs, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(faster.inputs(4.7 / 1024), spectra.inputs(4.7), rtol=0, atol=1e-12)
 
 
 def test_without_the_mean_an_offset_has_no_effect():

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
-from ctid_cli.models.transfer_function import TransferFunction
 
 SLOW = Submodel([3.0], [0.25, 0.25, 1.0])
 FAST = Submodel([1.0], [0.025, 0.01, 1.0])
@@ -95,8 +94,6 @@ def test_a_leading_coefficient_of_zero_keeps_its_place():
 def test_sum_is_the_sum():
     model = AdditiveModel([SLOW, REAL, RIGID], delay=0.3)
     w = np.array([0.1, 1.0, 2.0, 30.0])
-    expected = sum(s.frequency_response(w) for s in (SLOW, REAL, RIGID)) * np.exp(-0.3j * w)
-    np.testing.assert_allclose(model.frequency_response(w), expected, rtol=1e-14)
     by_hand = (3 / (0.25 * (1j * w) ** 2 + 0.25j * w + 1) + (0.5j * w + 2) / (0.1j * w + 1) - 4 / w**2) * np.exp(
         -0.3j * w
     )
@@ -105,15 +102,9 @@ def test_sum_is_the_sum():
     expected_poles = [-10.0, -0.5 - 1.9364916731j, -0.5 + 1.9364916731j, 0.0, 0.0]
     np.testing.assert_allclose(model.poles, expected_poles, rtol=1e-10)
     assert (model.dc_gain, AdditiveModel([SLOW, REAL]).dc_gain) == (np.inf, 5.0)
-
-
-@pytest.mark.parametrize(
-    ("submodels", "stable", "marginal"),
-    [([SLOW, FAST], True, True), ([SLOW, RIGID], False, True), ([SLOW, Submodel([1.0], [-1.0, 1.0])], False, False)],
-)
-def test_integrators_are_the_margin_of_stability(submodels, stable, marginal):
-    model = AdditiveModel(submodels)
-    assert (model.is_stable, model.is_marginally_stable) == (stable, marginal)
+    # Integrators are the margin of stability.
+    assert (model.is_stable, model.is_marginally_stable) == (False, True)
+    assert not AdditiveModel([SLOW, Submodel([1.0], [-1.0, 1.0])]).is_marginally_stable
 
 
 def test_sorting_puts_slow_submodels_first():
@@ -141,9 +132,7 @@ def test_models_never_change():
     ("numerator", "denominator", "message"),
     [
         ([1.0], [], "lists of coefficients in descending powers"),
-        ([[1.0]], [1.0, 2.0], "lists of coefficients in descending powers"),
         ([1.0], [np.nan, 1.0], "not a finite number"),
-        ([np.inf], [1.0, 1.0], "not a finite number"),
         ([1.0], [0.0, 1.0], "first denominator coefficient of a submodel is zero"),
         ([1.0], [1.0, 0.0], "give poles at the origin as integrators"),
         ([1.0, 2.0, 3.0], [1.0, 2.0], r"more zeros \(2\) than poles \(1\)"),
@@ -159,9 +148,7 @@ def test_impossible_submodels_are_refused(numerator, denominator, message):
     [
         ((-1, 0, 0), "number of poles of a submodel must be an integer of at least 0"),
         ((2, 0.5, 0), "number of zeros of a submodel must be an integer"),
-        ((2, 0, -1), "number of integrators of a submodel must be"),
         ((1, 2, 0), "got 2 zeros and 1 poles"),
-        ((0, 1, 0), "got 1 zeros and 0 poles"),
     ],
 )
 def test_impossible_structures_are_refused(numbers, message):
@@ -204,14 +191,6 @@ def test_poles_close_to_each_other_may_belong_to_two_submodels():
 
 
 def test_closeness_of_poles_is_a_matter_of_proportion():
-    slow = [Submodel([1.0], [constant, 1.0]) for constant in (1e9, 2e9)]
-    assert AdditiveModel(slow).order == 2
+    assert AdditiveModel([Submodel([1.0], [constant, 1.0]) for constant in (1e9, 2e9)]).order == 2
     with pytest.raises(DataError, match="in common"):
         AdditiveModel([Submodel([1.0], [constant, 1.0]) for constant in (1e-9, 1e-9 * (1 + 1e-9))])
-
-
-def test_one_term_is_a_transfer_function_of_any_structure():
-    model = AdditiveModel([Submodel([1.0, 2.0, 3.0], [4.0, 5.0, 6.0, 2.0])], delay=0.7)
-    w = np.array([0.1, 1.0])
-    expected = TransferFunction([1.0, 2.0, 3.0], [4.0, 5.0, 6.0, 2.0], 0.7).frequency_response(w)
-    np.testing.assert_allclose(model.frequency_response(w), expected, rtol=1e-14)

