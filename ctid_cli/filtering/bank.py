@@ -217,7 +217,7 @@ def double_chain(a: Array, b: Array, integrators: int) -> DoubleChain:
     single, entry, powers = chain(roots)
     powers = powers * (w0 ** np.arange(-order, 0.0))[:, None]
     output = b[::-1] @ powers[: b.size]
-    dynamics: Array = np.kron(np.eye(2), single)
+    dynamics = np.asarray(np.kron(np.eye(2), single), dtype=np.float64)
     dynamics[order:, :order] = np.outer(entry, output)
     return DoubleChain(w0, dynamics, np.concatenate((entry, np.zeros(order))), powers, output)
 

@@ -82,8 +82,8 @@ def test_instrumental_variables_end_at_the_same_estimate(initial_state):
     record = integrating(5, [1.5], [1, 0.5, 0])
     ours = DelayProfile(1, 0, (0.73, 0.73), initial_state=initial_state, integrators=1).fit(record)
     submodel = MeasuredSubmodels((Term(1, 0, 1),), 0.73, initial_state=initial_state).fit(record)
-    assert ours.cost == pytest.approx(submodel.cost, rel=1e-6)
     np.testing.assert_allclose(ours.model.numerator, submodel.model.numerator, rtol=1e-4)
+    np.testing.assert_allclose(ours.model.denominator, submodel.model.denominator, rtol=1e-4)
 
 
 def test_orders_are_searched_beside_integrators():
