@@ -1,15 +1,15 @@
 """The estimation problem of a single transfer function on the samples of one record."""
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, IntArray
+from ctid_cli.arrays import Array
 from ctid_cli.estimation.iteration import Equations, inadmissible, solve_scaled, with_best
 from ctid_cli.estimation.stability import reflect_unstable, with_stable_denominator
-from ctid_cli.filtering.bank import second_moments
+from ctid_cli.filtering.bank import second_moments, standard_rows
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.sensitivities import Structure
@@ -60,29 +60,26 @@ class SampledProblem(NamedTuple):
             moments = second_moments(self.data, np.concatenate(([1.0], theta[:n])), b, delay)
         if not np.isfinite(moments).all():
             return inadmissible(theta.size)
-        psi, phi, signs, error = _rows_of(n, m)
-        mixed, hessian = moments[psi[:, None], phi] * signs, moments[psi[:, None], psi] * signs
+        whole = _with_delay(n, m)
+        psi, phi, signs, error = whole.sensitivity_rows, whole.regressor_rows, whole.signs, whole.error_row
+        mixed, hessian = (moments[psi[:, None], rows] * (signs[:, None] * signs) for rows in (phi, psi))
         # x = sum b_j p^(m-j)/A u.
         rising = b[::-1]
         power = float(rising @ moments[: m + 1, : m + 1] @ rising)
-        return Equations(mixed, moments[psi, error] * signs[-2], hessian, float(moments[error, error]), power)
+        return Equations(mixed, moments[psi, error] * signs, hessian, float(moments[error, error]), power)
+
+    def rows(self, theta: Array) -> tuple[Array, Array]:
+        """Sensitivities of the simulated output, and the output error, at the used samples."""
+        rows, structure = standard_rows(self.data, *self.split(theta)), self.structure
+        return rows[:, structure.sensitivity_rows] * structure.signs, rows[:, structure.error_row]
 
     def admissible(self, theta: Array) -> Array:
         """Reflect unstable denominators."""
         return with_stable_denominator(theta, self.poles)
 
 
-@lru_cache
-def _rows_of(poles: int, zeros: int) -> tuple[IntArray, IntArray, Array, int]:
-    """Return the standard rows of the sensitivities and of the regressors, signs of their products, and of the error.
-
-    ``dx/da_i = -p^(n-i)/A x`` (of y in the regressor), ``dx/db_j = p^(m-j)/A u`` and ``dx/dtau = -p x``.
-    """
-    n, m = poles, zeros
-    of_b, tau = np.arange(m, -1, -1), 3 * n + 2
-    psi, phi = (np.concatenate((np.arange(last, last - n, -1), of_b, [tau])) for last in (2 * n, 3 * n))
-    sign = np.concatenate((-np.ones(n), np.ones(m + 1), [-1.0]))
-    return psi, phi, np.outer(sign, sign), 3 * n + 1
+#: Rows of the sensitivities, the delay among them, in the second moments.
+_with_delay = lru_cache(partial(Structure, delay=True))
 
 
 def at_known_delay(data: FilterData, structure: Structure) -> SampledProblem:

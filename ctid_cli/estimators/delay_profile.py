@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -128,6 +128,12 @@ class MeasuredFit(DeferredFields, Fit):
         linear = self.linear
         found = estimate_uncertainty(linear.sensitivities, linear.residuals, kind, draws, **noise)
         return found.in_ignored_loop if self.in_ignored_loop and kind == "auto" else found
+
+    def with_uncertainty(self, kind: Covariance, draws: int) -> Self:
+        """The fit with errors for a kind of noise, singular where it converged to parameters that have none."""
+        law = self.uncertainty(kind, draws)
+        singular = self.status is Status.CONVERGED and not np.isfinite(law.free_covariance).all()
+        return replace(self, covariance=law.covariance, law=law, status=Status.SINGULAR if singular else self.status)
 
     @property
     def linear(self) -> "MeasuredFit":
@@ -281,10 +287,7 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
                 else:
                     robust = robust_fit(refinement, self.loss, starts, self.nested)
                     fit = fitted(refinement, robust.found, profile, robust)
-                uncertainty = fit.uncertainty(self.covariance, self.bootstrap_draws)
-                singular = fit.status is Status.CONVERGED and not np.isfinite(uncertainty.free_covariance).all()
-                status = Status.SINGULAR if singular else fit.status
-                return replace(fit, covariance=uncertainty.covariance, law=uncertainty, status=status)
+                return fit.with_uncertainty(self.covariance, self.bootstrap_draws)
         raise DataError(Status.SINGULAR.value)
 
 

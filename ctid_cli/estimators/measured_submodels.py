@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.estimation.additive_estimate import radius_in_loop
-from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments
-from ctid_cli.estimation.common import Estimator, Start
+from ctid_cli.estimation.additive_problem import Instruments
+from ctid_cli.estimation.common import Estimator, Start, quality
 from ctid_cli.estimation.fixed import Fixed
 from ctid_cli.estimation.measured_records import without_means
 from ctid_cli.estimation.profile_refinement import AppliedModel
@@ -189,28 +188,28 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             model, method = start.model, "The start was given."
         problem, model = in_one_order(laid_out.problem, model)
         found = self.estimator._iterate(problem, model)
-        rows = problem.filter.rows(found.whole)
-        if rows is None or not np.isfinite(rows[2]).all():
+        y, equations = problem.data.y_used, found.equations
+        if not np.isfinite(equations.squared_error):
             raise DataError(
                 f"{named(laid_out.record)}the iterations for these terms diverged; use fewer or other terms, another "
                 "delay, or a longer record"
             )
-        order = _order(problem, found.whole, sort=self.factored and not self.fixed)
-        theta = found.whole[order]
-        ordered = problem.model(found.whole) if self.fixed else problem.model(found.whole).sorted()
+        order = found.order if self.factored else np.arange(found.theta.size)
+        theta = found.theta[order]
+        ordered = problem.model(found.theta) if self.fixed else problem.model(found.theta).sorted()
         names = (*ordered.names, *(f"x{k}" for k in range(1, problem.filter.free + 1)))
         if not self.factored:
             size, structure = problem.size, Structure(self.poles, self.zeros)
             whole = unfactored(ordered)
             theta = np.concatenate((whole.denominator[1:], _padded(whole.numerator, self.zeros + 1), theta[size:]))
             names = (*structure.names, *names[size:])
-        values: dict[str, Any] = {name: found.values[name] for name in ("status", "iterations", "cost", "count", "r2")}
-        values |= {name: found.values[name] for name in ("fit_percent", "condition_number")}
         fixed = np.isin(order, list(problem.fixed))
         fit = SubmodelsFit(
             model=unfactored(ordered),
             parameter_names=names,
             covariance=np.full((theta.size, theta.size), np.nan),
+            status=found.status,
+            iterations=found.history.steps,
             theta=theta,
             initial_states=(theta[problem.size :],),
             offsets=(laid_out.offset,),
@@ -220,13 +219,12 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             known=tuple(names[k] for k in np.flatnonzero(fixed)),
             additive=ordered if self.factored else None,
             start_method=method,
-            loop_radius=radius_in_loop(problem, ordered),
-            **values,
+            loop_radius=problem.loop_radius(ordered),
+            **quality(equations, float(np.sum((y - y.mean()) ** 2)), y.size),
         )
         samples = self._samples_of(fit, laid_out)
         fit = replace(fit, residuals=samples.residuals, sensitivities=samples.sensitivities, used=samples.used)
-        uncertainty = fit.uncertainty(self.covariance, self.bootstrap_draws)
-        return replace(fit, covariance=uncertainty.covariance, law=uncertainty)
+        return fit.with_uncertainty(self.covariance, self.bootstrap_draws)
 
     # --- what a fit is judged by -----------------------------------------------------------------------
 
@@ -285,14 +283,3 @@ def _single(fit: SubmodelsFit) -> Array:
 def _padded(b: Array, size: int) -> Array:
     """Numerator with its declared length."""
     return np.concatenate((np.zeros(size - b.size), b))
-
-
-def _order(problem: AdditiveProblem, whole: Array, *, sort: bool) -> IndexArray:
-    """Places of all parameters with submodels by rising natural frequency, those of free responses likewise."""
-    if not sort:
-        return np.arange(whole.size)
-    sorting, places = problem.model(whole).order_of_sorting, []
-    for first, widths in ((0, [term.size for term in problem.terms]), (problem.size, [t.order for t in problem.terms])):
-        own = np.split(np.arange(first, first + sum(widths)), np.cumsum(widths)[:-1])
-        places += [own[k] for k in sorting if first < whole.size]
-    return np.concatenate(places)
