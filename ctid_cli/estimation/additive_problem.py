@@ -14,7 +14,7 @@ from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import assessed, history_entry
 from ctid_cli.estimation.iteration import GUARDED, Equations, Iterated, Steps, inadmissible, iterate
-from ctid_cli.estimation.stability import is_hurwitz, reflect_unstable
+from ctid_cli.estimation.sampled_problem import is_hurwitz, reflect_unstable
 from ctid_cli.filtering.filter_data import FilterData, plain_array
 from ctid_cli.filtering.loop import loop_radius
 from ctid_cli.filtering.submodels import OPEN_LOOP, InitialState, LoopData, SubmodelFilter

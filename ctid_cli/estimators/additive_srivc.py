@@ -20,8 +20,7 @@ from ctid_cli.estimation.additive_problem import (
     estimate_submodels,
     loop_data,
 )
-from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_record
-from ctid_cli.estimation.fixed import Fixed, places_of
+from ctid_cli.estimation.common import Estimator, Fixed, Start, StartFrom, check_record, places_of
 from ctid_cli.estimation.iteration import StepRule, Steps
 from ctid_cli.estimation.modal_start import ModalStart, automatic_start
 from ctid_cli.filtering.filter_data import filter_data

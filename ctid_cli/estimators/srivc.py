@@ -16,8 +16,13 @@ from ctid_cli.estimation.additive_problem import (
 )
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, check_record, finish, history_of
 from ctid_cli.estimation.iteration import StepRule, Steps, iterate
-from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, cutoffs_of, least_squares_starts
-from ctid_cli.estimation.stability import with_stable_denominator
+from ctid_cli.estimation.sampled_problem import (
+    SampledProblem,
+    at_known_delay,
+    cutoffs_of,
+    least_squares_starts,
+    with_stable_denominator,
+)
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.fit import Fit, Status
 from ctid_cli.inference.sensitivities import Structure

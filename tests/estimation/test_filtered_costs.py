@@ -6,8 +6,7 @@ from scipy.optimize import least_squares
 
 from ctid_cli.estimation.filtered_costs import filtered_costs, percents
 from ctid_cli.estimation.iteration import Steps, iterate
-from ctid_cli.estimation.sampled_problem import at_known_delay
-from ctid_cli.estimation.stability import reflect_unstable
+from ctid_cli.estimation.sampled_problem import at_known_delay, reflect_unstable
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.simulate import simulate
