@@ -20,7 +20,7 @@ from .models.controller import DiscreteController as DiscreteController
 
 # Exact simulation
 from .filtering.simulate import simulate as simulate
-from .filtering.sampled import simulate_additive as simulate_additive
+from .filtering.simulate import simulate_additive as simulate_additive
 from .filtering.loop import simulate_loop as simulate_loop
 
 # Estimators of systems: options with ``fit(record, start)``

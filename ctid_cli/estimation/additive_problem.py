@@ -13,8 +13,9 @@ import numpy as np
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import assessed, history_entry
-from ctid_cli.estimation.iteration import GUARDED, Equations, Iterated, Steps, inadmissible, iterate
+from ctid_cli.estimation.iteration import GUARDED, Iterated, Steps, inadmissible, iterate
 from ctid_cli.estimation.sampled_problem import is_hurwitz, reflect_unstable
+from ctid_cli.filtering.bank import Equations
 from ctid_cli.filtering.filter_data import FilterData, plain_array
 from ctid_cli.filtering.loop import loop_radius
 from ctid_cli.filtering.submodels import OPEN_LOOP, InitialState, LoopData, SubmodelFilter
@@ -162,7 +163,7 @@ class AdditiveProblem:
     def equations(self, theta: Array) -> Equations:
         """Second moments of the iteration."""
         moments = self.filter.moments(theta) if np.isfinite(theta).all() else None
-        found: Equations = inadmissible(theta.size) if moments is None else Equations(**vars(moments))
+        found: Equations = moments or inadmissible(theta.size)
         return self._without_fixed(found) if self.fixed else found
 
     def rows(self, theta: Array) -> tuple[Array, Array] | None:

@@ -12,8 +12,9 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.delay_search import Descent
-from ctid_cli.estimation.iteration import Equations, Iterated, Problem
+from ctid_cli.estimation.iteration import Iterated, Problem
 from ctid_cli.estimation.sampled_problem import SampledProblem
+from ctid_cli.filtering.bank import Equations
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
 from ctid_cli.inference.criteria import percent_from_r_squared

@@ -12,7 +12,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
-from ctid_cli.estimation.iteration import Equations, Problem, Steps, iterate, solve_scaled, with_best
+from ctid_cli.estimation.iteration import Problem, Steps, iterate, solve_scaled, with_best
+from ctid_cli.filtering.bank import Equations
 from ctid_cli.inference.fit import Status
 
 #: The smallest delay step, as a fraction of the range of the delay.

@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 
 from ctid_cli.arrays import Array
+from ctid_cli.filtering.bank import Equations
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.fit import Status
 
@@ -40,20 +41,6 @@ PATIENCE = 10
 ROUNDING = 1e-13
 #: A change of the output below this fraction is convergence where rounding leaves no lower cost.
 AT_ROUNDING = 1e-7
-
-
-class Equations(NamedTuple):
-    """Second moments at one parameter vector."""
-
-    #: ``sum psi phi'``, shape (p, p).
-    instrument_regressor: Array
-    #: ``sum psi eps``, shape (p,).
-    instrument_error: Array
-    #: ``sum psi psi'``, shape (p, p).
-    hessian: Array
-    #: Infinite where the parameters are inadmissible or the response is not finite.
-    squared_error: float
-    output_power: float
 
 
 class Steps(NamedTuple):

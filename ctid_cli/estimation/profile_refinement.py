@@ -15,13 +15,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
-from ctid_cli.estimation.measured_records import MeasuredRecords
+from ctid_cli.estimation.measured_records import Layout, MeasuredRecords, sensitivities
 from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error
 from ctid_cli.estimation.optimum.box import box_of
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import ROUNDING, local_minimum
-from ctid_cli.estimation.output_error import Layout, sensitivities
 from ctid_cli.inference.robust_loss import Loss, RobustKind, Weighting, scale_of
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.iteration import Equations, inadmissible, solve_scaled, with_best
-from ctid_cli.filtering.bank import second_moments, standard_rows
+from ctid_cli.estimation.iteration import inadmissible, solve_scaled, with_best
+from ctid_cli.filtering.bank import Equations, second_moments, standard_rows
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.filtering.realisation import scaled_roots
 from ctid_cli.inference.input_response import output_bandwidth

@@ -154,7 +154,7 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
     --------
     >>> import numpy as np
     >>> from ctid_cli import HeldSignal, Record
-    >>> from ctid_cli.filtering.sampled import simulate_additive
+    >>> from ctid_cli.filtering.simulate import simulate_additive
     >>> from ctid_cli.models.additive import AdditiveModel, Submodel, Term
     >>> system = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
     >>> rng = np.random.default_rng(1)

@@ -9,14 +9,13 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Estimator, Fixed, Start, checked_bounds, places_of, quality
-from ctid_cli.estimation.iteration import Equations
-from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
+from ctid_cli.estimation.measured_records import Layout, MeasuredRecords, Treatment, sensitivities
 from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
-from ctid_cli.estimation.output_error import Layout, sensitivities
 from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement, RobustFit, robust_fit
 from ctid_cli.estimation.profile_search import Profile, search_delay
+from ctid_cli.filtering.bank import Equations
 from ctid_cli.inference.covariance import nearly_regular
 from ctid_cli.inference.fit import DeferredFields, Fit, Status
 from ctid_cli.inference.robust_loss import Loss, Weighting, weighted

@@ -13,8 +13,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.delay_search import SMALLEST_STEP, Limits, Minimum, descend
-from ctid_cli.estimation.filter_search import FilterPath, path_history
-from ctid_cli.estimation.filtered_costs import percents
+from ctid_cli.estimation.filtered_costs import FilterPath, path_history, percents
 from ctid_cli.estimation.redundancy import START, RedundantMinimum, SearchStatus, Visit
 from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.estimators.td_srivc import SrivcCost, TdSrivc

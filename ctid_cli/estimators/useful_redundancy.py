@@ -11,8 +11,14 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, initial_delay
 from ctid_cli.estimation.delay_grid import scan
 from ctid_cli.estimation.delay_search import Descent, Minimum
-from ctid_cli.estimation.filter_search import LARGEST_STEP, LATTICE, FilterPath, FilterSearch, path_history
-from ctid_cli.estimation.filtered_costs import filtered_costs
+from ctid_cli.estimation.filtered_costs import (
+    LARGEST_STEP,
+    LATTICE,
+    FilterPath,
+    FilterSearch,
+    filtered_costs,
+    path_history,
+)
 from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps, Variant
 from ctid_cli.estimation.redundancy import RedundantMinimum, Visit
 from ctid_cli.estimation.sampled_problem import SampledProblem

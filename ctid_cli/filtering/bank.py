@@ -38,6 +38,21 @@ Place = float | tuple[int, float]
 NOTHING, NO_ROWS = np.zeros(0), np.zeros((0, 0))
 
 
+class Equations(NamedTuple):
+    """Second moments at one parameter vector, of sensitivities or instruments psi, regressors phi and output error."""
+
+    #: ``sum psi phi'``, shape (p, p).
+    instrument_regressor: Array
+    #: ``sum psi eps``, shape (p,).
+    instrument_error: Array
+    #: ``sum psi psi'``, shape (p, p).
+    hessian: Array
+    #: Infinite where the parameters are inadmissible or the response is not finite.
+    squared_error: float
+    #: Sum of squares of the model output [output unit^2].
+    output_power: float
+
+
 class Modes(NamedTuple):
     """Partial fractions of one model, or of several submodels with their modes pooled."""
 

@@ -14,7 +14,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.filtering import kernels
 from ctid_cli.filtering.filter_data import plain_array
-from ctid_cli.filtering.sampled import SampledModel, sampled_model
+from ctid_cli.filtering.simulate import SampledModel, sampled_model
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.controller import DiscreteController, Relay
 from ctid_cli.models.transfer_function import TransferFunction

@@ -1,4 +1,6 @@
-"""Exact response of a transfer function to a held input, at any instants."""
+"""Exact responses of models to a held input, at any instants, and their sampled equivalents behind a constant hold."""
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -6,10 +8,12 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, chain_states, modal_form, modal_output
-from ctid_cli.filtering.filter_data import FilterData, clock_slack, plain_array
-from ctid_cli.filtering.realisation import chain, scaled_roots
+from ctid_cli.filtering.filter_data import FilterData, clock_slack, plain_array, split_delay
+from ctid_cli.filtering.realisation import chain, held_step, scaled_roots
+from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.band_limited import FINER
+from ctid_cli.signals.checks import require_positive
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.regularity import REGULARITY, regular_interval
 
@@ -102,3 +106,104 @@ def _response(a: Array, b: Array, delay: float, data: FilterData) -> Array:
     n = gain.size
     reading = (b / w0 ** np.arange(1.0, n + 1))[::-1] @ powers
     return np.asarray(chain_states(dynamics, gain, w0, data, delay)[:, :n] @ reading)
+
+
+class SampledModel(NamedTuple):
+    r"""``z_(k+1) = F z_k + g u_(k-shift)``, ``x_k = c z_k + d u_(k-shift)`` for an input held between the samples."""
+
+    #: F, block diagonal for a sum of submodels, shape (n, n).
+    transition: Array
+    #: g, shape (n,).
+    from_input: Array
+    #: c, shape (n,).
+    output: Array
+    direct: float
+    shift: int
+
+    def state_space(self) -> tuple[Array, Array, Array, Array]:
+        """Realisation with the late inputs as further states."""
+        n, size = self.from_input.size, self.from_input.size + self.shift
+        A, B, C, D = np.zeros((size, size)), np.zeros((size, 1)), np.zeros((1, size)), np.zeros((1, 1))
+        A[:n, :n], C[0, :n] = self.transition, self.output
+        if self.shift:
+            # The states behind the plant's are u_(k-1) … u_(k-shift).
+            A[:n, -1], C[0, -1], B[n, 0] = self.from_input, self.direct, 1.0
+            A[n:, n:] = np.eye(self.shift, k=-1)
+        else:
+            B[:, 0], D[0, 0] = self.from_input, self.direct
+        return A, B, C, D
+
+
+def sampled_model(model: AdditiveModel | TransferFunction, interval: float) -> SampledModel:
+    r"""Exact zero-order-hold equivalent of a model at rest.
+
+    With the delay ``(shift - fraction) h``, ``0 <= fraction < 1``, the output at ``t_k`` is that of the undelayed model
+    ``fraction h`` after ``t_(k-shift)``, while it still holds ``u_(k-shift)``.
+    """
+    require_positive("the sampling interval", interval, "s")
+    parts = [s.transfer_function() for s in model.submodels] if isinstance(model, AdditiveModel) else [model]
+    shift, fraction = split_delay(model.delay, interval)
+    n = sum(part.order for part in parts)
+    transition, from_input, output, direct = np.zeros((n, n)), np.zeros(n), np.zeros(n), 0.0
+    first = 0
+    for part in parts:
+        place = slice(first, first + part.order)
+        transition[place, place], from_input[place], output[place], at_once = _part(part, interval, fraction)
+        direct += at_once
+        first += part.order
+    return SampledModel(transition, from_input, output, direct, shift)
+
+
+def _part(part: TransferFunction, interval: float, fraction: float) -> tuple[Array, Array, Array, float]:
+    """One-interval map of an undelayed transfer function, read out a fraction of the interval after each sample."""
+    n = part.order
+    direct, strictly_proper = feedthrough(part)
+    if not n:
+        return np.zeros((0, 0)), np.zeros(0), np.zeros(0), direct
+    w0, roots = scaled_roots(plain_array(part.denominator))
+    dynamics, gain, powers = chain(roots)
+    output = (strictly_proper / w0 ** np.arange(1, n + 1))[::-1] @ powers
+    transition, from_input, _ = held_step(dynamics, gain, interval * w0)
+    if fraction:
+        part_way, from_held, _ = held_step(dynamics, gain, fraction * interval * w0)
+        output, direct = output @ part_way, float(output @ from_held) + direct
+    return transition, from_input, output, direct
+
+
+def simulate_additive(model: AdditiveModel, signal: HeldSignal, times: ArrayLike) -> Array:
+    """Output of a sum of submodels at rest before the first break of its input.
+
+    Parameters
+    ----------
+    model : AdditiveModel
+        The sum.
+    signal : HeldSignal
+        The input; zero before its first break.
+    times : array_like, shape (N,)
+        Instants [s], strictly increasing.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        Noise-free output [output unit].
+
+    Raises
+    ------
+    DataError
+        If the instants do not increase strictly.
+
+    Notes
+    -----
+    Exact for every clock and delay, as :func:`ctid_cli.filtering.simulate`, and formed submodel by submodel: no
+    polynomial of the order of the whole sum, with the rounding of its roots, is needed.
+
+    Examples
+    --------
+    >>> from ctid_cli.models.additive import Submodel
+    >>> model = AdditiveModel([Submodel([1.0], [1.0, 1.0]), Submodel([2.0], [0.5, 1.0])])
+    >>> simulate_additive(model, HeldSignal([0.0], [1.0]), [1.0]).round(6)
+    array([2.36145])
+    """
+    parts = [submodel.transfer_function() for submodel in model.submodels]
+    delayed = [TransferFunction(part.numerator, part.denominator, model.delay) for part in parts]
+    return np.asarray(np.sum([simulate(part, signal, times) for part in delayed], axis=0))

@@ -24,6 +24,7 @@ from ctid_cli.filtering import kernels
 from ctid_cli.filtering.bank import (
     MODAL_CONDITION_LIMIT,
     MOST_MODAL_INTEGRATORS,
+    Equations,
     ModalForm,
     Modes,
     double_chain,
@@ -58,22 +59,6 @@ class LoopData(NamedTuple):
 
 #: No feedback.
 OPEN_LOOP = LoopData(np.zeros(0), np.ones(1), np.ones(1), True)
-
-
-@dataclass(frozen=True, eq=False)
-class SubmodelMoments:
-    """Second moments at one parameter vector, in the terms of the module's equations."""
-
-    #: ``sum psi phi'``, shape (p, p).
-    instrument_regressor: Array
-    #: ``sum psi eps``, shape (p,).
-    instrument_error: Array
-    #: ``sum psi psi'``, shape (p, p).
-    hessian: Array
-    #: ``sum eps^2`` [output unit^2].
-    squared_error: float
-    #: Sum of squares of the model output driven by z [output unit^2].
-    output_power: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,8 +123,8 @@ class Part:
 class SubmodelFilter:
     """The filters of a record for sums of submodels of one structure.
 
-    All submodels are filtered in one compiled pass of their pooled modes. Submodels with (nearly) repeated poles, and
-    closed loops on irregular clocks, go through :func:`ctid_cli.filtering.bank.standard_rows` submodel by submodel,
+    All submodels are filtered in one compiled pass of their pooled modes. Submodels with (nearly) repeated poles go
+    through :func:`ctid_cli.filtering.bank.standard_rows` submodel by submodel,
     several times slower.
     """
 
@@ -162,7 +147,7 @@ class SubmodelFilter:
         if self.periodic and data.interval == 0.0:
             raise ValueError("initial_state periodic needs input and output on one regular clock")
 
-    def moments(self, theta: Array) -> SubmodelMoments | None:
+    def moments(self, theta: Array) -> Equations | None:
         """Return the second moments at one parameter vector; None where they are not finite."""
         # What overflows is found by the sums not being finite.
         with np.errstate(all="ignore"):
@@ -172,16 +157,14 @@ class SubmodelFilter:
         finite = np.isfinite(moments.hessian).all() and np.isfinite(moments.instrument_regressor).all()
         return moments if finite else None
 
-    def _moments(self, theta: Array) -> SubmodelMoments | None:
+    def _moments(self, theta: Array) -> Equations | None:
         pooled = None if self.free else self._pooled(theta)
         if pooled is None:
             rows = self.rows(theta)
             if rows is None:
                 return None
             psi, phi, error, output = rows
-            return SubmodelMoments(
-                psi.T @ phi, psi.T @ error, psi.T @ psi, float(error @ error), float(output @ output)
-            )
+            return Equations(psi.T @ phi, psi.T @ error, psi.T @ psi, float(error @ error), float(output @ output))
         psi, phi, output = pooled.psi, pooled.phi, pooled.output
         # psi and the model output are made of the rows up to that of the error.
         leading = 2 * pooled.modes.width + 2
@@ -190,7 +173,7 @@ class SubmodelFilter:
         power = output[:leading] @ gram @ output
         squared = float(gram[leading - 1, leading - 1])
         error = products[:, leading - 1].copy()
-        return SubmodelMoments(products @ phi, error, products @ psi, squared, float(power))
+        return Equations(products @ phi, error, products @ psi, squared, float(power))
 
     def rows(self, theta: Array) -> tuple[Array, Array, Array, Array] | None:
         """Return instruments, regressors, output error and model output at the used samples."""
@@ -224,8 +207,6 @@ class SubmodelFilter:
 
     def _pooled(self, theta: Array) -> "Pooled | None":
         """Return the partial fractions of all submodels; None where one has none."""
-        if self.loop.closed and self.data.interval == 0.0:
-            return None
         parts, forms = [], []
         for part in _parts(theta, self.terms):
             form = part.modal() if part is not None else None

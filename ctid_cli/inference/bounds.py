@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array
 from ctid_cli.errors import BiasedError, DataError
 from ctid_cli.filtering.loop import loop_radius, simulate_loop
-from ctid_cli.filtering.sampled import sampled_model
+from ctid_cli.filtering.simulate import sampled_model
 from ctid_cli.inference.covariance import sandwich, unit_inverse
 from ctid_cli.inference.sensitivities import Structure, sensitivities
 from ctid_cli.models.additive import AdditiveModel, Term

@@ -257,8 +257,7 @@ Source = SimulatedSource | MeasuredSource
 
 def _simulated(system: TransferFunction | AdditiveModel | OwnSystem, applied: HeldSignal, times: Array) -> Array:
     """Output of a model."""
-    from ctid_cli.filtering.sampled import simulate_additive
-    from ctid_cli.filtering.simulate import simulate
+    from ctid_cli.filtering.simulate import simulate, simulate_additive
 
     if isinstance(system, OwnSystem):
         return system.simulate(applied, times)

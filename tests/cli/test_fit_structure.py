@@ -7,7 +7,7 @@ import pytest
 
 from ctid_cli import HeldSignal, TransferFunction, load_fit
 from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.filtering.sampled import simulate_additive
+from ctid_cli.filtering.simulate import simulate_additive
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
 from tests.cli.records import write

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.filtering.sampled import simulate_additive
+from ctid_cli.filtering.simulate import simulate_additive
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.signals.held import HeldSignal

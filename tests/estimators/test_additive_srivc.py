@@ -13,8 +13,7 @@ from ctid_cli.estimation.iteration import Steps, iterate
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc
 from ctid_cli.estimators.srivc import Srivc
 from ctid_cli.filtering.filter_data import filter_data
-from ctid_cli.filtering.sampled import simulate_additive
-from ctid_cli.filtering.simulate import simulate
+from ctid_cli.filtering.simulate import simulate, simulate_additive
 from ctid_cli.inference.fit import Status
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.controller import DiscreteController

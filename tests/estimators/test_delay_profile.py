@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
+from ctid_cli.estimation.measured_records import Layout, sensitivities
 from ctid_cli.estimation.optimum import pilot
 from ctid_cli.estimation.optimum.projection import Problem
-from ctid_cli.estimation.output_error import Layout, sensitivities
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate

@@ -7,8 +7,7 @@ from scipy.optimize import least_squares
 from ctid_cli.estimation.common import Fixed
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc
 from ctid_cli.estimators.delay_profile import DelayProfile
-from ctid_cli.filtering.sampled import simulate_additive
-from ctid_cli.filtering.simulate import simulate
+from ctid_cli.filtering.simulate import simulate, simulate_additive
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal

@@ -6,7 +6,7 @@ import pytest
 
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.loop import loop_radius, simulate_loop
-from ctid_cli.filtering.sampled import sampled_model, simulate_additive
+from ctid_cli.filtering.simulate import sampled_model, simulate_additive
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction

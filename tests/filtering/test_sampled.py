@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.sampled import sampled_model, simulate_additive
-from ctid_cli.filtering.simulate import simulate
+from ctid_cli.filtering.simulate import sampled_model, simulate, simulate_additive
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.kernels import BLOCK
 from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.filtering.sampled import simulate_additive
-from ctid_cli.filtering.simulate import simulate
+from ctid_cli.filtering.simulate import simulate, simulate_additive
 from ctid_cli.filtering.submodels import OPEN_LOOP, LoopData, SubmodelFilter
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController

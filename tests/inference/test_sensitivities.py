@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import toeplitz
 
-from ctid_cli.filtering.sampled import simulate_additive
+from ctid_cli.filtering.simulate import simulate_additive
 from ctid_cli.inference.bounds import finite_record_covariance, limiting_accuracy
 from ctid_cli.inference.sensitivities import sensitivities
 from ctid_cli.models.additive import AdditiveModel, Submodel

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.sampled import simulate_additive
-from ctid_cli.filtering.simulate import simulate
+from ctid_cli.filtering.simulate import simulate, simulate_additive
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.common import Start
-from ctid_cli.estimation.filter_search import FilterSearch
-from ctid_cli.estimation.filtered_costs import FilteredCosts, percents
+from ctid_cli.estimation.filtered_costs import FilteredCosts, FilterSearch, percents
 from ctid_cli.estimators.useful_redundancy import RedundantFit, UsefulRedundancy
 from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, Drawing, pointed, ramp, spread
 from ctid_cli.simulation.dataset import DataSet
