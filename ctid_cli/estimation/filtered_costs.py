@@ -1,10 +1,10 @@
 """Output-error costs of a record behind low-pass filters as functions of the delay, on spectra."""
 
 from collections.abc import Iterable, Sequence
+from math import comb
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import comb
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.estimation.delay_search import Minimum
@@ -98,7 +98,7 @@ class FilteredCosts(NamedTuple):
 
         ``A Y = B U + T`` divided by the filter F reads ``Y = -sum (a_i - f_i) (jw)^(n-i)/F Y + B/F U + T/F``.
         """
-        svf = comb(self.poles, np.arange(self.poles + 1)) * cutoff ** np.arange(self.poles + 1)
+        svf = np.array([comb(self.poles, k) * cutoff**k for k in range(self.poles + 1)])
         gram, _ = projected_moments(*data, svf, np.zeros(self.zeros + 1), self.integrators)
         lengths = np.diag(gram)
         solved, theta = solve_scaled(gram, gram[:, -1], lengths, lengths, self.size - 1)
