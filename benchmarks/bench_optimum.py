@@ -30,7 +30,7 @@ from ctid_cli.signals.measurement import read_measurement
 
 TOLERANCE = 1e-6
 #: Poles whose distance is a smaller fraction of their magnitudes are one to the peer.
-CLOSE = 1e-5
+CLOSE = 3e-4
 #: Slowest pole times the record's length, and least damping, of a set that bounds nothing that matters.
 NEARLY_ZERO = 1e-6
 #: Poles and zeros tried on measured records, most of their samples, and the treatment of each: state, offset, delays.
