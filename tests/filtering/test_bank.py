@@ -167,17 +167,6 @@ def test_poles_far_slower_than_the_sampling_lose_no_accuracy(hold, regular, slow
     assert_close(rows[:, [0, 3, 5]], np.column_stack(expected), 1e-9)
 
 
-@pytest.mark.parametrize("regular", [True, False])
-@pytest.mark.parametrize(("system", "form"), FORMS)
-def test_zero_delay_is_no_delay(system, form, regular):
-    # Bit for bit: a delay far below the resolution of the clock, and an input moved by nothing.
-    r = record(6, regular=regular)
-    without = standard_rows(filter_data(r), *system, 0.0, form)
-    assert np.array_equal(standard_rows(filter_data(r), *system, 1e-30, form), without)
-    moved = Record(r.t, r.y, r.input.delayed(0.0))
-    assert np.array_equal(standard_rows(filter_data(moved), *system, 0.0, form), without)
-
-
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
 @pytest.mark.parametrize(("system", "form"), FORMS)
 def test_whole_intervals_of_delay_shift_the_rows_of_the_input(system, form, hold):
