@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.optimum import pilot
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.output_error import Layout, sensitivities
 from ctid_cli.estimators.delay_profile import DelayProfile
@@ -250,17 +249,3 @@ def test_a_range_beyond_the_record_or_no_record_is_refused():
         DelayProfile(2, 0, (0, 100)).fit(record_of())
     with pytest.raises(DataError, match="no record"):
         DelayProfile(2, 0, (0, 1)).fit([])
-
-
-@pytest.mark.parametrize("offset", ["remove", "estimate"])
-def test_the_profile_of_a_part_of_a_long_record_has_the_minimum_of_the_whole(monkeypatch, offset):
-    record = make_record(CASE_1, seed=4, snr_db=15.0, n=3000)
-    options = DelayProfile(2, 0, (0.0, 15.0), offset=offset, nested=True)
-    whole = options.fit(record)
-    monkeypatch.setattr(pilot, "LONG", 2000)
-    monkeypatch.setattr(pilot, "PART", 800)
-    part = options.fit(record)
-    assert part.profile.samples < 0.6 * record.n_samples <= whole.profile.samples
-    spacing = part.profile.delays[1]
-    assert abs(part.profile.delays[np.argmin(part.profile.costs)] - CASE_1.delay) < spacing
-    assert part.cost == pytest.approx(whole.cost, rel=1e-9)
