@@ -40,7 +40,6 @@ from tests.estimators.additive_records import (
 )
 from tests.estimators.records import assert_same_model
 
-FOUR = (MODE,) * 4
 TWO = (MODE, MODE)
 MIXED = AdditiveModel([Submodel([0.2, 2.0], [0.7, 1.0]), Submodel([0.4], [0.05, 0.01, 1.0])], 0.12)
 DELAYED = AdditiveModel(TWO_MODES.submodels, 0.12)

@@ -215,6 +215,18 @@ def test_history_leads_from_incumbent_to_incumbent(prepared):
     assert fit.history[-1].delay == fit.model.delay
 
 
+def test_where_no_path_leads_lower_the_next_valleys_are_looked_at():
+    # Two filters are too few for this start: J0 is above 25 % where they end, and paths start a period away from there.
+    record = make_record(snr_db=5, seed=5, replicate=2, n=2500)
+    fit = UsefulRedundancy(**options(filters=2, beta=2.0)).fit(record, Start(12.0))
+    away = []
+    for path in fit.paths:
+        incumbent = [visit.point for visit in fit.search.trajectory if visit.round < path.round][-1]
+        away.append(abs(path.delays[0] - incumbent) / fit.filters.periods[path.filter])
+    assert set(np.round(away, 9)) == {0.0, 1.0}
+    assert fit.model.delay == pytest.approx(8.0, abs=0.01)
+
+
 def test_too_few_rounds_end_the_search(prepared):
     record = make_record(snr_db=5, seed=5, replicate=2)
     fit = UsefulRedundancy(**options(max_rounds=1)).fit(record, Start(3.0))
