@@ -29,7 +29,7 @@ from ctid_cli import DataError, DelayProfile, HeldSignal, Record, TransferFuncti
 from ctid_cli.signals.measurement import read_measurement
 
 TOLERANCE = 1e-6
-#: Poles whose distance is a smaller fraction of their magnitudes are one to the peer.
+#: Poles whose distances, as fractions of their magnitudes, have a smaller product are left out by the peer.
 CLOSE = 3e-4
 #: Slowest pole times the record's length, and least damping, of a set that bounds nothing that matters.
 NEARLY_ZERO = 1e-6
@@ -138,7 +138,8 @@ class Peer:
         phi, y = np.column_stack(columns), self.record.y[self.use]
         phi = phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
         apart = np.abs(poles[:, None] - poles) / (np.abs(poles[:, None]) + np.abs(poles) + 1e-300)
-        if not np.isfinite(phi).all() or apart[~np.eye(poles.size, dtype=bool)].min(initial=1.0) < CLOSE:
+        np.fill_diagonal(apart, 1.0)
+        if not np.isfinite(phi).all() or apart.prod(axis=1).min() < CLOSE:
             # Poles that coincide have no modal responses of their own, and those of close ones are rounding.
             return y
         return y - phi @ np.linalg.lstsq(phi, y, rcond=1e-13)[0]
